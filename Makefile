@@ -1,0 +1,44 @@
+# `make demo` and `make test` need Python 3.11 or newer, git and make; everything else goes into .venv.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+READY := .venv/ready
+
+.PHONY: demo test check bench setup llvm clean
+
+demo: setup
+	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
+	@echo "Look at out/photo/overview.png; the numbers are in out/photo/run.json."
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+bench: setup
+	$(BIN)/python -m tests.benchmarks
+
+setup: $(READY) llvm
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $(READY)
+
+# The fast backend wants LLVM 17 or newer; Debian's libllvm19 is installed where that can be done without asking.
+# Where it cannot, everything works on the slow backend, and `ommatid doctor` names the one command that mends it.
+FAST := $(BIN)/python -c 'import sys; from simulate.variant import blocked; sys.exit(bool(blocked("llvm_ad_mono")))'
+ROOT := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo -n; fi)
+
+llvm: $(READY)
+	@$(FAST) || { [ -n "$(ROOT)" ] && command -v apt-get >/dev/null && echo "Installing libllvm19 ..." && \
+		$(ROOT) apt-get update -qq && $(ROOT) apt-get install -y -qq libllvm19; } >&2 2>/dev/null || true
+	@$(FAST) || echo "No LLVM 17 or newer here: rendering will be slow; .venv/bin/ommatid doctor says how to mend it."
+
+clean:
+	rm -rf .venv out

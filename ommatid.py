@@ -1,0 +1,373 @@
+"""The command line: a shell over scenes, simulate and reconstruct, which do the work and meet in files.
+
+Results go to stdout, as tables or with --json as one document; progress and what went wrong go to stderr.
+Exit code 0, or 2 for a scene, option or file to mend, 1 for what the machine denies. Heavy imports stand inside the
+command that needs them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from scenes.errors import DeniedError, InputError
+
+if TYPE_CHECKING:
+    from scenes.camera import Camera
+    from scenes.picture import Image
+    from scenes.scene import Scene
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Simulate, calibrate and reconstruct the images of flat compound-eye cameras, with error bars.",
+)
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="A scene file.")]
+SceneFiles = Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene files.")]
+Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
+Output = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a key, as in noise.variance=1e-6; empty removes it."),
+]
+Lenses = Annotated[
+    str, typer.Option("--lens", metavar="NAME,...", help="Keep these lens types; one named twice counts twice.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
+Progress = Callable[[float], None]
+
+
+@app.command()
+def run(
+    scenes: SceneFiles, output: Folder = Path("out"), sets: Sets = None, lens: Lenses = "", as_json: Json = False
+) -> None:
+    """Render, calibrate, reconstruct and report."""
+
+    def work(path: Path, folder: Path) -> dict[str, Any]:
+        from reconstruct.report import rows
+        from reconstruct.results import kept_results
+        from simulate.kept import kept_model
+
+        scene, camera, image = _opened(path, sets, lens)
+        stack = _rendered(scene, camera, image, folder)
+        with _progress("calibrate") as progress:
+            model, made = kept_model(folder / "model.npz", scene, camera, progress)
+        _say(f"calibrate: {_done(made)}")
+        names = (folder / "stack.exr", folder / "model.npz")
+        description, made = kept_results(folder, stack, model, names)
+        _say(f"reconstruct: {_done(made)}")
+        if not as_json:
+            _table(f"{scene.title or path.stem}: {folder}", rows(description))
+        return description
+
+    _each(scenes, output, work, as_json)
+
+
+@app.command()
+def render(
+    scenes: SceneFiles, output: Folder = Path("out"), sets: Sets = None, lens: Lenses = "", as_json: Json = False
+) -> None:
+    """Render the sub-images alone."""
+
+    def work(path: Path, folder: Path) -> dict[str, Any]:
+        scene, camera, image = _opened(path, sets, lens)
+        stack = _rendered(scene, camera, image, folder)
+        return {"file": str(folder / "stack.exr"), "sub_images": len(camera.sub_imagers), **stack.record}
+
+    _each(scenes, output, work, as_json)
+
+
+@app.command()
+def calibrate(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
+    """Find the observation matrix H alone."""
+    from scenes.camera import derive
+    from scenes.scene import read
+    from simulate.kept import kept_model
+
+    described = read(scene, sets or (), _names(lens))
+    camera = derive(described)
+    with _progress("calibrate") as progress:
+        model, made = kept_model(output, described, camera, progress)
+    _say(f"calibrate: {_done(made)}, {output}")
+    if as_json:
+        facts = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": int(model.matrix.nnz)}
+        _print_json({"file": str(output), **facts, **model.record})
+
+
+@app.command()
+def reconstruct(
+    stack: Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")],
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Their observation model, model.npz.")],
+    output: Output,
+    sets: Sets = None,
+    lens: Lenses = "",
+    as_json: Json = False,
+) -> None:
+    """Reconstruct from files alone."""
+    import scenes.model
+    import scenes.stack
+    from reconstruct import figure, report, results
+
+    recorded, calibrated = scenes.stack.read(stack), scenes.model.read(model)
+    if lens:
+        recorded, calibrated = recorded.restrict(_names(lens)), calibrated.restrict(_names(lens))
+    recorded = results.changed(recorded, sets or [], stack)
+    truth = results.truth_beside(stack, recorded)
+    restoration, description = results.reconstruct(recorded, calibrated, truth, (stack, model))
+    report.write_estimate(output, restoration, {"title": recorded.scene.title})
+    figure.write_estimate(output.with_suffix(".png"), restoration.estimate.reshape(restoration.shape))
+    if as_json:
+        _print_json({"file": str(output), **description})
+    else:
+        _table(str(output), report.rows(description))
+
+
+@app.command()
+def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
+    """Expected error, rank and null space of H.
+
+    From Eq. 5 and the ideal model: nothing is rendered.
+    """
+    from dataclasses import asdict
+
+    from reconstruct import accuracy
+    from reconstruct.prior import independent
+    from scenes.camera import derive
+    from scenes.scene import read
+    from simulate.ideal import ideal_matrix
+
+    described = read(scene, sets or (), _names(lens))
+    camera = derive(described)
+    noise = described.noise
+    actual = noise.variance + noise.quantisation_variance if noise else 0.0
+    told = described.estimator
+    prediction = accuracy.predict(
+        ideal_matrix(camera), independent(described.prior, camera.unknowns), actual, told, (camera.rows, camera.columns)
+    )
+    if as_json:
+        _print_json(asdict(prediction))
+    else:
+        _table(described.title or scene.stem, accuracy.rows(prediction))
+
+
+@app.command()
+def show(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
+    """The geometry, the plan, and what is left out."""
+    from scenes.camera import derive
+    from scenes.scene import read
+    from scenes.show import describe, sections
+    from simulate.variant import choose
+
+    described = read(scene, sets or (), _names(lens))
+    description = describe(described, derive(described), choose(described.render.variant))
+    if as_json:
+        _print_json(description)
+    else:
+        for title, lines in sections(description):
+            _table(title, lines)
+
+
+@app.command()
+def export(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
+    """Write a plain Mitsuba scene of stock sensors."""
+    from simulate.export import export as write
+
+    described, camera, image = _opened(scene, sets, lens)
+    picture = write(described, camera, image, output)
+    sensors = [sub.name for sub in camera.sub_imagers]
+    _say(f"{output} and {picture}: {len(sensors)} sensors; render one with: mitsuba -m scalar_rgb -s 0 {output}")
+    if as_json:
+        _print_json({"file": str(output), "picture": str(picture), "sensors": sensors})
+
+
+@app.command()
+def init(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The scene file to write.")], as_json: Json = False
+) -> None:
+    """Write a scene file to start from."""
+    from scenes.files import write_text
+
+    if file.exists():
+        raise InputError(f"{file}: exists already; choose another name or remove it first")
+    write_text(file, (Path(__file__).parent / "scenes" / "starter.toml").read_text(encoding="utf-8"))
+    _say(f"{file}: written; next: ommatid run {file} -o out")
+    if as_json:
+        _print_json({"file": str(file)})
+
+
+@app.command()
+def schema(as_json: Json = False) -> None:
+    """Print the JSON Schema of scene files."""
+    del as_json  # it is one JSON document anyway
+    from scenes.scene import Scene
+
+    _print_json(Scene.model_json_schema())
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Which backends work here, and what repairs them."""
+    from scenes.versions import versions
+    from simulate.variant import PREFERENCE, diagnosis, probe
+
+    found = [probe(variant) for variant in PREFERENCE]
+    advice = diagnosis(found)
+    installed = versions("mitsuba", "drjit", "OpenEXR", "scipy", "scikit-image")
+    if as_json:
+        backends = [{"variant": one.variant, "reason": one.reason, "samples_per_second": one.speed} for one in found]
+        _print_json({"backends": backends, "advice": advice, "versions": installed, "cores": os.cpu_count()})
+        return
+    lines = [
+        (one.variant, f"works, {one.speed / 1e6:.0f} million samples a second" if not one.reason else one.reason)
+        for one in found
+    ]
+    _table("Backends", lines)
+    _table("Versions", list(installed.items()))
+    _print(advice)
+
+
+def main() -> None:
+    """Run the command line; every failure ends in one sentence on stderr and an exit code."""
+    try:
+        code = app(standalone_mode=False)
+    except Exception as error:
+        code = _complain(error)
+    except KeyboardInterrupt:
+        _say("ommatid: stopped; finished files stay, the next run carries on from them")
+        code = 1
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _complain(error: Exception, where: str = "") -> int:
+    """Say in one sentence what went wrong; the exit code."""
+    prefix = f"ommatid: {where}" if where else "ommatid: "
+    if isinstance(error, _Worst):
+        return error.code
+    if hasattr(error, "format_message"):  # of the command line's own parser
+        _say(f"{prefix}{cast(Any, error).format_message()}")
+        return 2
+    if isinstance(error, InputError | DeniedError):
+        _say(f"{prefix}{error}")
+        return 2 if isinstance(error, InputError) else 1
+    if os.environ.get("OMMATID_TRACEBACK"):
+        raise error
+    if isinstance(error, MemoryError):
+        _say(f"{prefix}not enough memory; crop the target or close other programs")
+    elif isinstance(error, OSError):
+        _say(f"{prefix}{error.filename or 'the machine'}: {error.strerror or error}")
+    else:
+        _say(f"{prefix}unexpected {type(error).__name__}: {error}; set OMMATID_TRACEBACK=1 to see where, and report it")
+    return 1
+
+
+class _Worst(Exception):
+    def __init__(self, code: int) -> None:
+        self.code = code
+
+
+def _each(paths: list[Path], output: Path, work: Callable[[Path, Path], dict[str, Any]], as_json: bool) -> None:
+    """Do every scene of a batch, whatever happens to the others; then end with the worst exit code."""
+    stems = [path.stem for path in paths]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise InputError(f"{output / stem}: two scenes of the batch are called '{stem}'; rename one of them")
+    results: list[dict[str, Any]] = []
+    worst = 0
+    for path in paths:
+        try:
+            results.append({"scene": str(path), **work(path, output / path.stem)})
+        except Exception as error:
+            code = _complain(error)
+            results.append({"scene": str(path), "error": str(error), "exit_code": code})
+            worst = max(worst, code)
+    if as_json:
+        _print_json(results)
+    if worst:
+        raise _Worst(worst)
+
+
+def _opened(path: Path, sets: list[str] | None, lens: str) -> tuple[Scene, Camera, Image]:
+    """A scene, its camera and its target, all checked before anything is written."""
+    import numpy as np
+
+    from scenes.camera import derive
+    from scenes.picture import load
+    from scenes.scene import read
+
+    scene = read(path, sets or (), _names(lens))
+    image = load(scene).astype(np.float32).astype(np.float64)  # the precision of truth.exr
+    return scene, derive(scene), image
+
+
+def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path) -> Any:
+    from scenes.files import make_folder
+    from scenes.picture import write_truth
+    from scenes.scene import TRUTH, resolved, write
+    from simulate.kept import kept_stack
+    from simulate.variant import choose
+
+    choose(scene.render.variant)
+    make_folder(folder)
+    write(folder / "scene.toml", resolved(scene, (camera.rows, camera.columns)))
+    write_truth(folder / TRUTH, image)
+    with _progress("render") as progress:
+        stack, made = kept_stack(folder / "stack.exr", scene, camera, image, progress)
+    _say(f"render: {_done(made)}, {folder / 'stack.exr'}")
+    return stack
+
+
+def _names(lens: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in lens.split(",")) if lens else ()
+
+
+def _done(made: bool) -> str:
+    return "done" if made else "up to date, nothing to do"
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _print(text: str) -> None:
+    print(text)
+
+
+def _print_json(document: object) -> None:
+    print(json.dumps(document, indent=2))
+
+
+def _table(title: str, lines: list[tuple[str, str]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", "", title=title, title_justify="left", show_header=False)
+    for name, value in lines:
+        table.add_row(name, value)
+    Console().print(table, markup=False)
+
+
+@contextmanager
+def _progress(stage: str) -> Generator[Progress]:
+    """A bar with the time left on stderr, where that is a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn(f"{stage:10}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(stage, total=1.0)
+        yield lambda fraction: bar.update(task, completed=fraction)
+
+
+if __name__ == "__main__":
+    main()

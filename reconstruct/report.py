@@ -1,0 +1,120 @@
+"""What a run says of itself: run.json, estimate.exr, and the rows of the table that is printed.
+
+The keys of run.json are a contract: stages, error, solver, model, skipped, versions, seeds.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes import exr
+from scenes.files import write_text
+from scenes.model import Model
+from scenes.plan import left_out
+from scenes.scene import Scene
+from scenes.stack import Stack
+from scenes.versions import versions
+
+from .restore import Restoration
+
+
+def write_estimate(path: Path, restoration: Restoration, record: dict[str, Any]) -> None:
+    """Write channels `estimate`, `variance` (diagonal of Eq. 5) and, where it is known, `truth`, as float32."""
+    shape = restoration.shape
+    channels = {
+        "estimate": restoration.estimate.reshape(shape).astype(np.float32),
+        "variance": restoration.expected.variance.reshape(shape).astype(np.float32),
+    }
+    if restoration.truth is not None:
+        channels["truth"] = restoration.truth.reshape(shape).astype(np.float32)
+    exr.write(path, [exr.Part("estimate", channels, record)])
+
+
+def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, Any]:
+    """Everything that run.json says, in JSON's types."""
+    error: dict[str, Any] = {
+        "predicted_mse": restoration.expected.mse,
+        "predicted_trimmed_mse": restoration.trimmed_mse,
+        "budget": restoration.budget(),
+    }
+    if restoration.error is not None and restoration.interval is not None:
+        error = {**asdict(restoration.error), "expected_given_truth": asdict(restoration.interval), **error}
+    stages = {
+        "render": _stage(stack.record),
+        "calibrate": {"method": model.record["method"], **_stage(model.record)},
+        "reconstruct": {"seconds": restoration.seconds},
+    }
+    return {
+        "title": stack.scene.title,
+        "measurements": model.measurements,
+        "unknowns": model.unknowns,
+        "stages": stages,
+        "error": error,
+        "solver": {
+            "method": restoration.method,
+            "condition": restoration.condition,
+            "digits": restoration.digits,
+        },
+        "model": model.record.get("agreement", {"rms_difference_from_ideal": 0.0, "max_z": None, "p_value": None}),
+        "skipped": [{"what": what, "why": why} for what, why in left_out(_as_run(stack, model))],
+        "versions": {**model.record["versions"], **stack.record["versions"], **versions("scipy", "scikit-image")},
+        "seeds": {"render": stack.record["seed"], "calibrate": model.record.get("seed")},
+    }
+
+
+def _as_run(stack: Stack, model: Model) -> Scene:
+    return stack.scene.model_copy(update={"calibration": model.scene.calibration})
+
+
+def write_run(path: Path, description: dict[str, Any]) -> None:
+    """Write run.json."""
+    write_text(path, json.dumps(description, indent=2, allow_nan=False) + "\n")
+
+
+def _stage(record: dict[str, Any]) -> dict[str, Any]:
+    keys = ("seconds", "samples", "passes", "sampler", "variant")
+    return {key: record[key] for key in keys if key in record}
+
+
+def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
+    """The lines of the printed table: what, and how much."""
+    error, stages = description["error"], description["stages"]
+    lines: list[tuple[str, str]] = []
+    for name, stage in stages.items():
+        made = [f"{stage['samples']} samples a pixel in {stage['passes']} passes"] if "samples" in stage else []
+        made += [stage["variant"]] if "variant" in stage else []
+        if name == "reconstruct":
+            made.append(f"{description['solver']['method']} form, {description['unknowns']} unknowns")
+        lines.append((f"{name}, seconds", ", ".join([f"{stage['seconds']:.2f}", *made])))
+    if "mse" in error:
+        given = error["expected_given_truth"]
+        lines.append(("mean squared error, measured", f"{error['mse']:.4g}"))
+        lines.append(
+            ("  expected for this picture", f"{given['mse']:.4g} (99 %: {given['low']:.4g} to {given['high']:.4g})")
+        )
+    lines.append(("  predicted (Eq. 5)", f"{error['predicted_mse']:.4g}"))
+    total = error["predicted_mse"]
+    for name, part in error["budget"].items():
+        if part > 0:
+            lines.append((f"    from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / total:.1f} %)"))
+    if "mse" in error:
+        psnr = "exact" if error["psnr"] is None else f"{error['psnr']:.2f} dB"
+        ssim = "picture too small" if error["ssim"] is None else f"{error['ssim']:.4f}"
+        lines += [("PSNR (peak 255)", psnr), ("structural similarity", ssim)]
+    lines.append(("digits left by the condition", f"{description['solver']['digits']:.1f}"))
+    agreement = description["model"]
+    if agreement["max_z"] is not None:
+        difference = f"{agreement['rms_difference_from_ideal']:.2g} rms"
+        lines.append(
+            (
+                "H against the ideal one",
+                f"{difference}, largest z {agreement['max_z']:.1f}, p {agreement['p_value']:.2g}",
+            )
+        )
+    lines += [(f"left out: {skip['what']}", skip["why"]) for skip in description["skipped"]]
+    return lines

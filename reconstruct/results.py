@@ -1,0 +1,91 @@
+"""The files of a reconstruction: estimate.exr, the pictures beside it, and run.json."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.errors import InputError
+from scenes.exr import read
+from scenes.files import digest, fingerprint
+from scenes.model import Model
+from scenes.scene import TRUTH, Scene, with_changes
+from scenes.stack import Stack
+
+from . import figure, report
+from .restore import Restoration, refuse_strangers, restore
+
+ESTIMATE, PICTURE, OVERVIEW, RUN = "estimate.exr", "estimate.png", "overview.png", "run.json"
+OURS = ("prior", "noise", "estimator")
+
+
+def changed(stack: Stack, overrides: list[str], path: Path) -> Stack:
+    """The stack with what its scene tells the estimator changed. Raises InputError for any other key."""
+    from dataclasses import replace
+
+    if not overrides:
+        return stack
+    scene = with_changes(stack.scene.plain(), path, overrides, ())
+    before, after = stack.scene.plain(), scene.plain()
+    for table in after.keys() | before.keys():
+        if table not in OURS and table != "target" and before.get(table) != after.get(table):
+            raise InputError(f"--set: [{table}] is already recorded in {path}; here only {', '.join(OURS)} can be set")
+    return replace(stack, scene=_with(stack.scene, scene))
+
+
+def _with(recorded: Scene, told: Scene) -> Scene:
+    return recorded.model_copy(update={table: getattr(told, table) for table in OURS})
+
+
+def truth_beside(path: Path, stack: Stack) -> NDArray[np.float64] | None:
+    """The target, (N,), from truth.exr in the stack's folder if it is the one that was rendered; else None."""
+    try:
+        truth = read(path.parent / TRUTH)[0].channels["Y"]
+    except (InputError, KeyError):
+        return None
+    return truth.astype(np.float64).ravel() if digest(truth) == stack.record.get("truth") else None
+
+
+def reconstruct(
+    stack: Stack, model: Model, truth: NDArray[np.float64] | None, names: tuple[Path, Path]
+) -> tuple[Restoration, dict[str, Any]]:
+    """The estimate and what run.json says of it. Raises InputError if stack and model do not belong together."""
+    refuse_strangers(stack, model, names)
+    restoration = restore(stack, model, truth)
+    return restoration, report.describe(stack, model, restoration)
+
+
+def write_results(folder: Path, stack: Stack, restoration: Restoration, description: dict[str, Any]) -> None:
+    """Write the four files of a run; run.json comes last and so stands for all. Raises DeniedError."""
+    record = {"title": stack.scene.title, "fingerprint": description["fingerprint"]}
+    report.write_estimate(folder / ESTIMATE, restoration, record)
+    figure.write_estimate(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
+    figure.write_overview(folder / OVERVIEW, stack.scene.title, stack, restoration)
+    report.write_run(folder / RUN, description)
+
+
+def made_from(stack: Stack, model: Model) -> str:
+    """Fingerprint of everything that an estimate depends on."""
+    told = {table: value for table, value in stack.scene.plain().items() if table in OURS}
+    return fingerprint([stack.record["fingerprint"], model.record["fingerprint"], told, stack.scene.title])
+
+
+def kept_results(folder: Path, stack: Stack, model: Model, names: tuple[Path, Path]) -> tuple[dict[str, Any], bool]:
+    """What run.json in `folder` says, and whether the reconstruction had to be made for it."""
+    wanted = made_from(stack, model)
+    files = (ESTIMATE, PICTURE, OVERVIEW, RUN)
+    if all((folder / name).is_file() for name in files):
+        try:
+            old = json.loads((folder / RUN).read_text(encoding="utf-8"))
+            if old["fingerprint"] == wanted:
+                return old, False
+        except (ValueError, KeyError, TypeError):  # damaged: to be made
+            pass
+    restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names)
+    description = {"fingerprint": wanted, **description}
+    write_results(folder, stack, restoration, description)
+    return description, True

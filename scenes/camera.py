@@ -1,0 +1,240 @@
+"""Geometry of a flat camera: one sensor behind arrays of micro-lenses, looking at a flat target.
+
+Lengths are millimetres. The camera looks along +z from the plane of the lenses, z = 0, with +y up, so the
+columns of an upright image run towards -x and its rows towards -y. Positions on the target called `row` and
+`column` are in pixels of the target, f, from its top left corner. The order of measurements everywhere: lens
+types as listed, sub-imagers (k, l) by rows, then pixels by rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from math import floor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .picture import shape
+from .scene import Lens, Scene
+
+MOST_MEASUREMENTS = 2**30
+
+
+@dataclass(frozen=True)
+class LensType:
+    """An array of equal sub-imagers; `ratio` is m, the pixels of f that a sensor pixel covers along one axis."""
+
+    name: str
+    ratio: Fraction
+    array: tuple[int, int]
+    pixels: tuple[int, int]
+    step: Fraction
+    origin: tuple[int, int]
+
+    @property
+    def count(self) -> int:
+        """Number of sub-imagers."""
+        return self.array[0] * self.array[1]
+
+    @property
+    def measurements(self) -> int:
+        """Number of sensor pixels of all its sub-imagers."""
+        return self.count * self.pixels[0] * self.pixels[1]
+
+    @property
+    def span(self) -> tuple[Fraction, Fraction]:
+        """Rows and columns of f that the array sees as a whole."""
+        return _span(self.ratio, self.array[0], self.pixels[0], self.step), _span(
+            self.ratio, self.array[1], self.pixels[1], self.step
+        )
+
+
+@dataclass(frozen=True)
+class SubImager:
+    """One lens and the patch of sensor behind it.
+
+    `window` is the row and column of f where its view begins; `lens` and `patch` are the (x, y) centres of the
+    lens and of the patch, `depth` the distance from the lens to the patch.
+    """
+
+    type: LensType
+    k: int
+    l: int  # noqa: E741  (the paper's letter)
+    window: tuple[Fraction, Fraction]
+    lens: tuple[float, float]
+    patch: tuple[float, float]
+    depth: float
+
+    @property
+    def name(self) -> str:
+        """Its name in a stack: type, k, l."""
+        return f"{self.type.name}.{self.k:02d}.{self.l:02d}"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """All lens types, and the target's grid that they are to resolve."""
+
+    rows: int
+    columns: int
+    target_pitch: float
+    distance: float
+    pixel_pitch: float
+    lens_pitch: float
+    types: tuple[LensType, ...]
+
+    @property
+    def unknowns(self) -> int:
+        """N, pixels of f."""
+        return self.rows * self.columns
+
+    @property
+    def measurements(self) -> int:
+        """M, sensor pixels of all sub-imagers."""
+        return sum(kind.measurements for kind in self.types)
+
+    def depth(self, kind: LensType) -> float:
+        """Distance of a type's sensor behind its lenses: its magnification times the target's distance."""
+        return self.distance * self.pixel_pitch / (float(kind.ratio) * self.target_pitch)
+
+    def focal_length(self, kind: LensType) -> float:
+        """From the thin-lens equation, 1/focal_length = 1/distance + 1/depth."""
+        return 1.0 / (1.0 / self.distance + 1.0 / self.depth(kind))
+
+    @cached_property
+    def sub_imagers(self) -> tuple[SubImager, ...]:
+        """Every sub-imager, in the order of measurements."""
+        across = sum(kind.array[1] for kind in self.types)
+        found: list[SubImager] = []
+        left = 0
+        for kind in self.types:
+            for k in range(kind.array[0]):
+                for l in range(kind.array[1]):  # noqa: E741
+                    x = ((across - 1) / 2 - (left + l)) * self.lens_pitch
+                    y = ((kind.array[0] - 1) / 2 - k) * self.lens_pitch
+                    found.append(self._sub_imager(kind, k, l, (x, y)))
+            left += kind.array[1]
+        return tuple(found)
+
+    def _sub_imager(self, kind: LensType, k: int, l: int, lens: tuple[float, float]) -> SubImager:  # noqa: E741
+        window = kind.origin[0] + k * kind.step, kind.origin[1] + l * kind.step
+        middle_row = float(window[0] + kind.ratio * kind.pixels[0] / 2)
+        middle_column = float(window[1] + kind.ratio * kind.pixels[1] / 2)
+        x, y = self.position(middle_row, middle_column)
+        depth = self.depth(kind)
+        shrink = depth / self.distance
+        patch = lens[0] + (lens[0] - x) * shrink, lens[1] + (lens[1] - y) * shrink
+        return SubImager(kind, k, l, window, lens, patch, depth)
+
+    def position(self, row: float, column: float) -> tuple[float, float]:
+        """(x, y) on the target plane of a point given in pixels of f."""
+        return (self.columns / 2 - column) * self.target_pitch, (self.rows / 2 - row) * self.target_pitch
+
+    def slices(self) -> list[slice]:
+        """Where each sub-imager's pixels stand among the measurements."""
+        found: list[slice] = []
+        start = 0
+        for sub in self.sub_imagers:
+            size = sub.type.pixels[0] * sub.type.pixels[1]
+            found.append(slice(start, start + size))
+            start += size
+        return found
+
+    def types_seeing(self) -> NDArray[np.int64]:
+        """(rows, columns): by how many lens types each pixel of f is seen whole."""
+        seen = np.zeros((self.rows, self.columns), dtype=np.int64)
+        for kind in self.types:
+            rows, columns = kind.span
+            seen[kind.origin[0] : kind.origin[0] + floor(rows), kind.origin[1] : kind.origin[1] + floor(columns)] += 1
+        return seen
+
+    def describe(self) -> dict[str, Any]:
+        """What must agree between a stack and a model, in JSON's types."""
+        return {
+            "target.shape": [self.rows, self.columns],
+            "target.pixel_pitch": self.target_pitch,
+            "target.distance": self.distance,
+            "camera.pixel_pitch": self.pixel_pitch,
+            "camera.lens_pitch": self.lens_pitch,
+            **{
+                f"camera.lens.{kind.name}": {
+                    "place": place,
+                    "magnification": str(1 / kind.ratio),
+                    "array": list(kind.array),
+                    "pixels": list(kind.pixels),
+                    "step": str(kind.step),
+                }
+                for place, kind in enumerate(self.types)
+            },
+        }
+
+
+def derive(scene: Scene) -> Camera:
+    """The camera that a scene describes.
+
+    Raises InputError if an array does not fit the target or if sub-images overlap on the sensor.
+    """
+    rows, columns = shape(scene)
+    types = tuple(_lens_type(lens, rows, columns, scene) for lens in scene.camera.lens)
+    camera = Camera(
+        rows=rows,
+        columns=columns,
+        target_pitch=scene.target.pixel_pitch,
+        distance=scene.target.distance,
+        pixel_pitch=scene.camera.pixel_pitch,
+        lens_pitch=scene.camera.lens_pitch,
+        types=types,
+    )
+    if camera.measurements > MOST_MEASUREMENTS:
+        raise InputError(f"{scene.source}: the lens arrays have {camera.measurements} pixels, at most 2^30 are served")
+    _refuse_overlap(camera, scene)
+    return camera
+
+
+def _span(ratio: Fraction, count: int, pixels: int, step: Fraction) -> Fraction:
+    return ratio * pixels + (count - 1) * step
+
+
+def _lens_type(lens: Lens, rows: int, columns: int, scene: Scene) -> LensType:
+    ratio = 1 / lens.magnification
+    most = tuple(
+        floor((size - (count - 1) * lens.step) / ratio) for size, count in zip((rows, columns), lens.array, strict=True)
+    )
+    if min(most) < 1:
+        raise InputError(
+            f"{scene.source}: camera.lens.{lens.name}.array: {lens.array[0]} x {lens.array[1]} sub-imagers of"
+            f" magnification {lens.magnification} do not fit a target of {rows} x {columns} pixels; use fewer"
+        )
+    pixels = (most[0], most[1]) if lens.pixels == "fit" else lens.pixels
+    if pixels[0] > most[0] or pixels[1] > most[1]:
+        raise InputError(
+            f"{scene.source}: camera.lens.{lens.name}.pixels asks for {pixels[0]} x {pixels[1]} pixels,"
+            f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}"
+        )
+    kind = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0))
+    origin = floor((rows - kind.span[0]) / 2), floor((columns - kind.span[1]) / 2)
+    return LensType(lens.name, ratio, lens.array, pixels, lens.step, origin)
+
+
+def _refuse_overlap(camera: Camera, scene: Scene) -> None:
+    # Patches of one type form a regular grid, and the types stand side by side: neighbours along either axis suffice.
+    subs = {(sub.type.name, sub.k, sub.l): sub for sub in camera.sub_imagers}
+    for place, kind in enumerate(camera.types):
+        pairs = [((kind.name, k, 0), (kind.name, k + 1, 0), 0) for k in range(kind.array[0] - 1)]
+        pairs += [((kind.name, 0, l), (kind.name, 0, l + 1), 1) for l in range(kind.array[1] - 1)]  # noqa: E741
+        if place:
+            before = camera.types[place - 1]
+            pairs.append(((before.name, 0, before.array[1] - 1), (kind.name, 0, 0), 1))
+        for one, other, axis in pairs:
+            first, second = subs[one], subs[other]
+            apart = first.patch[1 - axis] - second.patch[1 - axis]
+            needed = (first.type.pixels[axis] + second.type.pixels[axis]) / 2 * camera.pixel_pitch
+            if apart < needed * (1 - 1e-9):
+                raise InputError(
+                    f"{scene.source}: camera.lens_pitch: the sub-images {first.name} and {second.name} overlap on the"
+                    f" sensor (their centres stand {apart:.4g} mm apart, they need {needed:.4g} mm); widen the pitch"
+                )

@@ -1,0 +1,73 @@
+"""Writing files so that each appears whole or not at all, and naming what they were made from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import DeniedError, InputError
+
+
+def write_whole(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a file beside `path`, then rename it: readers never see half of it.
+
+    Raises DeniedError when the disk is full or refuses, InputError when the folder does not exist.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
+    if path.is_dir():
+        raise InputError(f"{path}: expected the name of a file, got a folder")
+    beside = path.with_name(f".{secrets.token_hex(4)}.part.{path.name}")
+    try:
+        write(beside)
+        with beside.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        beside.replace(path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DeniedError(
+            f"{path}: could not be written ({reason}); free some space or choose another folder"
+        ) from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text, whole or not at all."""
+    write_whole(path, lambda beside: _write_text(beside, text))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and its parents. Raises DeniedError or InputError in one sentence."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"{path}: expected a folder to write to, but a file of that name is in the way") from error
+    except OSError as error:
+        raise DeniedError(f"{path}: the folder could not be created ({error.strerror})") from error
+
+
+def digest(*arrays: NDArray[Any]) -> str:
+    """SHA-256 of the arrays' shapes, types and bytes, as hexadecimal text."""
+    total = hashlib.sha256()
+    for array in arrays:
+        total.update(f"{array.dtype.str}{array.shape}".encode())
+        total.update(np.ascontiguousarray(array).tobytes())
+    return total.hexdigest()
+
+
+def fingerprint(description: object) -> str:
+    """SHA-256 of a JSON description: two results with one fingerprint were made from the same."""
+    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,77 @@
+"""Changes to a scene's tables from the command line: `--set key=value` and `--lens I,II`."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from collections.abc import Iterable
+from typing import Any
+
+from .errors import InputError
+
+
+def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """Set keys such as `noise.variance=1e-6` or `camera.lens.II.pixels=[2,2]`; an empty value removes the key.
+
+    The value is read as TOML, else as text. Raises InputError if the key's table does not exist.
+    """
+    changed = copy.deepcopy(data)
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals or not key.strip():
+            raise InputError(f"--set {override}: expected KEY=VALUE, such as noise.variance=1e-6")
+        *tables, last = [part.strip() for part in key.split(".")]
+        table: Any = changed
+        for name in tables:
+            table = _inside(table, name, override)
+        if not isinstance(table, dict):
+            raise InputError(f"--set {override}: '{'.'.join(tables)}' is no table, so it has no key '{last}'")
+        if text.strip():
+            table[last] = _value(text)
+        else:
+            table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
+    return changed
+
+
+def _inside(table: Any, name: str, override: str) -> Any:
+    if isinstance(table, list):
+        lenses: dict[Any, Any] = {lens.get("name"): lens for lens in table if isinstance(lens, dict)}  # type: ignore[union-attr]
+        if name not in lenses:
+            raise InputError(f"--set {override}: no lens type is called '{name}'; there are {_names(lenses)}")
+        return lenses[name]
+    if not isinstance(table, dict):
+        raise InputError(f"--set {override}: '{name}' does not stand in a table")
+    return table.setdefault(name, {})  # type: ignore[return-value]
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text.strip()
+
+
+def keep_lenses(data: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Keep the named lens types in the order named; one named again joins a second time, called NAME-2.
+
+    Raises InputError if a name is unknown. No names: everything stays.
+    """
+    wanted = list(names)
+    if not wanted:
+        return data
+    camera = data.get("camera")
+    listed: Any = camera.get("lens") if isinstance(camera, dict) else None  # type: ignore[union-attr]
+    lenses: dict[Any, Any] = {}
+    if isinstance(listed, list):
+        lenses = {lens.get("name"): lens for lens in listed if isinstance(lens, dict)}  # type: ignore[union-attr]
+    chosen: list[Any] = []
+    for place, name in enumerate(wanted):
+        if name not in lenses:
+            raise InputError(f"--lens {','.join(wanted)}: no lens type is called '{name}'; there are {_names(lenses)}")
+        earlier = wanted[:place].count(name)
+        chosen.append({**lenses[name], "name": name if earlier == 0 else f"{name}-{earlier + 1}"})
+    return {**data, "camera": {**camera, "lens": chosen}}  # type: ignore[dict-item]
+
+
+def _names(lenses: Iterable[Any]) -> str:
+    return ", ".join(f"'{name}'" for name in lenses) or "none"

@@ -1,0 +1,290 @@
+"""The scene file: what the camera is, what it looks at, and what is to be computed.
+
+TOML in, a frozen and validated `Scene` out. Lengths are written with a unit ("6 um") and become
+millimetres here and nowhere else; a bare number where a length belongs and an unknown key are errors.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PrivateAttr,
+    ValidationError,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
+
+from .errors import InputError
+from .explain import explain
+from .files import write_text
+from .override import apply_overrides, keep_lenses
+
+FULL_SCALE = 256.0
+TRUTH = "truth.exr"
+LENS_NAME = r"^[A-Za-z0-9_-]+$"
+
+
+@cache
+def _units() -> Any:
+    import pint
+
+    return cast(Any, pint).UnitRegistry()
+
+
+def _length(value: object) -> float:
+    if isinstance(value, float | int) and not isinstance(value, bool):
+        raise ValueError(f'expected a length with its unit, such as "{value} mm", got the bare number {value}')
+    if not isinstance(value, str):
+        raise ValueError(f'expected a length with its unit, such as "1 mm", got {value!r}')
+    try:
+        length = float(_units().Quantity(value).to("mm").magnitude)
+    except Exception as error:  # pint raises a dozen kinds, tokenize's among them
+        raise ValueError(f'expected a length with its unit, such as "6 um" or "1 m", got {value!r}') from error
+    if not 0 < length < float("inf"):
+        raise ValueError(f"expected a length above zero, got {value!r}")
+    return length
+
+
+def _ratio(value: object) -> Fraction:
+    try:
+        if isinstance(value, bool) or not isinstance(value, str | int | float | Fraction):
+            raise ValueError
+        ratio = Fraction(str(value))
+    except (ValueError, ZeroDivisionError) as error:
+        raise ValueError(f'expected a ratio such as "1/3" or 0.25, got {value!r}') from error
+    if ratio.denominator > 10**6 or ratio.numerator > 10**6:
+        raise ValueError(f"expected a ratio of numbers up to a million, got {value!r}")
+    return ratio
+
+
+def _magnification(value: object) -> Fraction:
+    ratio = _ratio(value)
+    if not 0 < ratio <= 1:
+        raise ValueError(f'expected a magnification above 0 and at most 1, such as "1/3", got {value!r}')
+    return ratio
+
+
+def _step(value: object) -> Fraction:
+    ratio = _ratio(value)
+    if ratio < 0:
+        raise ValueError(f"expected a step of 0 or more pixels of the target, got {value!r}")
+    return ratio
+
+
+def _pair(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value  # type: ignore[arg-type]
+
+
+def _text_of(ratio: Fraction) -> str | int:
+    return int(ratio) if ratio.denominator == 1 else str(ratio)
+
+
+Length = Annotated[
+    float,
+    BeforeValidator(_length),
+    PlainSerializer(lambda value: f"{value!r} mm"),
+    WithJsonSchema({"type": "string", "description": 'a length with its unit, such as "6 um"'}),
+]
+_RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
+Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_text_of), _RATIO]
+Step = Annotated[Fraction, BeforeValidator(_step), PlainSerializer(_text_of), _RATIO]
+Count = Annotated[int, Field(ge=1)]
+Pair = Annotated[tuple[Count, Count], BeforeValidator(_pair)]
+Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(_pair)]
+Samples = Annotated[int, Field(ge=16, le=2**24, description="per sensor pixel; rendered in 16 passes or more")]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Target(_Table):
+    """The flat picture that the camera looks at."""
+
+    image: str = Field(description='"photo:NAME" for one that scikit-image ships, or a PNG, TIFF, EXR or NPY file')
+    origin: Corner | None = Field(
+        default=None, description="row and column where the crop starts; absent: the whole picture"
+    )
+    shape: Pair | None = Field(default=None, description="rows and columns of the crop")
+    pixel_pitch: Length = Field(description="side of one pixel of the target")
+    distance: Length = Field(description="from the plane of the lenses to the target")
+
+
+class Lens(_Table):
+    """One lens type: an array of equal sub-imagers."""
+
+    name: str = Field(pattern=LENS_NAME)
+    magnification: Magnification = Field(description="image size over object size, at most 1")
+    array: Pair = Field(description="rows and columns of sub-imagers")
+    pixels: Literal["fit"] | Pair = Field(description='rows and columns of a sub-image, or "fit"')
+    step: Step = Field(default=Fraction(1), description="pixels of the target from one sub-imager's window to the next")
+
+    @field_validator("pixels", mode="before")
+    @classmethod
+    def _pixels(cls, value: object) -> object:
+        numbers: list[object] = list(value) if isinstance(value, list | tuple) else []  # type: ignore[arg-type]
+        if value == "fit" or (len(numbers) == 2 and all(type(n) is int and n >= 1 for n in numbers)):  # type: ignore[operator]
+            return _pair(cast(object, value))
+        raise ValueError(f'expected two whole numbers of at least 1, such as [5, 5], or "fit", got {value!r}')
+
+
+class Camera(_Table):
+    """A flat sensor behind arrays of micro-lenses."""
+
+    pixel_pitch: Length = Field(description="side of one sensor pixel")
+    lens_pitch: Length = Field(description="from one lens's centre to the next")
+    lens: Annotated[tuple[Lens, ...], BeforeValidator(_pair), Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Camera:
+        names = [lens.name for lens in self.lens]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"expected a name of its own for every lens type, got {name!r} twice")
+        return self
+
+
+class Noise(_Table):
+    """What the sensor adds to the light."""
+
+    variance: float = Field(default=0.0, ge=0, description="Gaussian, in squared units of the target's values")
+    bits: int | None = Field(default=None, ge=1, le=24, description="of the recorded values; absent: no quantisation")
+
+    @property
+    def level(self) -> float:
+        """Height of a quantisation level, full scale / 2^bits; 0 without quantisation."""
+        return 0.0 if self.bits is None else FULL_SCALE / 2**self.bits
+
+    @property
+    def quantisation_variance(self) -> float:
+        """Variance that rounding to levels adds, level^2 / 12 (Wood et al., section 5)."""
+        return self.level**2 / 12
+
+
+class Prior(_Table):
+    """What is known of the image before any light is recorded."""
+
+    mean: float = 127.5
+    variance: float = Field(default=5461.25, gt=0, description="of every pixel, independent of its neighbours")
+
+
+class Estimator(_Table):
+    """How the image is estimated."""
+
+    noise_variance: float | None = Field(
+        default=None, ge=0, description="what the estimator expects; absent: all that is known"
+    )
+    method: Literal["auto", "measurement", "information"] = "auto"
+
+
+class Render(_Table):
+    """How the sub-images are rendered."""
+
+    samples: Samples = 256
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    variant: Literal["auto", "scalar_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
+    sampler: Literal["multijitter", "independent"] = "multijitter"
+
+
+class Calibration(_Table):
+    """How the observation matrix H is found."""
+
+    method: Literal["points", "ideal"] = "points"
+    samples: Samples = 256
+
+
+class Scene(_Table):
+    """A camera, its target and what is to be computed."""
+
+    title: str = ""
+    target: Target
+    camera: Camera
+    noise: Noise | None = None
+    prior: Prior = Prior()
+    estimator: Estimator = Estimator()
+    render: Render = Render()
+    calibration: Calibration = Calibration()
+
+    _source: Path = PrivateAttr(default=Path("scene"))
+
+    @property
+    def source(self) -> Path:
+        """The file that error messages name."""
+        return self._source
+
+    def plain(self) -> dict[str, Any]:
+        """The scene as TOML and JSON hold it; absent keys stay absent."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+def resolved(scene: Scene, shape: tuple[int, int]) -> Scene:
+    """The scene as a run's folder holds it: its target is the picture `truth.exr` beside it, whole."""
+    target = scene.target.model_copy(update={"image": TRUTH, "origin": None, "shape": shape})
+    return _moved(scene.model_copy(update={"target": target}), scene.source)
+
+
+def parse(data: dict[str, Any], source: Path) -> Scene:
+    """Validate a scene's tables. Raises InputError that names the file, the key and what was expected."""
+    try:
+        scene = Scene.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{source}: {explain(error, data, Scene)}") from error
+    return _moved(scene, source)
+
+
+def _moved(scene: Scene, source: Path) -> Scene:
+    scene._source = source  # pyright: ignore[reportPrivateUsage]
+    return scene
+
+
+def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) -> Scene:
+    """Read a scene file, apply `--set` overrides and keep only the named lens types, if any are named.
+
+    The target's picture, where it is a file, is looked for beside the scene file.
+    Raises InputError that names the file, the key, what was expected and what came.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such scene file; `ommatid init {path.name}` writes one to start from") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: could not be read as a scene file ({error})") from error
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    return with_changes(data, path, overrides, lenses)
+
+
+def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], lenses: Iterable[str]) -> Scene:
+    """The scene in `data` after `--set` overrides and `--lens`. Raises InputError."""
+    try:
+        data = keep_lenses(apply_overrides(data, overrides), lenses)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+    scene = parse(data, source)
+    image = scene.target.image
+    if re.match(r"^photo:", image) or Path(image).is_absolute():
+        return scene
+    target = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
+    return _moved(scene.model_copy(update={"target": target}), source)
+
+
+def write(path: Path, scene: Scene) -> None:
+    """Write a scene as TOML, defaults included. Raises InputError or DeniedError."""
+    import tomli_w
+
+    write_text(path, tomli_w.dumps(scene.plain()))

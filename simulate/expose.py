@@ -1,0 +1,32 @@
+"""From light to recorded values: sensor noise and quantisation, in the units of the target's pixel values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.camera import Camera
+from scenes.scene import Noise
+
+from .streams import generator
+
+
+def quantise(values: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+    """Round to the nearest multiple of `level`."""
+    return level * np.round(values / level)
+
+
+def expose(
+    light: NDArray[np.float64], noise: Noise, rngs: list[np.random.Generator], slices: list[slice]
+) -> NDArray[np.float64]:
+    """Recorded values of `light`, (M,): Gaussian noise from each sub-image's own generator, then quantisation."""
+    recorded = light.copy()
+    if noise.variance > 0:
+        for place, rng in zip(slices, rngs, strict=True):
+            recorded[place] += rng.normal(0.0, noise.variance**0.5, recorded[place].shape)
+    return recorded if noise.bits is None else quantise(recorded, noise.level)
+
+
+def generators(camera: Camera, seed: int) -> list[np.random.Generator]:
+    """One generator a sub-imager, which stays the same whatever other lens types the camera has."""
+    return [generator(seed, "noise", sub.type.name, sub.k, sub.l) for sub in camera.sub_imagers]

@@ -1,0 +1,48 @@
+"""Stacks and models on disk: kept while what they were made from has not changed, made again when it has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes import model, stack
+from scenes.camera import Camera
+from scenes.errors import InputError
+from scenes.model import Model
+from scenes.scene import Scene, resolved
+from scenes.stack import Stack
+
+from . import calibrate, render
+from .render import Progress
+
+
+def kept_stack(
+    path: Path, scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Progress
+) -> tuple[Stack, bool]:
+    """The stack at `path` as it is on disk, and whether it had to be rendered. Raises what rendering raises."""
+    try:
+        old = stack.read(path)
+    except InputError:  # missing, damaged or of another kind: to be made
+        old = None
+    if old is not None and old.record.get("fingerprint") == render.made_from(scene, camera, image):
+        now = resolved(scene, (camera.rows, camera.columns))
+        if old.scene != now:  # what the estimator is told may have changed, the values have not
+            stack.write(path, replace(old, scene=now))
+        return stack.read(path), False
+    stack.write(path, render.render(scene, camera, image, progress))
+    return stack.read(path), True
+
+
+def kept_model(path: Path, scene: Scene, camera: Camera, progress: Progress) -> tuple[Model, bool]:
+    """The model at `path` as it is on disk, and whether it had to be calibrated. Raises what calibration raises."""
+    try:
+        old = model.read(path)
+    except InputError:
+        old = None
+    if old is not None and old.record.get("fingerprint") == calibrate.made_from(scene, camera):
+        return old, False
+    model.write(path, calibrate.calibrate(scene, camera, progress))
+    return model.read(path), True

@@ -1,0 +1,228 @@
+"""The camera and its target in Mitsuba: a picture on the target goes in, what every sensor pixel reads comes out.
+
+On llvm and cuda one sensor of our own holds the whole camera; on scalar, where sensors written in Python are
+unusably slow, a `batch` of stock `perspective` sensors a lens type does. Lengths are millimetres.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+from math import atan, degrees
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.camera import Camera, LensType, SubImager
+
+from . import optics
+from .variant import activate
+
+MOST_SAMPLES = 4096  # film sums are float32: more in one call bias the mean by over 4e-5
+BLOCK = 16  # scalar variants seed by block, and pick its size by the number of threads unless it is given
+
+
+class Rig:
+    """A camera in front of an emissive target, ready to be exposed.
+
+    `groups` are the lens types that are exposed together, by the name that their random streams have.
+    """
+
+    def __init__(self, camera: Camera, variant: str, sampler: str = "multijitter") -> None:
+        """Build the Mitsuba scene; the target is black until `show` puts a picture on it."""
+        activate(variant)
+        import mitsuba as mi
+
+        self.camera = camera
+        self.variant = variant
+        jit = not variant.startswith("scalar")
+        self.groups: dict[str, tuple[LensType, ...]] = (
+            {"camera": camera.types} if jit else {kind.name: (kind,) for kind in camera.types}
+        )
+        if jit:
+            self._sensors = {"camera": _whole_camera(camera, sampler)}
+        else:
+            self._sensors = {kind.name: mi.load_dict(_batch(camera, kind, sampler)) for kind in camera.types}
+        self._scene = mi.load_dict(scene_of(target_of(camera, _texture(camera))))
+        self._parameters = mi.traverse(self._scene)
+
+    def show(self, image: NDArray[np.float64]) -> None:
+        """Put a picture, (rows, columns), on the target; signed values are allowed."""
+        import mitsuba as mi
+
+        texels = np.ascontiguousarray(image[:, :, None], dtype=np.float32)
+        self._parameters["target.emitter.radiance.data"] = mi.TensorXf(texels)
+        self._parameters.update()
+
+    def expose(self, group: str, samples: int, seed: int) -> NDArray[np.float64]:
+        """What the sensor pixels of a group read, in the order of measurements, with `samples` rays a pixel."""
+        import mitsuba as mi
+
+        sensor = self._sensors[group]
+        rendered: Any = mi.render(self._scene, sensor=sensor, spp=samples, seed=seed)  # pyright: ignore
+        image = np.array(rendered, dtype=np.float64)[..., 0]
+        types = self.groups[group]
+        if group == "camera":
+            return image.ravel()[: self.camera.measurements]
+        (rows, columns), count = types[0].pixels, types[0].count
+        return image.reshape(rows, count, columns).swapaxes(0, 1).ravel()
+
+    def places(self, group: str) -> slice:
+        """Where a group's pixels stand among all measurements."""
+        start = 0
+        for kind in self.camera.types:
+            if kind in self.groups[group]:
+                return slice(start, start + sum(member.measurements for member in self.groups[group]))
+            start += kind.measurements
+        raise KeyError(group)
+
+
+def scene_of(target: dict[str, Any]) -> dict[str, Any]:
+    """A Mitsuba scene with the emissive target and no sensor: light goes straight, nothing bounces."""
+    return {"type": "scene", "integrator": {"type": "path", "max_depth": 1, "block_size": BLOCK}, "target": target}
+
+
+def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
+    """The rectangle that the picture is on, seen from the front, upright, one texel a pixel of f."""
+    import mitsuba as mi
+
+    half = [camera.columns * camera.target_pitch / 2, camera.rows * camera.target_pitch / 2, 1.0]
+    place = mi.ScalarTransform4f().translate([0, 0, camera.distance]).rotate([0, 1, 0], 180).scale(half)
+    return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": texture}}
+
+
+def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int) -> dict[str, Any]:
+    """One sub-imager as Mitsuba's own `perspective` with a shifted principal point."""
+    import mitsuba as mi
+
+    rows, columns = sub.type.pixels
+    width = float(sub.type.ratio) * columns * camera.target_pitch
+    height = float(sub.type.ratio) * rows * camera.target_pitch
+    middle = (
+        float(sub.window[0] + sub.type.ratio * rows / 2),
+        float(sub.window[1] + sub.type.ratio * columns / 2),
+    )
+    x, y = camera.position(*middle)
+    lens_x, lens_y = sub.lens
+    return {
+        "type": "perspective",
+        "fov_axis": "x",
+        "fov": 2 * degrees(atan(width / 2 / camera.distance)),
+        "near_clip": camera.distance * 1e-3,
+        "far_clip": camera.distance * 2,
+        "principal_point_offset_x": -(x - lens_x) / width,
+        "principal_point_offset_y": -(y - lens_y) / height,
+        "to_world": mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0]),
+        "film": film(columns, rows),
+        "sampler": {"type": sampler, "sample_count": samples},
+    }
+
+
+def film(width: int, height: int) -> dict[str, Any]:
+    """A film that neither filters nor rounds to half precision."""
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "box"},
+        "pixel_format": "luminance",
+        "component_format": "float32",
+    }
+
+
+def _texture(camera: Camera) -> dict[str, Any]:
+    import mitsuba as mi
+
+    black = mi.Bitmap(np.zeros((camera.rows, camera.columns, 1), dtype=np.float32))
+    return texture_of({"bitmap": black})
+
+
+def texture_of(source: dict[str, Any]) -> dict[str, Any]:
+    """Texels as they are: upright, not filtered, not wrapped, not read as sRGB."""
+    import mitsuba as mi
+
+    upright = mi.ScalarTransform3f().translate([0, 1]).scale([1, -1])  # row 0 would lie at v = 0, the bottom
+    return {
+        "type": "bitmap",
+        "raw": True,
+        "filter_type": "nearest",
+        "wrap_mode": "clamp",
+        "to_uv": upright,
+        **source,
+    }
+
+
+def _batch(camera: Camera, kind: LensType, sampler: str) -> dict[str, Any]:
+    rows, columns = kind.pixels
+    batch: dict[str, Any] = {
+        "type": "batch",
+        "film": film(columns * kind.count, rows),
+        "sampler": {"type": sampler, "sample_count": 16},
+    }
+    members = [sub for sub in camera.sub_imagers if sub.type == kind]
+    for number, sub in enumerate(members):
+        batch[f"sub{number:06d}"] = stock_sensor(camera, sub, sampler, 16)
+    return batch
+
+
+def _whole_camera(camera: Camera, sampler: str) -> Any:
+    """All sub-imagers as one sensor: a film pixel a measurement, looked up in tables."""
+    import drjit as dr
+    import mitsuba as mi
+
+    # Powers of two: then film coordinates are exact and no ray can slip into a neighbour's pixel.
+    bits = max(camera.measurements - 1, 1).bit_length()
+    height = 1 << (bits // 2)
+    width = 1 << (bits - bits // 2)
+    tables = _tables(camera, width * height)
+
+    class CompoundEye(mi.Sensor):
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.tables = [mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in tables]
+            self.pixel = float(camera.pixel_pitch)
+            dr.make_opaque(self.tables)
+
+        def sample_ray(
+            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            del wavelength, aperture
+            across, down = position.x * width, position.y * height
+            column, row = dr.floor(across), dr.floor(down)
+            index = mi.UInt32(row) * width + mi.UInt32(column)
+            corner_x, corner_y, lens_x, lens_y, depth = (dr.gather(mi.Float, t, index, active) for t in self.tables)
+            x = corner_x + (across - column) * self.pixel
+            y = corner_y + (down - row) * self.pixel
+            ray = dr.zeros(mi.Ray3f)
+            ray.o = mi.Point3f(lens_x, lens_y, 0)
+            ray.d = dr.normalize(mi.Vector3f(*optics.through_pinhole(x, y, depth)))
+            ray.time = time
+            ray.maxt = dr.largest(mi.Float)
+            return ray, mi.Spectrum(1)
+
+        def sample_ray_differential(
+            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            # The default traces three rays for a footprint that a texture read at its nearest texel never uses.
+            ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def bbox(self) -> Any:
+            return mi.ScalarBoundingBox3f()
+
+    properties = mi.Properties()
+    properties["film"] = mi.load_dict(film(width, height))
+    properties["sampler"] = mi.load_dict({"type": sampler, "sample_count": 16})
+    return CompoundEye(properties)
+
+
+def _tables(camera: Camera, size: int) -> NDArray[np.float64]:
+    """(5, size): x and y of each pixel's corner from its lens, the lens's x and y, the depth; the last one repeated."""
+    columns: list[NDArray[np.float64]] = []
+    for sub in camera.sub_imagers:
+        row, column = (place.ravel() for place in np.indices(sub.type.pixels))
+        x, y = optics.pixel_corner(camera, sub, row, column)
+        same = np.ones_like(x)
+        columns.append(np.stack([x, y, same * sub.lens[0], same * sub.lens[1], same * sub.depth]))
+    known = np.concatenate(columns, axis=1)
+    return np.concatenate([known, np.repeat(known[:, -1:], size - known.shape[1], axis=1)], axis=1)

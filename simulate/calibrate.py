@@ -85,9 +85,9 @@ def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress) ->
     return Model(kept, camera, responses.matrix, variance, responses.batches, record)
 
 
-def spacing(types: tuple[LensType, ...]) -> int:
+def spacing(kind: LensType) -> int:
     """Pixels of f from one source to the next: a footprint touches at most ceil(m) + 2, rounding included."""
-    return max(ceil(kind.ratio) for kind in types) + 2
+    return ceil(kind.ratio) + 2
 
 
 def grid(camera: Camera, apart: int, row: int, column: int) -> NDArray[np.float64]:
@@ -103,8 +103,8 @@ def from_points(scene: Scene, camera: Camera, progress: Progress = no_progress) 
 
     variant = choose(scene.render.variant)
     work = plan(scene.calibration.samples)
-    rig = Rig(camera, variant, scene.render.sampler)
-    shares = {group: spacing(types) ** 2 for group, types in rig.groups.items()}
+    rig = Rig(camera, variant, scene.render.sampler, together=False)  # each type its own spacing
+    shares = {group: spacing(types[0]) ** 2 for group, types in rig.groups.items()}
     rows: list[sparse.csr_array] = []
     variances: list[NDArray[np.float64]] = []
     batches: list[NDArray[np.float64]] = []
@@ -116,7 +116,7 @@ def from_points(scene: Scene, camera: Camera, progress: Progress = no_progress) 
             progress((begun + fraction * share) / sum(shares.values()))
 
         tally, means = _sweep(rig, group, work, scene.render.seed, report)
-        matrix, order = _entries(camera, rig.places(group), spacing(types), tally.mean)
+        matrix, order = _entries(camera, rig.places(group), spacing(types[0]), tally.mean)
         rows.append(matrix)
         variances.append(tally.variance.ravel()[order])
         batches.append(means.reshape(BATCHES, -1)[:, order] - matrix.data)
@@ -135,19 +135,20 @@ def from_points(scene: Scene, camera: Camera, progress: Progress = no_progress) 
 def _sweep(rig: Rig, group: str, work: Plan, seed: int, progress: Progress) -> tuple[Tally, NDArray[np.float64]]:
     """What each sensor pixel reads, (pixels of the group, places of the grid), over all passes and in batches."""
     camera = rig.camera
-    apart = spacing(rig.groups[group])
+    apart = spacing(rig.groups[group][0])
     pixels = rig.places(group).stop - rig.places(group).start
     tally = Tally(pixels, apart**2)
     batches = np.zeros((BATCHES, pixels, apart**2))
     values = np.empty((pixels, apart**2))
     for number in range(work.passes):
         pass_seed = sampler_seed(seed, "calibration", group, number)
-        for place in range(apart**2):
-            rig.show(grid(camera, apart, *divmod(place, apart)))
-            values[:, place] = rig.expose(group, work.samples, pass_seed)
-            progress((number + (place + 1) / apart**2) / work.passes)
+        for first in range(0, apart**2, rig.channels):
+            several = range(first, min(first + rig.channels, apart**2))
+            rig.show(*(grid(camera, apart, *divmod(place, apart)) for place in several))
+            values[:, several] = rig.expose(group, work.samples, pass_seed)[: len(several)].T
+            progress((number + several.stop / apart**2) / work.passes)
         rig.show(np.ones((camera.rows, camera.columns)))
-        _check_rows(values.sum(axis=1), rig.expose(group, work.samples, pass_seed), camera)
+        _check_rows(values.sum(axis=1), rig.expose(group, work.samples, pass_seed)[0], camera)
         tally.add(values)
         batches[number % BATCHES] += values * (BATCHES / work.passes)
     return tally, batches

@@ -7,14 +7,15 @@ from math import ceil, isqrt
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize, special
 
 Vector = NDArray[np.float64]
 
 BATCHES = 4  # passes are also averaged in this many batches, whose scatter shows how errors go together
 FEWEST_PASSES = 16
 MOST_SAMPLES = 4096  # in one pass: the renderer's sums are float32
-ROUNDING = 2.0**-24
-OWN_SHARE = 0.5  # at most this much of a variance rests on a pixel's own few passes
+ROUNDING = 2.0**-24  # relative, of float32
+SMALLEST = 2.0**-126  # the smallest normal float32, so that no stored variance becomes 0
 
 
 @dataclass(frozen=True)
@@ -67,20 +68,31 @@ class Tally:
 
 def rounding_variance(values: Vector, samples: int) -> Vector:
     """Variance that float32 leaves in a mean of `samples` values: of its storage, and of the sums it came from."""
-    return (values * ROUNDING * (1 + samples / 8)) ** 2 + np.finfo(np.float32).tiny
+    return (values * ROUNDING * (1 + samples / 8)) ** 2 + SMALLEST
 
 
 def shrink(variance: Vector, passes: int) -> Vector:
-    """Draw the variances of one sub-image's pixels towards their mean, by as much as their own scatter tells.
+    """Draw the variances of one sub-image's pixels towards a typical one, by as much as their own scatter allows.
 
-    A variance from n passes scatters by 2 / (n - 1) of its square. What they scatter beyond that is real; its share
-    is the weight of a pixel's own variance in the best linear estimate, and at most a half: weights by noisier
-    variances make the predicted error too small.
+    The true variances are taken as draws from a scaled inverse chi-squared distribution whose two parameters are
+    fitted to the logarithms (Smyth 2004, Statistical Applications in Genetics and Molecular Biology 3, article 3):
+    what they scatter more than variances from so few passes must is real. Drawing towards the arithmetic mean would
+    give flat parts of a picture the variance of its edges.
     """
-    if variance.size < 2:
+    freedom = passes - 1
+    known = variance > 0
+    if known.sum() < 2:
         return variance
-    pooled = float(variance.mean())
-    scatter = float(variance.var(ddof=1))
-    expected = 2 / (passes + 1) * float((variance**2).mean())
-    own = min(OWN_SHARE, max(0.0, 1 - expected / scatter)) if scatter > 0 else 0.0
-    return pooled + own * (variance - pooled)
+    logarithms = np.log(variance[known])
+    excess = float(logarithms.var(ddof=1)) - float(special.polygamma(1, freedom / 2))
+    centre = float(logarithms.mean() - special.digamma(freedom / 2)) + np.log(freedom / 2)
+    if excess <= 0:  # all alike
+        return np.full_like(variance, np.exp(centre))
+    weight = 2 * _inverse_trigamma(excess)
+    typical = np.exp(centre + special.digamma(weight / 2) - np.log(weight / 2))
+    return (weight * typical + freedom * variance) / (weight + freedom - 2)  # the mean of what remains possible
+
+
+def _inverse_trigamma(value: float) -> float:
+    """Where the trigamma function, which falls from infinity to 0, has this value."""
+    return float(np.exp(optimize.brentq(lambda x: float(special.polygamma(1, np.exp(x))) - value, -20.0, 20.0)))

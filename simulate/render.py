@@ -63,7 +63,7 @@ def light(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Pr
         values = np.empty(camera.measurements)
         for group in rig.groups:
             seed = sampler_seed(scene.render.seed, "data", group, number)
-            values[rig.places(group)] = rig.expose(group, work.samples, seed)
+            values[rig.places(group)] = rig.expose(group, work.samples, seed)[0]
         tally.add(values)
         progress((number + 1) / work.passes)
     return Rendering(tally.mean, tally.variance, work.passes, work.samples, variant)

@@ -18,54 +18,68 @@ from scenes.camera import Camera, LensType, SubImager
 from . import optics
 from .variant import activate
 
-MOST_SAMPLES = 4096  # film sums are float32: more in one call bias the mean by over 4e-5
 BLOCK = 16  # scalar variants seed by block, and pick its size by the number of threads unless it is given
 
 
 class Rig:
     """A camera in front of an emissive target, ready to be exposed.
 
-    `groups` are the lens types that are exposed together, by the name that their random streams have.
+    `groups` are the lens types that are exposed at once, by the name that their random streams have: the whole
+    camera where that can be and is wanted (`together`), else each lens type by itself. `channels` is how many
+    pictures can be on the target at once, as its colours.
     """
 
-    def __init__(self, camera: Camera, variant: str, sampler: str = "multijitter") -> None:
+    def __init__(self, camera: Camera, variant: str, sampler: str = "multijitter", together: bool = True) -> None:
         """Build the Mitsuba scene; the target is black until `show` puts a picture on it."""
         activate(variant)
         import mitsuba as mi
 
         self.camera = camera
         self.variant = variant
-        jit = not variant.startswith("scalar")
-        self.groups: dict[str, tuple[LensType, ...]] = (
-            {"camera": camera.types} if jit else {kind.name: (kind,) for kind in camera.types}
-        )
-        if jit:
-            self._sensors = {"camera": _whole_camera(camera, sampler)}
+        self._jit = not variant.startswith("scalar")
+        self.groups: dict[str, tuple[LensType, ...]] = {kind.name: (kind,) for kind in camera.types}
+        if self._jit and together:
+            self.groups = {"camera": camera.types}
+        if self._jit:
+            self._sensors = {group: _one_sensor(camera, types, sampler) for group, types in self.groups.items()}
         else:
             self._sensors = {kind.name: mi.load_dict(_batch(camera, kind, sampler)) for kind in camera.types}
-        self._scene = mi.load_dict(scene_of(target_of(camera, _texture(camera))))
+        self.channels = 3 if variant.endswith("rgb") else 1
+        self._scene = mi.load_dict(scene_of(target_of(camera, self._black())))
         self._parameters = mi.traverse(self._scene)
 
-    def show(self, image: NDArray[np.float64]) -> None:
-        """Put a picture, (rows, columns), on the target; signed values are allowed."""
+    def show(self, *images: NDArray[np.float64]) -> None:
+        """Put pictures, (rows, columns), at most `channels` of them, on the target; signed values are allowed."""
         import mitsuba as mi
 
-        texels = np.ascontiguousarray(image[:, :, None], dtype=np.float32)
+        texels = np.zeros((self.camera.rows, self.camera.columns, self.channels), dtype=np.float32)
+        for channel, image in enumerate(images):
+            texels[..., channel] = image
         self._parameters["target.emitter.radiance.data"] = mi.TensorXf(texels)
         self._parameters.update()
 
     def expose(self, group: str, samples: int, seed: int) -> NDArray[np.float64]:
-        """What the sensor pixels of a group read, in the order of measurements, with `samples` rays a pixel."""
+        """What the sensor pixels of a group read of each picture, (channels, pixels in the order of measurements).
+
+        samples : rays a pixel, at most a few thousand, since the renderer's sums are float32
+        """
         import mitsuba as mi
 
         sensor = self._sensors[group]
         rendered: Any = mi.render(self._scene, sensor=sensor, spp=samples, seed=seed)  # pyright: ignore
-        image = np.array(rendered, dtype=np.float64)[..., 0]
+        image = np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0)
         types = self.groups[group]
-        if group == "camera":
-            return image.ravel()[: self.camera.measurements]
+        if self._jit:
+            return image.reshape(self.channels, -1)[:, : sum(kind.measurements for kind in types)]
         (rows, columns), count = types[0].pixels, types[0].count
-        return image.reshape(rows, count, columns).swapaxes(0, 1).ravel()
+        side_by_side = image.reshape(self.channels, rows, count, columns)
+        return side_by_side.swapaxes(1, 2).reshape(self.channels, -1)
+
+    def _black(self) -> dict[str, Any]:
+        import mitsuba as mi
+
+        texels = np.zeros((self.camera.rows, self.camera.columns, self.channels), dtype=np.float32)
+        return texture_of({"bitmap": mi.Bitmap(texels)})
 
     def places(self, group: str) -> slice:
         """Where a group's pixels stand among all measurements."""
@@ -118,23 +132,16 @@ def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int) -> 
     }
 
 
-def film(width: int, height: int) -> dict[str, Any]:
+def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:
     """A film that neither filters nor rounds to half precision."""
     return {
         "type": "hdrfilm",
         "width": width,
         "height": height,
         "rfilter": {"type": "box"},
-        "pixel_format": "luminance",
+        "pixel_format": "rgb" if channels == 3 else "luminance",
         "component_format": "float32",
     }
-
-
-def _texture(camera: Camera) -> dict[str, Any]:
-    import mitsuba as mi
-
-    black = mi.Bitmap(np.zeros((camera.rows, camera.columns, 1), dtype=np.float32))
-    return texture_of({"bitmap": black})
 
 
 def texture_of(source: dict[str, Any]) -> dict[str, Any]:
@@ -156,7 +163,7 @@ def _batch(camera: Camera, kind: LensType, sampler: str) -> dict[str, Any]:
     rows, columns = kind.pixels
     batch: dict[str, Any] = {
         "type": "batch",
-        "film": film(columns * kind.count, rows),
+        "film": film(columns * kind.count, rows, channels=3),
         "sampler": {"type": sampler, "sample_count": 16},
     }
     members = [sub for sub in camera.sub_imagers if sub.type == kind]
@@ -165,16 +172,16 @@ def _batch(camera: Camera, kind: LensType, sampler: str) -> dict[str, Any]:
     return batch
 
 
-def _whole_camera(camera: Camera, sampler: str) -> Any:
-    """All sub-imagers as one sensor: a film pixel a measurement, looked up in tables."""
+def _one_sensor(camera: Camera, types: tuple[LensType, ...], sampler: str) -> Any:
+    """All sub-imagers of some lens types as one sensor: a film pixel a measurement, looked up in tables."""
     import drjit as dr
     import mitsuba as mi
 
     # Powers of two: then film coordinates are exact and no ray can slip into a neighbour's pixel.
-    bits = max(camera.measurements - 1, 1).bit_length()
+    bits = max(sum(kind.measurements for kind in types) - 1, 1).bit_length()
     height = 1 << (bits // 2)
     width = 1 << (bits - bits // 2)
-    tables = _tables(camera, width * height)
+    tables = _tables(camera, types, width * height)
 
     class CompoundEye(mi.Sensor):
         def __init__(self, properties: Any) -> None:
@@ -216,10 +223,10 @@ def _whole_camera(camera: Camera, sampler: str) -> Any:
     return CompoundEye(properties)
 
 
-def _tables(camera: Camera, size: int) -> NDArray[np.float64]:
+def _tables(camera: Camera, types: tuple[LensType, ...], size: int) -> NDArray[np.float64]:
     """(5, size): x and y of each pixel's corner from its lens, the lens's x and y, the depth; the last one repeated."""
     columns: list[NDArray[np.float64]] = []
-    for sub in camera.sub_imagers:
+    for sub in (sub for sub in camera.sub_imagers if sub.type in types):
         row, column = (place.ravel() for place in np.indices(sub.type.pixels))
         x, y = optics.pixel_corner(camera, sub, row, column)
         same = np.ones_like(x)

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from scenes.errors import InputError
 
@@ -91,7 +91,7 @@ def activate(variant: str) -> None:
 
     if mi.variant() != variant:
         mi.set_variant(variant)
-    logger: Any = mi.logger()
+    logger = cast(Any, mi).logger()
     if logger is not None and not isinstance(logger.appender(0), _stderr_appender()):
         logger.clear_appenders()
         appender: Any = _stderr_appender()

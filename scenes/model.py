@@ -22,6 +22,7 @@ from scipy import sparse
 from .camera import Camera, derive
 from .errors import InputError
 from .files import digest, write_whole
+from .moderate import moderate
 from .scene import Scene, parse
 from .stack import restrict_camera
 
@@ -79,28 +80,27 @@ class Model:
 
         The errors of a row cancel in its sum, since all its entries share their rays, so what is left is about
         sum over j of var_ij (f_j - (H f)_i)^2. Neighbouring entries' errors cancel too, which smooth images notice:
-        the sum is scaled, a lens type at a time, to what the batches' scatter of H f shows.
+        the scatter of H f over the batches, moderated among the pixels of a lens type, says by how much.
         """
         flat = np.asarray(image, dtype=np.float64).ravel()
         rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
         away = flat[self.matrix.indices] - (self.matrix @ flat)[rows]
-        spread: Vector = np.bincount(rows, weights=self.variance * away**2, minlength=self.measurements).astype(
-            np.float64
-        )
+        trend = self._row_sums(rows, self.variance * away**2)
         count = len(self.batches)
         if count < 2:
-            return spread
-        seen = np.zeros(self.measurements)
-        for batch in self.batches:
-            seen += np.bincount(rows, weights=batch * away, minlength=self.measurements) ** 2
+            return trend
+        seen = sum((self._row_sums(rows, batch * away) ** 2 for batch in self.batches), np.zeros(self.measurements))
         seen /= count * (count - 1)
         start = 0
         for kind in self.camera.types:
-            place = slice(start, start + kind.measurements)
-            total = spread[place].sum()
-            spread[place] *= seen[place].sum() / total if total > 0 else 1.0
-            start = place.stop
-        return spread
+            place = np.arange(start, start + kind.measurements)
+            place = place[trend[place] > 0]
+            trend[place] *= moderate(seen[place] / trend[place], count)
+            start += kind.measurements
+        return trend
+
+    def _row_sums(self, rows: NDArray[np.int64], entries: Vector) -> Vector:
+        return np.bincount(rows, weights=entries, minlength=self.measurements).astype(np.float64)
 
 
 def write(path: Path, model: Model) -> None:

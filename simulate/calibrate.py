@@ -20,11 +20,12 @@ from scenes.camera import Camera, LensType
 from scenes.errors import DeniedError
 from scenes.files import fingerprint
 from scenes.model import Model
+from scenes.moderate import moderate
 from scenes.scene import Scene, resolved
 from scenes.versions import versions
 
 from .ideal import ideal_matrix, ideal_model
-from .passes import BATCHES, Plan, Tally, plan, rounding_variance, shrink
+from .passes import BATCHES, Plan, Tally, plan, rounding_variance
 from .render import Progress, no_progress
 from .streams import sampler_seed
 from .variant import choose
@@ -205,7 +206,7 @@ def settle(responses: Responses, camera: Camera) -> NDArray[np.float64]:
     settled = np.empty_like(responses.variance)
     for place in camera.slices():
         stored = slice(int(starts[place.start]), int(starts[place.stop]))
-        settled[stored] = shrink(responses.variance[stored], responses.passes)
+        settled[stored] = moderate(responses.variance[stored], responses.passes)
     return np.maximum(settled, rounding_variance(responses.matrix.data, responses.samples))
 
 

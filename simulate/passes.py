@@ -7,7 +7,6 @@ from math import ceil, isqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special
 
 Vector = NDArray[np.float64]
 
@@ -69,30 +68,3 @@ class Tally:
 def rounding_variance(values: Vector, samples: int) -> Vector:
     """Variance that float32 leaves in a mean of `samples` values: of its storage, and of the sums it came from."""
     return (values * ROUNDING * (1 + samples / 8)) ** 2 + SMALLEST
-
-
-def shrink(variance: Vector, passes: int) -> Vector:
-    """Draw the variances of one sub-image's pixels towards a typical one, by as much as their own scatter allows.
-
-    The true variances are taken as draws from a scaled inverse chi-squared distribution whose two parameters are
-    fitted to the logarithms (Smyth 2004, Statistical Applications in Genetics and Molecular Biology 3, article 3):
-    what they scatter more than variances from so few passes must is real. Drawing towards the arithmetic mean would
-    give flat parts of a picture the variance of its edges.
-    """
-    freedom = passes - 1
-    known = variance > 0
-    if known.sum() < 2:
-        return variance
-    logarithms = np.log(variance[known])
-    excess = float(logarithms.var(ddof=1)) - float(special.polygamma(1, freedom / 2))
-    centre = float(logarithms.mean() - special.digamma(freedom / 2)) + np.log(freedom / 2)
-    if excess <= 0:  # all alike
-        return np.full_like(variance, np.exp(centre))
-    weight = 2 * _inverse_trigamma(excess)
-    typical = np.exp(centre + special.digamma(weight / 2) - np.log(weight / 2))
-    return (weight * typical + freedom * variance) / (weight + freedom - 2)  # the mean of what remains possible
-
-
-def _inverse_trigamma(value: float) -> float:
-    """Where the trigamma function, which falls from infinity to 0, has this value."""
-    return float(np.exp(optimize.brentq(lambda x: float(special.polygamma(1, np.exp(x))) - value, -20.0, 20.0)))

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from scenes.camera import Camera
 from scenes.files import digest, fingerprint
+from scenes.moderate import moderate
 from scenes.scene import Scene, resolved
 from scenes.stack import Stack
 from scenes.versions import versions
 
-from .passes import Tally, plan, rounding_variance, shrink
+from .passes import Tally, plan, rounding_variance
 from .streams import sampler_seed
 from .variant import choose
 
@@ -78,7 +79,7 @@ def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: P
     start = perf_counter()
     rendering = light(scene, camera, image, progress)
     floor = rounding_variance(rendering.mean, rendering.samples)
-    variance = np.concatenate([shrink(rendering.variance[place], rendering.passes) for place in camera.slices()])
+    variance = np.concatenate([moderate(rendering.variance[place], rendering.passes) for place in camera.slices()])
     values = rendering.mean
     if scene.noise is not None:
         from .expose import expose, generators

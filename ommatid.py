@@ -91,9 +91,11 @@ def render(
 def calibrate(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
     """Find the observation matrix H alone."""
     from scenes.camera import derive
+    from scenes.files import refuse_output
     from scenes.scene import read
     from simulate.kept import kept_model
 
+    refuse_output(output, scene)
     described = read(scene, sets or (), _names(lens))
     camera = derive(described)
     with _progress("calibrate") as progress:
@@ -117,7 +119,11 @@ def reconstruct(
     import scenes.model
     import scenes.stack
     from reconstruct import figure, report, results
+    from scenes.files import refuse_output
 
+    refuse_output(output, stack, model)
+    if output.suffix == ".png":
+        raise InputError(f"{output}: expected the name of an OpenEXR file, such as {output.with_suffix('.exr')}")
     recorded, calibrated = scenes.stack.read(stack), scenes.model.read(model)
     if lens:
         recorded, calibrated = recorded.restrict(_names(lens)), calibrated.restrict(_names(lens))
@@ -180,8 +186,10 @@ def show(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json =
 @app.command()
 def export(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
     """Write a plain Mitsuba scene of stock sensors."""
+    from scenes.files import refuse_output
     from simulate.export import export as write
 
+    refuse_output(output, scene)
     described, camera, image = _opened(scene, sets, lens)
     picture = write(described, camera, image, output)
     sensors = [sub.name for sub in camera.sub_imagers]
@@ -245,7 +253,17 @@ def main() -> None:
     except KeyboardInterrupt:
         _say("ommatid: stopped; finished files stay, the next run carries on from them")
         code = 1
-    sys.exit(code if isinstance(code, int) else 0)
+    sys.exit(_delivered(code if isinstance(code, int) else 0))
+
+
+def _delivered(code: int) -> int:
+    """The exit code once what was printed has arrived: when Python ends, nobody says in a sentence that it has not."""
+    try:
+        print(end="", flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what cannot be delivered, or Python would try again
+        return code or _complain(error)
+    return code
 
 
 def _complain(error: Exception, where: str = "") -> int:
@@ -257,7 +275,7 @@ def _complain(error: Exception, where: str = "") -> int:
         _say(f"{prefix}{cast(Any, error).format_message()}")
         return 2
     if isinstance(error, InputError | DeniedError):
-        _say(f"{prefix}{error}")
+        _say(prefix + " ".join(str(error).splitlines()))
         return 2 if isinstance(error, InputError) else 1
     if os.environ.get("OMMATID_TRACEBACK"):
         raise error
@@ -353,7 +371,7 @@ def _table(title: str, lines: list[tuple[str, str]]) -> None:
     table = Table("", "", title=title, title_justify="left", show_header=False)
     for name, value in lines:
         table.add_row(name, value)
-    Console().print(table, markup=False)
+    Console(markup=False, emoji=False).print(table)  # a title is text, whatever brackets it has
 
 
 @contextmanager

@@ -13,8 +13,10 @@ so that no variance can come out negative.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -42,14 +44,21 @@ class Gain:
     condition: float
 
     def apply(self, residual: Vector) -> Vector:
-        """A r: (M,) to (N,)."""
+        """A r: (M,) to (N,), or (M, k) to (N, k) for many at once."""
+        column = (slice(None), *[None] * (residual.ndim - 1))
         if self.method == "information":
-            return _solve(self.factor, self.matrix.T @ (residual / self.noise_variance))
-        return self.prior_variance * (self.matrix.T @ _solve(self.factor, residual))
+            return _solve(self.factor, self.matrix.T @ (residual / self.noise_variance[column]))
+        return self.prior_variance[column] * (self.matrix.T @ _solve(self.factor, residual))
+
+    @cached_property
+    def _inverse(self) -> Matrix:
+        # In information form it is the posterior covariance itself, of which Eq. 5 needs every entry.
+        inverse, _ = linalg.lapack.dpotri(self.factor, lower=1)
+        return np.tril(inverse) + np.tril(inverse, -1).T
 
     def rows_of_transpose(self) -> Iterator[tuple[slice, Matrix]]:
         """A^T, a few hundred measurements at a time: the whole of A would not fit where its pieces do."""
-        inverse = _inverse(self.factor)
+        inverse = self._inverse
         measurements = self.matrix.shape[0]
         for start in range(0, measurements, CHUNK):
             some = slice(start, min(start + CHUNK, measurements))
@@ -61,8 +70,8 @@ class Gain:
     def resolution_defect(self) -> Matrix:
         """I - A H: (N, N), what the estimate does not take from the image itself."""
         if self.method == "information":
-            return _inverse(self.factor) / self.prior_variance
-        gain = self.prior_variance[:, None] * (self.matrix.T @ _inverse(self.factor))
+            return self._inverse / self.prior_variance
+        gain = self.prior_variance[:, None] * (self.matrix.T @ self._inverse)
         return np.eye(self.matrix.shape[1]) - (self.matrix.T @ gain.T).T
 
 
@@ -154,14 +163,7 @@ def _solve(factor: Matrix, right: Vector) -> Vector:
     return np.asarray(linalg.cho_solve((factor, True), right, check_finite=False))
 
 
-def _inverse(factor: Matrix) -> Matrix:
-    inverse, _ = linalg.lapack.dpotri(factor, lower=1)
-    return np.tril(inverse) + np.tril(inverse, -1).T
-
-
 def _refuse_too_large(size: int, unknowns: int) -> None:
-    import os
-
     needed = 8 * (3 * size**2 + 2 * unknowns**2)
     free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     if needed > free:

@@ -45,7 +45,7 @@ def write_overview(path: Path, title: str, stack: Stack, restoration: Restoratio
         above.insert(0, ("Truth", truth, "values"))
         below.append(("Error: estimate minus truth", estimate - truth, "signed"))
     deviation = np.sqrt(restoration.expected.variance).reshape(shape)
-    below.append(("Expected error, standard deviation", deviation, "spread"))
+    below.append(("Expected deviation (error bars)", deviation, "spread"))
     across = max(len(above), len(below) + 1)
     figure: Any = Figure(figsize=(COLUMN_INCHES * across, 7.2), dpi=RESOLUTION, layout="constrained")
     FigureCanvasAgg(figure)
@@ -60,11 +60,16 @@ def write_overview(path: Path, title: str, stack: Stack, restoration: Restoratio
 
 def _budget(axes: Any, restoration: Restoration) -> None:
     parts = {name.replace("_", " "): part for name, part in restoration.budget().items() if part > 0}
-    axes.barh(list(parts), list(parts.values()), color="tab:blue")
+    shares = [100 * part / restoration.expected.mse for part in parts.values()]
+    bars = axes.barh(list(parts), shares, color="tab:blue")
+    axes.bar_label(bars, [f"{share:.2g} %" for share in shares], padding=3, fontsize=8)
     axes.invert_yaxis()
-    axes.set_xscale("log")
-    axes.set_title(f"Expected squared error {restoration.expected.mse:.3g}\nand its parts", fontsize=10)
-    axes.set_xlabel("mean squared error (squared units of the values)", fontsize=8)
+    axes.set_xlim(0, 1.25 * max(shares))
+    axes.set_box_aspect(0.9)
+    axes.set_title(
+        f"Where the expected squared error\nof {restoration.expected.mse:.3g} a pixel comes from", fontsize=10
+    )
+    axes.set_xlabel("share (%)", fontsize=8)
     axes.tick_params(labelsize=8)
 
 
@@ -106,6 +111,6 @@ def _panel(figure: Any, axes: Any, name: str, image: Image, kind: str, grey: tup
     axes.tick_params(labelsize=8)
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.yaxis.get_major_locator().set_params(integer=True)
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.85)
+    bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
     bar.set_label(label, fontsize=8)
     bar.ax.tick_params(labelsize=8)

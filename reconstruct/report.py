@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -57,14 +58,18 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
         "error": error,
         "solver": {
             "method": restoration.method,
-            "condition": restoration.condition,
+            "condition": restoration.condition if isfinite(restoration.condition) else None,
             "digits": restoration.digits,
         },
         "model": model.record.get("agreement", {"rms_difference_from_ideal": 0.0, "max_z": None, "p_value": None}),
         "skipped": [{"what": what, "why": why} for what, why in left_out(_as_run(stack, model))],
         "versions": {**model.record["versions"], **stack.record["versions"], **versions("scipy", "scikit-image")},
-        "seeds": {"render": stack.record["seed"], "calibrate": model.record.get("seed")},
+        "seeds": {"scene": stack.record["seed"], "data": stack.record["streams"], **_streams(model)},
     }
+
+
+def _streams(model: Model) -> dict[str, Any]:
+    return {"calibration": model.record["streams"]} if "streams" in model.record else {}
 
 
 def _as_run(stack: Stack, model: Model) -> Scene:

@@ -30,9 +30,9 @@ def changed(stack: Stack, overrides: list[str], path: Path) -> Stack:
     if not overrides:
         return stack
     scene = with_changes(stack.scene.plain(), path, overrides, ())
-    before, after = stack.scene.plain(), scene.plain()
-    for table in after.keys() | before.keys():
-        if table not in OURS and table != "target" and before.get(table) != after.get(table):
+    for override in overrides:
+        table = override.partition("=")[0].split(".")[0].strip()
+        if table not in OURS:
             raise InputError(f"--set: [{table}] is already recorded in {path}; here only {', '.join(OURS)} can be set")
     return replace(stack, scene=_with(stack.scene, scene))
 

@@ -37,9 +37,9 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel]) -> str:
-    location = _trim(problem["loc"])
-    key = _dotted(location, data)
     kind = problem["type"]
+    location = problem["loc"] if kind == "extra_forbidden" else _trim(problem["loc"])
+    key = _dotted(location, data)
     if kind == "extra_forbidden":
         keys = known_keys(model)
         bare = ".".join(part for part in location if isinstance(part, str))

@@ -8,11 +8,12 @@ when little is written, and reads a truncated file as a shorter one: all of that
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import sys
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .files import digest, write_whole
+from .files import digest, fingerprint, write_whole
 
 ATTRIBUTE = "ommatid"
 
@@ -36,7 +37,7 @@ class Part:
 
 
 def write(path: Path, parts: Sequence[Part]) -> None:
-    """Write the parts, each with a SHA-256 of its pixels in its record, and check that they arrived.
+    """Write the parts, each with a SHA-256 of its pixels and one of its record, and check that they arrived.
 
     Raises InputError for a folder that does not exist, DeniedError for a disk that is full.
     """
@@ -49,6 +50,7 @@ def write(path: Path, parts: Sequence[Part]) -> None:
     for part in parts:
         channels = {name: np.ascontiguousarray(pixels, dtype=np.float32) for name, pixels in part.channels.items()}
         record = {**part.record, "parts": len(parts), "sha256": _seal(channels)}
+        record["seal"] = fingerprint(record)
         header = {
             "compression": OpenEXR.ZIP_COMPRESSION,
             "type": OpenEXR.scanlineimage,
@@ -113,10 +115,12 @@ def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], at
         raise InputError(f"{where} has no attribute '{ATTRIBUTE}'; expected a file that ommatid wrote")
     try:
         record = json.loads(attribute)
-        seal = record.pop("sha256")
-    except (json.JSONDecodeError, KeyError, AttributeError, TypeError) as error:
+        seal = record.pop("seal")
+        intact = fingerprint(record) == seal
+        pixels = record.pop("sha256")
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InputError(f"{where} has a damaged attribute '{ATTRIBUTE}'; make the file again") from error
-    if not channels or _seal(channels) != seal:
+    if not intact or not channels or _seal(channels) != pixels:
         raise InputError(f"{where} does not match its checksum; the file is cut short or altered, make it again")
     return Part(name, channels, record)
 
@@ -135,7 +139,8 @@ def _quiet() -> Generator[None]:
     try:
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
-        yield
+        with redirect_stdout(io.StringIO()):  # some warnings take the way through Python, whose buffer outlives this
+            yield
     finally:
         os.dup2(saved[0], 1)
         os.dup2(saved[1], 2)

@@ -21,10 +21,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
 
     Raises DeniedError when the disk is full or refuses, InputError when the folder does not exist.
     """
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
-    if path.is_dir():
-        raise InputError(f"{path}: expected the name of a file, got a folder")
+    refuse_output(path)
     beside = path.with_name(f".{secrets.token_hex(4)}.part.{path.name}")
     try:
         write(beside)
@@ -38,6 +35,17 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         ) from error
     finally:
         beside.unlink(missing_ok=True)
+
+
+def refuse_output(path: Path, *inputs: Path) -> None:
+    """Raise InputError where a result could not be written, or would replace what it is made from."""
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
+    if path.is_dir():
+        raise InputError(f"{path}: expected the name of a file, got a folder")
+    for read in inputs:
+        if path.resolve() == read.resolve():
+            raise InputError(f"{path}: would replace the file that is read; choose another name with -o")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import tokenize
 import zipfile
 import zlib
 from dataclasses import dataclass, replace
@@ -156,11 +157,12 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         raise InputError(f"{path}: no such file")
     names = ("indices", "indptr", "data", "shape", "variance", "batches")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # numpy leaves a damaged file open, so we open it
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays: dict[str, NDArray[Any]] = {name: file[name] for name in names}
             record = json.loads(str(file["ommatid"][()]))
             description, seal = record["description"], record["sha256"]
-    except (ValueError, KeyError, OSError, EOFError, TypeError, zipfile.BadZipFile, zlib.error, IndexError) as error:
+    except _UNREADABLE as error:
         reason = "it holds pickled objects" if "pickle" in str(error) else str(error)
         raise InputError(
             f"{path}: expected a model that ommatid wrote, got one that cannot be read: {reason}"
@@ -168,6 +170,14 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     if _seal(arrays, description) != seal:
         raise InputError(f"{path}: does not match its checksum; the file is damaged, calibrate again")
     return arrays, description
+
+
+# What numpy, zipfile and json raise for damaged files: RuntimeError for an encrypted one, TokenError for a header
+# that is no Python.
+_UNREADABLE = (
+    *(ValueError, KeyError, IndexError, TypeError, OSError, EOFError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
 
 
 def _seal(arrays: dict[str, NDArray[Any]], description: str) -> str:

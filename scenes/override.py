@@ -35,7 +35,7 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str,
 
 def _inside(table: Any, name: str, override: str) -> Any:
     if isinstance(table, list):
-        lenses: dict[Any, Any] = {lens.get("name"): lens for lens in table if isinstance(lens, dict)}  # type: ignore[union-attr]
+        lenses = _by_name(table)  # pyright: ignore[reportUnknownArgumentType]
         if name not in lenses:
             raise InputError(f"--set {override}: no lens type is called '{name}'; there are {_names(lenses)}")
         return lenses[name]
@@ -61,9 +61,7 @@ def keep_lenses(data: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         return data
     camera = data.get("camera")
     listed: Any = camera.get("lens") if isinstance(camera, dict) else None  # type: ignore[union-attr]
-    lenses: dict[Any, Any] = {}
-    if isinstance(listed, list):
-        lenses = {lens.get("name"): lens for lens in listed if isinstance(lens, dict)}  # type: ignore[union-attr]
+    lenses = _by_name(listed) if isinstance(listed, list) else {}  # pyright: ignore[reportUnknownArgumentType]
     chosen: list[Any] = []
     for place, name in enumerate(wanted):
         if name not in lenses:
@@ -71,6 +69,10 @@ def keep_lenses(data: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         earlier = wanted[:place].count(name)
         chosen.append({**lenses[name], "name": name if earlier == 0 else f"{name}-{earlier + 1}"})
     return {**data, "camera": {**camera, "lens": chosen}}  # type: ignore[dict-item]
+
+
+def _by_name(lenses: list[Any]) -> dict[str, Any]:
+    return {str(lens.get("name")): lens for lens in lenses if isinstance(lens, dict)}  # type: ignore[union-attr]
 
 
 def _names(lenses: Iterable[Any]) -> str:

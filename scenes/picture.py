@@ -114,7 +114,10 @@ def _shipped(name: str, where: str) -> Path:
 def _decode(path: Path, where: str) -> NDArray[Any]:
     kind = path.suffix.lower()
     if kind == ".exr":
-        channels = read_channels(path)
+        try:
+            channels = read_channels(path)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
         if "Y" in channels:
             return channels["Y"]
         if not {"R", "G", "B"} <= channels.keys():
@@ -130,4 +133,6 @@ def _decode(path: Path, where: str) -> NDArray[Any]:
         imread: Any = io.imread  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
         return np.asarray(imread(path))
     except Exception as error:  # every decoder raises kinds of its own
-        raise InputError(f"{where}: {path} could not be read as a picture ({error})") from error
+        raise InputError(
+            f"{where}: {path} could not be read as a picture; it is damaged or another kind of file"
+        ) from error

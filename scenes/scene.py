@@ -287,4 +287,5 @@ def write(path: Path, scene: Scene) -> None:
     """Write a scene as TOML, defaults included. Raises InputError or DeniedError."""
     import tomli_w
 
-    write_text(path, tomli_w.dumps(scene.plain()))
+    pair = re.compile(r"\[\s+(\d+),\s+(\d+),\s+\]")  # which the library spreads over four lines
+    write_text(path, pair.sub(r"[\1, \2]", tomli_w.dumps(scene.plain())))

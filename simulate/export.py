@@ -35,5 +35,5 @@ def export(scene: Scene, camera: Camera, image: NDArray[np.float64], path: Path)
         name = sub.name.replace(".", "_")  # a dot would be a path into the scene
         described[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.samples)
     state = mi.parser.parse_dict(mi.parser.ParserConfig("scalar_rgb"), described)
-    write_whole(path, lambda beside: mi.parser.write_file(state, beside))
+    write_whole(path, lambda beside: mi.parser.write_file(state, str(beside)))
     return picture

@@ -29,7 +29,7 @@ def kept_stack(
         old = None
     if old is not None and old.record.get("fingerprint") == render.made_from(scene, camera, image):
         now = resolved(scene, (camera.rows, camera.columns))
-        if old.scene != now:  # what the estimator is told may have changed, the values have not
+        if old.scene.plain() != now.plain():  # what the estimator is told may have changed, the values have not
             stack.write(path, replace(old, scene=now))
         return stack.read(path), False
     stack.write(path, render.render(scene, camera, image, progress))

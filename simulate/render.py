@@ -18,7 +18,7 @@ from scenes.stack import Stack
 from scenes.versions import versions
 
 from .passes import Tally, plan, rounding_variance
-from .streams import sampler_seed
+from .streams import sampler_seed, sampler_seeds
 from .variant import choose
 
 Progress = Callable[[float], None]
@@ -37,6 +37,7 @@ class Rendering:
     passes: int
     samples: int
     variant: str
+    streams: dict[str, int]
 
 
 def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
@@ -67,7 +68,8 @@ def light(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Pr
             values[rig.places(group)] = rig.expose(group, work.samples, seed)[0]
         tally.add(values)
         progress((number + 1) / work.passes)
-    return Rendering(tally.mean, tally.variance, work.passes, work.samples, variant)
+    streams = sampler_seeds(scene.render.seed, "data", rig.groups)
+    return Rendering(tally.mean, tally.variance, work.passes, work.samples, variant, streams)
 
 
 def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Progress = no_progress) -> Stack:
@@ -92,6 +94,7 @@ def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: P
         "samples": rendering.passes * rendering.samples,
         "passes": rendering.passes,
         "seed": scene.render.seed,
+        "streams": rendering.streams,
         "sampler": scene.render.sampler,
         "variant": rendering.variant,
         "versions": versions("mitsuba", "drjit", "OpenEXR"),

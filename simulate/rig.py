@@ -18,7 +18,7 @@ from scenes.camera import Camera, LensType, SubImager
 from . import optics
 from .variant import activate
 
-BLOCK = 16  # scalar variants seed by block, and pick its size by the number of threads unless it is given
+BLOCK = 4  # scalar variants seed by block, and pick its size by the number of threads unless it is given
 
 
 class Rig:
@@ -43,7 +43,7 @@ class Rig:
         if self._jit:
             self._sensors = {group: _one_sensor(camera, types, sampler) for group, types in self.groups.items()}
         else:
-            self._sensors = {kind.name: mi.load_dict(_batch(camera, kind, sampler)) for kind in camera.types}
+            self._sensors = {kind.name: mi.load_dict(batch_sensor(camera, kind, sampler)) for kind in camera.types}
         self.channels = 3 if variant.endswith("rgb") else 1
         self._scene = mi.load_dict(scene_of(target_of(camera, self._black())))
         self._parameters = mi.traverse(self._scene)
@@ -159,7 +159,8 @@ def texture_of(source: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _batch(camera: Camera, kind: LensType, sampler: str) -> dict[str, Any]:
+def batch_sensor(camera: Camera, kind: LensType, sampler: str) -> dict[str, Any]:
+    """All sub-imagers of a lens type as Mitsuba's own `batch`, side by side on one film of three channels."""
     rows, columns = kind.pixels
     batch: dict[str, Any] = {
         "type": "batch",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,11 @@ def _sequence(seed: int, purpose: Purpose, name: str, *place: int) -> np.random.
 def sampler_seed(seed: int, purpose: Purpose, name: str, number: int) -> int:
     """32 bits for the sampler of pass `number` over the sensors called `name`."""
     return int(_sequence(seed, purpose, name, number).generate_state(1)[0])
+
+
+def sampler_seeds(seed: int, purpose: Purpose, names: Iterable[str]) -> dict[str, int]:
+    """The seeds of the first pass over each of the named sensors, for the record of a run."""
+    return {name: sampler_seed(seed, purpose, name, 0) for name in names}
 
 
 def generator(seed: int, purpose: Purpose, name: str, *place: int) -> np.random.Generator:

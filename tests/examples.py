@@ -1,0 +1,75 @@
+"""Small scenes for the tests, and what many of them ask of statistics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from scenes.camera import Camera, derive
+from scenes.scene import Scene, parse
+from simulate.variant import blocked
+
+GALLERY = Path(__file__).parent.parent / "scenes"
+Lenses = tuple[tuple[Any, Any, Any], ...]
+
+VARIANTS = ["scalar_rgb", "llvm_ad_mono"]
+
+
+def scene(
+    shape: tuple[int, int] = (19, 19),
+    lenses: Lenses = (("1/3", [3, 3], [5, 5]),),
+    **tables: Any,
+) -> Scene:
+    """A scene with lens types A, B, ... of (magnification, array, pixels) and more tables by name."""
+    names = "ABCDEFGH"
+    data: dict[str, Any] = {
+        "target": {
+            "image": "photo:camera",
+            "origin": [96, 224],
+            "shape": list(shape),
+            "pixel_pitch": "1 mm",
+            "distance": "1 m",
+        },
+        "camera": {
+            "pixel_pitch": "6 um",
+            "lens_pitch": "0.5 mm",
+            "lens": [
+                {"name": name, "magnification": magnification, "array": array, "pixels": pixels}
+                for name, (magnification, array, pixels) in zip(names, lenses, strict=False)
+            ],
+        },
+        **tables,
+    }
+    return parse(data, Path("test.toml"))
+
+
+THREE = (("1/3", [3, 3], [5, 5]), ("1/5", [5, 5], [3, 3]), ("1/4", [4, 4], [4, 4]))
+
+
+def camera(shape: tuple[int, int] = (19, 19), lenses: Lenses = THREE) -> Camera:
+    """The camera of such a scene."""
+    return derive(scene(shape, lenses))
+
+
+def needs(variant: str) -> None:
+    """Skip where a variant does not work on this machine."""
+    reason = blocked(variant)
+    if reason:
+        pytest.skip(reason)
+
+
+def familywise(tests: int, significance: float = 0.01) -> float:
+    """Two-sided significance of each of many tests, so that all pass together with 1 - significance (Sidak)."""
+    return float(-np.expm1(np.log1p(-significance) / tests))
+
+
+def assert_student(difference: NDArray[np.float64], variance: NDArray[np.float64], passes: int) -> None:
+    """Each difference is compatible with its variance, estimated from `passes` passes, all of them at 1 %."""
+    limit = float(stats.t.isf(familywise(difference.size) / 2, passes - 1))
+    score = np.abs(difference) / np.sqrt(variance)
+    assert score.max() < limit, f"t = {score.max():.1f} at {int(score.argmax())}, the limit is {limit:.1f}"

@@ -1,0 +1,143 @@
+"""Measures of error, predictions, and the paper's numbers by a second method."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from reconstruct.accuracy import compare, expected_given, observability, predict, trimmed
+from reconstruct.estimator import factorise
+from reconstruct.prior import Prior, independent
+from scenes.camera import derive
+from scenes.scene import Estimator, read
+from scenes.scene import Prior as PriorTable
+from simulate.ideal import ideal_matrix
+
+from .examples import GALLERY
+
+PRIOR = PriorTable()
+
+
+@pytest.mark.parametrize(
+    ("name", "lenses", "reference", "rank"),
+    [
+        ("tile19", (), 2.79776586e-4, 361),
+        ("tile19", ("I", "I"), 2057.42393, 225),
+        ("tile19", ("I", "II"), 484.100274, 329),
+        ("tile35", (), 1.54401e-4, 1225),
+        ("tile35", ("I", "II"), 89.16378, 1205),
+        ("tile41", (), 1.24737e-3, 1681),
+    ],
+)
+def test_reference_values_of_extended_precision(
+    name: str, lenses: tuple[str, ...], reference: float, rank: int
+) -> None:
+    """Computed with 300 bits; expected and actual noise variance 1e-6."""
+    camera = derive(read(GALLERY / f"{name}.toml", (), lenses))
+    matrix = ideal_matrix(camera)
+    shape = (camera.rows, camera.columns)
+    found = predict(matrix, independent(PRIOR, camera.unknowns), 1e-6, Estimator(), shape)
+    assert found.mse == pytest.approx(reference, rel=1e-5)
+    assert (found.rank, found.null_space) == (rank, camera.unknowns - rank)
+
+
+@pytest.mark.parametrize(
+    ("lenses", "actual", "expected", "reference"),
+    [
+        ((), 1e-4, 1e-2, 0.0330911224),
+        (("I", "II"), 1e-4, 1e-2, 484.191545),
+        ((), 1e-2, 1.0, 35.5841883),
+        (("I", "II"), 1e-2, 1.0, 589.811609),
+    ],
+)
+def test_reference_values_where_the_expectation_is_wrong(
+    lenses: tuple[str, ...], actual: float, expected: float, reference: float
+) -> None:
+    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+    prior = independent(PRIOR, 361)
+    found = predict(ideal_matrix(camera), prior, actual, Estimator(noise_variance=expected), (19, 19))
+    assert found.mse == pytest.approx(reference, rel=1e-8)
+
+
+@pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I",)])
+@pytest.mark.parametrize("noise", [1e-6, 1e-2, 1.0])
+def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> None:
+    """With a white prior the expected error is the mean over H's singular values s of v P0 / (v + s^2 P0)."""
+    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+    matrix = ideal_matrix(camera)
+    singular = np.zeros(361)
+    values = np.linalg.svd(matrix.toarray(), compute_uv=False)
+    singular[: values.size] = values
+    by_values = np.mean(noise * PRIOR.variance / (noise + singular**2 * PRIOR.variance))
+    found = predict(matrix, independent(PRIOR, 361), noise, Estimator(), (19, 19))
+    assert found.mse == pytest.approx(by_values, rel=1e-6)
+    assert found.rank == np.linalg.matrix_rank(matrix.toarray(), tol=1e-9)
+    seen = values[: found.rank]
+    assert found.condition == pytest.approx(seen[0] / seen[-1], rel=1e-6)
+
+
+@pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I", "I")])
+def test_without_noise_the_error_is_the_null_space(lenses: tuple[str, ...]) -> None:
+    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+    found = predict(ideal_matrix(camera), independent(PRIOR, 361), 0.0, Estimator(), (19, 19))
+    assert found.mse == pytest.approx(PRIOR.variance * found.null_space / 361, rel=1e-9, abs=1e-12)
+
+
+def test_the_papers_claims_that_two_and_one_type_are_worse() -> None:
+    mse = {}
+    for lenses in ((), ("I", "II"), ("I", "I")):
+        camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+        matrix = ideal_matrix(camera)
+        prior = independent(PRIOR, 361)
+        for noise in (1e-6, 1e-2):
+            mse[len(set(lenses)), noise] = predict(matrix, prior, noise, Estimator(), (19, 19)).mse
+    assert mse[1, 1e-6] == pytest.approx(mse[1, 1e-2], rel=1e-3), "the null space keeps one type from improving"
+    assert mse[2, 1e-2] < mse[1, 1e-2] / 4
+    assert mse[2, 1e-6] > 0.95 * mse[2, 1e-2]
+    assert mse[0, 1e-2] < mse[2, 1e-2] / 100
+    assert mse[0, 1e-6] < 1e-3 * mse[0, 1e-2]
+
+
+def test_the_identity_sees_everything() -> None:
+    seen = observability(sparse.csr_array(np.eye(5)))
+    assert (seen.rank, seen.null_space, seen.condition) == (5, 0, pytest.approx(1))
+
+
+def test_measures_of_error() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 255, (20, 20))
+    noisy = truth + rng.normal(0, 2, truth.shape)
+    found = compare(noisy.ravel(), truth.ravel(), (20, 20))
+    assert found.mse == pytest.approx(np.mean((noisy - truth) ** 2))
+    assert found.psnr == pytest.approx(10 * np.log10(255**2 / found.mse))
+    assert found.ssim is not None
+    assert 0.9 < found.ssim < 1
+    same = compare(truth.ravel(), truth.ravel(), (20, 20))
+    assert (same.mse, same.psnr, same.ssim) == (0, None, pytest.approx(1))
+    assert compare(np.zeros(4), np.ones(4), (2, 2)).trimmed_mse is None
+    assert compare(np.zeros(4), np.ones(4), (2, 2)).ssim is None
+
+
+def test_trimming_takes_the_border_off() -> None:
+    image = np.ones((7, 9))
+    image[2:-2, 2:-2] = 5
+    assert trimmed(image.ravel(), (7, 9)) == 5
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_the_interval_holds_99_errors_in_a_hundred(wide: bool) -> None:
+    """Of one given image, over many draws of the noise, for an estimator that expects another noise as well."""
+    rng = np.random.default_rng(2)
+    matrix = sparse.csr_array(rng.normal(size=(60, 30)) / np.geomspace(1, 300 if wide else 2, 30))
+    noise = rng.uniform(0.2, 2, 60)
+    prior = Prior(np.zeros(30), np.full(30, 9.0))
+    truth = rng.normal(0, 2, 30)
+    gain = factorise(matrix, prior.variance, 2 * noise)
+    interval = expected_given(gain, prior, truth, noise)
+    draws = 20_000
+    recorded = (matrix @ truth)[:, None] + rng.normal(size=(60, draws)) * np.sqrt(noise)[:, None]
+    errors = np.mean((gain.apply(recorded) - truth[:, None]) ** 2, axis=0)
+    assert errors.mean() == pytest.approx(interval.mse, rel=0.02)
+    outside = np.mean((errors < interval.low) | (errors > interval.high))
+    assert 0.005 < outside < 0.02

@@ -1,0 +1,64 @@
+"""The sensor: noise of the right size from streams of its own, and quantisation as added noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from scenes.scene import Noise
+from simulate.expose import expose, generators, quantise
+from simulate.streams import generator, sampler_seed
+
+from .examples import THREE, camera
+
+
+def test_noise_has_the_variance_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    size = 40_000
+    noise = expose(np.full(size, 100.0), Noise(variance=0.25), [rng], [slice(0, size)]) - 100
+    bounds = stats.chi2.ppf([0.005, 0.995], size - 1) / (size - 1)
+    assert bounds[0] < noise.var(ddof=1) / 0.25 < bounds[1]
+    assert abs(noise.mean()) < 2.6 * (0.25 / size) ** 0.5
+
+
+@pytest.mark.parametrize("bits", [4, 8, 12])
+def test_quantisation_acts_as_noise_of_a_twelfth_of_the_squared_step(bits: int) -> None:
+    values = np.random.default_rng(1).uniform(0, 255, 100_000)
+    step = 256 / 2**bits
+    error = quantise(values, Noise(bits=bits).level) - values
+    assert np.abs(error).max() <= step / 2 * (1 + 1e-12)
+    assert error.var() == pytest.approx(step**2 / 12, rel=0.02)
+    assert Noise(bits=bits).quantisation_variance == pytest.approx(error.var(), rel=0.02)
+    levels = np.unique(quantise(values, step) / step)
+    assert (levels == np.round(levels)).all()
+
+
+def test_no_noise_changes_nothing() -> None:
+    light = np.linspace(0, 255, 50)
+    np.testing.assert_array_equal(expose(light, Noise(), [], []), light)
+
+
+def test_a_sub_imagers_noise_does_not_depend_on_its_neighbours() -> None:
+    three, one = camera(), camera(lenses=THREE[:1])
+    noise = Noise(variance=1.0)
+    whole = expose(np.zeros(three.measurements), noise, generators(three, 5), three.slices())
+    alone = expose(np.zeros(one.measurements), noise, generators(one, 5), one.slices())
+    np.testing.assert_array_equal(whole[: one.measurements], alone)
+    others = expose(np.zeros(one.measurements), noise, generators(one, 6), one.slices())
+    assert abs(np.corrcoef(alone, others)[0, 1]) < 4 / 225**0.5
+
+
+def test_streams_differ_in_every_part_of_their_name() -> None:
+    seeds = [
+        sampler_seed(seed, purpose, name, number)
+        for seed in range(3)
+        for purpose in ("data", "calibration", "noise")
+        for name in ("camera", "I", "II")
+        for number in range(16)
+    ]
+    assert len(set(seeds)) == len(seeds)
+    assert all(0 <= seed < 2**32 for seed in seeds)
+    first = generator(0, "noise", "I", 0, 1).random(4)
+    assert not np.array_equal(first, generator(0, "noise", "I", 1, 0).random(4))
+    np.testing.assert_array_equal(first, generator(0, "noise", "I", 0, 1).random(4))

@@ -1,0 +1,89 @@
+"""The README is true: its commands run, its keys and files are those of the program."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from scenes.explain import known_keys
+from scenes.scene import Scene
+
+from .examples import GALLERY
+
+ROOT = Path(__file__).parent.parent
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+OMMATID = Path(sys.executable).with_name("ommatid")
+QUICK = ["--set", "render.samples=16", "--set", "calibration.samples=16", "--set", "render.variant=scalar_rgb"]
+
+
+def commands() -> list[list[str]]:
+    """Every line of the README's shell blocks that starts with ommatid, in order, comments left out."""
+    blocks = re.findall(r"```sh\n(.*?)```", TEXT, flags=re.DOTALL)
+    lines = [line.split("#")[0].split() for block in blocks for line in block.splitlines()]
+    return [line for line in lines if line and line[0] == "ommatid"]
+
+
+def test_every_command_works_as_it_is_written(tmp_path: Path) -> None:
+    """In their order, in an empty folder with the gallery in it; only samples are spared."""
+    shutil.copytree(GALLERY, tmp_path / "scenes", ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    found = commands()
+    assert len(found) >= 9
+    for words in found:
+        extra = QUICK if words[1] == "run" else []
+        ended = subprocess.run([str(OMMATID), *words[1:], *extra], cwd=tmp_path, capture_output=True, text=True)
+        assert ended.returncode == 0, f"{' '.join(words)}: {ended.stderr}"
+    made = {path.name for path in (tmp_path / "out" / "mine").iterdir()}
+    listed = set(re.findall(r"`([a-z]+\.(?:png|exr|json|npz|toml))`", TEXT[TEXT.index("## The files of a run") :]))
+    assert made <= listed
+    assert {"overview.png", "run.json", "stack.exr", "model.npz", "scene.toml", "truth.exr"} <= listed
+
+
+def test_the_numbers_beside_the_predictions_are_true() -> None:
+    for line in TEXT.splitlines():
+        claimed = re.match(r"ommatid (predict .*?)\s+# ([0-9.e-]+)[,:]", line)
+        if claimed:
+            ended = subprocess.run(
+                [str(OMMATID), *claimed[1].split(), "--json"], cwd=ROOT, capture_output=True, text=True, check=True
+            )
+            assert json.loads(ended.stdout)["mse"] == pytest.approx(float(claimed[2]), rel=1e-3)
+
+
+def test_the_two_commands_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"make ([a-z]+)", TEXT):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+    assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+def test_every_key_is_explained() -> None:
+    table = TEXT[TEXT.index("## The scene file") : TEXT.index("### Units and axes")]
+    starter = (GALLERY / "starter.toml").read_text(encoding="utf-8")
+    for key in known_keys(Scene):
+        last = key.rsplit(".", 1)[-1]
+        assert f"`{last}`" in table or f"[{key}]" in table, key
+        assert re.search(rf"^(# )?\[*({re.escape(key)}|{last})\b", starter, flags=re.MULTILINE), key
+
+
+def test_the_snippets_are_toml_that_the_program_reads() -> None:
+    for block in re.findall(r"```toml\n(.*?)```", TEXT, flags=re.DOTALL):
+        lens = tomllib.loads(block)["camera"]["lens"][0]
+        assert set(lens) <= {key.rsplit(".", 1)[-1] for key in known_keys(Scene)}
+
+
+def test_pictures_exist() -> None:
+    for picture in re.findall(r"\]\(([^)]+\.png)\)", TEXT):
+        assert (ROOT / picture).is_file()
+
+
+@pytest.mark.parametrize("command", ["run", "render", "calibrate", "reconstruct", "predict", "show", "export", "init"])
+def test_every_command_is_listed_and_helps(command: str) -> None:
+    assert f"`ommatid {command}" in TEXT
+    ended = subprocess.run([str(OMMATID), command, "--help"], capture_output=True, text=True, check=True)
+    assert "Usage" in ended.stdout

@@ -17,6 +17,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -51,14 +52,14 @@ class Gain:
         return self.prior_variance[column] * (self.matrix.T @ _solve(self.factor, residual))
 
     @cached_property
-    def _inverse(self) -> Matrix:
-        # In information form it is the posterior covariance itself, of which Eq. 5 needs every entry.
+    def inverse(self) -> Matrix:
+        """Inverse of the factorised matrix; in information form the posterior covariance, all of which Eq. 5 needs."""
         inverse, _ = linalg.lapack.dpotri(self.factor, lower=1)
         return np.tril(inverse) + np.tril(inverse, -1).T
 
     def rows_of_transpose(self) -> Iterator[tuple[slice, Matrix]]:
         """A^T, a few hundred measurements at a time: the whole of A would not fit where its pieces do."""
-        inverse = self._inverse
+        inverse = self.inverse
         measurements = self.matrix.shape[0]
         for start in range(0, measurements, CHUNK):
             some = slice(start, min(start + CHUNK, measurements))
@@ -70,8 +71,8 @@ class Gain:
     def resolution_defect(self) -> Matrix:
         """I - A H: (N, N), what the estimate does not take from the image itself."""
         if self.method == "information":
-            return self._inverse / self.prior_variance
-        gain = self.prior_variance[:, None] * (self.matrix.T @ self._inverse)
+            return self.inverse / self.prior_variance
+        gain = self.prior_variance[:, None] * (self.matrix.T @ self.inverse)
         return np.eye(self.matrix.shape[1]) - (self.matrix.T @ gain.T).T
 
 
@@ -152,6 +153,10 @@ def expected_error(gain: Gain, prior_variance: Vector, noise: dict[str, Vector])
 
 def noise_covariance(gain: Gain, noise_variance: Vector) -> Matrix:
     """A Rvm A^T: (N, N), the covariance that noise of variances (M,) gives the estimate."""
+    if gain.method == "information":
+        weights = noise_variance / gain.noise_variance**2
+        middle = gain.matrix.T @ sparse.csr_array(gain.matrix.multiply(weights[:, None]))
+        return gain.inverse @ (middle @ gain.inverse)
     total = np.zeros((gain.matrix.shape[1],) * 2)
     for some, transposed in gain.rows_of_transpose():
         weighted = np.sqrt(noise_variance[some, None]) * transposed
@@ -165,9 +170,18 @@ def _solve(factor: Matrix, right: Vector) -> Vector:
 
 def _refuse_too_large(size: int, unknowns: int) -> None:
     needed = 8 * (3 * size**2 + 2 * unknowns**2)
-    free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
+    free = _free_memory()
     if needed > free:
         raise InputError(
             f"the dense estimator needs {needed / 1e9:.1f} GB for {unknowns} pixels, {free / 1e9:.1f} GB are free;"
             " crop the target with target.origin and target.shape"
         )
+
+
+def _free_memory() -> int:
+    """Bytes that can be had without swapping; where the system does not say, what is built in."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -43,6 +43,8 @@ Sets = Annotated[
 Lenses = Annotated[
     str, typer.Option("--lens", metavar="NAME,...", help="Keep these lens types; one named twice counts twice.")
 ]
+INTERRUPTED = 130  # what the parser makes of Ctrl-C
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
 Progress = Callable[[float], None]
 
@@ -54,11 +56,13 @@ def run(
     """Render, calibrate, reconstruct and report."""
 
     def work(path: Path, folder: Path) -> dict[str, Any]:
+        from reconstruct.estimator import refuse_too_large
         from reconstruct.report import rows
         from reconstruct.results import kept_results
         from simulate.kept import kept_model
 
         scene, camera, image = _opened(path, sets, lens)
+        refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method)
         stack = _rendered(scene, camera, image, folder)
         with _progress("calibrate") as progress:
             model, made = kept_model(folder / "model.npz", scene, camera, progress)
@@ -120,10 +124,11 @@ def reconstruct(
     import scenes.stack
     from reconstruct import figure, report, results
     from scenes.files import refuse_output
+    from scenes.scene import TRUTH
 
-    refuse_output(output, stack, model)
     if output.suffix == ".png":
         raise InputError(f"{output}: expected the name of an OpenEXR file, such as {output.with_suffix('.exr')}")
+    refuse_output(output, stack, model, stack.parent / TRUTH)
     recorded, calibrated = scenes.stack.read(stack), scenes.model.read(model)
     if lens:
         recorded, calibrated = recorded.restrict(_names(lens)), calibrated.restrict(_names(lens))
@@ -147,6 +152,7 @@ def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Jso
     from dataclasses import asdict
 
     from reconstruct import accuracy
+    from reconstruct.estimator import refuse_too_large
     from reconstruct.prior import independent
     from scenes.camera import derive
     from scenes.scene import read
@@ -154,6 +160,7 @@ def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Jso
 
     described = read(scene, sets or (), _names(lens))
     camera = derive(described)
+    refuse_too_large(camera.measurements, camera.unknowns, described.estimator.method)
     noise = described.noise
     actual = noise.variance + noise.quantisation_variance if noise else 0.0
     told = described.estimator
@@ -248,6 +255,8 @@ def main() -> None:
     """Run the command line; every failure ends in one sentence on stderr and an exit code."""
     try:
         code = app(standalone_mode=False)
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
     except Exception as error:
         code = _complain(error)
     except KeyboardInterrupt:
@@ -284,7 +293,8 @@ def _complain(error: Exception, where: str = "") -> int:
     elif isinstance(error, OSError):
         _say(f"{prefix}{error.filename or 'the machine'}: {error.strerror or error}")
     else:
-        _say(f"{prefix}unexpected {type(error).__name__}: {error}; set OMMATID_TRACEBACK=1 to see where, and report it")
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        _say(f"{prefix}unexpected {what}; set OMMATID_TRACEBACK=1 to see where, and report it")
     return 1
 
 
@@ -316,19 +326,17 @@ def _each(paths: list[Path], output: Path, work: Callable[[Path, Path], dict[str
 
 def _opened(path: Path, sets: list[str] | None, lens: str) -> tuple[Scene, Camera, Image]:
     """A scene, its camera and its target, all checked before anything is written."""
-    import numpy as np
-
     from scenes.camera import derive
     from scenes.picture import load
     from scenes.scene import read
 
     scene = read(path, sets or (), _names(lens))
-    image = load(scene).astype(np.float32).astype(np.float64)  # the precision of truth.exr
-    return scene, derive(scene), image
+    camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
+    return scene, camera, load(scene)
 
 
 def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path) -> Any:
-    from scenes.files import make_folder
+    from scenes.files import make_folder, refuse_output
     from scenes.picture import write_truth
     from scenes.scene import TRUTH, resolved, write
     from simulate.kept import kept_stack
@@ -336,6 +344,8 @@ def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path) -> Any:
 
     choose(scene.render.variant)
     make_folder(folder)
+    for name in ("scene.toml", TRUTH):
+        refuse_output(folder / name, scene.source, Path(scene.target.image))
     write(folder / "scene.toml", resolved(scene, (camera.rows, camera.columns)))
     write_truth(folder / TRUTH, image)
     with _progress("render") as progress:

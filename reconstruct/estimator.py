@@ -102,9 +102,9 @@ def factorise(
     Raises InputError if memory does not suffice or if the matrix is not positive definite in float64.
     """
     measurements, unknowns = matrix.shape
-    chosen = method if method != "auto" else ("measurement" if measurements < unknowns else "information")
+    chosen = _chosen(measurements, unknowns, method)
     size = measurements if chosen == "measurement" else unknowns
-    _refuse_too_large(size, unknowns)
+    refuse_too_large(measurements, unknowns, method)
     if noise_variance.min() <= 0:
         raise InputError("the estimator needs an expected noise variance above 0; set estimator.noise_variance")
     if chosen == "information":
@@ -168,7 +168,15 @@ def _solve(factor: Matrix, right: Vector) -> Vector:
     return np.asarray(linalg.cho_solve((factor, True), right, check_finite=False))
 
 
-def _refuse_too_large(size: int, unknowns: int) -> None:
+def _chosen(measurements: int, unknowns: int, method: Method) -> Literal["measurement", "information"]:
+    if method == "auto":
+        return "measurement" if measurements < unknowns else "information"
+    return method
+
+
+def refuse_too_large(measurements: int, unknowns: int, method: Method) -> None:
+    """Raise InputError if the estimator's dense matrices would not fit in memory."""
+    size = measurements if _chosen(measurements, unknowns, method) == "measurement" else unknowns
     needed = 8 * (3 * size**2 + 2 * unknowns**2)
     free = _free_memory()
     if needed > free:

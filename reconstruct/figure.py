@@ -49,7 +49,7 @@ def write_overview(path: Path, title: str, stack: Stack, restoration: Restoratio
     across = max(len(above), len(below) + 1)
     figure: Any = Figure(figsize=(COLUMN_INCHES * across, 7.2), dpi=RESOLUTION, layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     grey = _grey_range(restoration)
     for number, panels in enumerate((above, below)):
         for place, (name, image, kind) in enumerate(panels):

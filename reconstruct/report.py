@@ -61,15 +61,20 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
             "condition": restoration.condition if isfinite(restoration.condition) else None,
             "digits": restoration.digits,
         },
-        "model": model.record.get("agreement", {"rms_difference_from_ideal": 0.0, "max_z": None, "p_value": None}),
+        "model": model.record.get("agreement", _unknown(model)),
         "skipped": [{"what": what, "why": why} for what, why in left_out(_as_run(stack, model))],
         "versions": {**model.record["versions"], **stack.record["versions"], **versions("scipy", "scikit-image")},
-        "seeds": {"scene": stack.record["seed"], "data": stack.record["streams"], **_streams(model)},
+        "seeds": {
+            "scene": stack.record["seed"],
+            "data": stack.record["first_seed"],
+            "calibration": model.record.get("first_seed"),
+        },
     }
 
 
-def _streams(model: Model) -> dict[str, Any]:
-    return {"calibration": model.record["streams"]} if "streams" in model.record else {}
+def _unknown(model: Model) -> dict[str, float | None]:
+    known = 0.0 if model.record["method"] == "ideal" else None
+    return {"rms_difference_from_ideal": known, "max_z": None, "p_value": None}
 
 
 def _as_run(stack: Stack, model: Model) -> Scene:

@@ -74,6 +74,8 @@ def restore(stack: Stack, model: Model, truth: Vector | None = None) -> Restorat
     scene = stack.scene
     prior = independent(scene.prior, model.unknowns)
     noise = known_noise(stack)
+    if model.variance.any():
+        noise["calibration"] = model.prior_spread(prior.variance)
     gain = _gain(scene, model, prior, noise)
     image = estimate(gain, stack.values, prior.mean)
     if model.variance.any():

@@ -20,7 +20,7 @@ from . import figure, report
 from .restore import Restoration, refuse_strangers, restore
 
 ESTIMATE, PICTURE, OVERVIEW, RUN = "estimate.exr", "estimate.png", "overview.png", "run.json"
-OURS = ("prior", "noise", "estimator")
+OURS = ("prior", "estimator")
 
 
 def changed(stack: Stack, overrides: list[str], path: Path) -> Stack:
@@ -70,8 +70,9 @@ def write_results(folder: Path, stack: Stack, restoration: Restoration, descript
 
 def made_from(stack: Stack, model: Model) -> str:
     """Fingerprint of everything that an estimate depends on."""
-    told = {table: value for table, value in stack.scene.plain().items() if table in OURS}
-    return fingerprint([stack.record["fingerprint"], model.record["fingerprint"], told, stack.scene.title])
+    arrays = (stack.values, stack.variance, model.matrix.data, model.matrix.indices, model.variance, model.batches)
+    records = [stack.record, model.record]
+    return fingerprint([digest(*arrays), records, stack.scene.plain()])
 
 
 def kept_results(folder: Path, stack: Stack, model: Model, names: tuple[Path, Path]) -> tuple[dict[str, Any], bool]:
@@ -81,9 +82,9 @@ def kept_results(folder: Path, stack: Stack, model: Model, names: tuple[Path, Pa
     if all((folder / name).is_file() for name in files):
         try:
             old = json.loads((folder / RUN).read_text(encoding="utf-8"))
-            if old["fingerprint"] == wanted:
+            if old["fingerprint"] == wanted == read(folder / ESTIMATE)[0].record["fingerprint"]:
                 return old, False
-        except (ValueError, KeyError, TypeError):  # damaged: to be made
+        except (InputError, ValueError, KeyError, TypeError):  # damaged: to be made
             pass
     restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names)
     description = {"fingerprint": wanted, **description}

@@ -8,10 +8,10 @@ types as listed, sub-imagers (k, l) by rows, then pixels by rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from math import floor
+from math import ceil, floor
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from .picture import shape
 from .scene import Lens, Scene
 
 MOST_MEASUREMENTS = 2**30
+MOST_SUB_IMAGERS = 2**14
 
 
 @dataclass(frozen=True)
@@ -108,17 +109,22 @@ class Camera:
     @cached_property
     def sub_imagers(self) -> tuple[SubImager, ...]:
         """Every sub-imager, in the order of measurements."""
-        across = sum(kind.array[1] for kind in self.types)
-        found: list[SubImager] = []
-        left = 0
-        for kind in self.types:
-            for k in range(kind.array[0]):
-                for l in range(kind.array[1]):  # noqa: E741
-                    x = ((across - 1) / 2 - (left + l)) * self.lens_pitch
-                    y = ((kind.array[0] - 1) / 2 - k) * self.lens_pitch
-                    found.append(self._sub_imager(kind, k, l, (x, y)))
-            left += kind.array[1]
-        return tuple(found)
+        places = enumerate(self.types)
+        return tuple(
+            self.sub_imager(place, k, l)
+            for place, kind in places
+            for k in range(kind.array[0])
+            for l in range(kind.array[1])  # noqa: E741
+        )
+
+    def sub_imager(self, place: int, k: int, l: int) -> SubImager:  # noqa: E741
+        """Sub-imager (k, l) of the lens type that stands at `place` in the list; types stand side by side."""
+        kind = self.types[place]
+        across = sum(other.array[1] for other in self.types)
+        left = sum(other.array[1] for other in self.types[:place])
+        x = ((across - 1) / 2 - (left + l)) * self.lens_pitch
+        y = ((kind.array[0] - 1) / 2 - k) * self.lens_pitch
+        return self._sub_imager(kind, k, l, (x, y))
 
     def _sub_imager(self, kind: LensType, k: int, l: int, lens: tuple[float, float]) -> SubImager:  # noqa: E741
         window = kind.origin[0] + k * kind.step, kind.origin[1] + l * kind.step
@@ -148,9 +154,23 @@ class Camera:
         """(rows, columns): by how many lens types each pixel of f is seen whole."""
         seen = np.zeros((self.rows, self.columns), dtype=np.int64)
         for kind in self.types:
-            rows, columns = kind.span
-            seen[kind.origin[0] : kind.origin[0] + floor(rows), kind.origin[1] : kind.origin[1] + floor(columns)] += 1
+            axes = [np.zeros(size, dtype=np.int64) for size in (self.rows, self.columns)]
+            for axis, marked in enumerate(axes):
+                for number in range(kind.array[axis]):
+                    start = kind.origin[axis] + number * kind.step
+                    marked[ceil(start) : floor(start + kind.ratio * kind.pixels[axis])] = 1
+            seen += np.outer(*axes)
         return seen
+
+    def restrict(self, names: tuple[str, ...]) -> tuple[Camera, NDArray[np.bool_]]:
+        """The camera with only the named lens types, and which measurements are theirs. Raises InputError."""
+        known = [kind.name for kind in self.types]
+        for name in names:
+            if name not in known or names.count(name) > 1:
+                asked = ",".join(names)
+                raise InputError(f"--lens {asked}: expected each of {', '.join(known)} at most once, got '{name}'")
+        kept = np.concatenate([np.full(kind.measurements, kind.name in names) for kind in self.types])
+        return replace(self, types=tuple(kind for kind in self.types if kind.name in names)), kept
 
     def describe(self) -> dict[str, Any]:
         """What must agree between a stack and a model, in JSON's types."""
@@ -189,6 +209,12 @@ def derive(scene: Scene) -> Camera:
         lens_pitch=scene.camera.lens_pitch,
         types=types,
     )
+    for kind in types:
+        if kind.count > MOST_SUB_IMAGERS:
+            raise InputError(
+                f"{scene.source}: camera.lens.{kind.name}.array has {kind.count} sub-imagers, at most"
+                f" {MOST_SUB_IMAGERS} a lens type are served; use fewer"
+            )
     if camera.measurements > MOST_MEASUREMENTS:
         raise InputError(f"{scene.source}: the lens arrays have {camera.measurements} pixels, at most 2^30 are served")
     _refuse_overlap(camera, scene)
@@ -221,20 +247,21 @@ def _lens_type(lens: Lens, rows: int, columns: int, scene: Scene) -> LensType:
 
 
 def _refuse_overlap(camera: Camera, scene: Scene) -> None:
-    # Patches of one type form a regular grid, and the types stand side by side: neighbours along either axis suffice.
-    subs = {(sub.type.name, sub.k, sub.l): sub for sub in camera.sub_imagers}
+    # The patches of a type form a regular grid and the types stand side by side, so these neighbours suffice.
+    pairs: list[tuple[SubImager, SubImager, int]] = []
     for place, kind in enumerate(camera.types):
-        pairs = [((kind.name, k, 0), (kind.name, k + 1, 0), 0) for k in range(kind.array[0] - 1)]
-        pairs += [((kind.name, 0, l), (kind.name, 0, l + 1), 1) for l in range(kind.array[1] - 1)]  # noqa: E741
+        first = camera.sub_imager(place, 0, 0)
+        if kind.array[0] > 1:
+            pairs.append((first, camera.sub_imager(place, 1, 0), 0))
+        if kind.array[1] > 1:
+            pairs.append((first, camera.sub_imager(place, 0, 1), 1))
         if place:
-            before = camera.types[place - 1]
-            pairs.append(((before.name, 0, before.array[1] - 1), (kind.name, 0, 0), 1))
-        for one, other, axis in pairs:
-            first, second = subs[one], subs[other]
-            apart = first.patch[1 - axis] - second.patch[1 - axis]
-            needed = (first.type.pixels[axis] + second.type.pixels[axis]) / 2 * camera.pixel_pitch
-            if apart < needed * (1 - 1e-9):
-                raise InputError(
-                    f"{scene.source}: camera.lens_pitch: the sub-images {first.name} and {second.name} overlap on the"
-                    f" sensor (their centres stand {apart:.4g} mm apart, they need {needed:.4g} mm); widen the pitch"
-                )
+            pairs.append((camera.sub_imager(place - 1, 0, camera.types[place - 1].array[1] - 1), first, 1))
+    for first, second, axis in pairs:
+        apart = first.patch[1 - axis] - second.patch[1 - axis]
+        needed = (first.type.pixels[axis] + second.type.pixels[axis]) / 2 * camera.pixel_pitch
+        if apart < needed * (1 - 1e-9):
+            raise InputError(
+                f"{scene.source}: camera.lens_pitch: the sub-images {first.name} and {second.name} overlap on the"
+                f" sensor (their centres stand {apart:.4g} mm apart, they need {needed:.4g} mm); widen the pitch"
+            )

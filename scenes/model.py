@@ -25,7 +25,6 @@ from .errors import InputError
 from .files import digest, write_whole
 from .moderate import moderate
 from .scene import Scene, parse
-from .stack import restrict_camera
 
 Vector = NDArray[np.float64]
 
@@ -66,7 +65,7 @@ class Model:
 
     def restrict(self, names: tuple[str, ...]) -> Model:
         """Only the named lens types, in the model's own order. Raises InputError for a name it does not have."""
-        camera, kept = restrict_camera(self.camera, names)
+        camera, kept = self.camera.restrict(names)
         stored = np.repeat(kept, np.diff(self.matrix.indptr))
         return replace(
             self,
@@ -74,6 +73,7 @@ class Model:
             matrix=self.matrix[kept],
             variance=self.variance[stored],
             batches=self.batches[:, stored],
+            record={key: value for key, value in self.record.items() if key != "agreement"},  # of all types
         )
 
     def spread(self, image: Vector) -> Vector:
@@ -99,6 +99,11 @@ class Model:
             trend[place] *= moderate(seen[place] / trend[place], count)
             start += kind.measurements
         return trend
+
+    def prior_spread(self, prior_variance: Vector) -> Vector:
+        """The same before anything is known of the image but the (N,) variance of its pixels: sum of var_ij P0_j."""
+        rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
+        return self._row_sums(rows, self.variance * prior_variance[self.matrix.indices])
 
     def _row_sums(self, rows: NDArray[np.int64], entries: Vector) -> Vector:
         return np.bincount(rows, weights=entries, minlength=self.measurements).astype(np.float64)

@@ -22,7 +22,7 @@ LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray wei
 
 
 def load(scene: Scene) -> Image:
-    """The target, (rows, columns), cropped as the scene says.
+    """The target, (rows, columns), cropped as the scene says, in the precision of float32.
 
     Raises InputError if the picture is missing, unreadable, too small for the crop or holds NaN.
     """
@@ -39,9 +39,11 @@ def load(scene: Scene) -> Image:
         crop = picture
     else:
         crop = _crop(picture, scene)
-    if not np.isfinite(crop).all():
+    with np.errstate(over="ignore"):
+        rounded = crop.astype(np.float32).astype(np.float64)  # the precision of the renderer and of truth.exr
+    if not np.isfinite(rounded).all():
         raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
-    return crop
+    return rounded
 
 
 def shape(scene: Scene) -> tuple[int, int]:
@@ -65,7 +67,7 @@ def luminance(pixels: NDArray[Any], where: str) -> Image:
         values = pixels.astype(np.float64) * 255.0
     elif pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
         values = pixels.astype(np.float64)
-    elif pixels.dtype == np.uint16:
+    elif pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
         values = pixels.astype(np.float64) / 257.0
     else:
         raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")

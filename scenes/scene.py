@@ -185,7 +185,7 @@ class Estimator(_Table):
     """How the image is estimated."""
 
     noise_variance: float | None = Field(
-        default=None, ge=0, description="what the estimator expects; absent: all that is known"
+        default=None, gt=0, description="what the estimator expects; absent: all that is known"
     )
     method: Literal["auto", "measurement", "information"] = "auto"
 

@@ -38,7 +38,7 @@ class Stack:
 
     def restrict(self, names: tuple[str, ...]) -> Stack:
         """Only the named lens types, in the stack's own order. Raises InputError for a name it does not have."""
-        camera, kept = restrict_camera(self.camera, names)
+        camera, kept = self.camera.restrict(names)
         lenses = tuple(lens for lens in self.scene.camera.lens if lens.name in names)
         update = {"camera": self.scene.camera.model_copy(update={"lens": lenses})}
         return replace(
@@ -48,18 +48,6 @@ class Stack:
             values=self.values[kept],
             variance=self.variance[kept],
         )
-
-
-def restrict_camera(camera: Camera, names: tuple[str, ...]) -> tuple[Camera, NDArray[np.bool_]]:
-    """The camera with only the named lens types, and which measurements are theirs. Raises InputError."""
-    known = [kind.name for kind in camera.types]
-    for name in names:
-        if name not in known or names.count(name) > 1:
-            raise InputError(
-                f"--lens {','.join(names)}: expected each of {', '.join(known)} at most once, got '{name}'"
-            )
-    kept = np.concatenate([np.full(kind.measurements, kind.name in names) for kind in camera.types])
-    return replace(camera, types=tuple(kind for kind in camera.types if kind.name in names)), kept
 
 
 def write(path: Path, stack: Stack) -> None:

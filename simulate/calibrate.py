@@ -27,6 +27,7 @@ def made_from(scene: Scene, camera: Camera) -> str:
     """Fingerprint of everything that H depends on."""
     description: dict[str, Any] = {"camera": camera.describe(), "calibration": scene.calibration.model_dump()}
     if scene.calibration.method != "ideal":
+        description["versions"] = versions("mitsuba")
         render = scene.render
         description["render"] = {"seed": render.seed, "variant": render.variant, "sampler": render.sampler}
     return fingerprint(description)
@@ -51,7 +52,7 @@ def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress) ->
         "samples": responses.passes * responses.samples,
         "passes": responses.passes,
         "seed": scene.render.seed,
-        "streams": responses.streams,
+        "first_seed": responses.first_seed,
         "variant": responses.variant,
         "agreement": agreement(responses.matrix, variance, camera, responses.passes),
         "versions": versions("mitsuba", "drjit", "scipy"),
@@ -77,7 +78,7 @@ def agreement(matrix: sparse.csr_array, variance: NDArray[np.float64], camera: C
     difference = sparse.csr_array(matrix - ideal_matrix(camera))
     entries = int(difference.nnz)
     known = sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
-    # An entry that no ray has hit has the smallest uncertainty that one ray more could have shown.
+    # Where no ray has hit there is no scatter either: such an entry counts as uncertain as the others are on average.
     unseen = float(variance.mean())
     spread = np.asarray(known[difference.nonzero()], dtype=np.float64).ravel()
     spread[spread == 0] = unseen
@@ -85,5 +86,5 @@ def agreement(matrix: sparse.csr_array, variance: NDArray[np.float64], camera: C
     largest = float(np.max(np.abs(values) / np.sqrt(spread), initial=0.0))
     single = 2 * float(stats.t.sf(largest, passes - 1))
     chance = -np.expm1(entries * np.log1p(-single)) if single < 1 else 1.0
-    rms = float(np.sqrt((difference.data**2).sum() / max(matrix.nnz, 1)))
+    rms = float(np.sqrt((difference.data**2).sum() / max(entries, 1)))
     return {"rms_difference_from_ideal": rms, "max_z": largest, "p_value": float(chance)}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scenes.camera import Camera
 from scenes.scene import Noise
 
-from .streams import generator
+from .streams import noise_generator
 
 
 def quantise(values: NDArray[np.float64], level: float) -> NDArray[np.float64]:
@@ -29,4 +29,4 @@ def expose(
 
 def generators(camera: Camera, seed: int) -> list[np.random.Generator]:
     """One generator a sub-imager, which stays the same whatever other lens types the camera has."""
-    return [generator(seed, "noise", sub.type.name, sub.k, sub.l) for sub in camera.sub_imagers]
+    return [noise_generator(seed, sub.type.name, sub.k, sub.l) for sub in camera.sub_imagers]

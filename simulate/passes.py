@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-BATCHES = 4  # passes are also averaged in this many batches, whose scatter shows how errors go together
+BATCHES = 8  # passes are also averaged in this many batches, whose scatter shows how errors go together
 FEWEST_PASSES = 16
 MOST_SAMPLES = 4096  # in one pass: the renderer's sums are float32
 ROUNDING = 2.0**-24  # relative, of float32
-SMALLEST = 2.0**-126  # the smallest normal float32, so that no stored variance becomes 0
 
 
 @dataclass(frozen=True)
@@ -66,5 +65,8 @@ class Tally:
 
 
 def rounding_variance(values: Vector, samples: int) -> Vector:
-    """Variance that float32 leaves in a mean of `samples` values: of its storage, and of the sums it came from."""
-    return (values * ROUNDING * (1 + samples / 8)) ** 2 + SMALLEST
+    """Variance that float32 leaves in a mean of `samples` values: of its storage, and of the sums it came from.
+
+    A value of 0 is given the rounding of 1, since noise of exactly 0 has no inverse.
+    """
+    return ((np.abs(values) * (1 + samples / 8) + 1) * ROUNDING) ** 2

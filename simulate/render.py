@@ -18,7 +18,7 @@ from scenes.stack import Stack
 from scenes.versions import versions
 
 from .passes import Tally, plan, rounding_variance
-from .streams import sampler_seed, sampler_seeds
+from .streams import sampler_seeds
 from .variant import choose
 
 Progress = Callable[[float], None]
@@ -37,7 +37,7 @@ class Rendering:
     passes: int
     samples: int
     variant: str
-    streams: dict[str, int]
+    first_seed: int
 
 
 def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
@@ -48,6 +48,7 @@ def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
             "target": digest(image.astype(np.float32)),
             "noise": scene.noise.model_dump() if scene.noise else None,
             "render": scene.render.model_dump(),
+            "versions": versions("mitsuba"),
         }
     )
 
@@ -64,12 +65,12 @@ def light(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Pr
     for number in range(work.passes):
         values = np.empty(camera.measurements)
         for group in rig.groups:
-            seed = sampler_seed(scene.render.seed, "data", group, number)
+            seed = sampler_seeds(scene.render.seed, "data", number, work.passes)
             values[rig.places(group)] = rig.expose(group, work.samples, seed)[0]
         tally.add(values)
         progress((number + 1) / work.passes)
-    streams = sampler_seeds(scene.render.seed, "data", rig.groups)
-    return Rendering(tally.mean, tally.variance, work.passes, work.samples, variant, streams)
+    first = sampler_seeds(scene.render.seed, "data", 0, work.passes)(0)
+    return Rendering(tally.mean, tally.variance, work.passes, work.samples, variant, first)
 
 
 def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Progress = no_progress) -> Stack:
@@ -94,7 +95,7 @@ def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: P
         "samples": rendering.passes * rendering.samples,
         "passes": rendering.passes,
         "seed": scene.render.seed,
-        "streams": rendering.streams,
+        "first_seed": rendering.first_seed,
         "sampler": scene.render.sampler,
         "variant": rendering.variant,
         "versions": versions("mitsuba", "drjit", "OpenEXR"),

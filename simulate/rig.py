@@ -1,12 +1,15 @@
 """The camera and its target in Mitsuba: a picture on the target goes in, what every sensor pixel reads comes out.
 
 On llvm and cuda one sensor of our own holds the whole camera; on scalar, where sensors written in Python are
-unusably slow, a `batch` of stock `perspective` sensors a lens type does. Lengths are millimetres.
+unusably slow, a stock `perspective` sensor a sub-imager does. (A stock `batch` is no faster there, and gives now and
+then a ray to the wrong sub-imager: film coordinates are float32 and can round up to the next one's.) Lengths are
+millimetres.
 """
 
 # pyright: basic
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import atan, degrees
 from typing import Any
 
@@ -40,11 +43,10 @@ class Rig:
         self.groups: dict[str, tuple[LensType, ...]] = {kind.name: (kind,) for kind in camera.types}
         if self._jit and together:
             self.groups = {"camera": camera.types}
-        if self._jit:
-            self._sensors = {group: _one_sensor(camera, types, sampler) for group, types in self.groups.items()}
-        else:
-            self._sensors = {kind.name: mi.load_dict(batch_sensor(camera, kind, sampler)) for kind in camera.types}
         self.channels = 3 if variant.endswith("rgb") else 1
+        self._sensors: dict[str, dict[int, Any]] = {
+            group: self._sensors_of(group, types, sampler) for group, types in self.groups.items()
+        }
         self._scene = mi.load_dict(scene_of(target_of(camera, self._black())))
         self._parameters = mi.traverse(self._scene)
 
@@ -58,22 +60,30 @@ class Rig:
         self._parameters["target.emitter.radiance.data"] = mi.TensorXf(texels)
         self._parameters.update()
 
-    def expose(self, group: str, samples: int, seed: int) -> NDArray[np.float64]:
+    def expose(self, group: str, samples: int, seed: Callable[[int], int]) -> NDArray[np.float64]:
         """What the sensor pixels of a group read of each picture, (channels, pixels in the order of measurements).
 
         samples : rays a pixel, at most a few thousand, since the renderer's sums are float32
+        seed : the sampler's seed for each sensor, by its place in the camera
         """
         import mitsuba as mi
 
-        sensor = self._sensors[group]
-        rendered: Any = mi.render(self._scene, sensor=sensor, spp=samples, seed=seed)  # pyright: ignore
-        image = np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0)
-        types = self.groups[group]
+        images: list[NDArray[np.float64]] = []
+        for place, sensor in self._sensors[group].items():
+            rendered: Any = mi.render(self._scene, sensor=sensor, spp=samples, seed=seed(place))  # pyright: ignore
+            images.append(np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1))
+        return np.concatenate(images, axis=1)[:, : sum(kind.measurements for kind in self.groups[group])]
+
+    def _sensors_of(self, group: str, types: tuple[LensType, ...], sampler: str) -> dict[int, Any]:
+        import mitsuba as mi
+
         if self._jit:
-            return image.reshape(self.channels, -1)[:, : sum(kind.measurements for kind in types)]
-        (rows, columns), count = types[0].pixels, types[0].count
-        side_by_side = image.reshape(self.channels, rows, count, columns)
-        return side_by_side.swapaxes(1, 2).reshape(self.channels, -1)
+            return {list(self.groups).index(group): _one_sensor(self.camera, types, sampler)}
+        return {
+            place: mi.load_dict(stock_sensor(self.camera, sub, sampler, 16, self.channels))
+            for place, sub in enumerate(self.camera.sub_imagers)
+            if sub.type in types
+        }
 
     def _black(self) -> dict[str, Any]:
         import mitsuba as mi
@@ -105,7 +115,7 @@ def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
     return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": texture}}
 
 
-def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int) -> dict[str, Any]:
+def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int, channels: int = 1) -> dict[str, Any]:
     """One sub-imager as Mitsuba's own `perspective` with a shifted principal point."""
     import mitsuba as mi
 
@@ -127,7 +137,7 @@ def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int) -> 
         "principal_point_offset_x": -(x - lens_x) / width,
         "principal_point_offset_y": -(y - lens_y) / height,
         "to_world": mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0]),
-        "film": film(columns, rows),
+        "film": film(columns, rows, channels),
         "sampler": {"type": sampler, "sample_count": samples},
     }
 
@@ -159,26 +169,12 @@ def texture_of(source: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def batch_sensor(camera: Camera, kind: LensType, sampler: str) -> dict[str, Any]:
-    """All sub-imagers of a lens type as Mitsuba's own `batch`, side by side on one film of three channels."""
-    rows, columns = kind.pixels
-    batch: dict[str, Any] = {
-        "type": "batch",
-        "film": film(columns * kind.count, rows, channels=3),
-        "sampler": {"type": sampler, "sample_count": 16},
-    }
-    members = [sub for sub in camera.sub_imagers if sub.type == kind]
-    for number, sub in enumerate(members):
-        batch[f"sub{number:06d}"] = stock_sensor(camera, sub, sampler, 16)
-    return batch
-
-
 def _one_sensor(camera: Camera, types: tuple[LensType, ...], sampler: str) -> Any:
     """All sub-imagers of some lens types as one sensor: a film pixel a measurement, looked up in tables."""
     import drjit as dr
     import mitsuba as mi
 
-    # Powers of two: then film coordinates are exact and no ray can slip into a neighbour's pixel.
+    # Powers of two: film coordinates come divided by the film's size, which then costs no digit.
     bits = max(sum(kind.measurements for kind in types) - 1, 1).bit_length()
     height = 1 << (bits // 2)
     width = 1 << (bits - bits // 2)
@@ -196,7 +192,7 @@ def _one_sensor(camera: Camera, types: tuple[LensType, ...], sampler: str) -> An
         ) -> tuple[Any, Any]:
             del wavelength, aperture
             across, down = position.x * width, position.y * height
-            column, row = dr.floor(across), dr.floor(down)
+            column, row = _pixel(across, down, width, height)
             index = mi.UInt32(row) * width + mi.UInt32(column)
             corner_x, corner_y, lens_x, lens_y, depth = (dr.gather(mi.Float, t, index, active) for t in self.tables)
             x = corner_x + (across - column) * self.pixel
@@ -222,6 +218,26 @@ def _one_sensor(camera: Camera, types: tuple[LensType, ...], sampler: str) -> An
     properties["film"] = mi.load_dict(film(width, height))
     properties["sampler"] = mi.load_dict({"type": sampler, "sample_count": 16})
     return CompoundEye(properties)
+
+
+def _pixel(across: Any, down: Any, width: int, height: int) -> tuple[Any, Any]:
+    """Column and row of the film's pixel that a ray is for, not of the one that its coordinates may round up to.
+
+    The renderer adds a pixel's number to an offset from 0 to 1 in float32; once in some hundred thousand rays the sum
+    is the next pixel's number, which another sub-imager may have. Rays come in the order of pixels, which settles it;
+    where they do not, the coordinates have to do.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    lanes, pixels = dr.width(across), width * height
+    column, row = dr.minimum(dr.floor(across), width - 1), dr.minimum(dr.floor(down), height - 1)
+    if lanes % pixels == 0:
+        number = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, lanes // pixels)
+        by_order = mi.Float(number % width), mi.Float(number // width)
+        near = (dr.abs(across - by_order[0] - 0.5) < 0.51) & (dr.abs(down - by_order[1] - 0.5) < 0.51)
+        column, row = dr.select(near, by_order[0], column), dr.select(near, by_order[1], row)
+    return column, row
 
 
 def _tables(camera: Camera, types: tuple[LensType, ...], size: int) -> NDArray[np.float64]:

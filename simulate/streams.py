@@ -1,31 +1,28 @@
-"""Streams of random numbers, one for every purpose, lens type, pass and sub-imager, all from the scene's seed."""
+"""Streams of random numbers, one for every purpose, sensor, pass and sub-imager, all from the scene's seed."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 
-Purpose = Literal["data", "calibration", "noise"]
-_PURPOSES: dict[Purpose, int] = {"data": 0, "calibration": 1, "noise": 2}
+Purpose = Literal["data", "calibration"]
 
 
-def _sequence(seed: int, purpose: Purpose, name: str, *place: int) -> np.random.SeedSequence:
-    return np.random.SeedSequence(seed, spawn_key=(_PURPOSES[purpose], zlib.crc32(name.encode()), *place))
+def sampler_seeds(seed: int, purpose: Purpose, number: int, passes: int) -> Callable[[int], int]:
+    """The sampler's 32 bits in pass `number` of `passes` for each sensor, by its place in the camera.
+
+    Scalar variants multiply a seed by the film's area to number their streams, so hashed seeds would collide on films
+    of many pixels. Counted on from a start that the scene's seed draws they cannot; data are even, calibration odd.
+    """
+    start = int(np.random.SeedSequence(seed).generate_state(1)[0]) & ~1
+    odd = int(purpose == "calibration")
+    return lambda sensor: (start + 2 * (sensor * passes + number) + odd) % 2**32
 
 
-def sampler_seed(seed: int, purpose: Purpose, name: str, number: int) -> int:
-    """32 bits for the sampler of pass `number` over the sensors called `name`."""
-    return int(_sequence(seed, purpose, name, number).generate_state(1)[0])
-
-
-def sampler_seeds(seed: int, purpose: Purpose, names: Iterable[str]) -> dict[str, int]:
-    """The seeds of the first pass over each of the named sensors, for the record of a run."""
-    return {name: sampler_seed(seed, purpose, name, 0) for name in names}
-
-
-def generator(seed: int, purpose: Purpose, name: str, *place: int) -> np.random.Generator:
-    """A generator that no other purpose, name or place shares."""
-    return np.random.Generator(np.random.PCG64DXSM(_sequence(seed, purpose, name, *place)))
+def noise_generator(seed: int, name: str, k: int, l: int) -> np.random.Generator:  # noqa: E741
+    """The generator of sub-imager (k, l) of the lens type `name`, which no other shares."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()), k, l))
+    return np.random.Generator(np.random.PCG64DXSM(sequence))

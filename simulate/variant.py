@@ -18,6 +18,7 @@ from typing import Any, cast
 from scenes.errors import InputError
 
 OLDEST_LLVM = (17, 0, 0)
+PATIENCE = 120  # seconds
 PREFERENCE = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 
 _PROBE = """
@@ -121,9 +122,12 @@ def _stderr_appender() -> Any:
 
 def probe(variant: str) -> Health:
     """Render a little in a process of its own, so that a broken backend can take down nothing but that."""
-    ended = subprocess.run(
-        [sys.executable, "-c", _PROBE, variant], capture_output=True, text=True, timeout=120, check=False
-    )
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-c", _PROBE, variant], capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Health(variant, f"a trial rendering did not end in {PATIENCE} s", 0.0)
     answer = ended.stdout.rfind('{"reason"')  # a backend may have written before it
     if ended.returncode != 0 or answer < 0:
         last = ended.stderr.strip().splitlines()[-1:] or [f"it ended with status {ended.returncode}"]

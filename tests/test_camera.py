@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from scenes.camera import Camera, derive
 from scenes.errors import InputError
-from scenes.scene import read
+from scenes.scene import parse, read
 
 from .examples import GALLERY, THREE, camera, scene
 
@@ -89,10 +90,6 @@ def test_windows_lie_on_the_target_and_are_centred(size: int, ratio: Fraction, c
     data = scene((size, size), lenses).plain()
     data["camera"]["lens"][0]["step"] = str(step)
     data["camera"]["lens_pitch"] = "20 mm"
-    from pathlib import Path
-
-    from scenes.scene import parse
-
     one = derive(parse(data, Path("a.toml")))
     kind = one.types[0]
     first, last = one.sub_imagers[0].window[0], one.sub_imagers[-1].window[0] + ratio * kind.pixels[0]
@@ -117,9 +114,19 @@ def test_what_does_not_fit_is_refused(lenses: tuple[tuple[str, list[int], object
 def test_overlapping_sub_images_are_refused() -> None:
     data = scene((19, 19), THREE).plain()
     data["camera"]["lens_pitch"] = "0.02 mm"
-    from pathlib import Path
-
-    from scenes.scene import parse
-
     with pytest.raises(InputError, match=r"lens_pitch.*overlap"):
+        derive(parse(data, Path("a.toml")))
+
+
+def test_gaps_between_windows_are_not_taken_for_seen() -> None:
+    data = scene((19, 19), (("1/3", [2, 2], [3, 3]),)).plain()
+    data["camera"]["lens"][0]["step"] = 10
+    one = derive(parse(data, Path("a.toml")))
+    assert one.types_seeing().sum() == (2 * 9) ** 2
+
+
+def test_too_many_sub_imagers_are_refused_at_once() -> None:
+    data = scene((19, 19), (("1/3", [3000, 3000], [1, 1]),)).plain()
+    data["camera"]["lens"][0]["step"] = 0
+    with pytest.raises(InputError, match="at most 16384"):
         derive(parse(data, Path("a.toml")))

@@ -41,3 +41,15 @@ def test_equal_things_get_one_variance_and_scale_goes_through() -> None:
 def test_too_few_or_no_variances_pass_unchanged() -> None:
     np.testing.assert_array_equal(moderate(np.array([3.0]), 16), [3.0])
     np.testing.assert_array_equal(moderate(np.zeros(5), 16), np.zeros(5))
+
+
+@pytest.mark.parametrize(("spread", "much"), [(0.5, 1.05), (1.0, 1.1), (2.0, 1.25)])
+def test_populations_that_are_no_inverse_chi_squared(spread: float, much: float) -> None:
+    """Lognormal true variances: sums may come out too large, by a stated much, but not too small."""
+    rng = np.random.default_rng(6)
+    ratios: list[float] = []
+    for _ in range(50):
+        true = np.exp(spread * rng.normal(size=225))
+        seen = true * rng.chisquare(15, true.size) / 15
+        ratios.append(float(moderate(seen, 16).sum() / true.sum()))
+    assert 0.97 < np.mean(ratios) < much

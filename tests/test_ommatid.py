@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any, cast
@@ -300,12 +303,14 @@ def test_what_is_out_of_date_is_done_again(setting: str, redone: set[str], kept:
 
 
 @pytest.mark.parametrize(
-    ("name", "stage"), [("stack.exr", "render"), ("model.npz", "calibrate"), ("run.json", "reconstruct")]
+    ("name", "stage"),
+    [("stack.exr", "render"), ("model.npz", "calibrate"), ("run.json", "reconstruct"), ("estimate.exr", "reconstruct")],
 )
 def test_a_damaged_file_is_made_again(name: str, stage: str, kept: Path, finished: Path, ommatid: Command) -> None:
     whole = (kept / name).read_bytes()
     (kept / name).write_bytes(whole[: len(whole) // 2])
-    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True}
+    # What was made again took another time, which run.json has to say: the reconstruction follows.
+    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True, "reconstruct": True}
     assert_same_light(kept / "stack.exr", finished / "stack.exr")
     described = [json.loads((folder / "run.json").read_text(encoding="utf-8")) for folder in (kept, finished)]
     assert numbers(described[0]) == numbers(described[1])
@@ -386,3 +391,54 @@ def test_the_schema_knows_every_key_of_the_gallery(name: str, ommatid: Command) 
     data["target"]["distnace"] = data["target"].pop("distance")
     assert _unknown(data, [schema], schema) == ["distnace"], "the walk finds what is not there"
     assert all(table["additionalProperties"] is False for table in [schema, *schema["$defs"].values()])
+
+
+# --- what must not be lost
+
+
+@pytest.mark.parametrize("command", ["run", "render"])
+def test_the_scene_that_is_read_is_never_replaced(command: str, here: Path, ommatid: Command) -> None:
+    (here / "scene").mkdir()
+    mine = here / "scene" / "scene.toml"
+    mine.write_text("# mine\n" + (here / "tiny.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    before = mine.read_bytes()
+    ended = ommatid(command, "scene/scene.toml", "-o", ".")
+    assert ended.code == 2
+    assert "would replace" in ended.err
+    assert mine.read_bytes() == before
+    assert [path.name for path in mine.parent.iterdir()] == ["scene.toml"]
+
+
+@pytest.mark.parametrize("name", ["stack.exr", "model.npz", "truth.exr"])
+def test_reconstruct_never_replaces_what_it_reads(name: str, kept: Path, ommatid: Command) -> None:
+    before = stamps(kept)
+    ended = ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", kept / name)
+    assert ended.code == 2
+    assert stamps(kept) == before
+
+
+def test_ctrl_c_ends_in_one_sentence_and_keeps_what_is_done(here: Path) -> None:
+    """Interrupted while it calibrates, a run leaves a whole stack and no part of a model."""
+    command = [sys.executable, "-m", "ommatid", "run", "tiny.toml", "-o", "out"]
+    more = ["--set", "calibration.samples=1000000"]
+    with subprocess.Popen([*command, *more], cwd=here, stderr=subprocess.PIPE, text=True) as started:
+        assert started.stderr is not None
+        assert "render: done" in started.stderr.readline()
+        started.send_signal(signal.SIGINT)
+        said = started.stderr.read()
+    assert started.returncode == 1
+    assert said.strip() == "ommatid: stopped; finished files stay, the next run carries on from them"
+    assert {path.name for path in (here / "out" / "tiny").iterdir()} == {"scene.toml", "truth.exr", "stack.exr"}
+
+
+def test_a_title_with_dollar_signs_is_drawn_as_it_is(here: Path, ommatid: Command) -> None:
+    extra = ("--set", "calibration.method=ideal", "--set", 'title="a $^$ b"')
+    assert ommatid("run", here / "tiny.toml", "-o", "out", *extra).code == 0
+
+
+def test_too_large_a_reconstruction_is_refused_before_anything_is_rendered(here: Path, ommatid: Command) -> None:
+    sets = ["target.origin=", "target.shape=[512, 512]", "camera.lens.I.pixels=fit", "camera.lens_pitch=9 mm"]
+    ended = ommatid("run", "tiny.toml", "-o", "out", *(word for one in sets for word in ("--set", one)))
+    assert ended.code == 2
+    assert "GB" in ended.err
+    assert not (here / "out").exists()

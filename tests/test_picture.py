@@ -43,6 +43,7 @@ GREY = np.arange(20 * 30, dtype=np.uint8).reshape(20, 30)
         ("grey.png", GREY, GREY),
         ("deep.png", GREY.astype(np.uint16) * 257, GREY),
         ("grey.tiff", GREY, GREY),
+        ("big.npy", (GREY.astype(np.uint16) * 257).astype(">u2"), GREY),
         ("float.tiff", GREY.astype(np.float32) / 7, GREY / np.float32(7)),
         ("grey.npy", GREY, GREY),
         ("signed.npy", GREY - 300.25, GREY - 300.25),
@@ -85,7 +86,7 @@ def test_crops_outside_the_picture_are_refused(tmp_path: Path, target: dict[str,
         load(looking_at(path, **target))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e39])
 def test_nan_is_refused_where_it_is_seen_and_only_there(tmp_path: Path, bad: float) -> None:
     pixels = GREY.astype(np.float64)
     pixels[0, 0] = bad

@@ -19,7 +19,7 @@ from simulate.passes import Plan
 from simulate.points import entries_of, spacing, sweep
 from simulate.render import no_progress
 from simulate.rig import Rig
-from simulate.streams import sampler_seed
+from simulate.streams import sampler_seeds
 
 from .alternation import Row, alternate
 
@@ -80,6 +80,6 @@ def by_sources(rig: Rig, sources: NDArray[np.int64], seed: int) -> NDArray[np.fl
         image.flat[source] = 1.0
         rig.show(image)
         for group in rig.groups:
-            own = sampler_seed(seed, "calibration", group, 0)
+            own = sampler_seeds(seed, "calibration", 0, PASS.passes)
             columns[rig.places(group), place] = rig.expose(group, PASS.samples, own)[0]
     return columns

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scenes.camera import Camera, derive
 from scenes.picture import load
 from scenes.scene import read
-from simulate.rig import Rig, batch_sensor, film, scene_of, stock_sensor, target_of, texture_of
+from simulate.rig import Rig, film, scene_of, stock_sensor, target_of, texture_of
 
 from .alternation import Row, alternate
 
@@ -33,8 +33,8 @@ def camera_rows(scene_file: Path, variant: str, samples: int) -> list[Row]:
     loop, batches = _loop(camera, picture, samples), _batches(camera, picture, samples)
     stock = f"{len(camera.sub_imagers)} `perspective` sensors, one by one"
     if variant.startswith("scalar"):
-        # There our rig is a batch of stock sensors itself.
-        ways = {f"Rig: {len(camera.types)} `batch` sensors": ours, stock: loop}
+        # There our rig is a loop of stock sensors itself.
+        ways = {"Rig: as many stock sensors": ours, stock: loop}
     else:
         ways = {"Rig: one sensor": ours, stock: loop, f"{len(camera.types)} `batch` sensors": batches}
     readings = [way(0) for way in ways.values()]  # and so each is warm
@@ -64,10 +64,9 @@ def _ours(camera: Camera, picture: NDArray[np.float64], variant: str, samples: i
     rig.show(*[picture] * rig.channels)
 
     def expose(seed: int) -> NDArray[np.float64]:
-        # Each type a seed of its own, else their noise would be alike.
-        seeds = range(seed * len(rig.groups), (seed + 1) * len(rig.groups))
+        # Each sensor a seed of its own, else their noise would be alike.
         return np.concatenate(
-            [rig.expose(group, samples, own)[0] for group, own in zip(rig.groups, seeds, strict=True)]
+            [rig.expose(group, samples, lambda place: 1000 * seed + place)[0] for group in rig.groups]
         )
 
     return expose
@@ -102,7 +101,17 @@ def _batches(camera: Camera, picture: NDArray[np.float64], samples: int) -> Read
 
     scene = _stock_scene(camera, picture)
     sensors = [
-        mi.load_dict({**batch_sensor(camera, kind, SAMPLER), "film": film(kind.pixels[1] * kind.count, kind.pixels[0])})
+        mi.load_dict(
+            {
+                "type": "batch",
+                "film": film(kind.pixels[1] * kind.count, kind.pixels[0]),
+                "sampler": {"type": SAMPLER, "sample_count": samples},
+                **{
+                    f"sub{place:04d}": stock_sensor(camera, sub, SAMPLER, samples)
+                    for place, sub in enumerate(sub for sub in camera.sub_imagers if sub.type == kind)
+                },
+            }
+        )
         for kind in camera.types
     ]
 

@@ -21,7 +21,12 @@ from scenes.scene import Scene
 from scenes.stack import Stack
 from scenes.versions import versions
 
-from .restore import Restoration
+from .restore import MOST_FEIGNED, Restoration
+
+WARNING = (
+    "the lens types leave pixels open on which the noise of H feigns information:"
+    " raise calibration.samples, or take calibration.method = 'ideal' if the camera is"
+)
 
 
 def write_estimate(path: Path, restoration: Restoration, record: dict[str, Any]) -> None:
@@ -61,7 +66,7 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
             "condition": restoration.condition if isfinite(restoration.condition) else None,
             "digits": restoration.digits,
         },
-        "model": model.record.get("agreement", _unknown(model)),
+        "model": {**model.record.get("agreement", _unknown(model)), "feigned_information": restoration.feigned},
         "skipped": [{"what": what, "why": why} for what, why in left_out(_as_run(stack, model))],
         "versions": {**model.record["versions"], **stack.record["versions"], **versions("scipy", "scikit-image")},
         "seeds": {
@@ -126,5 +131,7 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
                 f"{difference}, largest z {agreement['max_z']:.1f}, p {agreement['p_value']:.2g}",
             )
         )
+    if agreement["feigned_information"] > MOST_FEIGNED:
+        lines.append(("do not trust the predicted error", WARNING))
     lines += [(f"left out: {skip['what']}", skip["why"]) for skip in description["skipped"]]
     return lines

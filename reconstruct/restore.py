@@ -25,12 +25,16 @@ from .prior import Prior, independent
 
 Vector = NDArray[np.float64]
 
+MOST_FEIGNED = 0.1  # of what is believed of a pixel: above it the expected error is too small to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
 
 
 @dataclass(frozen=True)
 class Restoration:
-    """An estimate, (N,), its expected error (Eq. 5), and how it compares where the truth is known."""
+    """An estimate, (N,), its expected error (Eq. 5), and how it compares where the truth is known.
+
+    `feigned` is the largest share of what is believed of a pixel that the noise of H may have feigned.
+    """
 
     estimate: Vector
     expected: ExpectedError
@@ -38,6 +42,7 @@ class Restoration:
     shape: tuple[int, int]
     method: str
     condition: float
+    feigned: float
     seconds: float
     truth: Vector | None
     error: Error | None
@@ -94,6 +99,7 @@ def restore(stack: Stack, model: Model, truth: Vector | None = None) -> Restorat
         shape=shape,
         method=gain.method,
         condition=gain.condition,
+        feigned=float((model.feigned(gain.noise_variance) * expected.variance).max()),
         seconds=perf_counter() - start,
         truth=truth,
         error=error,

@@ -100,6 +100,15 @@ class Model:
             start += kind.measurements
         return trend
 
+    def feigned(self, noise_variance: Vector) -> Vector:
+        """Information on each pixel that the noise of H alone would seem to bring: (N,), sum over i of var_ij / Rv_i.
+
+        Where the measurements leave a pixel open, an estimator that takes H for exact believes this much too much.
+        """
+        rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
+        weights = self.variance / noise_variance[rows]
+        return np.bincount(self.matrix.indices, weights=weights, minlength=self.unknowns).astype(np.float64)
+
     def prior_spread(self, prior_variance: Vector) -> Vector:
         """The same before anything is known of the image but the (N,) variance of its pixels: sum of var_ij P0_j."""
         rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))

@@ -57,6 +57,20 @@ def test_fewer_lens_types_are_worse() -> None:
     assert errors[1] < errors[2]
 
 
+def test_noise_of_h_that_feigns_information_is_told() -> None:
+    """Two types leave a null space, which a noisy H seems to see: Eq. 5 then promises half of the real error."""
+    told: list[float] = []
+    for lenses in ((), ("I", "II")):
+        stack, model, restoration = chain(read(GALLERY / "tile19.toml", ["calibration.samples=1024"], lenses))
+        told.append(restoration.feigned)
+        lines = report.rows(report.describe(stack, model, restoration))
+        warned = any(line.startswith("do not trust") for line, _ in lines)
+        assert warned == bool(lenses)
+    assert told[1] > 10 * told[0]
+    _, _, exact = chain(read(GALLERY / "tile19.toml", ["calibration.method=ideal"], ("I", "II")))
+    assert exact.feigned == 0
+
+
 def test_the_budget_says_what_is_there_and_adds_up() -> None:
     render = {"variant": "scalar_rgb", "samples": 64}
     noise = {"variance": 1.0, "bits": 6}

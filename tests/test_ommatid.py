@@ -195,7 +195,7 @@ def test_run_json_keeps_the_contract(finished: Path) -> None:
     assert sum(error["budget"].values()) == pytest.approx(error["predicted_mse"], rel=1e-9)
     assert min(error["budget"].values()) >= 0
     assert set(run["solver"]) == {"method", "condition", "digits"}
-    assert set(run["model"]) == {"rms_difference_from_ideal", "max_z", "p_value"}
+    assert set(run["model"]) == {"rms_difference_from_ideal", "max_z", "p_value", "feigned_information"}
     assert all(set(skip) == {"what", "why"} for skip in run["skipped"])
     assert {"ommatid", "python", "mitsuba", "drjit", "numpy", "scipy"} <= set(run["versions"])
     assert run["seeds"]

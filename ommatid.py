@@ -248,7 +248,7 @@ def doctor(as_json: Json = False) -> None:
     ]
     _table("Backends", lines)
     _table("Versions", list(installed.items()))
-    _print(advice)
+    print(advice)
 
 
 def main() -> None:
@@ -275,26 +275,25 @@ def _delivered(code: int) -> int:
     return code
 
 
-def _complain(error: Exception, where: str = "") -> int:
+def _complain(error: Exception) -> int:
     """Say in one sentence what went wrong; the exit code."""
-    prefix = f"ommatid: {where}" if where else "ommatid: "
     if isinstance(error, _Worst):
         return error.code
     if hasattr(error, "format_message"):  # of the command line's own parser
-        _say(f"{prefix}{cast(Any, error).format_message()}")
+        _say(f"ommatid: {cast(Any, error).format_message()}")
         return 2
     if isinstance(error, InputError | DeniedError):
-        _say(prefix + " ".join(str(error).splitlines()))
+        _say("ommatid: " + " ".join(str(error).splitlines()))
         return 2 if isinstance(error, InputError) else 1
     if os.environ.get("OMMATID_TRACEBACK"):
         raise error
     if isinstance(error, MemoryError):
-        _say(f"{prefix}not enough memory; crop the target or close other programs")
+        _say("ommatid: not enough memory; crop the target or close other programs")
     elif isinstance(error, OSError):
-        _say(f"{prefix}{error.filename or 'the machine'}: {error.strerror or error}")
+        _say(f"ommatid: {error.filename or 'the machine'}: {error.strerror or error}")
     else:
         what = " ".join(f"{type(error).__name__}: {error}".split())
-        _say(f"{prefix}unexpected {what}; set OMMATID_TRACEBACK=1 to see where, and report it")
+        _say(f"ommatid: unexpected {what}; set OMMATID_TRACEBACK=1 to see where, and report it")
     return 1
 
 
@@ -364,10 +363,6 @@ def _done(made: bool) -> str:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr)
-
-
-def _print(text: str) -> None:
-    print(text)
 
 
 def _print_json(document: object) -> None:

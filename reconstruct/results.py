@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,6 @@ OURS = ("prior", "estimator")
 
 def changed(stack: Stack, overrides: list[str], path: Path) -> Stack:
     """The stack with what its scene tells the estimator changed. Raises InputError for any other key."""
-    from dataclasses import replace
-
     if not overrides:
         return stack
     scene = with_changes(stack.scene.plain(), path, overrides, ())
@@ -68,24 +67,36 @@ def write_results(folder: Path, stack: Stack, restoration: Restoration, descript
     report.write_run(folder / RUN, description)
 
 
+def _of(model: Model) -> tuple[NDArray[Any], ...]:
+    matrix = model.matrix
+    return matrix.data, matrix.indices, matrix.indptr, model.variance, model.batches
+
+
 def made_from(stack: Stack, model: Model) -> str:
     """Fingerprint of everything that an estimate depends on."""
-    arrays = (stack.values, stack.variance, model.matrix.data, model.matrix.indices, model.variance, model.batches)
+    arrays = (stack.values, stack.variance, *_of(model))
     records = [stack.record, model.record]
     return fingerprint([digest(*arrays), records, stack.scene.plain()])
+
+
+def _standing(folder: Path) -> dict[str, Any] | None:
+    """run.json of a folder whose results are all there, whole and of one reconstruction; else None."""
+    if not all((folder / name).is_file() for name in (ESTIMATE, PICTURE, OVERVIEW, RUN)):
+        return None
+    try:
+        old: dict[str, Any] = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        estimated = read(folder / ESTIMATE)[0].record["fingerprint"]
+        return old if old["fingerprint"] == estimated else None
+    except (InputError, ValueError, KeyError, TypeError):
+        return None
 
 
 def kept_results(folder: Path, stack: Stack, model: Model, names: tuple[Path, Path]) -> tuple[dict[str, Any], bool]:
     """What run.json in `folder` says, and whether the reconstruction had to be made for it."""
     wanted = made_from(stack, model)
-    files = (ESTIMATE, PICTURE, OVERVIEW, RUN)
-    if all((folder / name).is_file() for name in files):
-        try:
-            old = json.loads((folder / RUN).read_text(encoding="utf-8"))
-            if old["fingerprint"] == wanted == read(folder / ESTIMATE)[0].record["fingerprint"]:
-                return old, False
-        except (InputError, ValueError, KeyError, TypeError):  # damaged: to be made
-            pass
+    old = _standing(folder)
+    if old is not None and old["fingerprint"] == wanted:
+        return old, False
     restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names)
     description = {"fingerprint": wanted, **description}
     write_results(folder, stack, restoration, description)

@@ -46,6 +46,11 @@ class LensType:
         """Number of sensor pixels of all its sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
 
+    def middle(self, window: tuple[Fraction, Fraction]) -> tuple[float, float]:
+        """Row and column of f in the middle of a sub-imager's view that begins at `window`."""
+        row, column = (start + self.ratio * count / 2 for start, count in zip(window, self.pixels, strict=True))
+        return float(row), float(column)
+
     @property
     def span(self) -> tuple[Fraction, Fraction]:
         """Rows and columns of f that the array sees as a whole."""
@@ -128,9 +133,7 @@ class Camera:
 
     def _sub_imager(self, kind: LensType, k: int, l: int, lens: tuple[float, float]) -> SubImager:  # noqa: E741
         window = kind.origin[0] + k * kind.step, kind.origin[1] + l * kind.step
-        middle_row = float(window[0] + kind.ratio * kind.pixels[0] / 2)
-        middle_column = float(window[1] + kind.ratio * kind.pixels[1] / 2)
-        x, y = self.position(middle_row, middle_column)
+        x, y = self.position(*kind.middle(window))
         depth = self.depth(kind)
         shrink = depth / self.distance
         patch = lens[0] + (lens[0] - x) * shrink, lens[1] + (lens[1] - y) * shrink

@@ -49,11 +49,8 @@ def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress) ->
     variance = settle(responses, camera)
     record |= {
         "seconds": perf_counter() - start,
-        "samples": responses.passes * responses.samples,
-        "passes": responses.passes,
         "seed": scene.render.seed,
-        "first_seed": responses.first_seed,
-        "variant": responses.variant,
+        **responses.record(),
         "agreement": agreement(responses.matrix, variance, camera, responses.passes),
         "versions": versions("mitsuba", "drjit", "scipy"),
     }

@@ -37,6 +37,25 @@ def plan(samples: int) -> Plan:
     return Plan(passes, side * ceil(each / side))
 
 
+@dataclass(frozen=True)
+class OverPasses:
+    """How a mean over passes was made: passes, samples a pixel in each, Mitsuba's variant, the first sampler's seed."""
+
+    passes: int
+    samples: int
+    variant: str
+    first_seed: int
+
+    def record(self) -> dict[str, int | str]:
+        """What the file that holds the mean says of it; samples are those of all passes."""
+        return {
+            "samples": self.passes * self.samples,
+            "passes": self.passes,
+            "variant": self.variant,
+            "first_seed": self.first_seed,
+        }
+
+
 class Tally:
     """Running mean and variance over passes of arrays of one shape (Welford), in float64."""
 

@@ -20,7 +20,7 @@ from scenes.camera import Camera, LensType
 from scenes.errors import DeniedError
 from scenes.scene import Scene
 
-from .passes import BATCHES, Plan, Tally, plan
+from .passes import BATCHES, OverPasses, Plan, Tally, plan
 from .render import Progress, no_progress
 from .streams import sampler_seeds
 from .variant import choose
@@ -34,19 +34,16 @@ MARGIN = Fraction(1, 1024)  # pixels of f by which rays may land beside a footpr
 
 
 @dataclass(frozen=True)
-class Responses:
-    """H before it becomes a model: the means of its entries, (nnz,) variances of them from the scatter of the passes,
+class Responses(OverPasses):
+    """H before it becomes a model.
 
-    and (batches, nnz) deviations of the means of some passes from those of all.
+    `matrix` holds the means of its entries, `variance`, (nnz,), their variances from the scatter of the passes, and
+    `batches`, (batches, nnz), deviations of the means of some passes from those of all.
     """
 
     matrix: sparse.csr_array
     variance: NDArray[np.float64]
     batches: NDArray[np.float32]
-    passes: int
-    samples: int
-    variant: str
-    first_seed: int
 
 
 def spacing(kind: LensType) -> int:
@@ -101,9 +98,9 @@ def from_points(scene: Scene, camera: Camera, progress: Progress = no_progress) 
 def sweep(
     rig: Rig, group: str, work: Plan, seed: int, progress: Progress
 ) -> tuple[Tally, NDArray[np.float32], NDArray[np.float64]]:
-    """What each sensor pixel reads, (pixels of the group, places of the grid), over all passes and in batches,
+    """What each sensor pixel reads of every grid over all passes, in batches of them, and of a uniform target.
 
-    and what it reads of a uniform target.
+    The first two are (pixels of the group, places of the grid), in batches one for each; the last is (pixels,).
     """
     camera = rig.camera
     apart = spacing(rig.groups[group][0])

@@ -17,7 +17,7 @@ from scenes.scene import Scene, resolved
 from scenes.stack import Stack
 from scenes.versions import versions
 
-from .passes import Tally, plan, rounding_variance
+from .passes import OverPasses, Tally, plan, rounding_variance
 from .streams import sampler_seeds
 from .variant import choose
 
@@ -29,15 +29,11 @@ def no_progress(fraction: float) -> None:
 
 
 @dataclass(frozen=True)
-class Rendering:
+class Rendering(OverPasses):
     """Light on every sensor pixel, (M,): the mean of the passes, and the variance of that mean from their scatter."""
 
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
-    passes: int
-    samples: int
-    variant: str
-    first_seed: int
 
 
 def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
@@ -69,8 +65,14 @@ def light(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Pr
             values[rig.places(group)] = rig.expose(group, work.samples, seed)[0]
         tally.add(values)
         progress((number + 1) / work.passes)
-    first = sampler_seeds(scene.render.seed, "data", 0, work.passes)(0)
-    return Rendering(tally.mean, tally.variance, work.passes, work.samples, variant, first)
+    return Rendering(
+        passes=work.passes,
+        samples=work.samples,
+        variant=variant,
+        first_seed=sampler_seeds(scene.render.seed, "data", 0, work.passes)(0),
+        mean=tally.mean,
+        variance=tally.variance,
+    )
 
 
 def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Progress = no_progress) -> Stack:
@@ -92,12 +94,9 @@ def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: P
         "fingerprint": made_from(scene, camera, image),
         "truth": digest(image.astype(np.float32)),
         "seconds": perf_counter() - start,
-        "samples": rendering.passes * rendering.samples,
-        "passes": rendering.passes,
         "seed": scene.render.seed,
-        "first_seed": rendering.first_seed,
         "sampler": scene.render.sampler,
-        "variant": rendering.variant,
+        **rendering.record(),
         "versions": versions("mitsuba", "drjit", "OpenEXR"),
     }
     kept = resolved(scene, (camera.rows, camera.columns))

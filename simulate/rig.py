@@ -27,9 +27,9 @@ BLOCK = 4  # scalar variants seed by block, and pick its size by the number of t
 class Rig:
     """A camera in front of an emissive target, ready to be exposed.
 
-    `groups` are the lens types that are exposed at once, by the name that their random streams have: the whole
-    camera where that can be and is wanted (`together`), else each lens type by itself. `channels` is how many
-    pictures can be on the target at once, as its colours.
+    `groups` are the lens types that are exposed at once, by a name: the whole camera where that can be and is wanted
+    (`together`), else each lens type by itself. `channels` is how many pictures can be on the target at once, as its
+    colours.
     """
 
     def __init__(self, camera: Camera, variant: str, sampler: str = "multijitter", together: bool = True) -> None:
@@ -38,7 +38,6 @@ class Rig:
         import mitsuba as mi
 
         self.camera = camera
-        self.variant = variant
         self._jit = not variant.startswith("scalar")
         self.groups: dict[str, tuple[LensType, ...]] = {kind.name: (kind,) for kind in camera.types}
         if self._jit and together:
@@ -64,7 +63,7 @@ class Rig:
         """What the sensor pixels of a group read of each picture, (channels, pixels in the order of measurements).
 
         samples : rays a pixel, at most a few thousand, since the renderer's sums are float32
-        seed : the sampler's seed for each sensor, by its place in the camera
+        seed : the sampler's seed by the place of a sensor: of a group where a group is one sensor, else a sub-imager
         """
         import mitsuba as mi
 
@@ -122,11 +121,7 @@ def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int, cha
     rows, columns = sub.type.pixels
     width = float(sub.type.ratio) * columns * camera.target_pitch
     height = float(sub.type.ratio) * rows * camera.target_pitch
-    middle = (
-        float(sub.window[0] + sub.type.ratio * rows / 2),
-        float(sub.window[1] + sub.type.ratio * columns / 2),
-    )
-    x, y = camera.position(*middle)
+    x, y = camera.position(*sub.type.middle(sub.window))
     lens_x, lens_y = sub.lens
     return {
         "type": "perspective",

@@ -95,7 +95,12 @@ def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
     camera = derive(described)
     model = ideal_model(described, camera)
     other = scene(lenses=THREE, render={"seed": 9, "samples": 64}, noise={"variance": 2.0})
-    refuse_strangers(render(other, camera, np.full((19, 19), 50.0)), model, ("a", "b"))
+    stack = render(other, camera, np.full((19, 19), 50.0))
+    refuse_strangers(stack, model, ("a", "b"))
+    restoration = restore(stack, model, np.full(361, 50.0))
+    assert restoration.interval is not None
+    assert restoration.error is not None
+    assert restoration.interval.low < restoration.error.mse < restoration.interval.high
 
 
 @pytest.mark.parametrize(

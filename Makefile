@@ -10,8 +10,9 @@ demo: setup
 	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
 	@echo "Look at out/photo/overview.png; the numbers are in out/photo/run.json."
 
+# One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
 test: setup
-	$(BIN)/python -m pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
 
 check: setup
 	$(BIN)/ruff check .

@@ -20,9 +20,10 @@ import typer
 from scenes.errors import DeniedError, InputError
 
 if TYPE_CHECKING:
+    from reconstruct.accuracy import Prediction
     from scenes.camera import Camera
     from scenes.picture import Image
-    from scenes.scene import Scene
+    from scenes.scene import Noise, Scene
 
 app = typer.Typer(
     add_completion=False,
@@ -56,7 +57,7 @@ def run(
     """Render, calibrate, reconstruct and report."""
 
     def work(path: Path, folder: Path) -> dict[str, Any]:
-        from reconstruct.estimator import refuse_too_large
+        from reconstruct.memory import refuse_too_large
         from reconstruct.report import rows
         from reconstruct.results import kept_results
         from simulate.kept import kept_model
@@ -117,6 +118,9 @@ def reconstruct(
     output: Output,
     sets: Sets = None,
     lens: Lenses = "",
+    region: Annotated[
+        str, typer.Option("--region", metavar="ROW,COLUMN,ROWS,COLUMNS", help="Mean of a region and its error bar.")
+    ] = "",
     as_json: Json = False,
 ) -> None:
     """Reconstruct from files alone."""
@@ -128,6 +132,7 @@ def reconstruct(
 
     if output.suffix == ".png":
         raise InputError(f"{output}: expected the name of an OpenEXR file, such as {output.with_suffix('.exr')}")
+    corner, size = _region(region)
     refuse_output(output, stack, model, stack.parent / TRUTH)
     recorded, calibrated = scenes.stack.read(stack), scenes.model.read(model)
     if lens:
@@ -135,6 +140,9 @@ def reconstruct(
     recorded = results.changed(recorded, sets or [], stack)
     truth = results.truth_beside(stack, recorded)
     restoration, description = results.reconstruct(recorded, calibrated, truth, (stack, model))
+    if region:
+        mean, deviation = restoration.region(corner, size)
+        description["region"] = {"corner": corner, "size": size, "mean": mean, "deviation": deviation}
     report.write_estimate(output, restoration, {"title": recorded.scene.title})
     figure.write_estimate(output.with_suffix(".png"), restoration.estimate.reshape(restoration.shape))
     if as_json:
@@ -152,25 +160,77 @@ def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Jso
     from dataclasses import asdict
 
     from reconstruct import accuracy
-    from reconstruct.estimator import refuse_too_large
-    from reconstruct.prior import independent
-    from scenes.camera import derive
     from scenes.scene import read
-    from simulate.ideal import ideal_matrix
 
     described = read(scene, sets or (), _names(lens))
-    camera = derive(described)
-    refuse_too_large(camera.measurements, camera.unknowns, described.estimator.method)
-    noise = described.noise
-    actual = noise.variance + noise.quantisation_variance if noise else 0.0
-    told = described.estimator
-    prediction = accuracy.predict(
-        ideal_matrix(camera), independent(described.prior, camera.unknowns), actual, told, (camera.rows, camera.columns)
-    )
+    prediction = _predicted(described)
     if as_json:
         _print_json(asdict(prediction))
     else:
         _table(described.title or scene.stem, accuracy.rows(prediction))
+
+
+@app.command()
+def design(
+    scene: SceneFile,
+    candidates: Annotated[
+        str, typer.Option("--candidates", metavar="1/M,...", help="Magnifications; dots continue the step before.")
+    ] = "1/2,1/3,...,1/9",
+    sets: Sets = None,
+    lens: Lenses = "",
+    as_json: Json = False,
+) -> None:
+    """Which lens type to add.
+
+    Ranks magnifications by the expected error (Eq. 5) with each.
+    """
+    from dataclasses import asdict
+
+    from reconstruct.design import Choice, ranked, rows
+    from scenes.candidates import magnifications, with_lens
+    from scenes.scene import read
+
+    wanted = magnifications(candidates)
+    described = read(scene, sets or (), _names(lens))
+    before = _predicted(described)
+    choices: list[Choice] = []
+    with _progress("design") as progress:
+        for place, magnification in enumerate(wanted):
+            try:
+                choices.append(Choice(str(magnification), _predicted(with_lens(described, magnification))))
+            except InputError as error:
+                choices.append(Choice(str(magnification), None, str(error).removeprefix(f"{scene}: ")))
+            progress((place + 1) / len(wanted))
+    choices = ranked(choices)
+    if as_json:
+        _print_json({"before": asdict(before), "candidates": [asdict(choice) for choice in choices]})
+    else:
+        _table(f"{described.title or scene.stem}: what one more lens type would bring", rows(before, choices))
+
+
+@app.command()
+def paper(
+    output: Folder = Path("paper"),
+    image: Annotated[
+        str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")
+    ] = "photo:camera",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the noise in Figure 7.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """The paper's figures and claims, computed anew."""
+    from reconstruct.paper import rows, write_paper
+    from simulate.expose import expose, generators
+    from simulate.ideal import ideal_matrix
+
+    def record(camera: Camera, light: Any, noise: Noise, number: int) -> Any:
+        return expose(light, noise, generators(camera, number), camera.slices())
+
+    with _progress("paper") as progress:
+        description = write_paper(output, ideal_matrix, record, image, seed, progress)
+    if as_json:
+        _print_json(description)
+    else:
+        _table(f"The paper's claims: {output / 'claims.csv'}", rows(description))
 
 
 @app.command()
@@ -334,6 +394,22 @@ def _opened(path: Path, sets: list[str] | None, lens: str) -> tuple[Scene, Camer
     return scene, camera, load(scene)
 
 
+def _predicted(scene: Scene) -> Prediction:
+    """What Eq. 5 and the ideal model promise of a scene."""
+    from reconstruct.accuracy import predict
+    from reconstruct.memory import refuse_too_large
+    from reconstruct.prior import prior_of
+    from scenes.camera import derive
+    from simulate.ideal import ideal_matrix
+
+    camera = derive(scene)
+    refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method)
+    noise, shape = scene.noise, (camera.rows, camera.columns)
+    actual = noise.variance + noise.quantisation_variance if noise else 0.0
+    prior = prior_of(scene.prior, shape, camera.target_pitch)
+    return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape)
+
+
 def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path) -> Any:
     from scenes.files import make_folder, refuse_output
     from scenes.picture import write_truth
@@ -351,6 +427,14 @@ def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path) -> Any:
         stack, made = kept_stack(folder / "stack.exr", scene, camera, image, progress)
     _say(f"render: {_done(made)}, {folder / 'stack.exr'}")
     return stack
+
+
+def _region(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
+    try:
+        row, column, rows, columns = (int(number) for number in (text or "0,0,1,1").split(","))
+    except ValueError as error:
+        raise InputError(f"--region: expected ROW,COLUMN,ROWS,COLUMNS, such as 8,8,4,4, got '{text}'") from error
+    return (row, column), (rows, columns)
 
 
 def _names(lens: str) -> tuple[str, ...]:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, stats
+from scipy import linalg, sparse
 
+from scenes.errors import InputError
 from scenes.scene import Estimator
 
-from .estimator import Gain, Vector, expected_error, factorise, noise_covariance
+from .estimator import factorise
+from .expected import expected_error, widths
+from .forms.form import Vector
+from .forms.svd import svd
 from .prior import Prior
+from .problem import Problem
 
 TRIM = 2
 PEAK = 255.0
@@ -27,15 +33,6 @@ class Observability:
     rank: int
     null_space: int
     condition: float
-
-
-@dataclass(frozen=True)
-class Interval:
-    """Expectation of the mean squared error given the image, and where it falls 99 times in 100."""
-
-    mse: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -68,24 +65,6 @@ def compare(estimate: Vector, truth: Vector, shape: tuple[int, int]) -> Error:
     return Error(mse, trimmed(squared, shape), psnr, ssim)
 
 
-def expected_given(gain: Gain, prior: Prior, truth: Vector, noise_variance: Vector) -> Interval:
-    """What the mean squared error of this very image should be: |(I - A H)(f - f0)|^2 + trace(A Rvm A^T), over N.
-
-    A photograph is no draw from the prior, so Eq. 5 does not answer for it. The interval takes the error as a gamma
-    variate of the same mean and variance, the quadratic form's own: 4 b^T K b + 2 trace(K^2).
-    """
-    away = truth - prior.mean
-    bias = away - gain.apply(gain.matrix @ away)
-    covariance = noise_covariance(gain, noise_variance)
-    mean = float(bias @ bias + np.trace(covariance))
-    variance = float(4 * bias @ covariance @ bias + 2 * np.sum(covariance**2))
-    if variance == 0:
-        return Interval(mean / truth.size, mean / truth.size, mean / truth.size)
-    shape, scale = mean**2 / variance, variance / mean
-    low, high = (float(stats.gamma.ppf(level, shape, scale=scale)) for level in (0.005, 0.995))
-    return Interval(mean / truth.size, low / truth.size, high / truth.size)
-
-
 def observability(matrix: sparse.csr_array) -> Observability:
     """Rank and condition of H, from the eigenvalues of the smaller of H H^T and H^T H."""
     return _observability(_gram_values(matrix), matrix.shape[1])
@@ -106,7 +85,10 @@ def _observability(values: NDArray[np.float64], unknowns: int) -> Observability:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What Eq. 5 promises of a camera before anything is rendered."""
+    """What Eq. 5 promises of a camera before anything is rendered.
+
+    degrees_of_freedom : trace of A H;  resolution : median width of the averaging kernel, in pixels of f
+    """
 
     measurements: int
     unknowns: int
@@ -115,7 +97,10 @@ class Prediction:
     condition: float
     mse: float
     trimmed_mse: float | None
-    trim: int = TRIM
+    trim: int
+    degrees_of_freedom: float
+    resolution: float | None
+    method: str
 
 
 def predict(
@@ -124,31 +109,42 @@ def predict(
     """Expected squared error for noise of variance `actual`; the estimator expects what it is told, else the same.
 
     Without any noise the error is the limit of Eq. 5: the prior's part in the null space of H.
+    Raises InputError where the estimator is to find the noise from a stack, or where no form is right.
     """
     measurements, unknowns = matrix.shape
     seen = observability(matrix)
-    believed = actual if estimator.noise_variance is None else estimator.noise_variance
+    if estimator.noise_variance == "fit":
+        raise InputError("estimator.noise_variance 'fit' takes a recorded stack; set a number to predict without one")
+    believed = actual if estimator.noise_variance is None else float(estimator.noise_variance)
     if believed > 0:
-        gain = factorise(matrix, prior.variance, np.full(measurements, believed), estimator.method)
-        variance = expected_error(gain, prior.variance, {"noise": np.full(measurements, actual)}).variance
+        problem = Problem(matrix, prior, np.full(measurements, believed))
+        form, solver = factorise(problem, estimator.method, estimator.tolerance)
+        expected = expected_error(form, {"noise": np.full(measurements, actual)})
+        method, variance, resolved = solver.method, expected.variance, expected.resolved
     else:
-        variance = _null_space_error(matrix, prior, seen.rank)
-    mse = float(variance.mean())
-    return Prediction(measurements, unknowns, seen.rank, seen.null_space, seen.condition, mse, trimmed(variance, shape))
-
-
-def _null_space_error(matrix: sparse.csr_array, prior: Prior, rank: int) -> Vector:
-    # As Rv goes to 0, I - A H becomes the projection onto the null space of H P0^1/2.
-    scaled = sparse.csr_array(matrix.multiply(np.sqrt(prior.variance)[None, :]))
-    _, vectors = linalg.eigh((scaled.T @ scaled).toarray(), overwrite_a=True, check_finite=False)
-    unseen = vectors[:, : matrix.shape[1] - rank]
-    return prior.variance * np.sum(unseen**2, axis=1)
+        limit = svd(Problem(matrix, prior, np.ones(measurements)))
+        method, variance, resolved = limit.name, limit.expected_variance(0.0, actual), limit.resolved()
+    mse, width = float(variance.mean()), float(np.median(widths(resolved)))
+    return Prediction(
+        measurements,
+        unknowns,
+        seen.rank,
+        seen.null_space,
+        seen.condition,
+        mse,
+        trimmed(variance, shape),
+        TRIM,
+        float(resolved.sum()),
+        width if isfinite(width) else None,
+        method,
+    )
 
 
 def rows(prediction: Prediction) -> list[tuple[str, str]]:
     """The lines of the printed table: what, and how much."""
     deviation = float(np.sqrt(prediction.mse))
     inner = "the target is too small" if prediction.trimmed_mse is None else f"{prediction.trimmed_mse:.6g}"
+    width = "nothing is resolved" if prediction.resolution is None else f"{prediction.resolution:.3g} pixels of f"
     return [
         ("measurements", str(prediction.measurements)),
         ("unknowns", str(prediction.unknowns)),
@@ -157,4 +153,7 @@ def rows(prediction: Prediction) -> list[tuple[str, str]]:
         ("condition of H", f"{prediction.condition:.4g} (largest over smallest singular value above zero)"),
         ("expected squared error (Eq. 5)", f"{prediction.mse:.6g} a pixel, a deviation of {deviation:.3g} of 255"),
         (f"  without a border of {prediction.trim} pixels", inner),
+        ("degrees of freedom", f"{prediction.degrees_of_freedom:.6g} of {prediction.unknowns}"),
+        ("resolution, median", width),
+        ("form of the estimator", prediction.method),
     ]

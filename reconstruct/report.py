@@ -21,6 +21,7 @@ from scenes.scene import Scene
 from scenes.stack import Stack
 from scenes.versions import versions
 
+from .estimator import Solver
 from .restore import MOST_FEIGNED, Restoration
 
 WARNING = (
@@ -61,11 +62,8 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
         "unknowns": model.unknowns,
         "stages": stages,
         "error": error,
-        "solver": {
-            "method": restoration.method,
-            "condition": restoration.condition if isfinite(restoration.condition) else None,
-            "digits": restoration.digits,
-        },
+        "solver": _solver(restoration.solver),
+        "diagnostics": _diagnostics(restoration),
         "model": {**model.record.get("agreement", _unknown(model)), "feigned_information": restoration.feigned},
         "skipped": [{"what": what, "why": why} for what, why in left_out(_as_run(stack, model))],
         "versions": {**model.record["versions"], **stack.record["versions"], **versions("scipy", "scikit-image")},
@@ -75,6 +73,41 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
             "calibration": model.record.get("first_seed"),
         },
     }
+
+
+def _solver(solver: Solver) -> dict[str, Any]:
+    return {
+        "method": solver.method,
+        "why": solver.why,
+        "condition": solver.condition if isfinite(solver.condition) else None,
+        "digits": solver.digits,
+        "bound": solver.bound,
+        "variance_bound": solver.variance_bound,
+        "refinements": solver.refinements,
+        "tried": [{"method": name, "why_not": reason} for name, reason in solver.tried],
+    }
+
+
+def _diagnostics(restoration: Restoration) -> dict[str, Any]:
+    width = float(np.median(restoration.expected.resolution))
+    fit, residual = restoration.fit, restoration.residual
+    described: dict[str, Any] = {
+        "pixels_used": int(restoration.left.used.sum()),
+        "pixels_dead": restoration.left.dead,
+        "pixels_saturated": restoration.left.saturated,
+        "degrees_of_freedom": restoration.expected.degrees_of_freedom,
+        "resolution": width if isfinite(width) else None,
+        "chi_squared": asdict(residual),
+    }
+    if fit is not None:
+        doubt = [value if isfinite(value) else None for value in fit.uncertainty]
+        names = ("variance", "correlation_length", "noise_variance")
+        values = (fit.variance, fit.length, fit.noise_variance)
+        described["fit"] = {
+            name: {"value": value, "relative_deviation": spread}
+            for name, value, spread in zip(names, values, doubt, strict=False)
+        } | {"evaluations": fit.evaluations}
+    return described
 
 
 def _unknown(model: Model) -> dict[str, float | None]:
@@ -117,11 +150,13 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     for name, part in error["budget"].items():
         if part > 0:
             lines.append((f"    from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / total:.1f} %)"))
+    if "region" in description:
+        lines.append(_region_row(description["region"]))
     if "mse" in error:
         psnr = "exact" if error["psnr"] is None else f"{error['psnr']:.2f} dB"
         ssim = "picture too small" if error["ssim"] is None else f"{error['ssim']:.4f}"
         lines += [("PSNR (peak 255)", psnr), ("structural similarity", ssim)]
-    lines.append(("digits left by the condition", f"{description['solver']['digits']:.1f}"))
+    lines += _solver_rows(description["solver"]) + _diagnostic_rows(description["diagnostics"], description["unknowns"])
     agreement = description["model"]
     if agreement["max_z"] is not None:
         difference = f"{agreement['rms_difference_from_ideal']:.2g} rms"
@@ -135,3 +170,38 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         lines.append(("do not trust the predicted error", WARNING))
     lines += [(f"left out: {skip['what']}", skip["why"]) for skip in description["skipped"]]
     return lines
+
+
+def _solver_rows(solver: dict[str, Any]) -> list[tuple[str, str]]:
+    bounds = f"error below {solver['bound']:.0e}, of variances {solver['variance_bound']:.0e} (relative)"
+    lines = [("right digits", f"{solver['digits']:.1f}: {bounds}")]
+    return lines + [(f"  not by the {failed['method']} form", failed["why_not"]) for failed in solver["tried"]]
+
+
+def _diagnostic_rows(found: dict[str, Any], unknowns: int) -> list[tuple[str, str]]:
+    lines: list[tuple[str, str]] = []
+    if found["pixels_dead"] or found["pixels_saturated"]:
+        lines.append(("sensor pixels left out", f"{found['pixels_dead']} dead, {found['pixels_saturated']} saturated"))
+    if not found["pixels_used"]:
+        lines.append(("do not look for the image here", "no sensor pixel is left, so this is the prior"))
+    width = "nothing is resolved" if found["resolution"] is None else f"{found['resolution']:.3g} pixels of f"
+    residual = found["chi_squared"]
+    expected = f"{residual['expected']:.0f}, give or take {residual['deviation']:.0f}"
+    lines += [
+        ("degrees of freedom", f"{found['degrees_of_freedom']:.1f} of {unknowns}"),
+        ("resolution, median", width),
+        ("chi-squared of the residual", f"{residual['chi_squared']:.0f}, expected {expected}"),
+    ]
+    for name, one in found.get("fit", {}).items():
+        if name == "evaluations" or one["value"] is None:
+            continue
+        doubt = "unknown" if one["relative_deviation"] is None else f"{100 * one['relative_deviation']:.0f} %"
+        unit = " pixels of f" if name == "correlation_length" else ""
+        lines.append((f"found: {name.replace('_', ' ')}", f"{one['value']:.4g}{unit} (uncertain by {doubt})"))
+    return lines
+
+
+def _region_row(region: dict[str, Any]) -> tuple[str, str]:
+    (row, column), (rows, columns) = region["corner"], region["size"]
+    where = f"mean of {rows} x {columns} pixels at {row}, {column}"
+    return where, f"{region['mean']:.4f}, give or take {region['deviation']:.2g}"

@@ -18,9 +18,11 @@ def left_out(scene: Scene) -> tuple[tuple[str, str], ...]:
             left.append(("sensor noise", "noise.variance is 0"))
         if scene.noise.bits is None:
             left.append(("quantisation", "the scene has no noise.bits"))
+    if scene.prior.kind == "independent":
+        left.append(("covariances between pixels of the prior", "prior.kind is 'independent'"))
     if scene.calibration.method == "ideal":
         left.append(("point sources", "calibration.method is 'ideal', H comes in closed form"))
         left.append(("second estimate for the uncertainty of H", "the ideal H has none"))
-    elif scene.estimator.noise_variance is not None:
+    elif scene.prior.kind != "fit" and scene.estimator.noise_variance not in (None, "fit"):
         left.append(("second estimate for the uncertainty of H", "estimator.noise_variance says what to expect"))
     return tuple(left)

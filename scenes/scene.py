@@ -1,7 +1,7 @@
 """The scene file: what the camera is, what it looks at, and what is to be computed.
 
-TOML in, a frozen and validated `Scene` out. Lengths are written with a unit ("6 um") and become
-millimetres here and nowhere else; a bare number where a length belongs and an unknown key are errors.
+TOML in, a frozen and validated `Scene` out. Lengths are written with a unit ("6 um"); a bare number where a length
+belongs and an unknown key are errors.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import re
 import tomllib
 from collections.abc import Iterable
 from fractions import Fraction
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -19,10 +18,8 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    PlainSerializer,
     PrivateAttr,
     ValidationError,
-    WithJsonSchema,
     field_validator,
     model_validator,
 )
@@ -31,80 +28,11 @@ from .errors import InputError
 from .explain import explain
 from .files import write_text
 from .override import apply_overrides, keep_lenses
+from .quantities import Believed, Corner, Length, Magnification, Pair, Samples, Step, pair
 
 FULL_SCALE = 256.0
 TRUTH = "truth.exr"
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
-
-
-@cache
-def _units() -> Any:
-    import pint
-
-    return cast(Any, pint).UnitRegistry()
-
-
-def _length(value: object) -> float:
-    if isinstance(value, float | int) and not isinstance(value, bool):
-        raise ValueError(f'expected a length with its unit, such as "{value} mm", got the bare number {value}')
-    if not isinstance(value, str):
-        raise ValueError(f'expected a length with its unit, such as "1 mm", got {value!r}')
-    try:
-        length = float(_units().Quantity(value).to("mm").magnitude)
-    except Exception as error:  # pint raises a dozen kinds, tokenize's among them
-        raise ValueError(f'expected a length with its unit, such as "6 um" or "1 m", got {value!r}') from error
-    if not 0 < length < float("inf"):
-        raise ValueError(f"expected a length above zero, got {value!r}")
-    return length
-
-
-def _ratio(value: object) -> Fraction:
-    try:
-        if isinstance(value, bool) or not isinstance(value, str | int | float | Fraction):
-            raise ValueError
-        ratio = Fraction(str(value))
-    except (ValueError, ZeroDivisionError) as error:
-        raise ValueError(f'expected a ratio such as "1/3" or 0.25, got {value!r}') from error
-    if ratio.denominator > 10**6 or ratio.numerator > 10**6:
-        raise ValueError(f"expected a ratio of numbers up to a million, got {value!r}")
-    return ratio
-
-
-def _magnification(value: object) -> Fraction:
-    ratio = _ratio(value)
-    if not 0 < ratio <= 1:
-        raise ValueError(f'expected a magnification above 0 and at most 1, such as "1/3", got {value!r}')
-    return ratio
-
-
-def _step(value: object) -> Fraction:
-    ratio = _ratio(value)
-    if ratio < 0:
-        raise ValueError(f"expected a step of 0 or more pixels of the target, got {value!r}")
-    return ratio
-
-
-def _pair(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value  # type: ignore[arg-type]
-
-
-def _text_of(ratio: Fraction) -> str | int:
-    return int(ratio) if ratio.denominator == 1 else str(ratio)
-
-
-Length = Annotated[
-    float,
-    BeforeValidator(_length),
-    PlainSerializer(lambda value: f"{value!r} mm"),
-    WithJsonSchema({"type": "string", "description": 'a length with its unit, such as "6 um"'}),
-]
-_RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
-Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_text_of), _RATIO]
-Step = Annotated[Fraction, BeforeValidator(_step), PlainSerializer(_text_of), _RATIO]
-Count = Annotated[int, Field(ge=1)]
-Pair = Annotated[tuple[Count, Count], BeforeValidator(_pair)]
-Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(_pair)]
-Samples = Annotated[int, Field(ge=16, le=2**24, description="per sensor pixel; rendered in 16 passes or more")]
 
 
 class _Table(BaseModel):
@@ -137,7 +65,7 @@ class Lens(_Table):
     def _pixels(cls, value: object) -> object:
         numbers: list[object] = list(value) if isinstance(value, list | tuple) else []  # type: ignore[arg-type]
         if value == "fit" or (len(numbers) == 2 and all(type(n) is int and n >= 1 for n in numbers)):  # type: ignore[operator]
-            return _pair(cast(object, value))
+            return pair(cast(object, value))
         raise ValueError(f'expected two whole numbers of at least 1, such as [5, 5], or "fit", got {value!r}')
 
 
@@ -146,7 +74,7 @@ class Camera(_Table):
 
     pixel_pitch: Length = Field(description="side of one sensor pixel")
     lens_pitch: Length = Field(description="from one lens's centre to the next")
-    lens: Annotated[tuple[Lens, ...], BeforeValidator(_pair), Field(min_length=1)]
+    lens: Annotated[tuple[Lens, ...], BeforeValidator(pair), Field(min_length=1)]
 
     @model_validator(mode="after")
     def _names_differ(self) -> Camera:
@@ -162,6 +90,9 @@ class Noise(_Table):
 
     variance: float = Field(default=0.0, ge=0, description="Gaussian, in squared units of the target's values")
     bits: int | None = Field(default=None, ge=1, le=24, description="of the recorded values; absent: no quantisation")
+    saturation: float | None = Field(
+        default=None, description="recorded values stop here; pixels that reach it are left out; absent: none does"
+    )
 
     @property
     def level(self) -> float:
@@ -177,17 +108,46 @@ class Noise(_Table):
 class Prior(_Table):
     """What is known of the image before any light is recorded."""
 
+    kind: Literal["independent", "exponential", "power", "fit"] = Field(
+        default="independent",
+        description="how pixels go together: not at all; exp(-distance / length); a power of frequency; found by fit",
+    )
     mean: float = 127.5
-    variance: float = Field(default=5461.25, gt=0, description="of every pixel, independent of its neighbours")
+    variance: float = Field(default=5461.25, gt=0, description="of every pixel; of kind fit: where the search starts")
+    correlation_length: Length | None = Field(
+        default=None, description="on the target, of kind exponential; of kind fit: where the search starts"
+    )
+    exponent: float | None = Field(
+        default=None, ge=0, le=8, description="a of a power spectrum 1/frequency^a, of kind power; absent: 2"
+    )
+
+    @model_validator(mode="after")
+    def _only_what_the_kind_has(self) -> Prior:
+        if self.kind == "exponential" and self.correlation_length is None:
+            raise ValueError('kind "exponential" needs a correlation_length, such as "10 mm"')
+        if self.kind in ("independent", "power") and self.correlation_length is not None:
+            raise ValueError(f'correlation_length belongs to kind "exponential" or "fit", got kind "{self.kind}"')
+        if self.kind != "power" and self.exponent is not None:
+            raise ValueError(f'exponent belongs to kind "power", got kind "{self.kind}"')
+        return self
 
 
 class Estimator(_Table):
     """How the image is estimated."""
 
-    noise_variance: float | None = Field(
-        default=None, gt=0, description="what the estimator expects; absent: all that is known"
+    noise_variance: Believed | None = Field(
+        default=None, description='what the estimator expects; "fit": found from the stack; absent: all that is known'
     )
-    method: Literal["auto", "measurement", "information"] = "auto"
+    method: Literal[
+        "auto",
+        "covariance",
+        "information",
+        "square-root-information",
+        "square-root-covariance",
+        "svd",
+        "dual",
+    ] = Field(default="auto", description="the form of the estimator; auto: the cheapest that is right to tolerance")
+    tolerance: float = Field(default=1e-8, gt=0, le=1, description="relative error of the computation that is allowed")
 
 
 class Render(_Table):

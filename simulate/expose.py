@@ -19,12 +19,15 @@ def quantise(values: NDArray[np.float64], level: float) -> NDArray[np.float64]:
 def expose(
     light: NDArray[np.float64], noise: Noise, rngs: list[np.random.Generator], slices: list[slice]
 ) -> NDArray[np.float64]:
-    """Recorded values of `light`, (M,): Gaussian noise from each sub-image's own generator, then quantisation."""
+    """Recorded values of `light`, (M,): noise from each sub-image's own generator, quantisation, saturation."""
     recorded = light.copy()
     if noise.variance > 0:
         for place, rng in zip(slices, rngs, strict=True):
             recorded[place] += rng.normal(0.0, noise.variance**0.5, recorded[place].shape)
-    return recorded if noise.bits is None else quantise(recorded, noise.level)
+    if noise.bits is not None:
+        recorded = quantise(recorded, noise.level)
+    # Last, so that a saturated pixel is known by its value whatever the levels are.
+    return recorded if noise.saturation is None else np.minimum(recorded, noise.saturation)
 
 
 def generators(camera: Camera, seed: int) -> list[np.random.Generator]:

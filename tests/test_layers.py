@@ -49,7 +49,8 @@ def test_the_packages_are_ours_and_export_nothing(package: str) -> None:
 
 
 def test_reconstruct_works_where_mitsuba_does_not_exist() -> None:
-    names = [f"reconstruct.{path.stem}" for package, path in MODULES if package == "reconstruct"]
+    paths = [path.relative_to(ROOT).with_suffix("") for package, path in MODULES if package == "reconstruct"]
+    names = [".".join(path.parts) for path in paths]
     script = (
         "import sys, importlib\n"
         "sys.modules['mitsuba'] = sys.modules['drjit'] = sys.modules['simulate'] = None\n"

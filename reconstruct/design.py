@@ -1,0 +1,43 @@
+"""Which lens type to add: the expected error after each (Wood et al., section 6), from Eq. 5 alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .accuracy import Prediction
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A magnification, and what is expected once it is there; None and `reason` where it cannot be had."""
+
+    magnification: str
+    expected: Prediction | None
+    reason: str = ""
+
+
+def ranked(choices: list[Choice]) -> list[Choice]:
+    """The least expected error first; what cannot be had last."""
+    return sorted(choices, key=lambda choice: np.inf if choice.expected is None else choice.expected.mse)
+
+
+def rows(before: Prediction, choices: list[Choice]) -> list[tuple[str, str]]:
+    """The lines of the printed table: magnification, expected error, and what it is worth."""
+    lines = [("as it is", f"{before.mse:.6g} a pixel, {before.null_space} dimensions unseen")]
+    for choice in choices:
+        found = choice.expected
+        if found is None:
+            lines.append((f"+ {choice.magnification}", choice.reason))
+            continue
+        gain = before.mse / found.mse if found.mse > 0 else float("inf")
+        more = found.measurements - before.measurements
+        lines.append(
+            (
+                f"+ {choice.magnification}",
+                f"{found.mse:.6g} a pixel, {gain:.3g} times less; {found.null_space} dimensions unseen,"
+                f" {more} measurements more",
+            )
+        )
+    return lines

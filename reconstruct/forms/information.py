@@ -1,0 +1,68 @@
+"""Information form: Cholesky of I + B^T B, B = S^-1 H L, the smaller matrix where unknowns are fewer.
+
+Fast, and right to ten digits and more where H leaves no null space. With a null space and little noise the unit matrix
+drowns in the rounding of B^T B, and digits are lost in proportion to the ratio of prior to noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from scipy import sparse
+
+from ..problem import Problem
+from .cholesky import Factor, factorise_positive
+from .form import Form, Matrix, NotSolvableError, Vector, multipliers
+
+
+@dataclass(frozen=True)
+class Information(Form):
+    """I + B^T B, scaled and factorised."""
+
+    factor: Factor
+
+    name: ClassVar[str] = "information"
+
+    def solve(self, shift: Matrix, residual: Matrix) -> tuple[Matrix, Matrix]:
+        """u = (I + B^T B)^-1 (c + L^T H^T Rv^-1 r)."""
+        u = self.factor.solve(shift + self.problem.adjoint(residual / self.problem.noise_variance[:, None]))
+        return u, multipliers(self.problem, u, residual)
+
+    @cached_property
+    def inverse(self) -> Matrix:
+        """(I + B^T B)^-1: (K, K)."""
+        return self.factor.inverse()
+
+    def variance(self) -> Vector:
+        """The diagonal of L (I + B^T B)^-1 L^T."""
+        if self.problem.prior.independent:
+            return self.problem.prior.variance * np.diagonal(self.inverse)
+        root = self.problem.prior.root
+        return np.maximum(np.einsum("ij,ij->i", root @ self.inverse, root), 0.0)
+
+    def columns(self, some: slice) -> tuple[Matrix, Matrix]:
+        """From the inverse, which costs a third of solving for every pixel."""
+        prior = self.problem.prior
+        u = self.inverse[:, some] * prior.root[some] if prior.independent else self.inverse @ prior.root[some].T
+        return u, multipliers(self.problem, u, np.zeros((self.problem.measurements, u.shape[1])))
+
+
+def information(problem: Problem) -> Information:
+    """Factorise in information form. Raises NotSolvableError without noise, or where float64 does not suffice."""
+    if not problem.noisy:
+        raise NotSolvableError("it needs noise in every measurement")
+    if problem.prior.independent:
+        scaled = sparse.csr_array(problem.matrix.multiply(1 / problem.deviation[:, None]))
+        scaled = sparse.csr_array(scaled.multiply(problem.prior.root[None, :]))
+        normal = np.asarray((scaled.T @ scaled).toarray())
+    else:
+        whitened = problem.whitened()
+        normal = whitened.T @ whitened
+    normal[np.diag_indices(normal.shape[0])] += 1.0
+    if not np.isfinite(normal).all():
+        raise NotSolvableError("the squares of its matrix leave the range of double precision")
+    factor, condition = factorise_positive(normal)
+    return Information(problem, condition, factor)

@@ -1,0 +1,42 @@
+"""What the dense forms of the estimator need of memory, and what there is."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from scenes.errors import InputError
+
+
+def needed_memory(form: str, measurements: int, unknowns: int) -> int:
+    """Bytes that a form and the analysis of its error need."""
+    both = measurements + unknowns
+    matrix = {
+        "covariance": 3 * measurements**2 + 2 * measurements * unknowns + 2 * unknowns**2,
+        "information": 5 * unknowns**2,
+        "square-root-information": 4 * both * unknowns + 2 * unknowns**2,
+        "square-root-covariance": 3 * both**2,
+        "svd": 4 * measurements * unknowns + 5 * unknowns**2,
+        "dual": 5 * measurements * both + 4 * both * unknowns,
+    }
+    return 8 * matrix[form]
+
+
+def refuse_too_large(measurements: int, unknowns: int, method: str) -> None:
+    """Raise InputError if the estimator's dense matrices would not fit in memory."""
+    form = ("covariance" if measurements < unknowns else "information") if method == "auto" else method
+    needed, free = needed_memory(form, measurements, unknowns), free_memory()
+    if needed > free:
+        raise InputError(
+            f"the dense estimator needs {needed / 1e9:.1f} GB for {unknowns} pixels, {free / 1e9:.1f} GB are free;"
+            " crop the target with target.origin and target.shape"
+        )
+
+
+def free_memory() -> int:
+    """Bytes that can be had without swapping; where the system does not say, what is built in."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -234,6 +234,25 @@ def paper(
 
 
 @app.command()
+def stability(output: Folder = Path("stability"), as_json: Json = False) -> None:
+    """Right digits on stiff and extreme cases, against exact arithmetic."""
+    from reconstruct.stability import rows, write_stability
+    from reconstruct.stability_cases import CHANGES, LENSES
+    from scenes.camera import derive
+    from scenes.scene import read
+    from simulate.ideal import ideal_matrix
+
+    tile = Path(__file__).parent / "scenes" / "tile19.toml"
+    matrices = {name: ideal_matrix(derive(read(tile, CHANGES, lenses))) for name, lenses in LENSES.items()}
+    with _progress("stability") as progress:
+        summary = write_stability(output, matrices, progress)
+    if as_json:
+        _print_json(summary)
+    else:
+        _table("Stiff and extreme cases", rows(summary))
+
+
+@app.command()
 def show(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
     """The geometry, the plan, and what is left out."""
     from scenes.camera import derive

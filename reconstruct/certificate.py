@@ -1,38 +1,45 @@
 """How far a computed estimate is from the exact one, at most: refinement, and a bound that asks no factorisation.
 
 The exact u is where |S^-1 (r - H L u)|^2 + |u - c|^2 is least, a function that rises at least as fast as the square of
-the distance from there. So for any u and l, with the residuals
+the distance from there. So for any u and l, with the residuals p and q (`residuals`), the distance is at most
+|p| + |S^-1 q| / 2, whoever computed them. The same residuals, solved for, correct the estimate until the bound no
+longer falls. Distances are in u, that is in standard deviations of the prior.
 
-    p = c + L^T H^T l - u,    q = r - H L u - Rv l,
-
-the distance is at most |p| + |S^-1 q| / 2, whoever computed them. Both cancel almost wholly and are therefore formed in
-twice the precision; the same residuals, solved for, correct the estimate until the bound no longer falls.
-Distances are in u, that is in standard deviations of the prior.
+Where a measurement has no noise S has no inverse, and where prior and noise are far more than 30 decades apart the
+bound drowns in the rounding of p. Then the form that solved is asked how far off u is, twice that is taken, and only
+if it gives back to four digits a u and l that were chosen by chance: what loses a direction, of the prior's or of the
+measurements', does not.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from .forms.form import Form
-from .prior import Prior
-from .problem import Problem
-from .twofold import ROUNDING, Rows, Twofold, exact, rows_of, rows_of_dense
+from .residuals import Exact
+from .twofold import Twofold, dots, exact
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Indices = NDArray[np.intp]
 Pair = tuple[Twofold, Twofold]
+Parts = tuple[Matrix, Matrix]
 
 MOST_REFINEMENTS = 12
+MOST_STALLED = 4  # refinements that do not halve the bound
 ENOUGH = 1e-15  # relative: float64 holds no more
-VANISHED = 1e-8  # of c or u: p must have fallen that far before the factorisation is believed about the rest
-CONTRACTION = 1e-2  # of one correction to the one before, likewise
+GIVEN_BACK = 1e-4  # relative error of a known u, above which a form is not believed about errors
+PROBES = 3
+MEETINGS = 3  # solutions after which measurements without noise must be met
+FAR_BELOW = 1e10  # times the rounding of twice the precision: 1e-20 of the values
+SAFETY = 10  # for variances, of which not all are checked and which expected errors add up
+FEW = 128  # pixels up to which every variance is checked
+SAMPLE = 16  # pixels beyond that
+NOTHING = 1e-28  # of the prior's variance: a posterior variance below, in twice the precision, is 0
 
 
 @dataclass(frozen=True)
@@ -46,160 +53,191 @@ class Refined:
     steps: int
 
 
-@dataclass(frozen=True)
-class Exact:
-    """A problem's matrices laid out for products in twice the precision."""
-
-    problem: Problem
-
-    @cached_property
-    def _matrix(self) -> Rows:
-        return rows_of(self.problem.matrix)
-
-    @cached_property
-    def _transposed(self) -> Rows:
-        return rows_of(sparse.csr_array(self.problem.matrix.T))
-
-    @cached_property
-    def _root(self) -> tuple[Rows, Rows]:
-        root = self.problem.prior.root
-        return rows_of_dense(root), rows_of_dense(root.T)
-
-    @cached_property
-    def _sizes(self) -> tuple[sparse.csr_array, Prior]:
-        prior = self.problem.prior
-        return abs(self.problem.matrix), Prior(prior.mean, np.abs(prior.root))
-
-    @property
-    def rounding(self) -> float:
-        """Relative rounding of the residuals, from the number of terms in their longest sum."""
-        longest = max(self._matrix.data.shape[0], self._transposed.data.shape[0])
-        return ROUNDING * (4 + longest + (0 if self.problem.prior.independent else self.problem.prior.freedoms))
-
-    def observe(self, freedoms: Twofold) -> Twofold:
-        """H L u."""
-        prior = self.problem.prior
-        spread = freedoms.scaled(prior.root[:, None]) if prior.independent else self._root[0].times(freedoms)
-        return self._matrix.times(spread)
-
-    def adjoint(self, measurements: Twofold) -> Twofold:
-        """L^T H^T l."""
-        prior = self.problem.prior
-        seen = self._transposed.times(measurements)
-        return seen.scaled(prior.root[:, None]) if prior.independent else self._root[1].times(seen)
-
-    def recorded(self, values: Vector) -> Twofold:
-        """g - H f0: (M, 1)."""
-        return exact(values[:, None]) - self._matrix.times(exact(self.problem.prior.mean[:, None]))
-
-    def residuals(self, u: Twofold, pull: Twofold, shift: Twofold, recorded: Twofold) -> tuple[Twofold, Twofold]:
-        """p and q of the module's text: (K, q) and (M, q)."""
-        noise = self.problem.noise_variance[:, None]
-        return shift + self.adjoint(pull) - u, recorded - self.observe(u) - pull.scaled(noise)
-
-    def doubts(self, u: Matrix, pull: Matrix, shift: Matrix, recorded: Matrix) -> tuple[Matrix, Matrix]:
-        """How far rounding may have moved p and q, from the sizes of all that is added up in them."""
-        matrix, prior = self._sizes
-        u, pull = np.abs(u), np.abs(pull)
-        p = np.abs(shift) + prior.gather(matrix.T @ pull) + u
-        q = np.abs(recorded) + matrix @ prior.spread(u) + self.problem.noise_variance[:, None] * pull
-        return self.rounding * p, self.rounding * q
-
-
 def refine(form: Form, exactly: Exact, shift: Matrix, recorded: Twofold) -> Refined:
     """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), and correct; what has the least bound is kept."""
-    target = exact(shift)
-    first, multiplier = form.solve(shift, recorded.high)
-    found: Pair = exact(first), exact(multiplier)
-    residuals: Pair = exactly.residuals(found[0], found[1], target, recorded)
-    right = shift, recorded.high
-    bound: Vector = _bound(form, exactly, found, residuals, right, None)
-    best: tuple[Pair, Vector] = found, bound
-    previous: Vector | None = None
-    steps = 0
-    while steps < MOST_REFINEMENTS and not (bound <= ENOUGH).all():
-        p, q = residuals
-        change, step = form.solve(p.high, q.high)
-        found = found[0] + exact(change), found[1] + exact(step)
-        residuals = exactly.residuals(found[0], found[1], target, recorded)
-        size = np.linalg.norm(change, axis=0)
-        rate = None if previous is None else size / np.where(previous > 0, previous, 1.0)
-        bound, previous = _bound(form, exactly, found, residuals, right, rate), size
-        steps += 1
-        if _worst(bound) < _worst(best[1]):
-            best = found, bound
-    u, pull = best[0][0].high, best[0][1].high
-    away = _relative(np.linalg.norm(u - first, axis=0), np.linalg.norm(u, axis=0))
-    return Refined(u, pull, best[1], away + best[1], steps)
+    with np.errstate(all="ignore"):  # what overflows makes a bound that no tolerance admits
+        found, bound, first, steps = _Judge(form, exactly, shift, recorded).corrected()
+        away = _relative(_norms(found[0].high - first), _norms(found[0].high))
+    return Refined(found[0].high, found[1].high, bound, away + bound, steps)
+
+
+def exact_variances(form: Form, exactly: Exact, pixels: Indices) -> tuple[Vector, Vector]:
+    """Posterior variances of some pixels, whatever the form lost, and how far they may be off: (n,) each.
+
+    With c = L^T e_i and r = 0 they are c u + u p - l q but for a term of second order in p and q, |M^-1/2 (p, q)|^2.
+    """
+    images = np.zeros((form.problem.unknowns, pixels.size))
+    images[pixels, np.arange(pixels.size)] = 1.0
+    shift = form.problem.prior.gather(images)
+    with np.errstate(all="ignore"):
+        judge = _Judge(form, exactly, shift, exact(np.zeros((form.problem.measurements, pixels.size))))
+        (u, pull), *_ = judge.corrected()
+        return judge.form_of_second_order(u, pull)
 
 
 def variance_error(form: Form, exactly: Exact) -> float:
-    """Relative error of the posterior variances where it shows best, from an exact solution for a few pixels.
+    """Relative error of the posterior variances, times 10, from exact ones for every pixel, or for some of very many.
 
-    The pixels of the largest and the least variance, two more, and a sum over all of them with signs by chance, which
-    is compared as a whole; infinite where no exact solution is to be had.
+    Of many pixels those of the largest and the least variance, in itself and beside the prior's, others by chance, and
+    a sum over all of them with signs by chance, whose solution is compared as a whole.
+    Infinite where no exact variances are to be had.
     """
-    problem = form.problem
+    prior, count = form.problem.prior, form.problem.unknowns
     with np.errstate(all="ignore"):
         variance = form.variance()
         if not np.isfinite(variance).all():
             return float("inf")
-        count = problem.unknowns
-        pixels = np.array([variance.argmin(), variance.argmax(), count // 3, 2 * count // 3])
-        images = np.zeros((count, pixels.size + 1))
-        images[pixels, np.arange(pixels.size)] = 1.0
-        images[:, -1] = np.random.default_rng(0).choice([-1.0, 1.0], count)
-        shift = problem.prior.gather(images)
-        nothing = exact(np.zeros((problem.measurements, images.shape[1])))
-        found = refine(form, exactly, shift, nothing)
-        size = np.linalg.norm(found.freedoms, axis=0)
-        right = np.einsum("kq,kq->q", shift, found.freedoms)[:-1]
-        doubt = (np.linalg.norm(shift, axis=0) * size * found.bound)[:-1]
-        wrong = np.abs(variance[pixels] - right) + doubt
-        relative = np.divide(wrong, right, out=np.where(wrong > 0, np.inf, 0.0), where=right > 0)
-    worst = max(float(relative.max()), float(found.first[-1]))
-    return worst if isfinite(worst) else float("inf")
+        pixels = _chosen(variance, prior.variance)
+        right, doubt = exact_variances(form, exactly, pixels)
+        # Where neither knows better than 0, 0 it is.
+        zero = (variance[pixels] == 0) & (right <= doubt) & (doubt <= NOTHING * prior.variance[pixels])
+        wrong = np.where(zero, 0.0, np.abs(variance[pixels] - right) + doubt)
+        worst = _worst(np.divide(wrong, right, out=np.where(wrong > 0, np.inf, 0.0), where=right > 0))
+        if count > FEW:
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, 1))
+            nothing = exact(np.zeros((form.problem.measurements, 1)))
+            worst = max(worst, _worst(refine(form, exactly, prior.gather(signs), nothing).first))
+    return SAFETY * worst
 
 
-def _bound(
-    form: Form,
-    exactly: Exact,
-    found: Pair,
-    residuals: Pair,
-    right: tuple[Matrix, Matrix],
-    rate: Vector | None,
-) -> Vector:
-    """The bound of the module's text, relative to |u|; or a smaller one, where the factorisation earned belief.
+@dataclass(frozen=True)
+class _Judge:
+    """A form that solves for c = `shift` and r = `recorded`, and how far what it finds is from the exact u."""
 
-    Belief: p has vanished beside c or u, so no direction was lost, and corrections contract. Then twice what the form
-    makes of the residuals, and of their rounding, stands for the distance. Without noise there is no other bound.
-    """
-    problem = exactly.problem
-    u, pull = found[0].high, found[1].high
-    p, q = residuals[0].high, residuals[1].high
-    p_doubt, q_doubt = exactly.doubts(u, pull, *right)
-    size = np.linalg.norm(u, axis=0)
-    p_size = np.linalg.norm(np.abs(p) + p_doubt, axis=0)
-    if problem.noisy:
-        rigorous = p_size + 0.5 * np.linalg.norm((np.abs(q) + q_doubt) / problem.deviation[:, None], axis=0)
-    else:
-        rigorous = np.where(p_size > 0, np.inf, 0.0)
-    if rate is not None and not (rigorous <= ENOUGH * size).all():
+    form: Form
+    exactly: Exact
+    shift: Matrix
+    recorded: Twofold
+
+    def corrected(self) -> tuple[Pair, Vector, Matrix, int]:
+        """The best u and l, the bound of u, the u found at first, and how many corrections were made."""
+        first, multiplier = self.form.solve(self.shift, self.recorded.high)
+        found: Pair = exact(first), exact(multiplier)
+        residuals, bound = self.judged(found)
+        best, steps, stalled = (found, bound), 0, 0
+        while steps < MOST_REFINEMENTS and stalled < MOST_STALLED and not (bound <= ENOUGH).all():
+            change, step = self.form.solve(residuals[0].high, residuals[1].high)
+            found = found[0] + exact(change), found[1] + exact(step)
+            residuals, bound = self.judged(found)
+            steps += 1
+            stalled = 0 if _worst(bound) < 0.5 * _worst(best[1]) else stalled + 1
+            if _worst(bound) < _worst(best[1]):
+                best = found, bound
+        return *best, first, steps
+
+    def judged(self, found: Pair) -> tuple[Pair, Vector]:
+        """The residuals of u and l, and the bound of the module's text, relative to |u|: (q,)."""
+        residuals = self.exactly.residuals(found[0], found[1], exact(self.shift), self.recorded)
+        parts = residuals[0].high, residuals[1].high
+        doubts = self.exactly.doubts(found[0].high, found[1].high, self.shift, self.recorded.high)
+        distance, size = self._rigorous(parts, doubts), _norms(found[0].high)
+        if not self.exactly.problem.noisy:
+            # What contradicts is shared out by whatever weights: with signs by chance it shows how much that matters.
+            some = self._silent(parts), self._silent(doubts)
+            silent = some[0], (some[1][0], some[1][1] + np.abs(some[0][1]))
+            distance += self._believed(*silent)[0] if self.trusted[0] else _infinite(silent)
+        if not (distance <= ENOUGH * size).all() and self.trusted[1]:
+            distance = np.fmin(distance, self._believed(parts, doubts)[0])
+        return residuals, _relative(distance, size)
+
+    def form_of_second_order(self, u: Twofold, pull: Twofold) -> tuple[Vector, Vector]:
+        """c u + u p - l q, and how far that may be from c u of the exact u: (q,) each, for r = 0."""
+        p, q = self.exactly.residuals(u, pull, exact(self.shift), self.recorded)
+        doubts = self.exactly.doubts(u.high, pull.high, self.shift, self.recorded.high)
+        value = (dots(self.shift, u) + dots(u.high, p) - dots(pull.high, q)).high
+        parts = p.high, q.high
+        second = self._rigorous(parts, doubts)
+        if not self.exactly.problem.noisy:
+            silent = self._silent(parts), self._silent(doubts)
+            second += np.sqrt(self._believed(*silent)[1]) if self.trusted[0] else _infinite(silent)
+        second = 4 * second**2
+        if self.trusted[1]:
+            second = np.fmin(second, self._believed(parts, doubts)[1])
+        first = np.sum(np.abs(u.high) * doubts[0], axis=0) + np.sum(np.abs(pull.high) * doubts[1], axis=0)
+        rounding = self.exactly.rounding * np.sum(np.abs(self.shift * u.high), axis=0)
+        return value, first + second + rounding
+
+    def _rigorous(self, residuals: Parts, doubts: Parts) -> Vector:
+        """|p| + |S^-1 q| / 2 over the measurements with noise."""
+        noisy = self.exactly.problem.noise_variance > 0
+        white = (np.abs(residuals[1]) + doubts[1])[noisy] / self.exactly.problem.deviation[noisy, None]
+        return _norms(np.abs(residuals[0]) + doubts[0]) + 0.5 * _norms(white)
+
+    def _silent(self, parts: Parts) -> Parts:
+        """q of the measurements without noise alone."""
+        noisy = self.exactly.problem.noise_variance > 0
+        return np.zeros_like(parts[0]), np.where(noisy[:, None], 0.0, parts[1])
+
+    def _believed(self, residuals: Parts, doubts: Parts) -> tuple[Vector, Vector]:
+        """Twice what the form makes of residuals and of their rounding, with signs by chance: |u|, and u p - l q."""
         signs = np.random.default_rng(0)
-        left, _ = form.solve(p, q)
-        rounded, _ = form.solve(p_doubt * _signs(signs, p_doubt), q_doubt * _signs(signs, q_doubt))
-        believed = 2 * (np.linalg.norm(left, axis=0) + np.linalg.norm(rounded, axis=0))
-        earned = (p_size <= VANISHED * np.maximum(size, np.linalg.norm(right[0], axis=0))) & (rate <= CONTRACTION)
-        rigorous = np.where(earned, np.fmin(believed, rigorous), rigorous)
-    return _relative(rigorous, size)
+        rounded = tuple(doubt * signs.choice([-1.0, 1.0], doubt.shape) for doubt in doubts)
+        distance, energy = np.zeros((2, self.shift.shape[1]))
+        for p, q in (residuals, rounded):
+            u, pull = self.form.solve(p, q)
+            distance += 2 * _norms(u)
+            energy += 2 * (np.abs(np.sum(u * p, axis=0)) + np.abs(np.sum(pull * q, axis=0)))
+        return distance, 2 * energy
+
+    @cached_property
+    def trusted(self) -> tuple[bool, bool]:
+        """Whether the form gives back u and l by chance: with l in measurements without noise alone; in all of them."""
+        problem, rng = self.exactly.problem, np.random.default_rng(1)
+        u = exact(rng.normal(size=(problem.prior.freedoms, 2 * PROBES)))
+        noisy = problem.noise_variance > 0
+        scale = np.where(noisy, problem.deviation, self.exactly.signal)[:, None]
+        white = rng.normal(size=(problem.measurements, 2 * PROBES))
+        white[noisy, :PROBES] = 0.0
+        pull = exact(np.divide(white, scale, out=np.zeros_like(white), where=scale > 0))
+        nothing = exact(np.zeros_like(u.high)), exact(np.zeros_like(white))
+        p, q = self.exactly.residuals(u, pull, *nothing)  # right sides whose exact solution is u and l, but for signs
+        found = self.form.solve(-p.high, -q.high)[0] + self.form.solve(-p.low, -q.low)[0]
+        error = np.nan_to_num(_relative(_norms(found - u.high), _norms(u.high)), nan=np.inf)
+        met = bool(noisy.all()) or self._meets(u.high[:, :PROBES])
+        return met and bool((error[:PROBES] <= GIVEN_BACK).all()), met and bool((error <= GIVEN_BACK).all())
+
+    def _meets(self, shift: Matrix) -> bool:
+        """Whether corrections meet r = 0 in measurements without noise, far below rounding.
+
+        If not, the form has taken for dependent what depends on rounding only, and what it finds is arbitrary.
+        """
+        right = exact(shift), exact(np.zeros((self.exactly.problem.measurements, shift.shape[1])))
+        found: Pair = exact(np.zeros_like(shift)), right[1]
+        p: Matrix = shift
+        q: Matrix = right[1].high
+        for _ in range(MEETINGS):
+            change, step = self.form.solve(p, q)
+            found = found[0] + exact(change), found[1] + exact(step)
+            residuals = self.exactly.residuals(found[0], found[1], *right)
+            p, q = residuals[0].high, residuals[1].high
+        doubt = self.exactly.doubts(found[0].high, found[1].high, shift, right[1].high)[1]
+        silent = self.exactly.problem.noise_variance == 0
+        return bool((np.abs(q) <= FAR_BELOW * doubt)[silent].all())
+
+
+def _chosen(variance: Vector, before: Vector) -> NDArray[np.intp]:
+    """Pixels whose variances are checked."""
+    if variance.size <= FEW:
+        return np.arange(variance.size)
+    share = np.divide(variance, before, out=np.ones_like(variance), where=before > 0)
+    extremes = [variance.argmin(), variance.argmax(), share.argmin(), share.argmax()]
+    others = np.random.default_rng(2).choice(variance.size, SAMPLE - len(extremes), replace=False)
+    return np.concatenate([extremes, others])
+
+
+def _norms(values: Matrix) -> Vector:
+    """The 2-norm of every column, without overflow: (q,)."""
+    largest = np.abs(values).max(axis=0, initial=0.0)
+    scale = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
+    return scale * np.linalg.norm(values / scale, axis=0)
+
+
+def _infinite(pairs: tuple[Parts, Parts]) -> Vector:
+    return np.where(np.any([part.any(axis=0) for pair in pairs for part in pair], axis=0), np.inf, 0.0)
 
 
 def _relative(error: Vector, size: Vector) -> Vector:
     return np.divide(error, size, out=np.where(error > 0, np.inf, 0.0), where=size > 0)
-
-
-def _signs(rng: np.random.Generator, like: Matrix) -> Matrix:
-    return rng.choice([-1.0, 1.0], like.shape)
 
 
 def _worst(bound: Vector) -> float:

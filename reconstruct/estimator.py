@@ -18,7 +18,8 @@ import numpy as np
 
 from scenes.errors import InputError
 
-from .certificate import Exact, Refined, refine, variance_error
+from .certificate import Refined, refine, variance_error
+from .corrected import Corrected
 from .forms.covariance import covariance
 from .forms.dual import dual
 from .forms.form import Form, NotSolvableError, Vector
@@ -28,11 +29,13 @@ from .forms.square_root_information import square_root_information
 from .forms.svd import svd
 from .memory import free_memory, needed_memory
 from .problem import Problem
+from .residuals import Exact
 
 TOLERANCE = 1e-8
 LEAST_DIGITS = 1.0  # that the condition must leave for a form with squares to be worth a try
 EPS = float(np.finfo(np.float64).eps)
 CONTRADICTION = 1e-6  # of the measurements: float32 files hold no more
+USEFUL = 1e-3  # bound of an estimate that tells whether measurements without noise are met
 WIDE = 1e12  # ratio of the largest to the least noise variance from which on the SVD loses what the noisy rows say
 
 FORMS: dict[str, Callable[[Problem], Form]] = {
@@ -70,9 +73,13 @@ class Solver:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The image f^, (N,), the multipliers l = Rv^-1 (g - H f^), (M,), and the form with which they were found."""
+    """The image f^, (N,), the multipliers l = Rv^-1 (g - H f^), (M,), and the form with which they were found.
+
+    freedoms : (K,) u of f^ = f0 + L u, which f^ itself does not show where L u is far below f0
+    """
 
     image: Vector
+    freedoms: Vector
     multipliers: Vector
     form: Form
     solver: Solver
@@ -84,17 +91,15 @@ def candidates(problem: Problem, method: str = "auto") -> tuple[list[str], str]:
         return [method], "asked for"
     if not problem.noisy:
         return ["dual"], "some measurements have no noise"
-    fewer = problem.measurements < problem.prior.freedoms
-    first = "covariance" if fewer else "information"
-    why = "fewer measurements than unknowns" if fewer else "no fewer measurements than unknowns"
-    noise = problem.noise_variance
+    noise, sizes = problem.noise_variance, (problem.measurements, problem.prior.freedoms)
+    # Where the information form fails, H has a null space that the covariance form does not mind.
+    first = ["covariance"] if sizes[0] < sizes[1] else ["information", "covariance"]
+    why = "fewer measurements than unknowns" if sizes[0] < sizes[1] else "no fewer measurements than unknowns"
     if noise.size and noise.max() > WIDE * noise.min():
-        return [
-            first,
-            "square-root-information",
-            "dual",
-        ], f"{why}, noise variances {noise.max() / noise.min():.0e} apart"
-    return [first, "svd", "square-root-covariance" if fewer else "square-root-information", "dual"], why
+        apart = f"noise variances {noise.max() / noise.min():.0e} apart"
+        return [*first, "square-root-information", "dual"], f"{why}, {apart}"
+    arrays = ["square-root-covariance"] if sizes[0] < sizes[1] else []
+    return [*first, "svd", *arrays, "square-root-information", "dual"], why
 
 
 def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, Solver]:
@@ -116,7 +121,7 @@ def estimate(problem: Problem, recorded: Vector, method: str = "auto", tolerance
     form, solver, refined = _first_good(problem, method, tolerance, recorded)
     assert refined is not None  # it is there because measurements were given
     image = problem.prior.mean + problem.prior.spread(refined.freedoms[:, 0])
-    return Estimate(image, refined.multipliers[:, 0], form, solver)
+    return Estimate(image, refined.freedoms[:, 0], refined.multipliers[:, 0], form, solver)
 
 
 def _first_good(
@@ -125,6 +130,7 @@ def _first_good(
     names, why = candidates(problem, method)
     exactly = Exact(problem)
     tried: list[tuple[str, str]] = []
+    worth: list[Form] = []  # correcting, since the estimate is right and only variances are not
     for name in names:
         try:
             form = _built(name, problem)
@@ -132,16 +138,17 @@ def _first_good(
             tried.append((name, str(error)))
             continue
         solver = Solver(name, why, form.condition, variance_error(form, exactly), tuple(tried))
-        refined = None
-        if recorded is not None:
-            refined = refine(form, exactly, np.zeros((problem.prior.freedoms, 1)), exactly.recorded(recorded))
-            _refuse_contradictions(problem, recorded, refined)
-            solver = replace(solver, bound=float(refined.bound[0]) + EPS, refinements=refined.steps)
-        worst = max(solver.variance_bound, solver.bound or 0.0)
-        if worst <= tolerance:
+        solver, refined = _with_estimate(solver, form, exactly, recorded)
+        if _accepted(solver, tolerance, tried):
             return form, solver, refined
-        what = "variances" if solver.variance_bound > tolerance else "the estimate"
-        tried.append((name, f"{what} right to {worst:.1e} only"))
+        if (solver.bound or 0.0) <= tolerance:
+            worth.append(form)
+    for form in reversed(worth if method == "auto" else []):
+        corrected = Corrected(problem, form.condition, form, exactly)
+        solver = Solver(f"{form.name}, corrected", why, form.condition, corrected.variance_error, tuple(tried))
+        solver, refined = _with_estimate(solver, form, exactly, recorded)
+        if _accepted(solver, tolerance, tried):
+            return corrected, solver, refined
     raise InputError(
         f"no form of the estimator reaches a relative error of {tolerance:g} here ("
         + "; ".join(f"{name}: {reason}" for name, reason in tried)
@@ -149,14 +156,32 @@ def _first_good(
     )
 
 
-def _refuse_contradictions(problem: Problem, recorded: Vector, refined: Refined) -> None:
-    silent = problem.noise_variance == 0
-    seen = problem.matrix @ problem.prior.mean + problem.observe(refined.freedoms)[:, 0]
-    left = np.abs(recorded - seen)[silent].max(initial=0.0)
-    if left > CONTRADICTION * np.abs(recorded).max(initial=0.0):
+def _with_estimate(
+    solver: Solver, form: Form, exactly: Exact, recorded: Vector | None
+) -> tuple[Solver, Refined | None]:
+    if recorded is None:
+        return solver, None
+    refined = refine(form, exactly, np.zeros((form.problem.prior.freedoms, 1)), exactly.recorded(recorded))
+    bound = float(refined.bound[0]) + EPS
+    if bound <= USEFUL:
+        _refuse_contradictions(exactly, recorded, refined)
+    return replace(solver, bound=bound, refinements=refined.steps), refined
+
+
+def _accepted(solver: Solver, tolerance: float, tried: list[tuple[str, str]]) -> bool:
+    worst = max(solver.variance_bound, solver.bound or 0.0)
+    if worst > tolerance:
+        what = "variances" if solver.variance_bound > tolerance else "the estimate"
+        tried.append((solver.method, f"{what} right to {worst:.1e} only"))
+    return worst <= tolerance
+
+
+def _refuse_contradictions(exactly: Exact, recorded: Vector, refined: Refined) -> None:
+    left = exactly.contradiction(recorded, refined.freedoms[:, 0])
+    if left > CONTRADICTION:
         raise InputError(
-            f"measurements that are said to have no noise contradict one another or the prior by {left:.2g};"
-            " set estimator.noise_variance to what noise they have"
+            f"measurements that are said to have no noise contradict one another or the prior by {left:.2g} of their"
+            " values; set estimator.noise_variance to what noise they have"
         )
 
 

@@ -13,7 +13,7 @@ from scipy import sparse
 
 Array = NDArray[np.float64]
 
-SPLITTER = 2.0**27 + 1
+UPPER = np.int64(-(2**27))  # the bits of a number that its upper half keeps: sign, exponent and 26 digits
 ROUNDING = 2.0**-104  # relative, of one operation
 
 
@@ -63,6 +63,16 @@ class Rows:
         return _normal(total, rest)
 
 
+def dots(left: Array, right: Twofold) -> Twofold:
+    """Scalar products of columns, (n, q) each: (q,)."""
+    total, rest = np.zeros((2, left.shape[1]))
+    for a, high, low in zip(left, right.high, right.low, strict=True):
+        product, error = _product(high, a)
+        total, lost = _sum(total, product)
+        rest += lost + (error + low * a)
+    return _normal(total, rest)
+
+
 def rows_of(matrix: sparse.csr_array) -> Rows:
     """Lay out a sparse matrix; shorter rows are filled up with zeros."""
     counts = np.diff(matrix.indptr)
@@ -95,8 +105,8 @@ def _normal(high: Array, low: Array) -> Twofold:
 
 
 def _split(values: Array) -> tuple[Array, Array]:
-    shifted = SPLITTER * values
-    high = shifted - (shifted - values)
+    # By its bits: the usual multiplication by 2^27 + 1 would overflow for numbers that do not.
+    high = (np.ascontiguousarray(values).view(np.int64) & UPPER).view(np.float64)
     return high, values - high
 
 

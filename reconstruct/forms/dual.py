@@ -15,15 +15,16 @@ import numpy as np
 from scipy import linalg
 
 from ..problem import Problem
-from .form import Form, Matrix, NotSolvableError, Vector, root_variance
+from .form import Form, Matrix, Vector, root_variance
 from .sorted_qr import Indices, SortedQr, sorted_qr
 
 EPS = float(np.finfo(np.float64).eps)
+SWEEPS = 30
 
 
 @dataclass(frozen=True)
 class Dual(Form):
-    """Rows with signal `active`, of size `scale`; [H L, S] of them is Q [R1 R2] in the order `basic`, `free`.
+    """Rows with signal `active`, divided by `scale`; [H L, S] of them is Q [R1 R2] in the order `basic`, `free`.
 
     orthogonal : (m, rank) Q
     triangle : (rank, rank) R1;  weights : (rank, K + m - rank) W
@@ -73,47 +74,76 @@ class Dual(Form):
 
 
 def dual(problem: Problem) -> Dual:
-    """Factorise in dual form. Raises NotSolvableError where noise drowns in the rounding of H without being 0."""
+    """Factorise in dual form."""
     observed = problem.observed()
-    size = np.sqrt(np.square(observed).sum(axis=1))
-    active = np.flatnonzero(size > 0)
-    scale = size[active]
-    count, freedoms = active.size, problem.prior.freedoms
-    whole = np.zeros((count, freedoms + count))
-    whole[:, :freedoms] = observed[active] / scale[:, None]
-    whole[np.arange(count), freedoms + np.arange(count)] = problem.deviation[active] / scale
-    norms = np.sqrt(np.square(whole).sum(axis=0))
-    rows = np.argsort(-np.abs(whole).max(axis=1, initial=0.0), kind="stable")
+    active = np.flatnonzero(observed.any(axis=1))
+    scale = _row_scale(observed[active])
+    signal, noise = observed[active] / scale[:, None], problem.deviation[active] / scale
+    rows = np.argsort(-np.maximum(np.abs(signal).max(axis=1, initial=0.0), noise), kind="stable")
     active, scale = active[rows], scale[rows]
-    whole = whole[rows]
-    whole[:, freedoms:] = whole[:, freedoms:][:, rows]
-    norms[freedoms:] = norms[freedoms:][rows]
-    decompose: Any = linalg.qr
-    orthogonal, triangle, pivots = decompose(whole, overwrite_a=True, pivoting=True, check_finite=False)
-    rounding = 4 * EPS * (freedoms + count) * norms[pivots]
-    diagonal = np.abs(np.diagonal(triangle))
-    sound = diagonal > rounding[:count]
-    rank = int(np.argmin(sound)) if not sound.all() else count
-    if sound[rank:].any():
-        raise NotSolvableError("noise so small that it drowns in the rounding of H")
-    # What is below the rounding of its own column is rounding: the prior speaks there, and noise must not drown it.
-    triangle = np.where(np.abs(triangle[:rank]) > rounding, triangle[:rank], 0.0)
+    orthogonal, triangle, order, rank = _eliminated(np.hstack([signal[rows], np.diag(noise[rows])]))
     first = triangle[:, :rank]
+    weights: Matrix = np.zeros((0, order.size))
     if rank:
-        weights = np.asarray(linalg.solve_triangular(first, triangle[:, rank:], check_finite=False))
-    else:
-        weights = np.zeros((0, freedoms + count))
-    kept = diagonal[:rank]
-    condition = float(kept.max(initial=1.0) / kept.min(initial=1.0))
+        weights = linalg.solve_triangular(first, triangle[:, rank:], check_finite=False)
+    kept = np.abs(np.diagonal(first))
     return Dual(
         problem,
-        condition,
+        float(kept.max(initial=1.0) / kept.min(initial=1.0)),
         active,
         scale,
-        pivots[:rank],
-        pivots[rank:],
-        orthogonal[:, :rank],
+        order[:rank],
+        order[rank:],
+        orthogonal,
         first,
         weights,
         sorted_qr(np.vstack([weights, np.eye(weights.shape[1])])),
     )
+
+
+def _row_scale(matrix: Matrix) -> Vector:
+    """How large rows are whatever the sizes of columns are, in powers of 2: (m,), for rows that are not all zeros.
+
+    |a_ij| is nearly row_i column_j: least squares in the logarithms (Curtis and Reid 1972), by alternate means.
+    Rows are to be divided by it; columns keep their size, by which pivoting tells what the prior says most of.
+    """
+    there = matrix != 0
+    logarithm = np.log2(np.abs(matrix), out=np.zeros_like(matrix), where=there)
+    in_row, in_column = there.sum(axis=1), np.maximum(there.sum(axis=0), 1)
+    row, column = np.zeros(matrix.shape[0]), np.zeros(matrix.shape[1])
+    for _ in range(SWEEPS):
+        row = (logarithm.sum(axis=1) - there @ column) / in_row
+        column = (logarithm.sum(axis=0) - row @ there) / in_column
+    return np.exp2(np.round(row))
+
+
+def _eliminated(whole: Matrix) -> tuple[Matrix, Matrix, Indices, int]:
+    """Pivoted QR, (m, n), by columns of very different size: Q, (m, rank), R, (rank, n), the order, and the rank.
+
+    What is left of a column below its own rounding is rounding and becomes 0, so that it is not taken for a pivot
+    before smaller columns that are there: there the prior speaks, and small noise must not drown in it.
+    """
+    rows, columns = whole.shape
+    rounding = 4 * EPS * columns * np.sqrt(np.square(whole).sum(axis=0))
+    orthogonal, triangle, rank = np.eye(rows), whole.copy(), 0
+    order: Indices = np.arange(columns, dtype=np.intp)
+    turned: Matrix
+    reduced: Matrix
+    pivots: Indices
+    decompose: Any = linalg.qr
+    while rank < min(rows, columns):
+        rest = triangle[rank:, rank:]
+        rest[:, np.sqrt(np.square(rest).sum(axis=0)) <= rounding[order[rank:]]] = 0.0
+        if not rest.any():
+            break
+        turned, reduced, pivots = decompose(rest, pivoting=True, check_finite=False)
+        orthogonal[:, rank:] = orthogonal[:, rank:] @ turned
+        triangle[:rank, rank:] = triangle[:rank, rank:][:, pivots]
+        triangle[rank:, rank:] = reduced
+        order[rank:] = order[rank:][pivots]
+        diagonal = np.abs(np.diagonal(reduced))
+        sound = diagonal > rounding[order[rank : rank + diagonal.size]]
+        rank += diagonal.size if sound.all() else max(int(np.argmin(sound)), 1)
+    triangle = triangle[:rank]
+    return orthogonal[:, :rank], np.where(np.abs(triangle) > rounding[order], triangle, 0.0), order, rank
+

@@ -1,4 +1,4 @@
-"""What our ways to render and to calibrate gain over Mitsuba as it comes: `python -m tests.benchmarks`.
+"""What our ways to render, to calibrate and to estimate gain, and over what: `python -m tests.benchmarks`.
 
 Nothing here asserts a speed. Other load slows both sides of a ratio alike, so ratios are to be compared, not times.
 """
@@ -6,6 +6,7 @@ Nothing here asserts a speed. Other load slows both sides of a ratio alike, so r
 from __future__ import annotations
 
 import os
+from math import isnan
 from pathlib import Path
 from time import perf_counter
 
@@ -20,6 +21,7 @@ from simulate.variant import blocked
 from .alternation import VARIANTS, Row
 from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
+from .forms import NOISE, form_rows
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
@@ -52,6 +54,27 @@ def main() -> None:
     console = Console()
     console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell
     console.print(table)
+    console.print(_work_precision())
+
+
+def _work_precision() -> Table:
+    table = Table(title=f"Work and precision of the estimator's forms, noise variance {NOISE:g}", show_lines=False)
+    for name in ("unknowns", "measurements", "lens types", "form", "factorise", "solve", "solve, refine and bound"):
+        table.add_column(name, justify="right" if name not in ("lens types", "form") else "left")
+    for name in ("digits alone", "digits refined", "digits of the worst variance"):
+        table.add_column(name, justify="right")
+    before = None
+    for row in form_rows(SCENES):
+        if before is not None and (row.unknowns, row.lenses) != before:
+            table.add_section()
+        before = row.unknowns, row.lenses
+        what = [str(row.unknowns), str(row.measurements), row.lenses, row.form]
+        if row.seconds is None or row.digits is None:
+            table.add_row(*what, row.failed)
+            continue
+        seconds = [f"{value:.2g} s" if value >= 1 else f"{value * 1e3:.3g} ms" for value in row.seconds]
+        table.add_row(*what, *seconds, *("reference" if isnan(value) else f"{value:.1f}" for value in row.digits))
+    return table
 
 
 def _add(table: Table, what: str, row: Row) -> None:

@@ -63,7 +63,8 @@ def run(
         from simulate.kept import kept_model
 
         scene, camera, image = _opened(path, sets, lens)
-        refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method)
+        correlated = scene.prior.kind != "independent"
+        refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method, correlated=correlated)
         stack = _rendered(scene, camera, image, folder)
         with _progress("calibrate") as progress:
             model, made = kept_model(folder / "model.npz", scene, camera, progress)
@@ -127,6 +128,7 @@ def reconstruct(
     import scenes.model
     import scenes.stack
     from reconstruct import figure, report, results
+    from reconstruct.restore import refuse_outside
     from scenes.files import refuse_output
     from scenes.scene import TRUTH
 
@@ -137,6 +139,7 @@ def reconstruct(
     recorded, calibrated = scenes.stack.read(stack), scenes.model.read(model)
     if lens:
         recorded, calibrated = recorded.restrict(_names(lens)), calibrated.restrict(_names(lens))
+    refuse_outside(corner, size, (recorded.camera.rows, recorded.camera.columns))
     recorded = results.changed(recorded, sets or [], stack)
     truth = results.truth_beside(stack, recorded)
     restoration, description = results.reconstruct(recorded, calibrated, truth, (stack, model))
@@ -422,7 +425,8 @@ def _predicted(scene: Scene) -> Prediction:
     from simulate.ideal import ideal_matrix
 
     camera = derive(scene)
-    refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method)
+    correlated = scene.prior.kind != "independent"
+    refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method, correlated=correlated)
     noise, shape = scene.noise, (camera.rows, camera.columns)
     actual = noise.variance + noise.quantisation_variance if noise else 0.0
     prior = prior_of(scene.prior, shape, camera.target_pitch)
@@ -469,7 +473,7 @@ def _say(text: str) -> None:
 
 
 def _print_json(document: object) -> None:
-    print(json.dumps(document, indent=2))
+    print(json.dumps(document, indent=2, allow_nan=False))
 
 
 def _table(title: str, lines: list[tuple[str, str]]) -> None:

@@ -31,6 +31,7 @@ Parts = tuple[Matrix, Matrix]
 
 MOST_REFINEMENTS = 12
 MOST_STALLED = 4  # refinements that do not halve the bound
+EPS = float(np.finfo(np.float64).eps)
 ENOUGH = 1e-15  # relative: float64 holds no more
 GIVEN_BACK = 1e-4  # relative error of a known u, above which a form is not believed about errors
 PROBES = 3
@@ -131,14 +132,24 @@ class _Judge:
         parts = residuals[0].high, residuals[1].high
         doubts = self.exactly.doubts(found[0].high, found[1].high, self.shift, self.recorded.high)
         distance, size = self._rigorous(parts, doubts), _norms(found[0].high)
-        if not self.exactly.problem.noisy:
-            # What contradicts is shared out by whatever weights: with signs by chance it shows how much that matters.
-            some = self._silent(parts), self._silent(doubts)
-            silent = some[0], (some[1][0], some[1][1] + np.abs(some[0][1]))
-            distance += self._believed(*silent)[0] if self.trusted[0] else _infinite(silent)
         if not (distance <= ENOUGH * size).all() and self.trusted[1]:
             distance = np.fmin(distance, self._believed(parts, doubts)[0])
+        if not self.exactly.problem.noisy:
+            silent = self._silent(parts), self._silent(self._contradictions(parts, doubts))
+            distance += self._believed(*silent)[0] if self.trusted[0] else _infinite(silent)
         return residuals, _relative(distance, size)
+
+    def _contradictions(self, residuals: Parts, doubts: Parts) -> Parts:
+        """Doubts of measurements without noise that contradict one another.
+
+        With what weights the contradiction is shared out is arbitrary, so every one is as doubtful, in proportion to
+        its size, as the worst of them, and no less than a float64 is.
+        """
+        silent = (self.exactly.problem.noise_variance == 0)[:, None]
+        left, doubt = np.abs(residuals[1]), doubts[1]
+        share = np.divide(left, doubt, out=np.zeros_like(left), where=silent & (doubt > 0)).max(axis=0, initial=0.0)
+        share = np.where(share > FAR_BELOW, np.maximum(share, EPS / self.exactly.rounding), 1.0)
+        return doubts[0], share * doubt
 
     def form_of_second_order(self, u: Twofold, pull: Twofold) -> tuple[Vector, Vector]:
         """c u + u p - l q, and how far that may be from c u of the exact u: (q,) each, for r = 0."""

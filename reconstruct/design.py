@@ -31,13 +31,12 @@ def rows(before: Prediction, choices: list[Choice]) -> list[tuple[str, str]]:
         if found is None:
             lines.append((f"+ {choice.magnification}", choice.reason))
             continue
-        gain = before.mse / found.mse if found.mse > 0 else float("inf")
+        gain = f"{before.mse / found.mse:.3g} times less" if found.mse > 0 else "nothing is left"
         more = found.measurements - before.measurements
         lines.append(
             (
                 f"+ {choice.magnification}",
-                f"{found.mse:.6g} a pixel, {gain:.3g} times less; {found.null_space} dimensions unseen,"
-                f" {more} measurements more",
+                f"{found.mse:.6g} a pixel, {gain}; {found.null_space} dimensions unseen, {more} measurements more",
             )
         )
     return lines

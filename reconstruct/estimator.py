@@ -36,6 +36,7 @@ LEAST_DIGITS = 1.0  # that the condition must leave for a form with squares to b
 EPS = float(np.finfo(np.float64).eps)
 CONTRADICTION = 1e-6  # of the measurements: float32 files hold no more
 USEFUL = 1e-3  # bound of an estimate that tells whether measurements without noise are met
+SOMEHOW = 10.0  # a bound above it says that u is not known at all, and so not what contradicts what
 WIDE = 1e12  # ratio of the largest to the least noise variance from which on the SVD loses what the noisy rows say
 
 FORMS: dict[str, Callable[[Problem], Form]] = {
@@ -130,6 +131,8 @@ def _first_good(
     names, why = candidates(problem, method)
     exactly = Exact(problem)
     tried: list[tuple[str, str]] = []
+    refined: Refined | None = None
+    solver = Solver("", why, 0.0, 0.0)
     worth: list[Form] = []  # correcting, since the estimate is right and only variances are not
     for name in names:
         try:
@@ -149,6 +152,8 @@ def _first_good(
         solver, refined = _with_estimate(solver, form, exactly, recorded)
         if _accepted(solver, tolerance, tried):
             return corrected, solver, refined
+    if refined is not None and recorded is not None and (solver.bound or 0.0) < SOMEHOW:
+        _refuse_contradictions(exactly, recorded, refined)
     raise InputError(
         f"no form of the estimator reaches a relative error of {tolerance:g} here ("
         + "; ".join(f"{name}: {reason}" for name, reason in tried)
@@ -186,7 +191,8 @@ def _refuse_contradictions(exactly: Exact, recorded: Vector, refined: Refined) -
 
 
 def _built(name: str, problem: Problem) -> Form:
-    needed, free = needed_memory(name, problem.measurements, problem.unknowns), free_memory()
+    sizes, correlated = (problem.measurements, problem.unknowns), not problem.prior.independent
+    needed, free = needed_memory(name, *sizes, correlated=correlated), free_memory()
     if needed > free:
         raise NotSolvableError(f"it needs {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free")
     with np.errstate(all="ignore"):  # what overflows is caught by the certificate

@@ -8,24 +8,24 @@ from pathlib import Path
 from scenes.errors import InputError
 
 
-def needed_memory(form: str, measurements: int, unknowns: int) -> int:
-    """Bytes that a form and the analysis of its error need."""
+def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bool = False) -> int:
+    """Bytes that a form and the analysis of its error need; a `correlated` prior adds its root and copies of it."""
     both = measurements + unknowns
     matrix = {
         "covariance": 3 * measurements**2 + 2 * measurements * unknowns + 2 * unknowns**2,
-        "information": 5 * unknowns**2,
+        "information": 7 * unknowns**2,
         "square-root-information": 4 * both * unknowns + 2 * unknowns**2,
         "square-root-covariance": 3 * both**2,
         "svd": 4 * measurements * unknowns + 5 * unknowns**2,
         "dual": 5 * measurements * both + 4 * both * unknowns,
     }
-    return 8 * matrix[form]
+    return 8 * (matrix[form] + (4 * unknowns**2 if correlated else 0))
 
 
-def refuse_too_large(measurements: int, unknowns: int, method: str) -> None:
+def refuse_too_large(measurements: int, unknowns: int, method: str, *, correlated: bool = False) -> None:
     """Raise InputError if the estimator's dense matrices would not fit in memory."""
     form = ("covariance" if measurements < unknowns else "information") if method == "auto" else method
-    needed, free = needed_memory(form, measurements, unknowns), free_memory()
+    needed, free = needed_memory(form, measurements, unknowns, correlated=correlated), free_memory()
     if needed > free:
         raise InputError(
             f"the dense estimator needs {needed / 1e9:.1f} GB for {unknowns} pixels, {free / 1e9:.1f} GB are free;"

@@ -48,6 +48,11 @@ class Prior:
         """L^T f: (N,) to (K,), or (N, q) to (K, q)."""
         return _diagonal(self.root, image) if self.independent else self.root.T @ image
 
+    def restrict(self, pixels: NDArray[np.intp]) -> Prior:
+        """Of some pixels alone."""
+        some = self.root[pixels]
+        return Prior(self.mean[pixels], some if self.independent else root_of(some @ some.T))
+
 
 def independent(mean: float, variance: float, unknowns: int) -> Prior:
     """The paper's prior: every pixel with the same mean and variance, independent of its neighbours."""

@@ -46,8 +46,8 @@ class Accurate:
 class Reference:
     """The exact u, (K,), as `freedoms`, `image` f0 + L u, (N,), and posterior `variance`, (N,), and the bits it took.
 
-    Where measurements without noise contradict one another it is the limit of the same little noise in all of them;
-    `contradiction` is the largest |g - H f^|_i / (|g| + |H| |f^|)_i that is left among them.
+    Where measurements without noise contradict one another it is the limit of little noise in proportion to the signal
+    |(H L)_i| of each; `contradiction` is the largest |g - H f^|_i / (|g| + |H| |f^|)_i that is left among them.
     """
 
     freedoms: Accurate
@@ -146,8 +146,12 @@ def _agreed(observed: Any, away: Any, rows: _Rows) -> Any:
     agreed = _some(away, rows.kept)
     if len(rows.quiet) == len(rows.basis):
         return agreed
-    spanning = _some(_some(observed, rows.quiet).transpose(), rows.columns).transpose()
-    across = spanning.transpose()
+    quiet = _some(observed, rows.quiet)
+    across = _some(quiet.transpose(), rows.columns)
+    spanning = across.transpose()
+    for place, size in enumerate(_diagonal(quiet, quiet.transpose())):
+        for column in range(across.nrows()):
+            across[column, place] /= size
     best = (across * spanning).solve(across * _some(away, rows.quiet))
     fitted = _some(_some(observed, rows.basis).transpose(), rows.columns).transpose() * best
     first = len(rows.kept) - len(rows.basis)

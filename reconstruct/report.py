@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from math import isfinite
+from math import exp, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from scenes.stack import Stack
 from scenes.versions import versions
 
 from .estimator import Solver
+from .fit import Fit
 from .restore import MOST_FEIGNED, Restoration
 
 WARNING = (
@@ -92,22 +93,27 @@ def _diagnostics(restoration: Restoration) -> dict[str, Any]:
     width = float(np.median(restoration.expected.resolution))
     fit, residual = restoration.fit, restoration.residual
     described: dict[str, Any] = {
-        "pixels_used": int(restoration.left.used.sum()),
-        "pixels_dead": restoration.left.dead,
-        "pixels_saturated": restoration.left.saturated,
+        "pixels_used": int(restoration.usable.used.sum()),
+        "pixels_dead": restoration.usable.dead,
+        "pixels_saturated": restoration.usable.saturated,
         "degrees_of_freedom": restoration.expected.degrees_of_freedom,
         "resolution": width if isfinite(width) else None,
-        "chi_squared": asdict(residual),
+        "chi_squared": None if residual is None else asdict(residual),
     }
     if fit is not None:
-        doubt = [value if isfinite(value) else None for value in fit.uncertainty]
         names = ("variance", "correlation_length", "noise_variance")
-        values = (fit.variance, fit.length, fit.noise_variance)
+        found = {name: value for name, value in zip(names, _numbers(fit), strict=True) if value is not None}
+        doubts = [value if isfinite(value) else None for value in fit.spread]
         described["fit"] = {
-            name: {"value": value, "relative_deviation": spread}
-            for name, value, spread in zip(names, values, doubt, strict=False)
-        } | {"evaluations": fit.evaluations}
+            name: {"value": value, "log_deviation": doubt}
+            for (name, value), doubt in zip(found.items(), doubts, strict=True)
+        }
+        described["fit_measurements"], described["fit_doubtful"] = fit.measurements, fit.doubtful
     return described
+
+
+def _numbers(fit: Fit) -> tuple[float | None, ...]:
+    return fit.variance, fit.length, fit.noise_variance
 
 
 def _unknown(model: Model) -> dict[str, float | None]:
@@ -186,18 +192,20 @@ def _diagnostic_rows(found: dict[str, Any], unknowns: int) -> list[tuple[str, st
         lines.append(("do not look for the image here", "no sensor pixel is left, so this is the prior"))
     width = "nothing is resolved" if found["resolution"] is None else f"{found['resolution']:.3g} pixels of f"
     residual = found["chi_squared"]
-    expected = f"{residual['expected']:.0f}, give or take {residual['deviation']:.0f}"
     lines += [
         ("degrees of freedom", f"{found['degrees_of_freedom']:.1f} of {unknowns}"),
         ("resolution, median", width),
-        ("chi-squared of the residual", f"{residual['chi_squared']:.0f}, expected {expected}"),
     ]
+    if residual is not None:
+        expected = f"{residual['expected']:.4g}, give or take {residual['deviation']:.2g}"
+        lines.append(("chi-squared of the residual", f"{residual['chi_squared']:.4g}, expected {expected}"))
     for name, one in found.get("fit", {}).items():
-        if name == "evaluations" or one["value"] is None:
-            continue
-        doubt = "unknown" if one["relative_deviation"] is None else f"{100 * one['relative_deviation']:.0f} %"
+        spread = one["log_deviation"]
+        doubt = "how well is not known" if spread is None else f"within a factor of {exp(spread):.3g}"
         unit = " pixels of f" if name == "correlation_length" else ""
-        lines.append((f"found: {name.replace('_', ' ')}", f"{one['value']:.4g}{unit} (uncertain by {doubt})"))
+        lines.append((f"found: {name.replace('_', ' ')}", f"{one['value']:.4g}{unit}, {doubt}"))
+    if found.get("fit_doubtful"):
+        lines.append(("do not trust what was found", "the stack does not tell it: it lies where the search ended"))
     return lines
 
 

@@ -20,7 +20,8 @@ from scenes.stack import Stack
 from .accuracy import Error, compare, trimmed
 from .estimator import Estimate, Solver, estimate
 from .expected import ExpectedError, Interval, expected_error, expected_given, variance_of_sum
-from .likelihood import Evidence, Fit, fit
+from .fit import Fit, fit
+from .likelihood import Evidence
 from .prior import Prior, exponential, independent, prior_of
 from .problem import Problem
 
@@ -28,12 +29,11 @@ Vector = NDArray[np.float64]
 
 MOST_FEIGNED = 0.1  # of what is believed of a pixel: above it the expected error is too small to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
-FIRST_LENGTH = 5.0  # pixels: where the search for a correlation length starts unless the scene says
-FIRST_NOISE = 1e-4  # of the prior's variance: where the search for the noise starts
+KEPT = ("rendering", "calibration")  # noise that stays known when the rest of it is to be found
 
 
 @dataclass(frozen=True)
-class Left:
+class Usable:
     """Which of the M sensor pixels are used, and how many are not, and why."""
 
     used: NDArray[np.bool_]
@@ -64,9 +64,9 @@ class Restoration:
     estimated: Estimate
     expected: ExpectedError
     trimmed_mse: float | None
-    residual: Residual
+    residual: Residual | None
     shape: tuple[int, int]
-    left: Left
+    usable: Usable
     noise: dict[str, Vector]
     fit: Fit | None
     feigned: float
@@ -92,18 +92,21 @@ class Restoration:
 
     def region(self, corner: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
         """Mean of the estimate in a region and its expected deviation (Eq. 5). Raises InputError if it lies outside."""
-        rows, columns = self.shape
-        bottom, right = corner[0] + size[0], corner[1] + size[1]
-        if min(*corner) < 0 or min(*size) < 1 or bottom > rows or right > columns:
-            raise InputError(
-                f"a region of {size[0]} x {size[1]} pixels at row {corner[0]}, column {corner[1]} does not lie inside"
-                f" an image of {rows} x {columns}"
-            )
+        refuse_outside(corner, size, self.shape)
         weights = np.zeros(self.shape)
-        weights[corner[0] : bottom, corner[1] : right] = 1 / (size[0] * size[1])
-        total = np.sum(list(self.noise.values()), axis=0)
-        variance = variance_of_sum(self.estimated.form, weights.ravel(), total)
+        weights[corner[0] : corner[0] + size[0], corner[1] : corner[1] + size[1]] = 1 / (size[0] * size[1])
+        variance = variance_of_sum(self.estimated.form, weights.ravel(), _sum(self.noise))
         return float(weights.ravel() @ self.estimate), variance**0.5
+
+
+def refuse_outside(corner: tuple[int, int], size: tuple[int, int], shape: tuple[int, int]) -> None:
+    """Raise InputError unless a region of `size` at `corner` lies inside an image of `shape`."""
+    ends = corner[0] + size[0], corner[1] + size[1]
+    if min(*corner) < 0 or min(*size) < 1 or ends[0] > shape[0] or ends[1] > shape[1]:
+        raise InputError(
+            f"a region of {size[0]} x {size[1]} pixels at row {corner[0]}, column {corner[1]} does not lie inside"
+            f" an image of {shape[0]} x {shape[1]}"
+        )
 
 
 def refuse_strangers(stack: Stack, model: Model, names: tuple[Path | str, Path | str]) -> None:
@@ -117,14 +120,14 @@ def refuse_strangers(stack: Stack, model: Model, names: tuple[Path | str, Path |
             )
 
 
-def usable(stack: Stack) -> Left:
+def usable_pixels(stack: Stack) -> Usable:
     """Which pixels tell something: not those that are no number (dead), nor those at the level of saturation."""
     alive = np.isfinite(stack.values) & np.isfinite(stack.variance)
     noise = stack.scene.noise
     full = np.zeros_like(alive)
     if noise is not None and noise.saturation is not None:
         full = alive & (stack.values >= np.float32(noise.saturation))  # the stack holds float32
-    return Left(alive & ~full, int(np.sum(~alive)), int(np.sum(full)))
+    return Usable(alive & ~full, int(np.sum(~alive)), int(np.sum(full)))
 
 
 def restore(stack: Stack, model: Model, truth: Vector | None = None) -> Restoration:
@@ -133,18 +136,37 @@ def restore(stack: Stack, model: Model, truth: Vector | None = None) -> Restorat
     truth : (N,) or None;  Raises InputError if memory does not suffice, or if no form is right to the tolerance.
     """
     start = perf_counter()
-    left = usable(stack)
-    noise = {name: variances[left.used] for name, variances in known_noise(stack).items()}
+    usable = usable_pixels(stack)
+    noise = {name: variances[usable.used] for name, variances in known_noise(stack).items()}
     prior, estimated = _first_prior(stack, model), None
-    if model.variance.any():
-        noise["calibration"] = model.prior_spread(prior.variance)[left.used]
-        estimated = _estimated(stack, model, left, prior, noise)
-        noise["calibration"] = model.spread(estimated.image)[left.used]
-    found = _fitted(stack, model, left, noise)
+    uncertain, told = bool(model.variance.any()), stack.scene.estimator.noise_variance
+    if uncertain:
+        noise["calibration"] = model.prior_spread(prior.variance)[usable.used]
+        estimated = _estimated(stack, model, usable, prior, noise)
+        noise["calibration"] = model.spread(estimated.image)[usable.used]
+    found = _fitted(stack, model, usable, prior, noise)
+    if found is not None and uncertain:
+        # What the uncertainty of H adds was taken at an image that the first prior had left noisy.
+        told_prior, told_noise = _with_fit(stack, model, prior, noise, found)
+        better = _estimated(stack, model, usable, told_prior, told_noise)
+        noise["calibration"] = model.spread(better.image)[usable.used]
+        found = _fitted(stack, model, usable, prior, noise)
     if found is not None:
         prior, noise = _with_fit(stack, model, prior, noise, found)
-    if estimated is None or found is not None or stack.scene.estimator.noise_variance is None:
-        estimated = _estimated(stack, model, left, prior, noise)
+    if estimated is None or found is not None or told is None:
+        estimated = _estimated(stack, model, usable, prior, noise)
+    return _described(model, usable, noise, estimated, found, truth, start)
+
+
+def _described(
+    model: Model,
+    usable: Usable,
+    noise: dict[str, Vector],
+    estimated: Estimate,
+    found: Fit | None,
+    truth: Vector | None,
+    start: float,
+) -> Restoration:
     expected = expected_error(estimated.form, noise)
     shape = (model.camera.rows, model.camera.columns)
     return Restoration(
@@ -153,10 +175,10 @@ def restore(stack: Stack, model: Model, truth: Vector | None = None) -> Restorat
         trimmed_mse=trimmed(expected.variance, shape),
         residual=_residual(estimated, expected),
         shape=shape,
-        left=left,
+        usable=usable,
         noise=noise,
         fit=found,
-        feigned=_feigned(model, left, estimated, expected),
+        feigned=_feigned(model, usable, estimated, expected),
         seconds=perf_counter() - start,
         truth=truth,
         error=None if truth is None else compare(estimated.image, truth, shape),
@@ -182,39 +204,41 @@ def _first_prior(stack: Stack, model: Model) -> Prior:
     return prior_of(described, (model.camera.rows, model.camera.columns), stack.camera.target_pitch)
 
 
-def _estimated(stack: Stack, model: Model, left: Left, prior: Prior, noise: dict[str, Vector]) -> Estimate:
+def _expected_noise(stack: Stack, usable: Usable, noise: dict[str, Vector]) -> Vector:
+    told = stack.scene.estimator.noise_variance
+    return np.full(int(usable.used.sum()), told) if isinstance(told, float) else _sum(noise)
+
+
+def _estimated(stack: Stack, model: Model, usable: Usable, prior: Prior, noise: dict[str, Vector]) -> Estimate:
+    problem = Problem(model.matrix[usable.used], prior, _expected_noise(stack, usable, noise))
     told = stack.scene.estimator
-    number = told.noise_variance if isinstance(told.noise_variance, float) else None
-    expected = _sum(noise) if number is None else np.full(int(left.used.sum()), number)
-    problem = Problem(model.matrix[left.used], prior, expected)
-    return estimate(problem, stack.values[left.used], told.method, told.tolerance)
+    return estimate(problem, stack.values[usable.used], told.method, told.tolerance)
 
 
-def _fitted(stack: Stack, model: Model, left: Left, noise: dict[str, Vector]) -> Fit | None:
+def _fitted(stack: Stack, model: Model, usable: Usable, prior: Prior, noise: dict[str, Vector]) -> Fit | None:
     """The prior, and the noise if that is asked for, of largest marginal likelihood; None where nothing is asked."""
-    described, used = stack.scene.prior, left.used
+    described, used = stack.scene.prior, usable.used
     asked = stack.scene.estimator.noise_variance == "fit"
     if not used.any() or not (asked or described.kind == "fit"):
         return None
-    known = {name: values for name, values in noise.items() if not asked or name in ("rendering", "calibration")}
+    known = (
+        _sum({name: noise[name] for name in KEPT if name in noise}) if asked else _expected_noise(stack, usable, noise)
+    )
     matrix = model.matrix[used]
-    residual = stack.values[used] - matrix @ np.full(model.unknowns, described.mean)
-    length = described.correlation_length
-    pixels = FIRST_LENGTH if length is None else length / stack.camera.target_pitch
-    evidence = Evidence(matrix, residual, _sum(known), (model.camera.rows, model.camera.columns))
-    return fit(evidence, described.variance, pixels, FIRST_NOISE * described.variance if asked else None)
+    residual = stack.values[used] - matrix @ prior.mean
+    shape = (model.camera.rows, model.camera.columns)
+    return fit(Evidence(matrix, residual, known, shape, None if described.kind == "fit" else prior, not asked))
 
 
 def _with_fit(
     stack: Stack, model: Model, prior: Prior, noise: dict[str, Vector], found: Fit
 ) -> tuple[Prior, dict[str, Vector]]:
     """The prior and the noise once they are found; what was found stands for the noise that the scene describes."""
-    described = stack.scene.prior
-    if described.kind == "fit":
+    if found.variance is not None and found.length is not None:
         shape = (model.camera.rows, model.camera.columns)
-        prior = exponential(described.mean, found.variance, shape, found.length)
+        prior = exponential(stack.scene.prior.mean, found.variance, shape, found.length)
     if found.noise_variance is not None:
-        kept = {name: values for name, values in noise.items() if name in ("rendering", "calibration")}
+        kept = {name: noise[name] for name in KEPT if name in noise}
         noise = {**kept, "noise": np.full(noise["rendering"].size, found.noise_variance)}
     return prior, noise
 
@@ -223,15 +247,17 @@ def _sum(noise: dict[str, Vector]) -> Vector:
     return np.sum(list(noise.values()), axis=0)
 
 
-def _feigned(model: Model, left: Left, estimated: Estimate, expected: ExpectedError) -> float:
+def _feigned(model: Model, usable: Usable, estimated: Estimate, expected: ExpectedError) -> float:
     noise = np.full(model.measurements, np.inf)
-    noise[left.used] = estimated.form.problem.noise_variance
+    noise[usable.used] = estimated.form.problem.noise_variance
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
         return float(np.nan_to_num(model.feigned(noise) * expected.variance).max(initial=0.0))
 
 
-def _residual(estimated: Estimate, expected: ExpectedError) -> Residual:
+def _residual(estimated: Estimate, expected: ExpectedError) -> Residual | None:
+    """None where a measurement is said to have no noise: then there is no unit for what is left of it."""
     noise = estimated.form.problem.noise_variance
-    freedoms = noise.size - expected.degrees_of_freedom
-    squares = float(noise @ np.square(estimated.multipliers))
-    return Residual(squares, freedoms, (2 * max(freedoms, 0.0)) ** 0.5)
+    if not noise.size or not estimated.form.problem.noisy:
+        return None
+    freedoms = max(noise.size - expected.degrees_of_freedom, 0.0)
+    return Residual(float(noise @ np.square(estimated.multipliers)), freedoms, (2 * freedoms) ** 0.5)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scenes.errors import InputError
 from scenes.files import make_folder, write_text
 
+from .certificate import NOTHING
 from .estimator import FORMS, TOLERANCE, Estimate, estimate
 from .reference import Reference, reference
 from .residuals import Exact
@@ -85,8 +86,9 @@ def _compared(case: Case, asked: str, found: Estimate, exact: Reference) -> Outc
         variance = found.form.variance()
     size = float(np.linalg.norm(exact.freedoms.high))
     errors = [_share(float(np.linalg.norm(exact.freedoms.away(u))), size) for u in (alone[:, 0], found.freedoms)]
-    wrong = np.abs(exact.variance.away(variance))
     right = exact.variance.high
+    wrong = np.abs(exact.variance.away(variance))
+    wrong[(right == 0) & (wrong <= NOTHING * problem.prior.variance)] = 0.0
     errors.append(float(np.divide(wrong, right, out=np.where(wrong > 0, np.inf, 0.0), where=right > 0).max(initial=0)))
     bound = ANY if solver.bound is None else solver.bound
     promised = (bound, solver.variance_bound)

@@ -46,7 +46,9 @@ def with_lens(scene: Scene, magnification: Fraction) -> Scene:
 def _between(before: Fraction, last: Fraction, end: Fraction) -> list[Fraction]:
     step = 1 / last - 1 / before
     steps = (1 / end - 1 / last) / step if step else Fraction(-1)
-    if steps <= 0 or steps.denominator != 1 or steps > MOST:
+    if steps > MOST:
+        raise InputError(f"--candidates: expected at most {MOST} magnifications, got {int(steps)} up to {end}")
+    if steps <= 0 or steps.denominator != 1:
         raise InputError(f"--candidates: steps of {step} in 1/magnification never reach {end} after {last}")
     return [1 / (1 / last + step * number) for number in range(1, int(steps))]
 

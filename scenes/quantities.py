@@ -83,14 +83,14 @@ Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)
 Samples = Annotated[int, Field(ge=16, le=2**24, description="per sensor pixel; rendered in 16 passes or more")]
 
 
-def _believed(value: object) -> object:
-    if value == "fit" or (isinstance(value, float | int) and not isinstance(value, bool) and 0 <= value < float("inf")):
+def _expected_noise(value: object) -> object:
+    if value == "fit" or (isinstance(value, float | int) and not isinstance(value, bool) and 0 <= value <= 1e24):
         return value if value == "fit" else float(cast(float, value))
-    raise ValueError(f'expected a variance of 0 or more, or "fit", got {value!r}')
+    raise ValueError(f'expected a variance from 0 to 1e24, or "fit", got {value!r}')
 
 
-Believed = Annotated[
+ExpectedNoise = Annotated[
     float | str,
-    BeforeValidator(_believed),
+    BeforeValidator(_expected_noise),
     WithJsonSchema({"anyOf": [{"type": "number", "minimum": 0}, {"const": "fit"}]}),
 ]

@@ -28,9 +28,10 @@ from .errors import InputError
 from .explain import explain
 from .files import write_text
 from .override import apply_overrides, keep_lenses
-from .quantities import Believed, Corner, Length, Magnification, Pair, Samples, Step, pair
+from .quantities import Corner, ExpectedNoise, Length, Magnification, Pair, Samples, Step, pair
 
 FULL_SCALE = 256.0
+LARGEST = 1e12  # of a value: files hold float32, and squares of values have to fit as well
 TRUTH = "truth.exr"
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
@@ -88,10 +89,15 @@ class Camera(_Table):
 class Noise(_Table):
     """What the sensor adds to the light."""
 
-    variance: float = Field(default=0.0, ge=0, description="Gaussian, in squared units of the target's values")
+    variance: float = Field(
+        default=0.0, ge=0, le=LARGEST**2, description="Gaussian, in squared units of the target's values"
+    )
     bits: int | None = Field(default=None, ge=1, le=24, description="of the recorded values; absent: no quantisation")
     saturation: float | None = Field(
-        default=None, description="recorded values stop here; pixels that reach it are left out; absent: none does"
+        default=None,
+        ge=-LARGEST,
+        le=LARGEST,
+        description="recorded values stop here; pixels that reach it are left out; absent: none does",
     )
 
     @property
@@ -112,10 +118,10 @@ class Prior(_Table):
         default="independent",
         description="how pixels go together: not at all; exp(-distance / length); a power of frequency; found by fit",
     )
-    mean: float = 127.5
-    variance: float = Field(default=5461.25, gt=0, description="of every pixel; of kind fit: where the search starts")
+    mean: float = Field(default=127.5, ge=-LARGEST, le=LARGEST)
+    variance: float = Field(default=5461.25, gt=0, le=LARGEST**2, description="of every pixel; kind fit finds it")
     correlation_length: Length | None = Field(
-        default=None, description="on the target, of kind exponential; of kind fit: where the search starts"
+        default=None, description="on the target, of kind exponential; kind fit finds it"
     )
     exponent: float | None = Field(
         default=None, ge=0, le=8, description="a of a power spectrum 1/frequency^a, of kind power; absent: 2"
@@ -125,8 +131,8 @@ class Prior(_Table):
     def _only_what_the_kind_has(self) -> Prior:
         if self.kind == "exponential" and self.correlation_length is None:
             raise ValueError('kind "exponential" needs a correlation_length, such as "10 mm"')
-        if self.kind in ("independent", "power") and self.correlation_length is not None:
-            raise ValueError(f'correlation_length belongs to kind "exponential" or "fit", got kind "{self.kind}"')
+        if self.kind != "exponential" and self.correlation_length is not None:
+            raise ValueError(f'correlation_length belongs to kind "exponential", got kind "{self.kind}"')
         if self.kind != "power" and self.exponent is not None:
             raise ValueError(f'exponent belongs to kind "power", got kind "{self.kind}"')
         return self
@@ -135,7 +141,7 @@ class Prior(_Table):
 class Estimator(_Table):
     """How the image is estimated."""
 
-    noise_variance: Believed | None = Field(
+    noise_variance: ExpectedNoise | None = Field(
         default=None, description='what the estimator expects; "fit": found from the stack; absent: all that is known'
     )
     method: Literal[

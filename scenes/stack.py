@@ -90,11 +90,14 @@ def read(path: Path) -> Stack:
             raise InputError(
                 f"{path}: part '{part.name}' should hold Y and variance of {sub.type.pixels}, got {shapes}"
             )
+    variance = _flat(parts, "variance")
+    if (variance < 0).any():
+        raise InputError(f"{path}: holds variances below 0; make it again")
     return Stack(
         scene=scene,
         camera=camera,
         values=_flat(parts, "Y"),
-        variance=_flat(parts, "variance"),
+        variance=variance,
         record=first["record"],
     )
 

@@ -100,6 +100,7 @@ def activate(variant: str) -> None:
         logger.set_log_level(mi.LogLevel.Warn)
 
 
+INTERRUPTED = "Received interrupt signal"  # on which whoever asked for it hears the command line's own sentence
 _APPENDERS: dict[str, Any] = {}
 
 
@@ -111,7 +112,8 @@ def _stderr_appender() -> Any:
         class Stderr(mi.Appender):
             def append(self, level: object, text: str) -> None:
                 del level
-                print(text, file=sys.stderr)
+                if INTERRUPTED not in text:
+                    print(text, file=sys.stderr)
 
             def log_progress(self, *arguments: object) -> None:
                 del arguments

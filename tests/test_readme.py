@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from ommatid import app
 from scenes.explain import known_keys
 from scenes.scene import Scene
 
@@ -104,7 +105,9 @@ def test_pictures_exist() -> None:
         assert (ROOT / picture).is_file()
 
 
-@pytest.mark.parametrize("command", ["run", "render", "calibrate", "reconstruct", "predict", "show", "export", "init"])
+@pytest.mark.parametrize(
+    "command", [command.callback.__name__ for command in app.registered_commands if command.callback]
+)
 def test_every_command_is_listed_and_helps(command: str) -> None:
     assert f"`ommatid {command}" in TEXT
     ended = subprocess.run([str(OMMATID), command, "--help"], capture_output=True, text=True, check=True)

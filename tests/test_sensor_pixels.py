@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruct import report
-from reconstruct.restore import Restoration, restore, usable
+from reconstruct.restore import Restoration, restore, usable_pixels
 from scenes import stack as stacks
 from scenes.camera import derive
 from scenes.errors import InputError
@@ -58,7 +58,7 @@ def test_dead_pixels_are_left_out_and_counted() -> None:
     dead[[0, 17, 400]] = True
     broken = replace(stack, values=np.where(dead, np.nan, stack.values))
     found = restore(broken, model, truth)
-    assert (found.left.dead, found.left.saturated, int(found.left.used.sum())) == (3, 0, 703)
+    assert (found.usable.dead, found.usable.saturated, int(found.usable.used.sum())) == (3, 0, 703)
     whole = restore(stack, model, truth)
     assert found.expected.mse > whole.expected.mse
     assert np.isfinite(found.estimate).all()
@@ -76,12 +76,14 @@ def test_saturated_pixels_are_left_out(bits: int | None) -> None:
     stack, model, truth = recorded(scene(lenses=THREE, noise=noise))
     assert stack.values.max() == 30.3
     found = restore(stack, model, truth)
-    assert found.left.saturated > 30
+    assert found.usable.saturated > 30
     assert found.error is not None
     assert found.interval is not None
     assert found.error.mse < found.interval.high
     blind = replace(stack, scene=stack.scene.model_copy(update={"noise": Noise(variance=1.0, bits=bits)}))
     believed = restore(blind, model, truth).residual
+    assert believed is not None
+    assert found.residual is not None
     assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
     assert abs(believed.chi_squared - believed.expected) > 4 * believed.deviation
 
@@ -90,7 +92,7 @@ def test_saturation_survives_the_file(tmp_path: Path) -> None:
     """The stack holds float32: a level that float32 rounds down is still known."""
     stack, _, _ = recorded(scene(lenses=THREE, noise={"variance": 1.0, "saturation": 30.3}))
     stacks.write(tmp_path / "stack.exr", stack)
-    assert usable(stacks.read(tmp_path / "stack.exr")).saturated == usable(stack).saturated > 0
+    assert usable_pixels(stacks.read(tmp_path / "stack.exr")).saturated == usable_pixels(stack).saturated > 0
 
 
 def test_a_stack_of_which_nothing_is_left_gives_the_prior_and_says_so() -> None:
@@ -105,7 +107,7 @@ def test_a_stack_of_which_nothing_is_left_gives_the_prior_and_says_so() -> None:
         found = restore(nothing, model, truth)
         assert found.estimate == pytest.approx(np.full(361, 99.0))
         assert found.expected.variance == pytest.approx(np.full(361, 16.0))
-        assert found.left.dead == 706
+        assert found.usable.dead == 706
         assert "no sensor pixel is left" in rows(found, nothing, model)["do not look for the image here"]
 
 
@@ -122,8 +124,10 @@ def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:
 
 def test_chi_squared_of_the_residual_tells_a_wrong_noise() -> None:
     right = restored(scene(lenses=THREE, noise=SENSOR))
+    assert right.residual is not None
     assert abs(right.residual.chi_squared - right.residual.expected) < 4 * right.residual.deviation
     wrong = restored(scene(lenses=THREE, noise=SENSOR, estimator={"noise_variance": 0.25}))
+    assert wrong.residual is not None
     assert wrong.residual.chi_squared > wrong.residual.expected + 10 * wrong.residual.deviation
 
 
@@ -137,7 +141,7 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     assert found.error is not None
     assert found.error.mse < paper.error.mse / 3
     assert found.fit is not None
-    assert found.fit.noise_variance == pytest.approx(1.0, rel=4 * found.fit.uncertainty[2])
+    assert found.fit.noise_variance == pytest.approx(1.0, rel=4 * found.fit.spread[2])
     lines = rows(found, stack, model)
     assert {"found: variance", "found: correlation length", "found: noise variance"} <= set(lines)
     known = restored(scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}))
@@ -145,7 +149,7 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     assert known.fit.noise_variance is None
     noise_alone = restored(scene(lenses=THREE, noise={"variance": 9.0}, estimator={"noise_variance": "fit"}))
     assert noise_alone.fit is not None
-    assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.uncertainty[2])
+    assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.spread[0])
     assert noise_alone.estimated.form.problem.prior.independent
 
 
@@ -185,3 +189,51 @@ def test_a_region_from_the_command_line(kept: Path, ommatid: Command) -> None:
     assert "mean of 4 x 5 pixels at 2, 3" in ommatid("reconstruct", *files, "2,3,4,5").out
     for wrong in ("2,3", "a,b,c,d", "0,0,99,99"):
         assert ommatid("reconstruct", *files, wrong).code == 2
+
+
+def test_nothing_that_is_no_number_is_printed(kept: Path, ommatid: Command) -> None:
+    """What a scene file may hold stays inside float32: beyond it is refused, and JSON has no Infinity."""
+    files = ("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "far.exr", "--json", "--set")
+    for setting in ("prior.mean=1e300", "prior.variance=1e300", "estimator.noise_variance=1e300"):
+        ended = ommatid(*files, setting)
+        assert (ended.code, ended.out) == (2, "")
+        assert setting.split("=")[0] in ended.err
+    document(ommatid(*files, "prior.mean=1e12"))
+
+
+def test_variances_below_nothing_are_refused(kept: Path, ommatid: Command) -> None:
+    stack = stacks.read(kept / "stack.exr")
+    variance = stack.variance.copy()
+    variance[0] = -1.0
+    stacks.write(kept / "stack.exr", replace(stack, variance=variance))
+    ended = ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "below.exr")
+    assert ended.code == 2
+    assert "variances below 0" in ended.err
+
+
+def test_without_noise_there_is_no_chi_squared() -> None:
+    stack, model, truth = recorded(scene(lenses=THREE, noise={"variance": 0.0}, estimator={"noise_variance": 0.0}))
+    found = restore(stack, model, truth)
+    assert found.residual is None
+    assert "chi-squared of the residual" not in rows(found, stack, model)
+    assert found.estimate == pytest.approx(truth, rel=1e-6)
+
+
+@pytest.mark.parametrize("told", [{"noise_variance": "fit"}, {}])
+def test_a_fit_with_an_uncertain_h(told: dict[str, Any]) -> None:
+    """What the uncertainty of H adds is taken at the fitted image: chi-squared is as expected."""
+    described = scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}, estimator=told)
+    stack, model, truth = recorded(described)
+    rng = np.random.default_rng(0)
+    spread = 0.002 * rng.normal(size=model.matrix.nnz)
+    uncertain = replace(
+        model,
+        matrix=model.matrix
+        + type(model.matrix)((spread, model.matrix.indices, model.matrix.indptr), model.matrix.shape),
+        variance=np.full(model.matrix.nnz, 0.002**2),
+    )
+    found = restore(stack, uncertain, truth)
+    assert found.residual is not None
+    assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
+    assert found.fit is not None
+    assert not found.fit.doubtful

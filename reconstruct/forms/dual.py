@@ -146,4 +146,3 @@ def _eliminated(whole: Matrix) -> tuple[Matrix, Matrix, Indices, int]:
         rank += diagonal.size if sound.all() else max(int(np.argmin(sound)), 1)
     triangle = triangle[:rank]
     return orthogonal[:, :rank], np.where(np.abs(triangle) > rounding[order], triangle, 0.0), order, rank
-

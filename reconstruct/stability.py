@@ -175,7 +175,8 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         worst: dict[str, Any] = min(solved, key=lambda case: float(case[field]))
         lines.append((name, f"{worst[field]:.1f}: {worst['case']}, {worst['ran']}"))
     refused = [case["case"] for case in summary["cases"] if case["verdict"] == REFUSED]
-    lines += [(f"refused: {name}", "the sentence is in stability.md") for name in refused]
+    if refused:
+        lines.append(("refused, with the sentence in stability.md", "; ".join(refused)))
     return [*lines, ("files", ", ".join(summary["files"]))]
 
 

@@ -93,7 +93,7 @@ def variance_error(form: Form, exactly: Exact) -> float:
         # Where neither knows better than 0, 0 it is.
         zero = (variance[pixels] == 0) & (right <= doubt) & (doubt <= NOTHING * prior.variance[pixels])
         wrong = np.where(zero, 0.0, np.abs(variance[pixels] - right) + doubt)
-        worst = _worst(np.divide(wrong, right, out=np.where(wrong > 0, np.inf, 0.0), where=right > 0))
+        worst = _worst(_relative(wrong, right))
         if count > FEW:
             signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, 1))
             nothing = exact(np.zeros((form.problem.measurements, 1)))
@@ -248,7 +248,8 @@ def _infinite(pairs: tuple[Parts, Parts]) -> Vector:
 
 
 def _relative(error: Vector, size: Vector) -> Vector:
-    return np.divide(error, size, out=np.where(error > 0, np.inf, 0.0), where=size > 0)
+    # What is no number is no zero.
+    return np.divide(error, size, out=np.where(error == 0, 0.0, np.inf), where=size > 0)
 
 
 def _worst(bound: Vector) -> float:

@@ -86,12 +86,15 @@ def test_tiles_share_the_measurements_out() -> None:
     )
 
 
-@pytest.mark.parametrize("noise", [400.0, 100.0, 1.0, 1e-2, 1e-6])
-@pytest.mark.parametrize(("variance", "length"), [(3000.0, 8.0), (50.0, 3.0)])
+# Signal and noise: of images that noise nearly drowns to those that it hardly touches.
+KNOWN = [(3000.0, 8.0, noise) for noise in (400.0, 100.0, 1.0, 1e-2, 1e-6)] + [
+    (50.0, 3.0, noise) for noise in (1.0, 1e-2, 1e-6)
+]
+
+
+@pytest.mark.parametrize(("variance", "length", "noise"), KNOWN)
 def test_what_the_stack_was_drawn_from_is_found(noise: float, variance: float, length: float) -> None:
     """Within four of its own standard deviations, wherever signal drowns noise or noise does not drown it."""
-    if noise > variance:
-        pytest.skip("more noise than signal: nothing can be found")
     found = fit(evidence(drawn(exponential(0.0, variance, SHAPE, length), 2), 0.0, noise, 3))
     assert not found.doubtful
     assert found.measurements == 706

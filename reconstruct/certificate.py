@@ -140,10 +140,9 @@ class _Judge:
         return residuals, _relative(distance, size)
 
     def _contradictions(self, residuals: Parts, doubts: Parts) -> Parts:
-        """Doubts of measurements without noise that contradict one another.
+        """Doubts of measurements without noise that contradict one another, with whatever weights that is shared out.
 
-        With what weights the contradiction is shared out is arbitrary, so every one is as doubtful, in proportion to
-        its size, as the worst of them, and no less than a float64 is.
+        Every one is as doubtful, in proportion to its size, as the worst of them, and no less than a float64 is.
         """
         silent = (self.exactly.problem.noise_variance == 0)[:, None]
         left, doubt = np.abs(residuals[1]), doubts[1]
@@ -208,14 +207,10 @@ class _Judge:
         return met and bool((error[:PROBES] <= GIVEN_BACK).all()), met and bool((error <= GIVEN_BACK).all())
 
     def _meets(self, shift: Matrix) -> bool:
-        """Whether corrections meet r = 0 in measurements without noise, far below rounding.
-
-        If not, the form has taken for dependent what depends on rounding only, and what it finds is arbitrary.
-        """
+        """Whether corrections meet r = 0 without noise, far below rounding; else what is dependent is arbitrary."""
         right = exact(shift), exact(np.zeros((self.exactly.problem.measurements, shift.shape[1])))
         found: Pair = exact(np.zeros_like(shift)), right[1]
-        p: Matrix = shift
-        q: Matrix = right[1].high
+        p, q = shift, right[1].high
         for _ in range(MEETINGS):
             change, step = self.form.solve(p, q)
             found = found[0] + exact(change), found[1] + exact(step)
@@ -248,8 +243,7 @@ def _infinite(pairs: tuple[Parts, Parts]) -> Vector:
 
 
 def _relative(error: Vector, size: Vector) -> Vector:
-    # What is no number is no zero.
-    return np.divide(error, size, out=np.where(error == 0, 0.0, np.inf), where=size > 0)
+    return np.divide(error, size, out=np.where(error == 0, 0.0, np.inf), where=size > 0)  # NaN is no zero
 
 
 def _worst(bound: Vector) -> float:

@@ -106,6 +106,45 @@ def test_nasty_problems_are_right_to_the_tolerance_or_refused(seed: int) -> None
         assert min(outcome.refined, outcome.variance) >= 7  # the tolerance, and ten for the sample
 
 
+def graded(seed: int) -> tuple[Problem, Vector]:
+    """A larger one: rows, columns or entries over many decades, null spaces exact or nearly so, correlated pixels."""
+    rng = np.random.default_rng(seed)
+    m, n = rng.integers(1, 25, 2)
+    draws = (
+        lambda: rng.integers(-3, 4, (m, n)).astype(float),
+        lambda: (rng.integers(-2, 3, (m, 3)) @ rng.integers(-2, 3, (3, n))).astype(float),
+        lambda: rng.normal(size=(m, 3)) @ rng.normal(size=(3, n)),
+        lambda: rng.normal(size=(m, n)) * 10.0 ** rng.uniform(-8, 8, (m, n)),
+    )
+    dense = draws[rng.integers(len(draws))]()
+    if rng.random() < 0.3:
+        dense *= 2.0 ** rng.integers(-30, 30, (m, 1))
+    if rng.random() < 0.3:
+        dense *= 2.0 ** rng.integers(-20, 20, (1, n))
+    if rng.random() < 0.3:
+        dense[rng.random((m, n)) < 0.6] = 0.0
+    root = np.full(n, 10.0 ** rng.uniform(-15, 15))
+    if rng.random() < 0.3:
+        root = rng.integers(-4, 5, (n, rng.integers(1, n + 2))).astype(float)
+    noise = 10.0 ** rng.uniform(-30, 12, m) if rng.random() < 0.3 else np.full(m, 10.0 ** rng.uniform(-30, 12))
+    noise[rng.random(m) < rng.choice([0.0, 0.1, 1.0])] = 0.0
+    prior = Prior(rng.normal(size=n) * rng.choice([0, 1, 100]), root)
+    matrix = sparse.csr_array(dense)
+    image = prior.mean + prior.spread(rng.normal(size=prior.freedoms))
+    g = matrix @ image + np.sqrt(noise) * rng.normal(size=m)
+    return Problem(matrix, prior, noise), g.astype(np.float32).astype(float) if rng.random() < 0.1 else g
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=250, deadline=None, derandomize=True)
+def test_graded_problems_are_never_wrong_in_silence(seed: int) -> None:
+    problem, g = graded(seed)
+    case = Case("graded", problem.matrix, problem.prior, problem.noise_variance, g)
+    exact = reference(problem, g)
+    asked = AUTO if seed % 3 else sorted(FORMS)[seed % len(FORMS)]
+    assert judged(case, asked, exact).verdict != SILENT
+
+
 def test_most_nasty_problems_are_solved() -> None:
     """Refusing everything would be no silent loss either."""
     solved = 0

@@ -35,6 +35,7 @@ EPS = float(np.finfo(np.float64).eps)
 ENOUGH = 1e-15  # relative: float64 holds no more
 GIVEN_BACK = 1e-4  # relative error of a known u, above which a form is not believed about errors
 PROBES = 3
+DRAWS = 6  # of signs for what contradicts: the few rows of a contradiction may all be met by chance
 MEETINGS = 4  # solutions after which measurements without noise must be met
 FAR_BELOW = 1e4  # times the rounding of twice the precision: some 1e-26 of the values
 SAFETY = 10  # for variances, of which not all are checked and which expected errors add up
@@ -136,7 +137,7 @@ class _Judge:
             distance = np.fmin(distance, self._believed(parts, doubts)[0])
         if not self.exactly.problem.noisy:
             silent = self._silent(parts), self._silent(self._contradictions(parts, doubts))
-            distance += self._believed(*silent)[0] if self.trusted[0] else _infinite(silent)
+            distance += self._believed(*silent, draws=DRAWS)[0] if self.trusted[0] else _infinite(silent)
         return residuals, _relative(distance, size)
 
     def _contradictions(self, residuals: Parts, doubts: Parts) -> Parts:
@@ -178,16 +179,15 @@ class _Judge:
         noisy = self.exactly.problem.noise_variance > 0
         return np.zeros_like(parts[0]), np.where(noisy[:, None], 0.0, parts[1])
 
-    def _believed(self, residuals: Parts, doubts: Parts) -> tuple[Vector, Vector]:
+    def _believed(self, residuals: Parts, doubts: Parts, draws: int = 1) -> tuple[Vector, Vector]:
         """Twice what the form makes of residuals and of their rounding, with signs by chance: |u|, and u p - l q."""
-        signs = np.random.default_rng(0)
-        rounded = tuple(doubt * signs.choice([-1.0, 1.0], doubt.shape) for doubt in doubts)
-        distance, energy = np.zeros((2, self.shift.shape[1]))
-        for p, q in (residuals, rounded):
-            u, pull = self.form.solve(p, q)
-            distance += 2 * _norms(u)
-            energy += 2 * (np.abs(np.sum(u * p, axis=0)) + np.abs(np.sum(pull * q, axis=0)))
-        return distance, 2 * energy
+        rng = np.random.default_rng(0)
+        signs = [[rng.choice([-1.0, 1.0], part.shape) for part in doubts] for _ in range(draws)]
+        parts = [residuals, *((doubts[0] * p, doubts[1] * q) for p, q in signs)]
+        solved = [(self.form.solve(p, q), p, q) for p, q in parts]
+        distances = [_norms(u) for (u, _), _, _ in solved]
+        energies = [np.abs(np.sum(u * p, axis=0)) + np.abs(np.sum(pull * q, axis=0)) for (u, pull), p, q in solved]
+        return 2 * (distances[0] + np.max(distances[1:], axis=0)), 4 * (energies[0] + np.max(energies[1:], axis=0))
 
     @cached_property
     def trusted(self) -> tuple[bool, bool]:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -22,8 +24,12 @@ from scenes.errors import DeniedError, InputError
 if TYPE_CHECKING:
     from reconstruct.accuracy import Prediction
     from scenes.camera import Camera
+    from scenes.parcel import Outcome, Parcel, Stages, Watch
     from scenes.picture import Image
     from scenes.scene import Noise, Scene
+    from scenes.stack import Stack
+    from scenes.workers import Ended
+    from scenes.workers import Workers as Crew
 
 app = typer.Typer(
     add_completion=False,
@@ -46,51 +52,80 @@ Lenses = Annotated[
 ]
 INTERRUPTED = 130  # what the parser makes of Ctrl-C
 
+Scheduler = Annotated[
+    str,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Send the scenes to the Dask cluster there: tcp://host:port."),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", metavar="N", min=1, help="Share the scenes among N processes on this machine."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
 Progress = Callable[[float], None]
 
 
 @app.command()
 def run(
-    scenes: SceneFiles, output: Folder = Path("out"), sets: Sets = None, lens: Lenses = "", as_json: Json = False
+    scenes: SceneFiles,
+    output: Folder = Path("out"),
+    sets: Sets = None,
+    lens: Lenses = "",
+    scheduler: Scheduler = "",
+    workers: Workers = None,
+    as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
 
-    def work(path: Path, folder: Path) -> dict[str, Any]:
-        from reconstruct.memory import refuse_too_large
+    def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
         from reconstruct.report import rows
-        from reconstruct.results import kept_results
-        from simulate.kept import kept_model
 
-        scene, camera, image = _opened(path, sets, lens)
-        correlated = scene.prior.kind != "independent"
-        refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method, correlated=correlated)
-        stack = _rendered(scene, camera, image, folder)
-        with _progress("calibrate") as progress:
-            model, made = kept_model(folder / "model.npz", scene, camera, progress)
-        _say(f"calibrate: {_done(made)}")
-        names = (folder / "stack.exr", folder / "model.npz")
-        description, made = kept_results(folder, stack, model, names)
-        _say(f"reconstruct: {_done(made)}")
         if not as_json:
-            _table(f"{scene.title or path.stem}: {folder}", rows(description))
+            _table(f"{scene.title or scene.source.stem}: {folder}", rows(description))
         return description
 
-    _each(scenes, output, work, as_json)
+    _each(scenes, output, _Batch(sets, lens, stages_of_run, tell), scheduler, workers, as_json)
 
 
 @app.command()
 def render(
-    scenes: SceneFiles, output: Folder = Path("out"), sets: Sets = None, lens: Lenses = "", as_json: Json = False
+    scenes: SceneFiles,
+    output: Folder = Path("out"),
+    sets: Sets = None,
+    lens: Lenses = "",
+    scheduler: Scheduler = "",
+    workers: Workers = None,
+    as_json: Json = False,
 ) -> None:
     """Render the sub-images alone."""
 
-    def work(path: Path, folder: Path) -> dict[str, Any]:
-        scene, camera, image = _opened(path, sets, lens)
-        stack = _rendered(scene, camera, image, folder)
-        return {"file": str(folder / "stack.exr"), "sub_images": len(camera.sub_imagers), **stack.record}
+    def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+        del scene
+        return {"file": str(folder / "stack.exr"), **description}
 
-    _each(scenes, output, work, as_json)
+    _each(scenes, output, _Batch(sets, lens, stages_of_render, tell), scheduler, workers, as_json)
+
+
+def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
+    """What `run` does of a scene, here or on a worker, and says of it."""
+    from reconstruct.choice import choose
+    from reconstruct.results import kept_results
+    from simulate.kept import kept_model
+
+    choose(scene, camera, scene.calibration.method == "ideal")  # what memory does not hold is refused before any work
+    stack = _rendered(scene, camera, image, folder, watch)
+    with watch.progress("calibrate") as progress:
+        model, made = kept_model(folder / "model.npz", scene, camera, progress)
+    watch.done("calibrate", made)
+    with watch.progress("reconstruct") as progress:
+        description, made = kept_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
+    watch.done("reconstruct", made)
+    return description
+
+
+def stages_of_render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
+    """What `render` does of a scene, here or on a worker, and says of it."""
+    stack = _rendered(scene, camera, image, folder, watch)
+    return {"sub_images": len(camera.sub_imagers), **stack.record}
 
 
 @app.command()
@@ -108,7 +143,7 @@ def calibrate(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses 
         model, made = kept_model(output, described, camera, progress)
     _say(f"calibrate: {_done(made)}, {output}")
     if as_json:
-        facts = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": int(model.matrix.nnz)}
+        facts = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
         _print_json({"file": str(output), **facts, **model.record})
 
 
@@ -122,6 +157,13 @@ def reconstruct(
     region: Annotated[
         str, typer.Option("--region", metavar="ROW,COLUMN,ROWS,COLUMNS", help="Mean of a region and its error bar.")
     ] = "",
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", metavar="ADDRESS", help="Send the tiles of a frame to this Dask scheduler.")
+    ] = "",
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", metavar="N", min=1, help="Share the tiles of a frame among N processes."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Reconstruct from files alone."""
@@ -131,10 +173,12 @@ def reconstruct(
     from reconstruct.restore import refuse_outside
     from scenes.files import refuse_output
     from scenes.scene import TRUTH
+    from scenes.workers import refuse_options
 
     if output.suffix == ".png":
         raise InputError(f"{output}: expected the name of an OpenEXR file, such as {output.with_suffix('.exr')}")
     corner, size = _region(region)
+    refuse_options(scheduler, workers)
     refuse_output(output, stack, model, stack.parent / TRUTH)
     recorded, calibrated = scenes.stack.read(stack), scenes.model.read(model)
     if lens:
@@ -142,7 +186,8 @@ def reconstruct(
     refuse_outside(corner, size, (recorded.camera.rows, recorded.camera.columns))
     recorded = results.changed(recorded, sets or [], stack)
     truth = results.truth_beside(stack, recorded)
-    restoration, description = results.reconstruct(recorded, calibrated, truth, (stack, model))
+    with _crew(scheduler, workers) as crew, _progress("reconstruct") as progress:
+        restoration, description = results.reconstruct(recorded, calibrated, truth, (stack, model), crew, progress)
     if region:
         mean, deviation = restoration.region(corner, size)
         description["region"] = {"corner": corner, "size": size, "mean": mean, "deviation": deviation}
@@ -258,13 +303,16 @@ def stability(output: Folder = Path("stability"), as_json: Json = False) -> None
 @app.command()
 def show(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
     """The geometry, the plan, and what is left out."""
+    from reconstruct.choice import choose as choose_way
     from scenes.camera import derive
     from scenes.scene import read
     from scenes.show import describe, sections
     from simulate.variant import choose
 
     described = read(scene, sets or (), _names(lens))
-    description = describe(described, derive(described), choose(described.render.variant))
+    camera = derive(described)
+    choice = choose_way(described, camera, described.calibration.method == "ideal")
+    description = describe(described, camera, choose(described.render.variant), choice.plan())
     if as_json:
         _print_json(description)
     else:
@@ -384,25 +432,153 @@ class _Worst(Exception):
         self.code = code
 
 
-def _each(paths: list[Path], output: Path, work: Callable[[Path, Path], dict[str, Any]], as_json: bool) -> None:
+@dataclass(frozen=True)
+class _Batch:
+    """What is asked of every scene: changes, the stages, and what to tell the user when they are done."""
+
+    sets: list[str] | None
+    lens: str
+    stages: Stages
+    tell: Callable[[Scene, Path, dict[str, Any]], dict[str, Any]]
+
+    def opened(self, path: Path) -> tuple[Scene, Camera, Image]:
+        return _opened(path, self.sets, self.lens)
+
+    def work(self, path: Path, folder: Path) -> dict[str, Any]:
+        """Do one scene in this process."""
+        from scenes.parcel import Watch
+
+        scene, camera, image = self.opened(path)
+        watch = Watch(_progress, partial(_say_done, folder))
+        return self.tell(scene, folder, self.stages(scene, camera, image, folder, watch))
+
+
+def _each(paths: list[Path], output: Path, batch: _Batch, scheduler: str, workers: int | None, as_json: bool) -> None:
     """Do every scene of a batch, whatever happens to the others; then end with the worst exit code."""
     stems = [path.stem for path in paths]
     for stem in stems:
         if stems.count(stem) > 1:
             raise InputError(f"{output / stem}: two scenes of the batch are called '{stem}'; rename one of them")
-    results: list[dict[str, Any]] = []
+    folders = {path: output / path.stem for path in paths}
+    results: dict[Path, dict[str, Any]] = {}
     worst = 0
-    for path in paths:
+    works = _sent(folders, batch, scheduler, workers) if scheduler or workers else _here(folders, batch)
+    for path, work in works:
         try:
-            results.append({"scene": str(path), **work(path, output / path.stem)})
+            results[path] = {"scene": str(path), **work()}
         except Exception as error:
             code = _complain(error)
-            results.append({"scene": str(path), "error": str(error), "exit_code": code})
+            results[path] = {"scene": str(path), "error": str(error), "exit_code": code}
             worst = max(worst, code)
     if as_json:
-        _print_json(results)
+        _print_json([results[path] for path in paths])
     if worst:
         raise _Worst(worst)
+
+
+Works = Generator[tuple[Path, Callable[[], dict[str, Any]]]]
+
+
+def _here(folders: dict[Path, Path], batch: _Batch) -> Works:
+    for path, folder in folders.items():
+        yield path, partial(batch.work, path, folder)
+
+
+def _sent(folders: dict[Path, Path], batch: _Batch, scheduler: str, count: int | None) -> Works:
+    """Send the scenes to workers: each as it ends, what is wrong with it already here first of all."""
+    from scenes.parcel import carry_out
+    from scenes.workers import refuse_options, workers
+
+    refuse_options(scheduler, count)
+    scenes: dict[Path, Scene] = {}
+    for path, folder in folders.items():
+        try:
+            scene, _, image = batch.opened(path)
+            _prepare(scene, image, folder)
+            scenes[path] = scene
+        except Exception as error:
+            yield path, partial(_raise, error)
+    if not scenes:
+        return
+    with workers(scheduler, count and min(count, len(scenes))) as pool:
+        pool.refuse_differences(partial(facts, any(scene.render.variant == "auto" for scene in scenes.values())))
+        parcels = _Parcels(batch, [(path, folders[path]) for path in scenes])
+        try:
+            for ended in pool.each(partial(carry_out, batch.stages), parcels):
+                path = parcels.sent[ended.place]
+                yield path, partial(_finished, batch, path, scenes.pop(path), folders[path], ended)
+        except DeniedError as error:
+            parcels.failed |= {path: DeniedError(f"{path}: {error}") for path in scenes}
+    for path in scenes:
+        yield path, partial(_raise, parcels.failed[path])
+
+
+class _Parcels:
+    """The scenes of a batch, opened again one by one as workers are free: the pictures of all might be too many."""
+
+    def __init__(self, batch: _Batch, places: list[tuple[Path, Path]]) -> None:
+        self.sent: list[Path] = []
+        self.failed: dict[Path, Exception] = {}
+        self._batch = batch
+        self._places = places
+
+    def __iter__(self) -> Iterator[Parcel]:
+        from scenes.parcel import packed
+
+        for path, folder in self._places:
+            try:
+                parcel = packed(*self._batch.opened(path), folder)
+            except Exception as error:  # removed meanwhile
+                self.failed[path] = error
+                continue
+            self.sent.append(path)
+            yield parcel
+
+
+def _finished(batch: _Batch, path: Path, scene: Scene, folder: Path, ended: Ended[Outcome]) -> dict[str, Any]:
+    """Take in what a worker made of a scene. Raises what stopped it there."""
+    from scenes.parcel import unpack
+
+    try:
+        outcome = ended.result()
+    except DeniedError as error:
+        raise DeniedError(f"{path}: {error}") from error
+    unpack(outcome, folder)
+    for stage, made in outcome.done.items():
+        _say_done(folder, stage, made)
+    if outcome.error is not None:
+        raise outcome.error
+    return batch.tell(scene, folder, outcome.description)
+
+
+def facts(chosen: bool) -> dict[str, str]:
+    """What has to be the same on all machines for results to be the same; `chosen`: the variant is left to them."""
+    from scenes.versions import versions
+
+    found = versions("mitsuba", "drjit", "scipy")
+    if chosen:
+        from simulate.variant import choose
+
+        found["the variant that render.variant 'auto' stands for"] = choose("auto")
+    return found
+
+
+def _raise(error: Exception) -> dict[str, Any]:
+    raise error
+
+
+@contextmanager
+def _crew(scheduler: str, count: int | None) -> Generator[Crew | None]:
+    """Workers for the tiles of a frame; none where they are done by threads of this process."""
+    from scenes.versions import versions
+    from scenes.workers import workers
+
+    if not scheduler and count is None:
+        yield None
+        return
+    with workers(scheduler, count) as crew:
+        crew.refuse_differences(partial(versions, "scipy"))
+        yield crew
 
 
 def _opened(path: Path, sets: list[str] | None, lens: str) -> tuple[Scene, Camera, Image]:
@@ -419,37 +595,50 @@ def _opened(path: Path, sets: list[str] | None, lens: str) -> tuple[Scene, Camer
 def _predicted(scene: Scene) -> Prediction:
     """What Eq. 5 and the ideal model promise of a scene."""
     from reconstruct.accuracy import predict
-    from reconstruct.memory import refuse_too_large
+    from reconstruct.choice import choose
+    from reconstruct.foresight import predict_large
     from reconstruct.prior import prior_of
     from scenes.camera import derive
-    from simulate.ideal import ideal_matrix
+    from simulate.ideal import ideal_matrix, ideal_model
 
     camera = derive(scene)
-    correlated = scene.prior.kind != "independent"
-    refuse_too_large(camera.measurements, camera.unknowns, scene.estimator.method, correlated=correlated)
+    choice = choose(scene, camera, exact=True)
     noise, shape = scene.noise, (camera.rows, camera.columns)
     actual = noise.variance + noise.quantisation_variance if noise else 0.0
+    if choice.way != "dense":
+        return predict_large(choice, ideal_model(scene, camera), actual)
     prior = prior_of(scene.prior, shape, camera.target_pitch)
     return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape)
 
 
-def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path) -> Any:
+def _prepare(scene: Scene, image: Image, folder: Path) -> None:
+    """Make the folder of a scene, with the scene and its target in it. Raises InputError or DeniedError."""
     from scenes.files import make_folder, refuse_output
     from scenes.picture import write_truth
     from scenes.scene import TRUTH, resolved, write
+
+    make_folder(folder)
+    for name in ("scene.toml", TRUTH):
+        refuse_output(folder / name, scene.source, Path(scene.target.image))
+    rows, columns = image.shape
+    write(folder / "scene.toml", resolved(scene, (rows, columns)))
+    write_truth(folder / TRUTH, image)
+
+
+def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> Stack:
     from simulate.kept import kept_stack
     from simulate.variant import choose
 
     choose(scene.render.variant)
-    make_folder(folder)
-    for name in ("scene.toml", TRUTH):
-        refuse_output(folder / name, scene.source, Path(scene.target.image))
-    write(folder / "scene.toml", resolved(scene, (camera.rows, camera.columns)))
-    write_truth(folder / TRUTH, image)
-    with _progress("render") as progress:
+    _prepare(scene, image, folder)
+    with watch.progress("render") as progress:
         stack, made = kept_stack(folder / "stack.exr", scene, camera, image, progress)
-    _say(f"render: {_done(made)}, {folder / 'stack.exr'}")
+    watch.done("render", made)
     return stack
+
+
+def _say_done(folder: Path, stage: str, made: bool) -> None:
+    _say(f"{stage}: {_done(made)}" + (f", {folder / 'stack.exr'}" if stage == "render" else ""))
 
 
 def _region(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -500,4 +689,6 @@ def _progress(stage: str) -> Generator[Progress]:
 
 
 if __name__ == "__main__":
-    main()
+    import ommatid  # by the name under which workers find its functions
+
+    ommatid.main()

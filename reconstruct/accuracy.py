@@ -87,14 +87,15 @@ def _observability(values: NDArray[np.float64], unknowns: int) -> Observability:
 class Prediction:
     """What Eq. 5 promises of a camera before anything is rendered.
 
+    rank, null_space, condition : of H, None for frames
     degrees_of_freedom : trace of A H;  resolution : median width of the averaging kernel, in pixels of f
     """
 
     measurements: int
     unknowns: int
-    rank: int
-    null_space: int
-    condition: float
+    rank: int | None
+    null_space: int | None
+    condition: float | None
     mse: float
     trimmed_mse: float | None
     trim: int
@@ -148,12 +149,20 @@ def rows(prediction: Prediction) -> list[tuple[str, str]]:
     return [
         ("measurements", str(prediction.measurements)),
         ("unknowns", str(prediction.unknowns)),
-        ("rank of H", str(prediction.rank)),
-        ("null space", f"{prediction.null_space} dimensions"),
-        ("condition of H", f"{prediction.condition:.4g} (largest over smallest singular value above zero)"),
+        *_rank_rows(prediction),
         ("expected squared error (Eq. 5)", f"{prediction.mse:.6g} a pixel, a deviation of {deviation:.3g} of 255"),
         (f"  without a border of {prediction.trim} pixels", inner),
         ("degrees of freedom", f"{prediction.degrees_of_freedom:.6g} of {prediction.unknowns}"),
         ("resolution, median", width),
         ("form of the estimator", prediction.method),
+    ]
+
+
+def _rank_rows(prediction: Prediction) -> list[tuple[str, str]]:
+    if prediction.rank is None or prediction.condition is None:
+        return [("rank of H", "not computed for a frame of this size")]
+    return [
+        ("rank of H", str(prediction.rank)),
+        ("null space", f"{prediction.null_space} dimensions"),
+        ("condition of H", f"{prediction.condition:.4g} (largest over smallest singular value above zero)"),
     ]

@@ -53,7 +53,7 @@ FORMS: dict[str, Callable[[Problem], Form]] = {
 class Solver:
     """Which form ran, why, and how right it is.
 
-    bound : of the relative error of the estimate, in standard deviations of the prior; None where nothing was estimated
+    bound : of the error of the estimate, in `unit`; None where nothing was estimated
     variance_bound : of the relative error of posterior variances, on pixels chosen to show it
     tried : forms that ran or were passed over before, with the reason
     """
@@ -65,6 +65,7 @@ class Solver:
     tried: tuple[tuple[str, str], ...] = ()
     bound: float | None = None
     refinements: int = 0
+    unit: str = "standard deviation of the prior"
 
     @property
     def digits(self) -> float:

@@ -12,10 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse, stats
 
 from .forms.form import Form, Matrix, Vector
 from .prior import Prior
+
+Pixels = NDArray[np.intp]
 
 CHUNK = 512
 
@@ -61,27 +64,32 @@ class Interval:
     high: float
 
 
-def expected_error(form: Form, noise: dict[str, Vector], truth: Prior | None = None) -> ExpectedError:
+def expected_error(
+    form: Form, noise: dict[str, Vector], truth: Prior | None = None, pixels: Pixels | None = None
+) -> ExpectedError:
     """Eq. 5 with the noises, and the prior, as they really are.
 
     noise : named (M,) variances that together are Rvm;  truth : the real prior, where it is not the expected one
+    pixels : of which alone the error is asked, absent: of all
     """
     problem = form.problem
-    count, measurements = problem.unknowns, problem.measurements
+    asked = np.arange(problem.unknowns) if pixels is None else pixels
+    count, measurements = asked.size, problem.measurements
     by_column = sparse.csc_array(problem.matrix)
     total = np.sum(list(noise.values()), axis=0) if noise else np.zeros(measurements)
     missing, noisy, resolved, weights = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(measurements)
-    for some, u, negative in _columns(form):
+    for place, some, u, negative in _columns(form, asked):
         if truth is None:
-            missing[some] = np.square(u).sum(axis=0)
+            missing[place] = np.square(u).sum(axis=0)
         else:
-            missing[some] = np.square(truth.gather(_units(count, some) + problem.matrix.T @ negative)).sum(axis=0)
-        resolved[some] = -np.asarray(by_column[:, some].multiply(negative).sum(axis=0)).ravel()
+            units = _units(problem.unknowns, some)
+            missing[place] = np.square(truth.gather(units + problem.matrix.T @ negative)).sum(axis=0)
+        resolved[place] = -np.asarray(by_column[:, some].multiply(negative).sum(axis=0)).ravel()
         squared = np.square(negative)
-        noisy[some] = total @ squared
+        noisy[place] = total @ squared
         weights += squared.sum(axis=1) / count
     as_expected = truth is None and np.array_equal(total, problem.noise_variance)
-    variance = form.variance() if as_expected else missing + noisy
+    variance = form.variance()[asked] if as_expected else missing + noisy
     parts = {name: float(weights @ values) for name, values in noise.items()}
     return ExpectedError(variance, float(missing.mean()), parts, resolved)
 
@@ -96,14 +104,17 @@ def expected_given(form: Form, truth: Vector, noise_variance: Vector) -> Interva
     away = truth - problem.prior.mean
     bias = away - form.gain(problem.matrix @ away)
     trace = squares = 0.0
-    for _, _, negative in _columns(form):
+    for _, _, _, negative in _columns(form, np.arange(problem.unknowns)):
         weighted = noise_variance[:, None] * negative
         trace += float(np.sum(weighted * negative))
         squares += float(np.square(form.gain(weighted)).sum())
-    mean = float(bias @ bias) + trace
     variance = 4 * _noise_of_sum(form, bias, noise_variance)[1] + 2 * squares
-    count = truth.size
-    if variance == 0:
+    return interval(float(bias @ bias) + trace, variance, truth.size)
+
+
+def interval(mean: float, variance: float, count: int) -> Interval:
+    """Of the mean of `count` squares whose sum has this mean and variance, taken as a gamma variate."""
+    if variance <= 0:
         return Interval(mean / count, mean / count, mean / count)
     shape, scale = mean**2 / variance, variance / mean
     low, high = (float(stats.gamma.ppf(level, shape, scale=scale)) for level in (0.005, 0.995))
@@ -132,13 +143,13 @@ def _noise_of_sum(form: Form, weights: Vector, noise_variance: Vector) -> tuple[
     return float(np.square(u).sum()), float(noise_variance @ np.square(negative[:, 0]))
 
 
-def _columns(form: Form) -> Iterator[tuple[slice, Matrix, Matrix]]:
-    """Some pixels, with u, (K, q), whose squares are the prior's part of Eq. 5, and -A^T e_i, (M, q)."""
-    for start in range(0, form.problem.unknowns, CHUNK):
-        some = slice(start, min(start + CHUNK, form.problem.unknowns))
-        u, negative = form.columns(some)
-        yield some, u, negative
+def _columns(form: Form, asked: Pixels) -> Iterator[tuple[slice, Pixels, Matrix, Matrix]]:
+    """Some of the pixels asked for: u, (K, q), whose squares are the prior's part of Eq. 5, and -A^T e_i, (M, q)."""
+    for start in range(0, asked.size, CHUNK):
+        place = slice(start, min(start + CHUNK, asked.size))
+        u, negative = form.columns(asked[place])
+        yield place, asked[place], u, negative
 
 
-def _units(count: int, some: slice) -> Matrix:
+def _units(count: int, some: Pixels) -> Matrix:
     return np.eye(count)[:, some]

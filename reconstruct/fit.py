@@ -13,14 +13,17 @@ from math import log
 from typing import Any
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg, optimize, sparse
 
 from scenes.errors import InputError
 
 from .forms.form import Vector
 from .likelihood import Evidence
+from .way import Task
 
 SIDE = 24  # pixels, of the tiles that a larger image is cut into
+WHOLE = 10_000  # pixels, of an image all of whose tiles have a say
+MOST_ALONG = 8  # tiles of a larger one, along each axis
 ENOUGH_SEEN = 0.5  # of the measurements, that must lie whole in a tile; else tiles grow
 SHORTEST, LONGEST = 0.05, 100.0  # correlation length: in pixels, and in sides of the image
 LENGTHS = (1.0, 5.0, 25.0)  # pixels, of the grid
@@ -51,9 +54,39 @@ class Fit:
     doubtful: bool
 
 
-def fit(evidence: Evidence) -> Fit:
+def evidence(task: Task, *, prior_known: bool, noise_known: bool) -> tuple[Evidence, list[Evidence]]:
+    """What a task's measurements tell of what is to be found, its `believed` being the noise that is known: the whole
+    of them, and in the tiles whose likelihoods are multiplied.
+
+    Of a frame only some tiles have a say, side by side at equal distances: enough to find three numbers.
+    """
+    if task.model.unknowns <= WHOLE:
+        prior = task.prior_on(task.shape) if prior_known else None
+        matrix = task.model.matrix[task.used]
+        residual = task.recorded[task.used] - matrix @ np.full(task.model.unknowns, task.prior.mean)
+        whole = Evidence(matrix, residual, task.believed, task.shape, prior, noise_known)
+        return whole, _blocks(whole)
+    starts = [np.unique(np.linspace(0, size - SIDE, MOST_ALONG).astype(int)) for size in task.shape]
+    blocks: list[Evidence] = []
+    shape = SIDE, SIDE
+    prior = task.prior_on(shape) if prior_known else None
+    places = np.cumsum(task.used) - 1
+    for row, column in product(*starts):
+        window = slice(row, row + SIDE), slice(column, column + SIDE)
+        numbers = task.model.numbers(*window)
+        some = task.used[numbers]
+        matrix = task.model.part(*window)[some]
+        residual = task.recorded[numbers[some]] - matrix @ np.full(SIDE * SIDE, task.prior.mean)
+        blocks.append(Evidence(matrix, residual, task.believed[places[numbers[some]]], shape, prior, noise_known))
+    joined = sparse.csr_array(sparse.block_diag([block.matrix for block in blocks], format="csr"))
+    residual = np.concatenate([block.residual for block in blocks])
+    known = np.concatenate([block.known_noise for block in blocks])
+    return Evidence(joined, residual, known, task.shape, prior, noise_known), blocks
+
+
+def fit(evidence: Evidence, blocks: list[Evidence] | None = None) -> Fit:
     """Find what the evidence leaves open. Raises InputError where it is too little, or without any noise."""
-    blocks = _blocks(evidence)
+    blocks = _blocks(evidence) if blocks is None else blocks
     used = sum(block.residual.size for block in blocks)
     if used < FEWEST:
         raise InputError(f"a prior or the noise is found from {FEWEST} measurements or more, got {used}")

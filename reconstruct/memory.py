@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from scenes.errors import InputError
-
 
 def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bool = False) -> int:
     """Bytes that a form and the analysis of its error need; a `correlated` prior adds its root and copies of it."""
@@ -20,17 +18,6 @@ def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bo
         "dual": 5 * measurements * both + 4 * both * unknowns,
     }
     return 8 * (matrix[form] + (4 * unknowns**2 if correlated else 0))
-
-
-def refuse_too_large(measurements: int, unknowns: int, method: str, *, correlated: bool = False) -> None:
-    """Raise InputError if the estimator's dense matrices would not fit in memory."""
-    form = ("covariance" if measurements < unknowns else "information") if method == "auto" else method
-    needed, free = needed_memory(form, measurements, unknowns, correlated=correlated), free_memory()
-    if needed > free:
-        raise InputError(
-            f"the dense estimator needs {needed / 1e9:.1f} GB for {unknowns} pixels, {free / 1e9:.1f} GB are free;"
-            " crop the target with target.origin and target.shape"
-        )
 
 
 def free_memory() -> int:

@@ -17,6 +17,9 @@ from scenes.errors import InputError
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
+LEAST_POWER = 1e-12  # of the largest, of a frequency: what a torus makes of a covariance may be a little below zero
+NOT_YET_FOUND = "prior.kind 'fit' takes a recorded stack; set another kind to predict without one"
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -72,7 +75,25 @@ def prior_of(described: scene.Prior, shape: tuple[int, int], pitch: float) -> Pr
     if described.kind == "power":
         exponent = 2.0 if described.exponent is None else described.exponent
         return _stationary(described.mean, described.variance, shape, _power_lags(shape, exponent))
-    raise InputError("prior.kind 'fit' takes a recorded stack; set another kind to predict without one")
+    raise InputError(NOT_YET_FOUND)
+
+
+def spectrum_of(described: scene.Prior, shape: tuple[int, int], pitch: float) -> float | Matrix:
+    """P0 as it is diagonal: the variance of independent pixels, else its spectrum under the cosine transform (DCT-II).
+
+    Such a prior is the stationary one reflected at the edges of the image: inside the two are the same, and within a
+    correlation length of an edge pixels vary more. Raises InputError for kind "fit", which takes a stack to find.
+    """
+    if described.kind == "independent":
+        return described.variance
+    if described.kind == "exponential" and described.correlation_length is not None:
+        lags = np.exp(-lag_distances(shape) * pitch / described.correlation_length)
+    elif described.kind == "power":
+        lags = _power_lags(shape, 2.0 if described.exponent is None else described.exponent)
+    else:
+        raise InputError(NOT_YET_FOUND)
+    waves = np.fft.fft2(lags).real[: shape[0], : shape[1]]
+    return described.variance * np.maximum(waves, LEAST_POWER * float(waves.max()))
 
 
 def exponential(mean: float, variance: float, shape: tuple[int, int], length: float) -> Prior:

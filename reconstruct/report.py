@@ -63,7 +63,7 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
         "unknowns": model.unknowns,
         "stages": stages,
         "error": error,
-        "solver": _solver(restoration.solver),
+        "solver": {"way": restoration.choice.way, **_solver(restoration.solver)},
         "diagnostics": _diagnostics(restoration),
         "model": {**model.record.get("agreement", _unknown(model)), "feigned_information": restoration.feigned},
         "skipped": [{"what": what, "why": why} for what, why in left_out(_as_run(stack, model))],
@@ -83,6 +83,7 @@ def _solver(solver: Solver) -> dict[str, Any]:
         "condition": solver.condition if isfinite(solver.condition) else None,
         "digits": solver.digits,
         "bound": solver.bound,
+        "unit": solver.unit,
         "variance_bound": solver.variance_bound,
         "refinements": solver.refinements,
         "tried": [{"method": name, "why_not": reason} for name, reason in solver.tried],
@@ -143,7 +144,7 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         made = [f"{stage['samples']} samples a pixel in {stage['passes']} passes"] if "samples" in stage else []
         made += [stage["variant"]] if "variant" in stage else []
         if name == "reconstruct":
-            made.append(f"{description['solver']['method']} form, {description['unknowns']} unknowns")
+            made.append(f"{_way(description['solver'])}, {description['unknowns']} unknowns")
         lines.append((f"{name}, seconds", ", ".join([f"{stage['seconds']:.2f}", *made])))
     if "mse" in error:
         given = error["expected_given_truth"]
@@ -178,9 +179,21 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     return lines
 
 
+def _way(solver: dict[str, Any]) -> str:
+    if solver["way"] == "frame":
+        return f"whole frame, {solver['refinements']} steps of conjugate gradients"
+    return f"{solver['method']} form"
+
+
 def _solver_rows(solver: dict[str, Any]) -> list[tuple[str, str]]:
-    bounds = f"error below {solver['bound']:.0e}, of variances {solver['variance_bound']:.0e} (relative)"
-    lines = [("right digits", f"{solver['digits']:.1f}: {bounds}")]
+    if solver["way"] == "frame":
+        lines = [
+            ("computation, error", f"below {solver['bound']:.1g} posterior standard deviations in every pixel"),
+            ("  of variances", f"{solver['variance_bound']:.1g}, relative, by exact solutions for some pixels"),
+        ]
+    else:
+        bounds = f"error below {solver['bound']:.0e}, of variances {solver['variance_bound']:.0e} (relative)"
+        lines = [("right digits", f"{solver['digits']:.1f}: {bounds}")]
     return lines + [(f"  not by the {failed['method']} form", failed["why_not"]) for failed in solver["tried"]]
 
 

@@ -6,24 +6,26 @@ and what the uncertainty of H adds at a first estimate of the image. Dead and sa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scenes import scene
 from scenes.errors import InputError
 from scenes.model import Model
 from scenes.stack import Stack
+from scenes.workers import Workers
 
 from .accuracy import Error, compare, trimmed
-from .estimator import Estimate, Solver, estimate
-from .expected import ExpectedError, Interval, expected_error, expected_given, variance_of_sum
-from .fit import Fit, fit
-from .likelihood import Evidence
-from .prior import Prior, exponential, independent, prior_of
-from .problem import Problem
+from .choice import WAYS, Choice, choose
+from .estimator import Solver
+from .expected import ExpectedError, Interval
+from .fit import Fit, evidence, fit
+from .frame import NotReachedError
+from .way import Hands, Outcome, Progress, Task, Way, is_one_number, to_nobody, total
 
 Vector = NDArray[np.float64]
 
@@ -55,14 +57,16 @@ class Residual:
 
 @dataclass(frozen=True)
 class Restoration:
-    """An estimate, (N,), its expected error (Eq. 5), and how it compares where the truth is known.
+    """An estimate with its expected error (Eq. 5), and how it compares where the truth is known.
 
+    choice : which way to it;  prior : what was believed of the image, found or told
     noise : what is known of it by name, (pixels used,) each
     feigned : the largest share of what is believed of a pixel that the noise of H may have feigned
     """
 
-    estimated: Estimate
-    expected: ExpectedError
+    outcome: Outcome
+    choice: Choice
+    prior: scene.Prior
     trimmed_mse: float | None
     residual: Residual | None
     shape: tuple[int, int]
@@ -73,17 +77,26 @@ class Restoration:
     seconds: float
     truth: Vector | None
     error: Error | None
-    interval: Interval | None
 
     @property
     def estimate(self) -> Vector:
         """f^, (N,)."""
-        return self.estimated.image
+        return self.outcome.image
+
+    @property
+    def expected(self) -> ExpectedError:
+        """Eq. 5."""
+        return self.outcome.expected
+
+    @property
+    def interval(self) -> Interval | None:
+        """What the error of this very image should be."""
+        return self.outcome.interval
 
     @property
     def solver(self) -> Solver:
-        """Which form ran, why, and how right it is."""
-        return self.estimated.solver
+        """What computed it, why, and how right it is."""
+        return self.outcome.solver
 
     def budget(self) -> dict[str, float]:
         """Parts of the expected squared error by their cause; they add up to it, an absent effect brings 0."""
@@ -95,7 +108,7 @@ class Restoration:
         refuse_outside(corner, size, self.shape)
         weights = np.zeros(self.shape)
         weights[corner[0] : corner[0] + size[0], corner[1] : corner[1] + size[1]] = 1 / (size[0] * size[1])
-        variance = variance_of_sum(self.estimated.form, weights.ravel(), _sum(self.noise))
+        variance = self.outcome.variance_of_sum(weights.ravel())
         return float(weights.ravel() @ self.estimate), variance**0.5
 
 
@@ -130,59 +143,65 @@ def usable_pixels(stack: Stack) -> Usable:
     return Usable(alive & ~full, int(np.sum(~alive)), int(np.sum(full)))
 
 
-def restore(stack: Stack, model: Model, truth: Vector | None = None) -> Restoration:
+def restore(
+    stack: Stack,
+    model: Model,
+    truth: Vector | None = None,
+    workers: Workers | None = None,
+    progress: Progress = to_nobody,
+) -> Restoration:
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 
-    truth : (N,) or None;  Raises InputError if memory does not suffice, or if no form is right to the tolerance.
+    truth : (N,) or None;  workers : who does tiles, absent: threads of this process
+    Raises InputError if memory does not suffice, or if no way is right to what the scene asks.
     """
+    choice = choose(stack.scene, model.camera, model.exact)
+    hands = Hands(workers, progress)
+    try:
+        return _restored(stack, model, truth, choice, hands)
+    except NotReachedError as error:
+        if stack.scene.estimator.method != "auto":
+            raise
+        return _restored(stack, model, truth, replace(choice, way="tiles", why=str(error)), hands)
+
+
+def _restored(stack: Stack, model: Model, truth: Vector | None, choice: Choice, hands: Hands) -> Restoration:
     start = perf_counter()
     usable = usable_pixels(stack)
-    noise = {name: variances[usable.used] for name, variances in known_noise(stack).items()}
-    prior, estimated = _first_prior(stack, model), None
-    uncertain, told = bool(model.variance.any()), stack.scene.estimator.noise_variance
+    noise = {name: _of_used(variances, usable.used) for name, variances in known_noise(stack).items()}
+    prior, told = _first_prior(stack), stack.scene.estimator.noise_variance
+    uncertain, way = bool(model.variance.any()), None
     if uncertain:
-        noise["calibration"] = model.prior_spread(prior.variance)[usable.used]
-        estimated = _estimated(stack, model, usable, prior, noise)
-        noise["calibration"] = model.spread(estimated.image)[usable.used]
+        noise["calibration"] = model.prior_spread(np.full(model.unknowns, prior.variance))[usable.used]
+        way = _way(choice, stack, model, usable, prior, noise, hands)
+        noise["calibration"] = model.spread(way.image)[usable.used]
     found = _fitted(stack, model, usable, prior, noise)
     if found is not None and uncertain:
         # What the uncertainty of H adds was taken at an image that the first prior had left noisy.
-        told_prior, told_noise = _with_fit(stack, model, prior, noise, found)
-        better = _estimated(stack, model, usable, told_prior, told_noise)
+        told_prior, told_noise = _with_fit(stack, prior, noise, found)
+        better = _way(choice, stack, model, usable, told_prior, told_noise, hands)
         noise["calibration"] = model.spread(better.image)[usable.used]
         found = _fitted(stack, model, usable, prior, noise)
     if found is not None:
-        prior, noise = _with_fit(stack, model, prior, noise, found)
-    if estimated is None or found is not None or told is None:
-        estimated = _estimated(stack, model, usable, prior, noise)
-    return _described(model, usable, noise, estimated, found, truth, start)
-
-
-def _described(
-    model: Model,
-    usable: Usable,
-    noise: dict[str, Vector],
-    estimated: Estimate,
-    found: Fit | None,
-    truth: Vector | None,
-    start: float,
-) -> Restoration:
-    expected = expected_error(estimated.form, noise)
+        prior, noise = _with_fit(stack, prior, noise, found)
+    if way is None or found is not None or told is None:
+        way = _way(choice, stack, model, usable, prior, noise, hands)
+    outcome = way.outcome(noise, truth)
     shape = (model.camera.rows, model.camera.columns)
     return Restoration(
-        estimated=estimated,
-        expected=expected,
-        trimmed_mse=trimmed(expected.variance, shape),
-        residual=_residual(estimated, expected),
+        outcome=outcome,
+        choice=choice,
+        prior=prior,
+        trimmed_mse=trimmed(outcome.expected.variance, shape),
+        residual=_residual(outcome, way.task.believed),
         shape=shape,
         usable=usable,
         noise=noise,
         fit=found,
-        feigned=_feigned(model, usable, estimated, expected),
+        feigned=_feigned(model, usable, way.task.believed, outcome.expected),
         seconds=perf_counter() - start,
         truth=truth,
-        error=None if truth is None else compare(estimated.image, truth, shape),
-        interval=None if truth is None else expected_given(estimated.form, truth, _sum(noise)),
+        error=None if truth is None else compare(outcome.image, truth, shape),
     )
 
 
@@ -191,73 +210,86 @@ def known_noise(stack: Stack) -> dict[str, Vector]:
     noise = {"rendering": stack.variance}
     described = stack.scene.noise
     if described is not None and described.variance > 0:
-        noise["noise"] = np.full(stack.values.size, described.variance)
+        noise["noise"] = _everywhere(described.variance, stack.values.size)
     if described is not None and described.bits is not None:
-        noise["quantisation"] = np.full(stack.values.size, described.quantisation_variance)
+        noise["quantisation"] = _everywhere(described.quantisation_variance, stack.values.size)
     return noise
 
 
-def _first_prior(stack: Stack, model: Model) -> Prior:
+def _everywhere(number: float, count: int) -> Vector:
+    return np.broadcast_to(np.float64(number), (count,))  # stored once
+
+
+def _of_used(values: Vector, used: NDArray[np.bool_]) -> Vector:
+    if used.all():
+        return values
+    return _everywhere(float(values[0]), int(used.sum())) if is_one_number(values) else values[used]
+
+
+def _first_prior(stack: Stack) -> scene.Prior:
+    """What is told of the prior; where that is to be found, the paper's."""
     described = stack.scene.prior
-    if described.kind == "fit":
-        return independent(described.mean, described.variance, model.unknowns)
-    return prior_of(described, (model.camera.rows, model.camera.columns), stack.camera.target_pitch)
+    return described.model_copy(update={"kind": "independent"}) if described.kind == "fit" else described
 
 
 def _expected_noise(stack: Stack, usable: Usable, noise: dict[str, Vector]) -> Vector:
     told = stack.scene.estimator.noise_variance
-    return np.full(int(usable.used.sum()), told) if isinstance(told, float) else _sum(noise)
+    return _everywhere(told, int(usable.used.sum())) if isinstance(told, float) else total(noise)
 
 
-def _estimated(stack: Stack, model: Model, usable: Usable, prior: Prior, noise: dict[str, Vector]) -> Estimate:
-    problem = Problem(model.matrix[usable.used], prior, _expected_noise(stack, usable, noise))
-    told = stack.scene.estimator
-    return estimate(problem, stack.values[usable.used], told.method, told.tolerance)
+def _way(
+    choice: Choice,
+    stack: Stack,
+    model: Model,
+    usable: Usable,
+    prior: scene.Prior,
+    noise: dict[str, Vector],
+    hands: Hands,
+) -> Way:
+    told = stack.scene
+    believed = _expected_noise(stack, usable, noise)
+    task = Task(model, stack.values, usable.used, believed, prior, told.estimator, told.tiles)
+    return WAYS[choice.way](task, hands)
 
 
-def _fitted(stack: Stack, model: Model, usable: Usable, prior: Prior, noise: dict[str, Vector]) -> Fit | None:
+def _fitted(stack: Stack, model: Model, usable: Usable, prior: scene.Prior, noise: dict[str, Vector]) -> Fit | None:
     """The prior, and the noise if that is asked for, of largest marginal likelihood; None where nothing is asked."""
-    described, used = stack.scene.prior, usable.used
+    described = stack.scene.prior
     asked = stack.scene.estimator.noise_variance == "fit"
-    if not used.any() or not (asked or described.kind == "fit"):
+    if not usable.used.any() or not (asked or described.kind == "fit"):
         return None
-    known = (
-        _sum({name: noise[name] for name in KEPT if name in noise}) if asked else _expected_noise(stack, usable, noise)
-    )
-    matrix = model.matrix[used]
-    residual = stack.values[used] - matrix @ prior.mean
-    shape = (model.camera.rows, model.camera.columns)
-    return fit(Evidence(matrix, residual, known, shape, None if described.kind == "fit" else prior, not asked))
+    kept = {name: noise[name] for name in KEPT if name in noise}
+    known = total(kept) if asked else _expected_noise(stack, usable, noise)
+    task = Task(model, stack.values, usable.used, known, prior, stack.scene.estimator, stack.scene.tiles)
+    return fit(*evidence(task, prior_known=described.kind != "fit", noise_known=not asked))
 
 
 def _with_fit(
-    stack: Stack, model: Model, prior: Prior, noise: dict[str, Vector], found: Fit
-) -> tuple[Prior, dict[str, Vector]]:
+    stack: Stack, prior: scene.Prior, noise: dict[str, Vector], found: Fit
+) -> tuple[scene.Prior, dict[str, Vector]]:
     """The prior and the noise once they are found; what was found stands for the noise that the scene describes."""
     if found.variance is not None and found.length is not None:
-        shape = (model.camera.rows, model.camera.columns)
-        prior = exponential(stack.scene.prior.mean, found.variance, shape, found.length)
+        length = found.length * stack.camera.target_pitch
+        update = {"kind": "exponential", "variance": found.variance, "correlation_length": length}
+        prior = prior.model_copy(update=update)
     if found.noise_variance is not None:
         kept = {name: noise[name] for name in KEPT if name in noise}
-        noise = {**kept, "noise": np.full(noise["rendering"].size, found.noise_variance)}
+        noise = {**kept, "noise": _everywhere(found.noise_variance, noise["rendering"].size)}
     return prior, noise
 
 
-def _sum(noise: dict[str, Vector]) -> Vector:
-    return np.sum(list(noise.values()), axis=0)
-
-
-def _feigned(model: Model, usable: Usable, estimated: Estimate, expected: ExpectedError) -> float:
+def _feigned(model: Model, usable: Usable, believed: Vector, expected: ExpectedError) -> float:
+    if not model.variance.any():
+        return 0.0
     noise = np.full(model.measurements, np.inf)
-    noise[usable.used] = estimated.form.problem.noise_variance
+    noise[usable.used] = believed
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
         return float(np.nan_to_num(model.feigned(noise) * expected.variance).max(initial=0.0))
 
 
-def _residual(estimated: Estimate, expected: ExpectedError) -> Residual | None:
+def _residual(outcome: Outcome, believed: Vector) -> Residual | None:
     """None where a measurement is said to have no noise: then there is no unit for what is left of it."""
-    noise = estimated.form.problem.noise_variance
-    if not noise.size or not estimated.form.problem.noisy:
+    if not believed.size or not (believed > 0).all():
         return None
-    freedoms = max(noise.size - expected.degrees_of_freedom, 0.0)
-    return Residual(float(noise @ np.square(estimated.multipliers)), freedoms, (2 * freedoms) ** 0.5)
+    freedoms = max(believed.size - outcome.expected.degrees_of_freedom, 0.0)
+    return Residual(float(believed @ np.square(outcome.multipliers)), freedoms, (2 * freedoms) ** 0.5)

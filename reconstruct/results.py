@@ -16,12 +16,14 @@ from scenes.files import digest, fingerprint
 from scenes.model import Model
 from scenes.scene import TRUTH, Scene, with_changes
 from scenes.stack import Stack
+from scenes.workers import Workers
 
 from . import figure, report
 from .restore import Restoration, refuse_strangers, restore
+from .way import Progress, to_nobody
 
 ESTIMATE, PICTURE, OVERVIEW, RUN = "estimate.exr", "estimate.png", "overview.png", "run.json"
-OURS = ("prior", "estimator")
+OURS = ("prior", "estimator", "tiles")
 
 
 def changed(stack: Stack, overrides: list[str], path: Path) -> Stack:
@@ -50,11 +52,16 @@ def truth_beside(path: Path, stack: Stack) -> NDArray[np.float64] | None:
 
 
 def reconstruct(
-    stack: Stack, model: Model, truth: NDArray[np.float64] | None, names: tuple[Path, Path]
+    stack: Stack,
+    model: Model,
+    truth: NDArray[np.float64] | None,
+    names: tuple[Path, Path],
+    workers: Workers | None = None,
+    progress: Progress = to_nobody,
 ) -> tuple[Restoration, dict[str, Any]]:
     """The estimate and what run.json says of it. Raises InputError if stack and model do not belong together."""
     refuse_strangers(stack, model, names)
-    restoration = restore(stack, model, truth)
+    restoration = restore(stack, model, truth, workers, progress)
     return restoration, report.describe(stack, model, restoration)
 
 
@@ -68,8 +75,8 @@ def write_results(folder: Path, stack: Stack, restoration: Restoration, descript
 
 
 def _of(model: Model) -> tuple[NDArray[Any], ...]:
-    matrix = model.matrix
-    return matrix.data, matrix.indices, matrix.indptr, model.variance, model.batches
+    entries = () if model.stored is None else (model.stored.data, model.stored.indices, model.stored.indptr)
+    return (*entries, model.variance, model.batches)
 
 
 def made_from(stack: Stack, model: Model) -> str:
@@ -91,13 +98,15 @@ def _standing(folder: Path) -> dict[str, Any] | None:
         return None
 
 
-def kept_results(folder: Path, stack: Stack, model: Model, names: tuple[Path, Path]) -> tuple[dict[str, Any], bool]:
+def kept_results(
+    folder: Path, stack: Stack, model: Model, names: tuple[Path, Path], progress: Progress = to_nobody
+) -> tuple[dict[str, Any], bool]:
     """What run.json in `folder` says, and whether the reconstruction had to be made for it."""
     wanted = made_from(stack, model)
     old = _standing(folder)
     if old is not None and old["fingerprint"] == wanted:
         return old, False
-    restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names)
+    restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
     description = {"fingerprint": wanted, **description}
     write_results(folder, stack, restoration, description)
     return description, True

@@ -1,7 +1,8 @@
 """The observation model g = H f + v: a sparse H with the variance of its every entry (Wood et al., Eq. 1).
 
 H is (M, N): a row a sensor pixel in the order of measurements, a column a pixel of f, row by row. The file is what
-`scipy.sparse.load_npz` reads, with `variance` (in the order of `data`) and a JSON text `ommatid` beside it.
+`scipy.sparse.load_npz` reads, with `variance` (in the order of `data`) and a JSON text `ommatid` beside it. The ideal
+H of a large frame is not stored, it follows from the scene: such a file has the format "boxes" and no entries.
 """
 
 from __future__ import annotations
@@ -12,7 +13,11 @@ import json
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from .boxes import Boxes
 from .camera import Camera, derive
 from .errors import InputError
 from .files import digest, write_whole
@@ -28,49 +34,128 @@ from .scene import Scene, parse
 
 Vector = NDArray[np.float64]
 
+ENTRIES = ("indices", "indptr", "data")
+ALIKE, MOST_KINDS = (
+    200,
+    24,
+)  # pixels of like contrast, whose scatter is moderated together, at least; such groups, at most
+NOWHERE = -1  # what a measurement sees that sees nothing: no window has it
+
 
 @dataclass(frozen=True)
 class Model:
-    """H as `matrix` (CSR, float64), `variance` of each stored entry, the camera it belongs to.
+    """H as `stored` (CSR, float64), or None where it follows from the camera; `variance` of each stored entry.
 
-    `batches`, (B, nnz), are deviations from `matrix` of B independent estimates of it whose mean it is; without
+    `batches`, (B, nnz), are deviations from `stored` of B independent estimates of it whose mean it is; without
     uncertainty there are none. `record` says how it was found: method, samples, seconds, agreement with the ideal
     model, fingerprint.
     """
 
     scene: Scene
     camera: Camera
-    matrix: sparse.csr_array
+    stored: sparse.csr_array | None
     variance: Vector
     batches: NDArray[np.float32]
     record: dict[str, Any]
 
     @property
+    def matrix(self) -> sparse.csr_array:
+        """H. Raises InputError where it is too large to be stored."""
+        if self.stored is None:
+            raise InputError(
+                f"H of {self.unknowns} pixels is too large to be stored; take estimator.method = 'frame' or 'tiles'"
+            )
+        return self.stored
+
+    @property
+    def entries(self) -> int:
+        """Of H, stored or not."""
+        return self.boxes.entries if self.stored is None else int(self.stored.nnz)
+
+    @property
+    def exact(self) -> bool:
+        """Whether H is that of a perfect camera."""
+        return self.record["method"] == "ideal"
+
+    @cached_property
+    def boxes(self) -> Boxes:
+        """H of a perfect camera, whatever this one is."""
+        return Boxes(self.camera)
+
+    @property
     def measurements(self) -> int:
         """M."""
-        return int(self.matrix.shape[0])
+        return self.camera.measurements
 
     @property
     def unknowns(self) -> int:
         """N."""
-        return int(self.matrix.shape[1])
+        return self.camera.unknowns
 
     def forward(self, image: Vector) -> Vector:
         """H f: (N,) or (rows, columns) to (M,)."""
-        return self.matrix @ np.asarray(image, dtype=np.float64).ravel()
+        if self.stored is None:
+            return self.boxes.forward(image)
+        return self.stored @ np.asarray(image, dtype=np.float64).ravel()
 
     def adjoint(self, measurements: Vector) -> Vector:
         """H^T g: (M,) to (N,)."""
-        return self.matrix.T @ np.asarray(measurements, dtype=np.float64)
+        if self.stored is None:
+            return self.boxes.adjoint(measurements)
+        return self.stored.T @ np.asarray(measurements, dtype=np.float64)
+
+    def numbers(self, rows: slice, columns: slice) -> NDArray[np.int64]:
+        """Which measurements see nothing but a window of f: (m,)."""
+        if self.exact:
+            return self.boxes.numbers(rows, columns)
+        top, bottom, left, right = self._reach
+        inside = (top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop)
+        return np.flatnonzero(inside)
+
+    def part(self, rows: slice, columns: slice) -> sparse.csr_array:
+        """H of the window from these measurements: (m, pixels of the window)."""
+        if self.exact:
+            return self.boxes.part(rows, columns)
+        some = self.matrix[self.numbers(rows, columns)]
+        row, column = np.divmod(some.indices, self.camera.columns)
+        shape = rows.stop - rows.start, columns.stop - columns.start
+        indices = (row - rows.start) * shape[1] + column - columns.start
+        return sparse.csr_array((some.data, indices, some.indptr), shape=(some.shape[0], shape[0] * shape[1]))
+
+    def signature(self, rows: slice, columns: slice) -> Hashable:
+        """What two windows have in common whose `part` is the same."""
+        return self.boxes.signature(rows, columns) if self.exact else (rows.start, columns.start)
+
+    @property
+    def reach(self) -> int:
+        """Rows or columns of f, whichever are more, that the widest measurement sees."""
+        if self.stored is None:
+            return max(ceil(kind.ratio) + 1 for kind in self.camera.types)
+        top, bottom, left, right = self._reach
+        return int(max((bottom - top).max(), (right - left).max())) + 1
+
+    @cached_property
+    def _reach(self) -> tuple[NDArray[np.int64], ...]:
+        """First and last row, first and last column of f that each measurement sees; none where it sees nothing."""
+        assert self.stored is not None
+        row, column = np.divmod(self.stored.indices.astype(np.int64), self.camera.columns)
+        seen = np.diff(self.stored.indptr) > 0
+        starts = self.stored.indptr[:-1][seen]
+        found = [np.full(seen.size, NOWHERE) for _ in range(4)]
+        for ends, (pick, values) in zip(found, product((np.minimum, np.maximum), (row, column)), strict=True):
+            ends[seen] = pick.reduceat(values, starts)
+        return found[0], found[2], found[1], found[3]
 
     def restrict(self, names: tuple[str, ...]) -> Model:
         """Only the named lens types, in the model's own order. Raises InputError for a name it does not have."""
         camera, kept = self.camera.restrict(names)
+        if self.stored is None:
+            return replace(self, camera=camera)
         stored = np.repeat(kept, np.diff(self.matrix.indptr))
         return replace(
             self,
             camera=camera,
-            matrix=self.matrix[kept],
+            stored=self.matrix[kept],
             variance=self.variance[stored],
             batches=self.batches[:, stored],
             record={key: value for key, value in self.record.items() if key != "agreement"},  # of all types
@@ -81,7 +166,7 @@ class Model:
 
         The errors of a row cancel in its sum, since all its entries share their rays, so what is left is about
         sum over j of var_ij (f_j - (H f)_i)^2. Neighbouring entries' errors cancel too, which smooth images notice:
-        the scatter of H f over the batches, moderated among the pixels of a lens type, says by how much.
+        the scatter of H f over the batches, moderated among pixels of a lens type with like contrast, says by how much.
         """
         flat = np.asarray(image, dtype=np.float64).ravel()
         rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
@@ -96,7 +181,10 @@ class Model:
         for kind in self.camera.types:
             place = np.arange(start, start + kind.measurements)
             place = place[trend[place] > 0]
-            trend[place] *= moderate(seen[place] / trend[place], count)
+            # Strong contrast lets errors cancel otherwise than weak one does, so that like is compared with like.
+            for alike in np.array_split(place[np.argsort(trend[place])], max(1, min(place.size // ALIKE, MOST_KINDS))):
+                if alike.size:
+                    trend[alike] *= moderate(seen[alike] / trend[alike], count)
             start += kind.measurements
         return trend
 
@@ -105,6 +193,8 @@ class Model:
 
         Where the measurements leave a pixel open, an estimator that takes H for exact believes this much too much.
         """
+        if not self.variance.size:
+            return np.zeros(self.unknowns)
         rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
         weights = self.variance / noise_variance[rows]
         return np.bincount(self.matrix.indices, weights=weights, minlength=self.unknowns).astype(np.float64)
@@ -120,22 +210,21 @@ class Model:
 
 def write(path: Path, model: Model) -> None:
     """Write a model, whole or not at all. Raises InputError or DeniedError."""
-    matrix = model.matrix
     arrays: dict[str, NDArray[Any]] = {
-        "indices": matrix.indices,
-        "indptr": matrix.indptr,
-        "data": matrix.data,
-        "shape": np.array(matrix.shape, dtype=np.int64),
+        "shape": np.array([model.measurements, model.unknowns], dtype=np.int64),
         "variance": model.variance,
         "batches": model.batches,
     }
+    if model.stored is not None:
+        arrays |= {name: getattr(model.stored, name) for name in ENTRIES}
+    layout = b"boxes" if model.stored is None else b"csr"
     description = json.dumps({"scene": model.scene.plain(), "record": model.record})
     record = json.dumps({"description": description, "sha256": _seal(arrays, description)})
 
     def fill(beside: Path) -> None:
         with beside.open("wb") as stream:
             savez: Any = np.savez_compressed
-            savez(stream, format=np.array(b"csr"), _is_array=np.array(True), ommatid=record, **arrays)
+            savez(stream, format=np.array(layout), _is_array=np.array(True), ommatid=record, **arrays)
         try:
             _arrays(beside)
         except InputError as error:
@@ -151,29 +240,34 @@ def read(path: Path) -> Model:
         content = json.loads(description)
         scene = parse(content["scene"], path)
         record = content["record"]
-        matrix = sparse.csr_array(
-            (arrays["data"], arrays["indices"], arrays["indptr"]), shape=tuple(arrays["shape"].tolist())
-        )
-        matrix.check_format()
+        matrix, shape = None, tuple(arrays["shape"].tolist())
+        if "data" in arrays:
+            matrix = sparse.csr_array((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
+            matrix.check_format()
+        if matrix is None and record["method"] != "ideal":
+            raise ValueError("it has no entries")
     except InputError:
         raise
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(f"{path}: holds no usable observation matrix ({error}); calibrate again") from error
     camera = derive(scene)
     expected = (camera.measurements, camera.unknowns)
-    if matrix.shape != expected or not arrays["variance"].shape == arrays["data"].shape == arrays["batches"].shape[1:]:
-        raise InputError(f"{path}: its matrix is {matrix.shape}, its scene wants {expected}; calibrate again")
+    entries = np.shape(arrays.get("data", ()))
+    if shape != expected or not arrays["variance"].shape == entries == arrays["batches"].shape[1:]:
+        raise InputError(f"{path}: its matrix is {shape}, its scene wants {expected}; calibrate again")
     return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
 
 
 def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    names = ("indices", "indptr", "data", "shape", "variance", "batches")
+    names = ("shape", "variance", "batches")
     try:
         # numpy leaves a damaged file open, so we open it
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays: dict[str, NDArray[Any]] = {name: file[name] for name in names}
+            if file["format"][()] != b"boxes":
+                arrays |= {name: file[name] for name in ENTRIES}
             record = json.loads(str(file["ommatid"][()]))
             description, seal = record["description"], record["sha256"]
     except _UNREADABLE as error:

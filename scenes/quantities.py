@@ -83,6 +83,25 @@ Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)
 Samples = Annotated[int, Field(ge=16, le=2**24, description="per sensor pixel; rendered in 16 passes or more")]
 
 
+def _memory(value: object) -> int:
+    if isinstance(value, str):
+        try:
+            size = int(_units().Quantity(value).to("byte").magnitude)
+        except Exception as error:  # as for lengths
+            raise ValueError(f'expected an amount of memory such as "4 GB", got {value!r}') from error
+        if 0 < size < 2**63:
+            return size
+    raise ValueError(f'expected an amount of memory with its unit, such as "4 GB", got {value!r}')
+
+
+Memory = Annotated[
+    int,
+    BeforeValidator(_memory),
+    PlainSerializer(lambda size: f"{size} B", return_type=str),
+    WithJsonSchema({"type": "string", "examples": ["4 GB"]}),
+]
+
+
 def _expected_noise(value: object) -> object:
     if value == "fit" or (isinstance(value, float | int) and not isinstance(value, bool) and 0 <= value <= 1e24):
         return value if value == "fit" else float(cast(float, value))

@@ -28,7 +28,7 @@ from .errors import InputError
 from .explain import explain
 from .files import write_text
 from .override import apply_overrides, keep_lenses
-from .quantities import Corner, ExpectedNoise, Length, Magnification, Pair, Samples, Step, pair
+from .quantities import Corner, ExpectedNoise, Length, Magnification, Memory, Pair, Samples, Step, pair
 
 FULL_SCALE = 256.0
 LARGEST = 1e12  # of a value: files hold float32, and squares of values have to fit as well
@@ -152,8 +152,31 @@ class Estimator(_Table):
         "square-root-covariance",
         "svd",
         "dual",
-    ] = Field(default="auto", description="the form of the estimator; auto: the cheapest that is right to tolerance")
-    tolerance: float = Field(default=1e-8, gt=0, le=1, description="relative error of the computation that is allowed")
+        "tiles",
+        "frame",
+    ] = Field(default="auto", description="a dense form, tiles, or the whole frame; auto: the cheapest that is right")
+    tolerance: float = Field(default=1e-8, gt=0, le=1, description="relative error that a dense form is allowed")
+    accuracy: float = Field(
+        default=0.01, gt=0, le=1, description="error that a frame is allowed, in its posterior standard deviations"
+    )
+    memory: Memory | None = Field(
+        default=None, description='never to be exceeded, such as "4 GB"; absent: half of what is free'
+    )
+
+
+class Tiles(_Table):
+    """How a frame is cut where it is reconstructed tile by tile."""
+
+    size: int = Field(default=35, ge=4, le=200, description="rows and columns of a tile, in pixels of the target")
+    overlap: int = Field(default=8, ge=0, description="border of a tile that its neighbours replace")
+
+    @model_validator(mode="after")
+    def _a_core_is_left(self) -> Tiles:
+        if 2 * self.overlap >= self.size:
+            raise ValueError(
+                f"tiles.overlap {self.overlap} leaves nothing of tiles of {self.size}; expected below half"
+            )
+        return self
 
 
 class Render(_Table):
@@ -181,6 +204,7 @@ class Scene(_Table):
     noise: Noise | None = None
     prior: Prior = Prior()
     estimator: Estimator = Estimator()
+    tiles: Tiles = Tiles()
     render: Render = Render()
     calibration: Calibration = Calibration()
 

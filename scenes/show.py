@@ -11,8 +11,8 @@ from .plan import left_out
 from .scene import Scene
 
 
-def describe(scene: Scene, camera: Camera, variant: str) -> dict[str, Any]:
-    """Geometry and plan in JSON's types; lengths are millimetres."""
+def describe(scene: Scene, camera: Camera, variant: str, reconstruction: dict[str, Any]) -> dict[str, Any]:
+    """Geometry and plan in JSON's types; lengths are millimetres. `reconstruction` is the plan of its last stage."""
     seen = camera.types_seeing()
     fewer = {
         str(count): int(np.sum(seen == count)) for count in range(len(camera.types)) if bool(np.any(seen == count))
@@ -31,7 +31,7 @@ def describe(scene: Scene, camera: Camera, variant: str) -> dict[str, Any]:
         "unknowns": camera.unknowns,
         "pixels_seen_by_fewer_types": fewer,
         "where": _where(camera),
-        "plan": _plan(scene, camera, variant),
+        "plan": _plan(scene, camera, variant, reconstruction),
         "skipped": [{"what": what, "why": why} for what, why in left_out(scene)],
     }
 
@@ -66,11 +66,11 @@ def _where(camera: Camera) -> list[str]:
     return found
 
 
-def _plan(scene: Scene, camera: Camera, variant: str) -> dict[str, Any]:
+def _plan(scene: Scene, camera: Camera, variant: str, reconstruction: dict[str, Any]) -> dict[str, Any]:
     plan: dict[str, Any] = {
         "render": {"variant": variant, "samples": scene.render.samples, "sensors": len(camera.sub_imagers)},
         "calibrate": {"method": scene.calibration.method},
-        "reconstruct": {"method": scene.estimator.method, "matrix": min(camera.measurements, camera.unknowns)},
+        "reconstruct": reconstruction,
     }
     if scene.calibration.method == "points":
         plan["calibrate"] |= {"variant": variant, "samples": scene.calibration.samples, "sources": camera.unknowns}

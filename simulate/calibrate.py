@@ -14,6 +14,7 @@ from scenes.camera import Camera
 from scenes.files import fingerprint
 from scenes.model import Model
 from scenes.moderate import moderate
+from scenes.partial import Partial
 from scenes.scene import Scene, resolved
 from scenes.versions import versions
 
@@ -33,7 +34,7 @@ def made_from(scene: Scene, camera: Camera) -> str:
     return fingerprint(description)
 
 
-def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress) -> Model:
+def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress, partial: Partial | None = None) -> Model:
     """H as the scene's `calibration.method` finds it, with the variance of every entry and its record.
 
     Raises InputError if the variant asked for does not work here, DeniedError if a row fails its check.
@@ -45,7 +46,7 @@ def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress) ->
         model = ideal_model(kept, camera)
         record |= {"seconds": perf_counter() - start, "versions": versions("scipy")}
         return replace(model, record=record)
-    responses = from_points(scene, camera, progress)
+    responses = from_points(scene, camera, progress, partial)
     variance = settle(responses, camera)
     record |= {
         "seconds": perf_counter() - start,

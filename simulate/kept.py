@@ -12,6 +12,7 @@ from scenes import model, stack
 from scenes.camera import Camera
 from scenes.errors import InputError
 from scenes.model import Model
+from scenes.partial import partial_of
 from scenes.scene import Scene, resolved
 from scenes.stack import Stack
 
@@ -32,7 +33,8 @@ def kept_stack(
         if old.scene.plain() != now.plain():  # what the estimator is told may have changed, the values have not
             stack.write(path, replace(old, scene=now))
         return stack.read(path), False
-    stack.write(path, render.render(scene, camera, image, progress))
+    with partial_of(path, render.made_from(scene, camera, image)) as partial:
+        stack.write(path, render.render(scene, camera, image, progress, partial))
     return stack.read(path), True
 
 
@@ -44,5 +46,6 @@ def kept_model(path: Path, scene: Scene, camera: Camera, progress: Progress) -> 
         old = None
     if old is not None and old.record.get("fingerprint") == calibrate.made_from(scene, camera):
         return old, False
-    model.write(path, calibrate.calibrate(scene, camera, progress))
+    with partial_of(path, calibrate.made_from(scene, camera)) as partial:
+        model.write(path, calibrate.calibrate(scene, camera, progress, partial))
     return model.read(path), True

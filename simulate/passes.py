@@ -8,6 +8,8 @@ from math import ceil, isqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from scenes.partial import State
+
 Vector = NDArray[np.float64]
 
 BATCHES = 8  # passes are also averaged in this many batches, whose scatter shows how errors go together
@@ -64,6 +66,16 @@ class Tally:
         self.count = 0
         self._mean = np.zeros(shape)
         self._squares = np.zeros(shape)
+
+    def state(self, name: str) -> State:
+        """All of it, to be kept under `name`."""
+        return {f"{name}.count": np.array(self.count), f"{name}.mean": self._mean, f"{name}.squares": self._squares}
+
+    def resume(self, name: str, state: State) -> None:
+        """Go on where a kept one of this name stopped, if there is one."""
+        if f"{name}.count" in state:
+            self.count = int(state[f"{name}.count"])
+            self._mean, self._squares = state[f"{name}.mean"], state[f"{name}.squares"]
 
     def add(self, values: Vector) -> None:
         """Take in one more pass."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scenes.camera import Camera
 from scenes.files import digest, fingerprint
 from scenes.moderate import moderate
+from scenes.partial import Partial
 from scenes.scene import Scene, resolved
 from scenes.stack import Stack
 from scenes.versions import versions
@@ -49,8 +50,17 @@ def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
     )
 
 
-def light(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Progress = no_progress) -> Rendering:
-    """Render the light alone, before the sensor. Raises InputError if the variant asked for does not work here."""
+def light(
+    scene: Scene,
+    camera: Camera,
+    image: NDArray[np.float64],
+    progress: Progress = no_progress,
+    partial: Partial | None = None,
+) -> Rendering:
+    """Render the light alone, before the sensor. Raises InputError if the variant asked for does not work here.
+
+    partial : where passes that are done are kept and found again
+    """
     from .rig import Rig
 
     variant = choose(scene.render.variant)
@@ -58,12 +68,16 @@ def light(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Pr
     rig = Rig(camera, variant, scene.render.sampler)
     rig.show(image)
     tally = Tally(camera.measurements)
-    for number in range(work.passes):
+    if partial is not None:
+        tally.resume("light", partial.state())
+    for number in range(tally.count, work.passes):
         values = np.empty(camera.measurements)
         for group in rig.groups:
             seed = sampler_seeds(scene.render.seed, "data", number, work.passes)
             values[rig.places(group)] = rig.expose(group, work.samples, seed)[0]
         tally.add(values)
+        if partial is not None:
+            partial.offer(lambda: tally.state("light"))
         progress((number + 1) / work.passes)
     return Rendering(
         passes=work.passes,
@@ -75,14 +89,20 @@ def light(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Pr
     )
 
 
-def render(scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Progress = no_progress) -> Stack:
+def render(
+    scene: Scene,
+    camera: Camera,
+    image: NDArray[np.float64],
+    progress: Progress = no_progress,
+    partial: Partial | None = None,
+) -> Stack:
     """Render and record the sub-images of `image`, (rows, columns).
 
     The variance of each pixel's mean is drawn towards its sub-image's and never below float32's rounding.
     Raises InputError if the variant asked for does not work here.
     """
     start = perf_counter()
-    rendering = light(scene, camera, image, progress)
+    rendering = light(scene, camera, image, progress, partial)
     floor = rounding_variance(rendering.mean, rendering.samples)
     variance = np.concatenate([moderate(rendering.variance[place], rendering.passes) for place in camera.slices()])
     values = rendering.mean

@@ -120,6 +120,7 @@ def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> Non
 def test_without_noise_the_error_is_the_null_space(lenses: tuple[str, ...]) -> None:
     camera = derive(read(GALLERY / "tile19.toml", (), lenses))
     found = predict(ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361), 0.0, Estimator(), (19, 19))
+    assert found.null_space is not None
     assert found.mse == pytest.approx(PRIOR.variance * found.null_space / 361, rel=1e-9, abs=1e-12)
 
 

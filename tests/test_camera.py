@@ -33,7 +33,7 @@ def test_the_papers_arrays() -> None:
 
 
 def test_fit_takes_the_largest_sub_image() -> None:
-    assert [kind.pixels for kind in gallery("photo").types] == [(19, 19), (11, 11), (14, 14)]
+    assert [kind.pixels for kind in gallery("photo").types] == [(79, 79), (47, 47), (59, 59)]
     assert (gallery("photo").types_seeing() == 3).all(), "59 = 60 - 1 leaves no pixel to fewer types"
     assert gallery("single").types[0].pixels == (59, 59)
 

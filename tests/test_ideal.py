@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scenes.boxes import overlap
 from scenes.camera import Camera
-from simulate.ideal import ideal_matrix, overlap
+from simulate.ideal import ideal_matrix
 
 from .examples import THREE, camera
 

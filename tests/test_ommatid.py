@@ -447,6 +447,7 @@ def test_a_title_with_dollar_signs_is_drawn_as_it_is(here: Path, ommatid: Comman
 
 def test_too_large_a_reconstruction_is_refused_before_anything_is_rendered(here: Path, ommatid: Command) -> None:
     sets = ["target.origin=", "target.shape=[512, 512]", "camera.lens.I.pixels=fit", "camera.lens_pitch=9 mm"]
+    sets.append("estimator.memory=20 MB")
     ended = ommatid("run", "tiny.toml", "-o", "out", *(word for one in sets for word in ("--set", one)))
     assert ended.code == 2
     assert "GB" in ended.err

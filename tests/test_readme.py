@@ -49,7 +49,7 @@ def fresh(tmp_path: Path) -> Path:
 
 def test_every_command_works_as_it_is_written(fresh: Path) -> None:
     """In their order; only samples are spared."""
-    found = [words for words in commands() if words[1] not in ALONE or "mine.toml" in words]
+    found = [words for words in CHAINED if not is_of_tile35(words)]
     assert len(found) >= 6
     for words in found:
         work(words, fresh)
@@ -60,7 +60,25 @@ def test_every_command_works_as_it_is_written(fresh: Path) -> None:
 
 
 # What `stability` computes is tests/test_stability.py, case by case; a second time would be a minute for nothing.
-STANDING = [words for words in commands() if words[1] in ALONE[:-1] and "mine.toml" not in words]
+STANDING = [
+    words
+    for words in commands()
+    if "mine.toml" not in words and (words[1] in ALONE[:-1] or (words[1] == "run" and "--workers" in words))
+]
+
+
+CHAINED = [words for words in commands() if words not in STANDING and words[1] != "stability"]
+
+
+def is_of_tile35(words: list[str]) -> bool:
+    return any("tile35" in word for word in words)
+
+
+def test_the_commands_on_another_scene_work_as_they_are_written(fresh: Path) -> None:
+    found = [words for words in CHAINED if is_of_tile35(words)]
+    assert len(found) >= 2
+    for words in found:
+        work(words, fresh)
 
 
 @pytest.mark.parametrize("words", STANDING, ids=" ".join)

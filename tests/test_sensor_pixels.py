@@ -150,7 +150,7 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     noise_alone = restored(scene(lenses=THREE, noise={"variance": 9.0}, estimator={"noise_variance": "fit"}))
     assert noise_alone.fit is not None
     assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.spread[0])
-    assert noise_alone.estimated.form.problem.prior.independent
+    assert noise_alone.prior.kind == "independent"
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_a_fit_with_an_uncertain_h(told: dict[str, Any]) -> None:
     spread = 0.002 * rng.normal(size=model.matrix.nnz)
     uncertain = replace(
         model,
-        matrix=model.matrix
+        stored=model.matrix
         + type(model.matrix)((spread, model.matrix.indices, model.matrix.indptr), model.matrix.shape),
         variance=np.full(model.matrix.nnz, 0.002**2),
     )

@@ -44,9 +44,8 @@ class Form(ABC):
     def variance(self) -> Vector:
         """The diagonal of the posterior covariance where prior and noise are what was expected: (N,), never below 0."""
 
-    def columns(self, some: slice) -> tuple[Matrix, Matrix]:
+    def columns(self, pixels: NDArray[np.intp]) -> tuple[Matrix, Matrix]:
         """For some pixels, c = L^T e_i, r = 0: u, (K, q), with |u|^2 the prior's part of Eq. 5, and l = -A^T e_i."""
-        pixels = np.arange(self.problem.unknowns)[some]
         unit = np.zeros((self.problem.unknowns, pixels.size))
         unit[pixels, np.arange(pixels.size)] = 1.0
         return self.solve(self.problem.prior.gather(unit), np.zeros((self.problem.measurements, pixels.size)))

@@ -1,11 +1,14 @@
 """What our ways to render, to calibrate and to estimate gain, and over what: `python -m tests.benchmarks`.
 
+`python -m tests.benchmarks frames` measures one part alone; the parts are `rendering`, `forms` and `frames`.
 Nothing here asserts a speed. Other load slows both sides of a ratio alike, so ratios are to be compared, not times.
 """
 
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Callable, Iterator
 from math import isnan
 from pathlib import Path
 from time import perf_counter
@@ -22,13 +25,27 @@ from .alternation import VARIANTS, Row
 from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
 from .forms import NOISE, form_rows
+from .frame_tables import bandwidth_table, frames_table, growth_table
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
 
 
 def main() -> None:
-    """Run every benchmark on every variant that works here, and print one table."""
+    """Run the benchmarks that are asked for, or every one, and print their tables as they come."""
+    names = sys.argv[1:] or list(PARTS)
+    unknown = [name for name in names if name not in PARTS]
+    if unknown:
+        raise SystemExit(f"{unknown[0]!r} is no part of the benchmarks; expected some of: {', '.join(PARTS)}")
+    console = Console()
+    console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell
+    for name in names:
+        for table in PARTS[name]():
+            console.print(table)
+
+
+def _rendering() -> Iterator[Table]:
+    """Rendering and calibration, on every variant that works here."""
     start = perf_counter()
     found = ", ".join(f"{name} {version}" for name, version in versions("mitsuba", "drjit").items())
     table = Table(title=f"Speed against stock Mitsuba, on {os.cpu_count()} cores with {found}", show_lines=True)
@@ -51,13 +68,10 @@ def main() -> None:
             f"All of it took {perf_counter() - start:.0f} s.",
         ]
     )
-    console = Console()
-    console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell
-    console.print(table)
-    console.print(_work_precision())
+    yield table
 
 
-def _work_precision() -> Table:
+def _forms() -> Iterator[Table]:
     table = Table(title=f"Work and precision of the estimator's forms, noise variance {NOISE:g}", show_lines=False)
     for name in ("unknowns", "measurements", "lens types", "form", "factorise", "solve", "solve, refine and bound"):
         table.add_column(name, justify="right" if name not in ("lens types", "form") else "left")
@@ -74,7 +88,15 @@ def _work_precision() -> Table:
             continue
         seconds = [f"{value:.2g} s" if value >= 1 else f"{value * 1e3:.3g} ms" for value in row.seconds]
         table.add_row(*what, *seconds, *("reference" if isnan(value) else f"{value:.1f}" for value in row.digits))
-    return table
+    yield table
+
+
+def _frames() -> Iterator[Table]:
+    for table in (frames_table, growth_table, bandwidth_table):
+        yield table()
+
+
+PARTS: dict[str, Callable[[], Iterator[Table]]] = {"rendering": _rendering, "forms": _forms, "frames": _frames}
 
 
 def _add(table: Table, what: str, row: Row) -> None:

@@ -16,7 +16,7 @@ from scipy import sparse
 from scenes.camera import derive
 from scenes.scene import read
 from simulate.passes import Plan
-from simulate.points import entries_of, spacing, sweep
+from simulate.points import Sweep, entries_of, spacing
 from simulate.render import no_progress
 from simulate.rig import Rig
 from simulate.streams import sampler_seeds
@@ -66,7 +66,9 @@ def by_grids(rig: Rig, seed: int) -> sparse.csr_array:
     """H, (M, N), by one pass of grids, the uniform target for its check included."""
     rows: list[sparse.csr_array] = []
     for group, types in rig.groups.items():
-        tally = sweep(rig, group, PASS, seed, no_progress)[0]
+        swept = Sweep(rig, group)
+        swept.one_more(PASS, seed, no_progress)
+        tally = swept.tally
         rows.append(entries_of(rig.camera, rig.places(group), spacing(types[0]), tally.mean)[0])
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 

@@ -1,0 +1,144 @@
+"""The estimate tile by tile: for frames that are too large for one dense problem, whatever their camera.
+
+Its error is that of what it is: of every pixel estimated from the measurements of its tile alone.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
+
+from scenes.files import digest
+from scenes.workers import workers
+
+from .estimator import Solver
+from .expected import ExpectedError, Interval, interval
+from .tiles import Done, Piece, Tile, cut, pulled, work, work_alone
+from .way import Outcome, Vector, Way, is_one_number, residual_multipliers, total
+
+MOST_TILES = 256  # in one piece
+
+
+class Tiled(Way):
+    """By tiles."""
+
+    def estimated(self) -> Vector:
+        """f^ alone: (N,)."""
+        pieces = list(self.pieces({}, None))
+        found = np.empty(self.task.shape)
+        for (tiles, _), done in zip(pieces, self.done(pieces), strict=True):
+            for tile, image in zip(tiles, done.image.T, strict=True):
+                found[tile.core] = image.reshape(found[tile.core].shape)
+        return found.ravel()
+
+    def outcome(self, noise: dict[str, Vector], truth: Vector | None) -> Outcome:
+        """The estimate and its error where the noise is as given."""
+        task = self.task
+        pieces = list(self.pieces(noise, truth))
+        results = self.done(pieces)
+        image, variance, resolved = (np.empty(task.shape) for _ in range(3))
+        missing, parts, sums = 0.0, dict.fromkeys(noise, 0.0), np.zeros(2)
+        for (tiles, _), done in zip(pieces, results, strict=True):
+            for place, tile in enumerate(tiles):
+                for whole, values in (
+                    (image, done.image[:, place]),
+                    (variance, done.variance),
+                    (resolved, done.resolved),
+                ):
+                    whole[tile.core] = values.reshape(whole[tile.core].shape)
+                share = done.variance.size / image.size
+                missing += share * done.missing
+                parts = {name: part + share * done.parts[name] for name, part in parts.items()}
+                sums += 0.0 if done.given is None else done.given[:, place]
+        self.image = image.ravel()
+        given: Interval | None = None if truth is None else interval(float(sums[0]), float(sums[1]), image.size)
+        return Outcome(
+            self.image,
+            residual_multipliers(task, self.image),
+            _worst([done.solver for done in results], len(pieces)),
+            ExpectedError(variance.ravel(), missing, parts, resolved.ravel()),
+            given,
+            lambda weights: self._variance_of_sum(weights, total(noise)),
+        )
+
+    def pieces(self, noise: dict[str, Vector], truth: Vector | None) -> Iterator[tuple[list[Tile], Piece]]:
+        """The work, in pieces of tiles that share a factorisation; without noise, of the image alone."""
+        task = self.task
+        groups: dict[object, list[Tile]] = {}
+        for tile in cut(task.shape, task.tiles.size, task.tiles.overlap):
+            groups.setdefault(self._key(tile, noise), []).append(tile)
+        for members in groups.values():
+            for first in range(0, len(members), MOST_TILES):
+                tiles = members[first : first + MOST_TILES]
+                yield tiles, self._piece(tiles, noise, truth)
+
+    def done(self, pieces: list[tuple[list[Tile], Piece]]) -> list[Done]:
+        """What becomes of them; each is computed by one thread, so that results do not depend on who does it."""
+        work_on = [piece for _, piece in pieces]
+        if self.hands.workers is not None:
+            return self.hands.workers.map(work_alone, work_on, self.hands.progress)
+        with threadpool_limits(1, "blas"), workers(threads=os.cpu_count() or 1) as here:
+            return here.map(work, work_on, self.hands.progress)
+
+    def _key(self, tile: Tile, noise: dict[str, Vector]) -> object:
+        task = self.task
+        varied = [values for values in (task.believed, *noise.values()) if not is_one_number(values)]
+        marks: list[str] = []
+        if varied or not task.used.all():
+            numbers = task.model.numbers(*tile.window)
+            marks = [digest(task.used[numbers]), *(digest(values[self._places(numbers)]) for values in varied)]
+        return task.model.signature(*tile.window), tile.shape, tile.kept.tobytes(), *marks
+
+    def _piece(self, tiles: list[Tile], noise: dict[str, Vector], truth: Vector | None) -> Piece:
+        task, one = self.task, tiles[0]
+        numbers = [task.model.numbers(*tile.window) for tile in tiles]
+        used = task.used[numbers[0]]
+        some = self._places(numbers[0])
+        pixels = np.arange(task.model.unknowns).reshape(task.shape)
+        return Piece(
+            matrix=task.model.part(*one.window)[used],
+            recorded=np.stack([task.recorded[found[task.used[found]]] for found in numbers], axis=1),
+            believed=task.believed[some],
+            noise={name: values[some] for name, values in noise.items()},
+            prior=task.prior_on(one.shape),
+            kept=one.kept,
+            told=task.told,
+            truth=None if truth is None else np.stack([truth[pixels[tile.window].ravel()] for tile in tiles], axis=1),
+            image_only=not noise,
+        )
+
+    def _places(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Where those of the measurements that are used stand among all that are."""
+        if self.task.used.all():
+            return numbers
+        return self._order[numbers[self.task.used[numbers]]]
+
+    @cached_property
+    def _order(self) -> NDArray[np.int64]:
+        return np.cumsum(self.task.used) - 1
+
+    def _variance_of_sum(self, weights: Vector, actual: Vector) -> float:
+        """Eq. 5 of w^T f^: the tiles' A^T w add up on the measurements that they share."""
+        task, pull = self.task, np.zeros(self.task.believed.size)
+        grid = weights.reshape(task.shape)
+        for tile in cut(task.shape, task.tiles.size, task.tiles.overlap):
+            inside = np.zeros_like(grid)
+            inside[tile.core] = grid[tile.core]
+            if inside.any():
+                places = self._places(task.model.numbers(*tile.window))
+                pull[places] += pulled(self._piece([tile], {}, None), inside[tile.window].ravel())
+        left = weights - task.model.adjoint(task.over_all(pull, 0.0))
+        return task.prior_spread(left) + float(actual @ np.square(pull))
+
+
+def _worst(solvers: list[Solver], pieces: int) -> Solver:
+    worst = max(solvers, key=lambda solver: max(solver.bound or 0.0, solver.variance_bound))
+    condition = max(solver.condition for solver in solvers)
+    why = f"each tile by itself, {pieces} factorisations"
+    return replace(worst, method=f"tiles, {worst.method}", why=why, condition=condition)

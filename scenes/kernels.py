@@ -1,0 +1,62 @@
+"""Averages over boxes and their adjoint, compiled: each reads and writes memory once.
+
+Work is cut into ranges of rows that do not depend on how many threads share them, so neither do the results.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True)
+def average(image, order, row_start, row_share, column_start, column_share, out, first, last):
+    """Averages of `image` over boxes, for places first to last in `order` of the sensor rows; see `boxes.Axis`."""
+    columns = image.shape[1]
+    across, pixels = out.shape[1], out.shape[3]
+    line = np.empty(columns)
+    for place in range(first, last):
+        row = order[place]
+        line[:] = 0.0
+        for q in range(row_share.shape[1]):
+            share = row_share[row, q]
+            if share != 0.0:
+                source = image[row_start[row] + q]
+                for x in range(columns):
+                    line[x] += share * source[x]
+        k, i = row // out.shape[2], row % out.shape[2]
+        for l in range(across):  # noqa: E741
+            for j in range(pixels):
+                column = l * pixels + j
+                start, total = column_start[column], 0.0
+                for q in range(column_share.shape[1]):
+                    total += column_share[column, q] * line[start + q]
+                out[k, l, i, j] = total
+
+
+@numba.njit(cache=True, nogil=True)
+def spread(readings, order, row_start, row_share, column_start, column_share, out, first, last):
+    """Add to rows first to last of `out` what the adjoint of `average` makes of `readings`."""
+    columns = out.shape[1]
+    across, pixels = readings.shape[1], readings.shape[3]
+    wide = row_share.shape[1]
+    line = np.empty(columns)
+    for row in order:
+        start = row_start[row]
+        if start + wide <= first or start >= last:
+            continue
+        k, i = row // readings.shape[2], row % readings.shape[2]
+        line[:] = 0.0
+        for l in range(across):  # noqa: E741
+            for j in range(pixels):
+                column = l * pixels + j
+                begin, value = column_start[column], readings[k, l, i, j]
+                for q in range(column_share.shape[1]):
+                    line[begin + q] += column_share[column, q] * value
+        for q in range(wide):
+            share = row_share[row, q]
+            if share != 0.0 and first <= start + q < last:
+                target = out[start + q]
+                for x in range(columns):
+                    target[x] += share * line[x]

@@ -1,0 +1,78 @@
+"""Work that was broken off: what is done of it waits beside the result, and the next run carries on from there."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import DeniedError
+from .files import write_whole
+
+State = dict[str, NDArray[Any]]
+
+SPACING = 30.0  # seconds between two savings: what a power cut may cost
+
+
+class Partial:
+    """What is done so far of something that a fingerprint names."""
+
+    def __init__(self, path: Path, fingerprint: str) -> None:
+        """Of the result that will stand at `path`."""
+        self._path = path.with_name(f".{path.name}.partial.npz")
+        self._fingerprint = fingerprint
+        self._saved = monotonic()
+        self._latest: Callable[[], State] | None = None
+
+    def state(self) -> State:
+        """What an earlier run left, if it was of the same; else nothing."""
+        try:
+            with self._path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+                found = {name: file[name] for name in file.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+            return {}
+        return found if str(found.pop("fingerprint", "")) == self._fingerprint else {}
+
+    def offer(self, latest: Callable[[], State]) -> None:
+        """Say how far the work is; it is written now and then, and when the work is broken off."""
+        self._latest = latest
+        if monotonic() - self._saved > SPACING:
+            self.save()
+
+    def save(self) -> None:
+        """Write what was offered last. Raises DeniedError."""
+        if self._latest is None:
+            return
+        state = {**self._latest(), "fingerprint": np.array(self._fingerprint)}
+
+        def fill(beside: Path) -> None:
+            with beside.open("wb") as stream:
+                np.savez(stream, allow_pickle=False, **state)
+
+        write_whole(self._path, fill)
+        self._saved = monotonic()
+
+    def remove(self) -> None:
+        """The work is done."""
+        self._path.unlink(missing_ok=True)
+
+
+@contextmanager
+def partial_of(path: Path, fingerprint: str) -> Generator[Partial]:
+    """What is done so far of the result at `path`: kept when the work is broken off, removed when it is done."""
+    partial = Partial(path, fingerprint)
+    try:
+        yield partial
+    except BaseException:
+        try:
+            partial.save()
+        except DeniedError:  # what broke the work off is the thing to tell
+            partial.remove()
+        raise
+    partial.remove()

@@ -29,7 +29,7 @@ from .way import Hands, Outcome, Progress, Task, Way, is_one_number, to_nobody, 
 
 Vector = NDArray[np.float64]
 
-MOST_FEIGNED = 0.1  # of what is believed of a pixel: above it the expected error is too small to be trusted
+MOST_FEIGNED = 0.05  # of what is believed of a pixel on average: above it the expected error is not to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
 KEPT = ("rendering", "calibration")  # noise that stays known when the rest of it is to be found
 
@@ -61,7 +61,7 @@ class Restoration:
 
     choice : which way to it;  prior : what was believed of the image, found or told
     noise : what is known of it by name, (pixels used,) each
-    feigned : the largest share of what is believed of a pixel that the noise of H may have feigned
+    feigned : the share of what is believed of a pixel, on average, that the noise of H may have feigned
     """
 
     outcome: Outcome
@@ -284,7 +284,7 @@ def _feigned(model: Model, usable: Usable, believed: Vector, expected: ExpectedE
     noise = np.full(model.measurements, np.inf)
     noise[usable.used] = believed
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
-        return float(np.nan_to_num(model.feigned(noise) * expected.variance).max(initial=0.0))
+        return float(np.nan_to_num(model.feigned(noise) * expected.variance).mean())
 
 
 def _residual(outcome: Outcome, believed: Vector) -> Residual | None:

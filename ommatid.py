@@ -10,9 +10,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -23,12 +22,13 @@ from scenes.errors import DeniedError, InputError
 
 if TYPE_CHECKING:
     from reconstruct.accuracy import Prediction
+    from scenes.batch import Batch
     from scenes.camera import Camera
-    from scenes.parcel import Outcome, Parcel, Stages, Watch
+    from scenes.parcel import Stages, Watch
     from scenes.picture import Image
+    from scenes.progress import Progress
     from scenes.scene import Noise, Scene
     from scenes.stack import Stack
-    from scenes.workers import Ended
     from scenes.workers import Workers as Crew
 
 app = typer.Typer(
@@ -61,7 +61,6 @@ Workers = Annotated[
     typer.Option("--workers", metavar="N", min=1, help="Share the scenes among N processes on this machine."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
-Progress = Callable[[float], None]
 
 
 @app.command()
@@ -83,7 +82,7 @@ def run(
             _table(f"{scene.title or scene.source.stem}: {folder}", rows(description))
         return description
 
-    _each(scenes, output, _Batch(sets, lens, stages_of_run, tell), scheduler, workers, as_json)
+    _each(scenes, output, _batch(sets, lens, stages_of_run, tell), scheduler, workers, as_json)
 
 
 @app.command()
@@ -102,7 +101,7 @@ def render(
         del scene
         return {"file": str(folder / "stack.exr"), **description}
 
-    _each(scenes, output, _Batch(sets, lens, stages_of_render, tell), scheduler, workers, as_json)
+    _each(scenes, output, _batch(sets, lens, stages_of_render, tell), scheduler, workers, as_json)
 
 
 def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
@@ -432,28 +431,20 @@ class _Worst(Exception):
         self.code = code
 
 
-@dataclass(frozen=True)
-class _Batch:
+def _batch(
+    sets: list[str] | None, lens: str, stages: Stages, tell: Callable[[Scene, Path, dict[str, Any]], dict[str, Any]]
+) -> Batch:
     """What is asked of every scene: changes, the stages, and what to tell the user when they are done."""
+    from scenes.batch import Batch
+    from scenes.parcel import Watch
 
-    sets: list[str] | None
-    lens: str
-    stages: Stages
-    tell: Callable[[Scene, Path, dict[str, Any]], dict[str, Any]]
+    def opened(path: Path) -> tuple[Scene, Camera, Image]:
+        return _opened(path, sets, lens)
 
-    def opened(self, path: Path) -> tuple[Scene, Camera, Image]:
-        return _opened(path, self.sets, self.lens)
-
-    def work(self, path: Path, folder: Path) -> dict[str, Any]:
-        """Do one scene in this process."""
-        from scenes.parcel import Watch
-
-        scene, camera, image = self.opened(path)
-        watch = Watch(_progress, partial(_say_done, folder))
-        return self.tell(scene, folder, self.stages(scene, camera, image, folder, watch))
+    return Batch(opened, stages, lambda folder: Watch(_progress, partial(_say_done, folder)), tell, facts)
 
 
-def _each(paths: list[Path], output: Path, batch: _Batch, scheduler: str, workers: int | None, as_json: bool) -> None:
+def _each(paths: list[Path], output: Path, batch: Batch, scheduler: str, workers: int | None, as_json: bool) -> None:
     """Do every scene of a batch, whatever happens to the others; then end with the worst exit code."""
     stems = [path.stem for path in paths]
     for stem in stems:
@@ -462,8 +453,7 @@ def _each(paths: list[Path], output: Path, batch: _Batch, scheduler: str, worker
     folders = {path: output / path.stem for path in paths}
     results: dict[Path, dict[str, Any]] = {}
     worst = 0
-    works = _sent(folders, batch, scheduler, workers) if scheduler or workers else _here(folders, batch)
-    for path, work in works:
+    for path, work in batch.works(folders, scheduler, workers):
         try:
             results[path] = {"scene": str(path), **work()}
         except Exception as error:
@@ -476,81 +466,6 @@ def _each(paths: list[Path], output: Path, batch: _Batch, scheduler: str, worker
         raise _Worst(worst)
 
 
-Works = Generator[tuple[Path, Callable[[], dict[str, Any]]]]
-
-
-def _here(folders: dict[Path, Path], batch: _Batch) -> Works:
-    for path, folder in folders.items():
-        yield path, partial(batch.work, path, folder)
-
-
-def _sent(folders: dict[Path, Path], batch: _Batch, scheduler: str, count: int | None) -> Works:
-    """Send the scenes to workers: each as it ends, what is wrong with it already here first of all."""
-    from scenes.parcel import carry_out
-    from scenes.workers import refuse_options, workers
-
-    refuse_options(scheduler, count)
-    scenes: dict[Path, Scene] = {}
-    for path, folder in folders.items():
-        try:
-            scene, _, image = batch.opened(path)
-            _prepare(scene, image, folder)
-            scenes[path] = scene
-        except Exception as error:
-            yield path, partial(_raise, error)
-    if not scenes:
-        return
-    with workers(scheduler, count and min(count, len(scenes))) as pool:
-        pool.refuse_differences(partial(facts, any(scene.render.variant == "auto" for scene in scenes.values())))
-        parcels = _Parcels(batch, [(path, folders[path]) for path in scenes])
-        try:
-            for ended in pool.each(partial(carry_out, batch.stages), parcels):
-                path = parcels.sent[ended.place]
-                yield path, partial(_finished, batch, path, scenes.pop(path), folders[path], ended)
-        except DeniedError as error:
-            parcels.failed |= {path: DeniedError(f"{path}: {error}") for path in scenes}
-    for path in scenes:
-        yield path, partial(_raise, parcels.failed[path])
-
-
-class _Parcels:
-    """The scenes of a batch, opened again one by one as workers are free: the pictures of all might be too many."""
-
-    def __init__(self, batch: _Batch, places: list[tuple[Path, Path]]) -> None:
-        self.sent: list[Path] = []
-        self.failed: dict[Path, Exception] = {}
-        self._batch = batch
-        self._places = places
-
-    def __iter__(self) -> Iterator[Parcel]:
-        from scenes.parcel import packed
-
-        for path, folder in self._places:
-            try:
-                parcel = packed(*self._batch.opened(path), folder)
-            except Exception as error:  # removed meanwhile
-                self.failed[path] = error
-                continue
-            self.sent.append(path)
-            yield parcel
-
-
-def _finished(batch: _Batch, path: Path, scene: Scene, folder: Path, ended: Ended[Outcome]) -> dict[str, Any]:
-    """Take in what a worker made of a scene. Raises what stopped it there."""
-    from scenes.parcel import unpack
-
-    try:
-        outcome = ended.result()
-    except DeniedError as error:
-        raise DeniedError(f"{path}: {error}") from error
-    unpack(outcome, folder)
-    for stage, made in outcome.done.items():
-        _say_done(folder, stage, made)
-    if outcome.error is not None:
-        raise outcome.error
-    return batch.tell(scene, folder, outcome.description)
-
-
 def facts(chosen: bool) -> dict[str, str]:
     """What has to be the same on all machines for results to be the same; `chosen`: the variant is left to them."""
     from scenes.versions import versions
@@ -561,10 +476,6 @@ def facts(chosen: bool) -> dict[str, str]:
 
         found["the variant that render.variant 'auto' stands for"] = choose("auto")
     return found
-
-
-def _raise(error: Exception) -> dict[str, Any]:
-    raise error
 
 
 @contextmanager
@@ -611,26 +522,13 @@ def _predicted(scene: Scene) -> Prediction:
     return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape)
 
 
-def _prepare(scene: Scene, image: Image, folder: Path) -> None:
-    """Make the folder of a scene, with the scene and its target in it. Raises InputError or DeniedError."""
-    from scenes.files import make_folder, refuse_output
-    from scenes.picture import write_truth
-    from scenes.scene import TRUTH, resolved, write
-
-    make_folder(folder)
-    for name in ("scene.toml", TRUTH):
-        refuse_output(folder / name, scene.source, Path(scene.target.image))
-    rows, columns = image.shape
-    write(folder / "scene.toml", resolved(scene, (rows, columns)))
-    write_truth(folder / TRUTH, image)
-
-
 def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> Stack:
+    from scenes.batch import prepare
     from simulate.kept import kept_stack
     from simulate.variant import choose
 
     choose(scene.render.variant)
-    _prepare(scene, image, folder)
+    prepare(scene, image, folder)
     with watch.progress("render") as progress:
         stack, made = kept_stack(folder / "stack.exr", scene, camera, image, progress)
     watch.done("render", made)

@@ -93,7 +93,7 @@ def sliding_maps(frame: Sliding, actual: tuple[float, ...], make: Callable[[Slid
 
 def _strip(frame: Sliding, axis: int, place: slice) -> Image:
     """The diagonal of the inverse of K in a strip along one edge, (depth, length), by blocks of its columns."""
-    assert isinstance(frame.prior, float)
+    prior = float(np.asarray(frame.prior))
     deep, length = place.stop - place.start, frame.shape[1 - axis]
     wide = max(max(means[1 - axis].width for means in frame.types) - 1, 1)
     through = [means[axis].gram[place, place].toarray() for means in frame.types]
@@ -109,7 +109,7 @@ def _strip(frame: Sliding, axis: int, place: slice) -> Image:
         if one != other:
             return block(blocks[one], blocks[other])
         own = block(blocks[one], blocks[one])
-        own[np.diag_indices_from(own)] += frame.prior
+        own[np.diag_indices_from(own)] += prior
         return own
 
     return inverse_diagonal(len(blocks), block_of).reshape(length, deep).T

@@ -121,7 +121,8 @@ def estimate(problem: Problem, recorded: Vector, method: str = "auto", tolerance
             f"expected {problem.measurements} finite measurements, got others; leave dead pixels out first"
         )
     form, solver, refined = _first_good(problem, method, tolerance, recorded)
-    assert refined is not None  # it is there because measurements were given
+    if refined is None:
+        raise RuntimeError("measurements were given, and nothing was estimated from them")
     image = problem.prior.mean + problem.prior.spread(refined.freedoms[:, 0])
     return Estimate(image, refined.freedoms[:, 0], refined.multipliers[:, 0], form, solver)
 

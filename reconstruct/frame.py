@@ -9,7 +9,6 @@ K is no less than the least eigenvalue of P0^-1, so that r^T K^-1 r is at most |
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -21,6 +20,7 @@ from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingType
 
 from scenes.camera import Camera
 from scenes.errors import InputError
+from scenes.progress import Progress, no_progress
 
 from .sliding import WORKERS, Sliding, sliding
 
@@ -94,13 +94,6 @@ class Frame:
         waves *= self.prior
         return np.asarray(fft.idctn(waves, 2, norm="ortho", workers=WORKERS, overwrite_x=True)).ravel()
 
-    def drawn(self, chance: Vector) -> Vector:
-        """P0^-1 of an image of the prior less its mean, made from independent normal numbers: (N,) to (N,)."""
-        if isinstance(self.prior, float):
-            return self.prior**0.5 * chance
-        waves = np.sqrt(self.prior) * chance.reshape(self.shape)
-        return np.asarray(fft.idctn(waves, 2, norm="ortho", workers=WORKERS)).ravel()
-
     def collected(self, readings: Vector) -> Vector:
         """H^T Rv^-1 g: (M,) to (N,)."""
         return self.observation.adjoint(self.weights * readings)
@@ -108,16 +101,10 @@ class Frame:
     @cached_property
     def nearby(self) -> Sliding:
         """The sliding camera whose types have the mean weights of this one's."""
-        means: list[float] = []
-        start = 0
-        for kind in self.camera.types:
-            means.append(float(self.weights[start : start + kind.measurements].mean()))
-            start += kind.measurements
-        return sliding(self.camera, tuple(means), self.prior)
+        means = tuple(float(self.weights[place].mean()) for place in self.camera.type_slices())
+        return sliding(self.camera, means, self.prior)
 
-    def solve(
-        self, right: Vector, accuracy: float = ACCURACY, progress: Callable[[float], None] | None = None
-    ) -> Solution:
+    def solve(self, right: Vector, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """C b to `accuracy` posterior standard deviations in every pixel.
 
         Raises NotReachedError if steps do not get there.
@@ -125,7 +112,7 @@ class Frame:
         with threadpool_limits(1, "blas"):  # products of vectors gain nothing from threads, and wait for them
             found, left, lanczos = np.zeros_like(right), right.copy(), _Lanczos()
             for _ in range(RESTARTS):
-                found, lanczos = self._improved(found, left, accuracy, lanczos, progress or _to_nobody)
+                found, lanczos = self._improved(found, left, accuracy, lanczos, progress)
                 left = right - self.apply(found)  # the steps' own residual knows nothing of their rounding
                 bound = self._bound(left)
                 if bound <= accuracy:
@@ -138,7 +125,7 @@ class Frame:
         return Solution(found, lanczos.count, bound, lanczos.largest / lanczos.least if lanczos.count else 1.0)
 
     def _improved(
-        self, start: Vector, residual: Vector, accuracy: float, lanczos: _Lanczos, progress: Callable[[float], None]
+        self, start: Vector, residual: Vector, accuracy: float, lanczos: _Lanczos, progress: Progress
     ) -> tuple[Vector, _Lanczos]:
         """Conjugate gradients from `start`, until their own residual meets the bound."""
         found, left, steps = start.copy(), residual.copy(), _Lanczos()
@@ -174,10 +161,6 @@ class Frame:
 
     def _prepared(self, image: Vector) -> Vector:
         return self.nearby.solve(image.reshape(self.shape)).ravel()
-
-
-def _to_nobody(fraction: float) -> None:
-    del fraction
 
 
 class _Lanczos:

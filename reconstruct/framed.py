@@ -54,7 +54,7 @@ class Framed(Way):
     def frame(self) -> Frame:
         """The system."""
         task = self.task
-        if is_one_number(task.believed) and task.used.all():
+        if is_one_number(task.believed) and task.complete:
             weights = np.broadcast_to(1 / task.believed[:1], task.believed.shape)
         else:
             weights = task.over_all(1 / task.believed, 0.0)
@@ -64,7 +64,7 @@ class Framed(Way):
     def solution(self) -> Solution:
         """f^ - f0."""
         task = self.task
-        recorded = np.where(task.used, task.recorded, 0.0) if not task.used.all() else task.recorded
+        recorded = np.where(task.used, task.recorded, 0.0) if not task.complete else task.recorded
         away = recorded - self._mean_seen
         return self.frame.solve(
             self.frame.collected(away), task.told.accuracy, lambda done: self.hands.progress(SOLVING * done)
@@ -117,14 +117,14 @@ class Framed(Way):
         """A^T w from c = C w: (pixels used,)."""
         pulled = self.frame.observation.forward(solved)
         pulled *= self.frame.weights
-        return pulled if self.task.used.all() else pulled[self.task.used]
+        return pulled if self.task.complete else pulled[self.task.used]
 
     def _maps(self, noise: dict[str, Vector]) -> Maps:
-        few = self.task.model.unknowns <= MANY and isinstance(self.frame.prior, float)
-        if few and not self._even(noise):
+        even = self._even(noise)
+        if not even and self.task.model.unknowns <= MANY and isinstance(self.frame.prior, float):
             return self._exact_maps(total(noise))
         found = sliding_maps(self.frame.nearby, self._by_type(total(noise)), self._map)
-        if self._even(noise):
+        if even:
             return found
         local = self._local_noise().reshape(self.task.shape)
         return Maps(found.posterior * local, found.missing * local, found.noisy * local)
@@ -156,9 +156,13 @@ class Framed(Way):
 
     def _even(self, noise: dict[str, Vector]) -> bool:
         """Whether H is perfect and the noise of each type one number, as is what is expected of it."""
-        if not (self.task.model.exact and self.task.used.all()):
+        if not (self.task.model.exact and self.task.complete):
             return False
-        parts = [one[place] for one in (self.task.believed, *noise.values()) for place in self.task.model.boxes.slices]
+        parts = [
+            one[place]
+            for one in (self.task.believed, *noise.values())
+            for place in self.task.model.camera.type_slices()
+        ]
         return all(is_one_number(part) or bool(np.ptp(part) <= 1e-9 * part.max()) for part in parts)
 
     def _local_noise(self) -> Vector:
@@ -169,11 +173,11 @@ class Framed(Way):
 
     def _by_type(self, values: Vector) -> tuple[float, ...]:
         everywhere = self.task.over_all(values, np.nan)
-        return tuple(float(np.nanmean(everywhere[place])) for place in self.task.model.boxes.slices)
+        return tuple(float(np.nanmean(everywhere[place])) for place in self.task.model.camera.type_slices())
 
     def _over_types(self, numbers: list[float]) -> Vector:
         found = np.empty(self.task.model.measurements)
-        for place, number in zip(self.task.model.boxes.slices, numbers, strict=True):
+        for place, number in zip(self.task.model.camera.type_slices(), numbers, strict=True):
             found[place] = number
         return found
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from scenes.files import make_folder, refuse_output, write_text
+from scenes.progress import Progress, no_progress
 
 from . import paper_figures as figures
 from .claims import Claim, errors, ranks
@@ -30,7 +31,6 @@ CLAIMS = "claims.csv"
 FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig7")
 
 Row = Sequence[str | float]
-Progress = Callable[[float], None]
 
 
 def write_paper(
@@ -39,7 +39,7 @@ def write_paper(
     record: Record,
     image: str = PHOTOGRAPH,
     seed: int = 0,
-    progress: Progress = lambda _: None,
+    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Write figures 2, 3, 4, 5 and 7, each as PNG and CSV, and the table of claims; say what was written and found.
 

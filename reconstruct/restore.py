@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scenes import scene
 from scenes.errors import InputError
 from scenes.model import Model
+from scenes.progress import Progress, no_progress
 from scenes.stack import Stack
 from scenes.workers import Workers
 
@@ -25,7 +26,7 @@ from .estimator import Solver
 from .expected import ExpectedError, Interval
 from .fit import Fit, evidence, fit
 from .frame import NotReachedError
-from .way import Hands, Outcome, Progress, Task, Way, is_one_number, to_nobody, total
+from .way import Hands, Outcome, Task, Way, is_one_number, total
 
 Vector = NDArray[np.float64]
 
@@ -148,7 +149,7 @@ def restore(
     model: Model,
     truth: Vector | None = None,
     workers: Workers | None = None,
-    progress: Progress = to_nobody,
+    progress: Progress = no_progress,
 ) -> Restoration:
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 

@@ -14,13 +14,13 @@ from scenes.errors import InputError
 from scenes.exr import read
 from scenes.files import digest, fingerprint
 from scenes.model import Model
+from scenes.progress import Progress, no_progress
 from scenes.scene import TRUTH, Scene, with_changes
 from scenes.stack import Stack
 from scenes.workers import Workers
 
 from . import figure, report
 from .restore import Restoration, refuse_strangers, restore
-from .way import Progress, to_nobody
 
 ESTIMATE, PICTURE, OVERVIEW, RUN = "estimate.exr", "estimate.png", "overview.png", "run.json"
 OURS = ("prior", "estimator", "tiles")
@@ -57,7 +57,7 @@ def reconstruct(
     truth: NDArray[np.float64] | None,
     names: tuple[Path, Path],
     workers: Workers | None = None,
-    progress: Progress = to_nobody,
+    progress: Progress = no_progress,
 ) -> tuple[Restoration, dict[str, Any]]:
     """The estimate and what run.json says of it. Raises InputError if stack and model do not belong together."""
     refuse_strangers(stack, model, names)
@@ -99,7 +99,7 @@ def _standing(folder: Path) -> dict[str, Any] | None:
 
 
 def kept_results(
-    folder: Path, stack: Stack, model: Model, names: tuple[Path, Path], progress: Progress = to_nobody
+    folder: Path, stack: Stack, model: Model, names: tuple[Path, Path], progress: Progress = no_progress
 ) -> tuple[dict[str, Any], bool]:
     """What run.json in `folder` says, and whether the reconstruction had to be made for it."""
     wanted = made_from(stack, model)

@@ -156,7 +156,8 @@ class Sliding:
         for axis in (0, 1):
             size = self.shape[axis]
             depth = min(DEPTH * max(means[axis].width for means in self.types), size // 2)
-            strips += [_Strip.of(self, axis, slice(0, depth)), _Strip.of(self, axis, slice(size - depth, size))]
+            ends = slice(0, depth), slice(size - depth, size)
+            strips += [_Strip.of(self, float(np.asarray(self.prior)), axis, place) for place in ends]
         return tuple(strips)
 
 
@@ -205,8 +206,7 @@ class _Strip:
     parts: tuple[tuple[sparse.csr_array, sparse.csr_array], ...]
 
     @staticmethod
-    def of(whole: Sliding, axis: int, place: slice) -> _Strip:
-        assert isinstance(whole.prior, float)
+    def of(whole: Sliding, prior: float, axis: int, place: slice) -> _Strip:
         depth, length = place.stop - place.start, whole.shape[1 - axis]
         reach = max(means[1 - axis].width for means in whole.types) - 1
         side = max(means[axis].width for means in whole.types) - 1
@@ -222,7 +222,7 @@ class _Strip:
                     entries = np.diagonal(through, -down)
                     across = slice(max(-down, 0), max(-down, 0) + entries.size)
                     band[below, : column.size, across] += column[:, None] * entries
-        band[0] += whole.prior
+        band[0] += prior
         flat = band.reshape(band.shape[0], length * depth)
         near = slice(max(place.start - side, 0), min(place.stop + side, whole.shape[axis]))
         parts = [

@@ -6,7 +6,6 @@ Its error is that of what it is: of every pixel estimated from the measurements 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -30,9 +29,8 @@ class Tiled(Way):
 
     def estimated(self) -> Vector:
         """f^ alone: (N,)."""
-        pieces = list(self.pieces({}, None))
-        found = np.empty(self.task.shape)
-        for (tiles, _), done in zip(pieces, self.done(pieces), strict=True):
+        found, groups = np.empty(self.task.shape), self.groups({})
+        for tiles, done in zip(groups, self.done(groups, {}, None), strict=True):
             for tile, image in zip(tiles, done.image.T, strict=True):
                 found[tile.core] = image.reshape(found[tile.core].shape)
         return found.ravel()
@@ -40,11 +38,11 @@ class Tiled(Way):
     def outcome(self, noise: dict[str, Vector], truth: Vector | None) -> Outcome:
         """The estimate and its error where the noise is as given."""
         task = self.task
-        pieces = list(self.pieces(noise, truth))
-        results = self.done(pieces)
+        groups = self.groups(noise)
+        results = self.done(groups, noise, truth)
         image, variance, resolved = (np.empty(task.shape) for _ in range(3))
         missing, parts, sums = 0.0, dict.fromkeys(noise, 0.0), np.zeros(2)
-        for (tiles, _), done in zip(pieces, results, strict=True):
+        for tiles, done in zip(groups, results, strict=True):
             for place, tile in enumerate(tiles):
                 for whole, values in (
                     (image, done.image[:, place]),
@@ -61,36 +59,37 @@ class Tiled(Way):
         return Outcome(
             self.image,
             residual_multipliers(task, self.image),
-            _worst([done.solver for done in results], len(pieces)),
+            _worst([done.solver for done in results], len(groups)),
             ExpectedError(variance.ravel(), missing, parts, resolved.ravel()),
             given,
             lambda weights: self._variance_of_sum(weights, total(noise)),
         )
 
-    def pieces(self, noise: dict[str, Vector], truth: Vector | None) -> Iterator[tuple[list[Tile], Piece]]:
-        """The work, in pieces of tiles that share a factorisation; without noise, of the image alone."""
-        task = self.task
-        groups: dict[object, list[Tile]] = {}
-        for tile in cut(task.shape, task.tiles.size, task.tiles.overlap):
-            groups.setdefault(self._key(tile, noise), []).append(tile)
-        for members in groups.values():
-            for first in range(0, len(members), MOST_TILES):
-                tiles = members[first : first + MOST_TILES]
-                yield tiles, self._piece(tiles, noise, truth)
+    def groups(self, noise: dict[str, Vector]) -> list[list[Tile]]:
+        """Tiles that share a factorisation, some at a time."""
+        alike: dict[object, list[Tile]] = {}
+        for tile in cut(self.task.shape, self.task.tiles.size, self.task.tiles.overlap):
+            alike.setdefault(self._key(tile, noise), []).append(tile)
+        return [
+            tiles[first : first + MOST_TILES] for tiles in alike.values() for first in range(0, len(tiles), MOST_TILES)
+        ]
 
-    def done(self, pieces: list[tuple[list[Tile], Piece]]) -> list[Done]:
-        """What becomes of them; each is computed by one thread, so that results do not depend on who does it."""
-        work_on = [piece for _, piece in pieces]
+    def done(self, groups: list[list[Tile]], noise: dict[str, Vector], truth: Vector | None) -> list[Done]:
+        """What becomes of them; without noise, of the image alone.
+
+        Each is computed by one thread, so that results do not depend on who does it.
+        """
+        pieces = (self._piece(tiles, noise, truth) for tiles in groups)  # each is made when somebody is free for it
         if self.hands.workers is not None:
-            return self.hands.workers.map(work_alone, work_on, self.hands.progress)
+            return self.hands.workers.map(work_alone, pieces, self.hands.progress, len(groups))
         with threadpool_limits(1, "blas"), workers(threads=os.cpu_count() or 1) as here:
-            return here.map(work, work_on, self.hands.progress)
+            return here.map(work, pieces, self.hands.progress, len(groups))
 
     def _key(self, tile: Tile, noise: dict[str, Vector]) -> object:
         task = self.task
         varied = [values for values in (task.believed, *noise.values()) if not is_one_number(values)]
         marks: list[str] = []
-        if varied or not task.used.all():
+        if varied or not task.complete:
             numbers = task.model.numbers(*tile.window)
             marks = [digest(task.used[numbers]), *(digest(values[self._places(numbers)]) for values in varied)]
         return task.model.signature(*tile.window), tile.shape, tile.kept.tobytes(), *marks
@@ -100,7 +99,7 @@ class Tiled(Way):
         numbers = [task.model.numbers(*tile.window) for tile in tiles]
         used = task.used[numbers[0]]
         some = self._places(numbers[0])
-        pixels = np.arange(task.model.unknowns).reshape(task.shape)
+        whole = None if truth is None else truth.reshape(task.shape)
         return Piece(
             matrix=task.model.part(*one.window)[used],
             recorded=np.stack([task.recorded[found[task.used[found]]] for found in numbers], axis=1),
@@ -109,13 +108,13 @@ class Tiled(Way):
             prior=task.prior_on(one.shape),
             kept=one.kept,
             told=task.told,
-            truth=None if truth is None else np.stack([truth[pixels[tile.window].ravel()] for tile in tiles], axis=1),
+            truth=None if whole is None else np.stack([whole[tile.window].ravel() for tile in tiles], axis=1),
             image_only=not noise,
         )
 
     def _places(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """Where those of the measurements that are used stand among all that are."""
-        if self.task.used.all():
+        if self.task.complete:
             return numbers
         return self._order[numbers[self.task.used[numbers]]]
 

@@ -13,6 +13,7 @@ from scipy import fft
 
 from scenes import scene
 from scenes.model import Model
+from scenes.progress import Progress, no_progress
 from scenes.workers import Workers
 
 from .estimator import Solver
@@ -21,11 +22,6 @@ from .prior import Prior, prior_of, spectrum_of
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.float64]
-Progress = Callable[[float], None]
-
-
-def to_nobody(fraction: float) -> None:
-    """Report no progress."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,7 @@ class Hands:
     """Who does what can be done side by side, absent: threads of this process; and who hears how the work goes on."""
 
     workers: Workers | None = None
-    progress: Progress = to_nobody
+    progress: Progress = no_progress
 
 
 @dataclass(frozen=True)
@@ -51,6 +47,11 @@ class Task:
     prior: scene.Prior
     told: scene.Estimator
     tiles: scene.Tiles
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether all pixels are used."""
+        return bool(self.used.all())
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -75,7 +76,7 @@ class Task:
 
     def over_all(self, values: Vector, rest: float) -> Vector:
         """Values of the pixels used as values of all: (pixels used,) to (M,), `rest` for the others."""
-        if self.used.all():
+        if self.complete:
             return values
         spread = np.full(self.used.size, rest)
         spread[self.used] = values
@@ -140,6 +141,6 @@ def is_one_number(values: Vector) -> bool:
 def residual_multipliers(task: Task, image: Vector) -> Vector:
     """Rv^-1 (g - H f^): (pixels used,); zeros where a measurement is said to have no noise."""
     left = task.recorded - task.model.forward(image)
-    if not task.used.all():
+    if not task.complete:
         left = left[task.used]
     return np.divide(left, task.believed, out=np.zeros_like(left), where=task.believed > 0)

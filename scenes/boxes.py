@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import pairwise
 from math import lcm
 
 import numpy as np
@@ -139,12 +138,6 @@ class Boxes:
         camera = self.camera
         return tuple(Box(kind, _axis(kind, 0, camera.rows), _axis(kind, 1, camera.columns)) for kind in camera.types)
 
-    @cached_property
-    def slices(self) -> tuple[slice, ...]:
-        """Where each lens type's measurements stand."""
-        ends = np.cumsum([0, *(kind.measurements for kind in self.camera.types)]).tolist()
-        return tuple(slice(first, last) for first, last in pairwise(ends))
-
     @property
     def entries(self) -> int:
         """How many H would have if it were stored."""
@@ -154,7 +147,7 @@ class Boxes:
         """H f: (N,) or (rows, columns) to (M,)."""
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.camera.rows, self.camera.columns)
         out = np.empty(self.camera.measurements)
-        for box, place in zip(self.boxes, self.slices, strict=True):
+        for box, place in zip(self.boxes, self.camera.type_slices(), strict=True):
             box.forward(grid, out[place])
         return out
 
@@ -162,7 +155,7 @@ class Boxes:
         """H^T g: (M,) to (N,)."""
         out = np.zeros((self.camera.rows, self.camera.columns))
         readings = np.ascontiguousarray(measurements, dtype=np.float64)
-        for box, place in zip(self.boxes, self.slices, strict=True):
+        for box, place in zip(self.boxes, self.camera.type_slices(), strict=True):
             box.adjoint(readings[place], out)
         return out.ravel()
 
@@ -172,7 +165,7 @@ class Boxes:
 
     def numbers(self, rows: slice, columns: slice) -> NDArray[np.int64]:
         """Which measurements see nothing but a window of f, by where they begin: (m,)."""
-        places = zip(self.slices, self.boxes, strict=True)
+        places = zip(self.camera.type_slices(), self.boxes, strict=True)
         return np.concatenate([place.start + box.numbers(rows, columns) for place, box in places])
 
     def part(self, rows: slice, columns: slice) -> sparse.csr_array:

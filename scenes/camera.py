@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import accumulate, pairwise
 from math import ceil, floor
 from typing import Any
 
@@ -152,6 +153,11 @@ class Camera:
             found.append(slice(start, start + size))
             start += size
         return found
+
+    def type_slices(self) -> list[slice]:
+        """Where each lens type's pixels stand among the measurements."""
+        ends = list(accumulate((kind.measurements for kind in self.types), initial=0))
+        return [slice(first, last) for first, last in pairwise(ends)]
 
     def types_seeing(self) -> NDArray[np.int64]:
         """(rows, columns): by how many lens types each pixel of f is seen whole."""

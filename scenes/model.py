@@ -137,10 +137,9 @@ class Model:
     @cached_property
     def _reach(self) -> tuple[NDArray[np.int64], ...]:
         """First and last row, first and last column of f that each measurement sees; none where it sees nothing."""
-        assert self.stored is not None
-        row, column = np.divmod(self.stored.indices.astype(np.int64), self.camera.columns)
-        seen = np.diff(self.stored.indptr) > 0
-        starts = self.stored.indptr[:-1][seen]
+        row, column = np.divmod(self.matrix.indices.astype(np.int64), self.camera.columns)
+        seen = np.diff(self.matrix.indptr) > 0
+        starts = self.matrix.indptr[:-1][seen]
         found = [np.full(seen.size, NOWHERE) for _ in range(4)]
         for ends, (pick, values) in zip(found, product((np.minimum, np.maximum), (row, column)), strict=True):
             ends[seen] = pick.reduceat(values, starts)
@@ -177,15 +176,12 @@ class Model:
             return trend
         seen = sum((self._row_sums(rows, batch * away) ** 2 for batch in self.batches), np.zeros(self.measurements))
         seen /= count * (count - 1)
-        start = 0
-        for kind in self.camera.types:
-            place = np.arange(start, start + kind.measurements)
-            place = place[trend[place] > 0]
+        for kind in self.camera.type_slices():
+            place = kind.start + np.flatnonzero(trend[kind] > 0)
             # Strong contrast lets errors cancel otherwise than weak one does, so that like is compared with like.
             for alike in np.array_split(place[np.argsort(trend[place])], max(1, min(place.size // ALIKE, MOST_KINDS))):
                 if alike.size:
                     trend[alike] *= moderate(seen[alike] / trend[alike], count)
-            start += kind.measurements
         return trend
 
     def feigned(self, noise_variance: Vector) -> Vector:

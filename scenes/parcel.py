@@ -14,11 +14,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from .camera import Camera, derive
+from .cluster import scratch
 from .errors import DeniedError, InputError
 from .files import write_whole
 from .picture import Image
+from .progress import Progress, no_progress
 from .scene import Scene, parse, resolved
-from .workers import scratch
 
 LAST = "run.json"  # stands for all the others
 
@@ -27,7 +28,7 @@ LAST = "run.json"  # stands for all the others
 class Watch:
     """Who hears how the work goes on: a context a stage for its progress, and whether the stage had to be done."""
 
-    progress: Callable[[str], AbstractContextManager[Callable[[float], None]]]
+    progress: Callable[[str], AbstractContextManager[Progress]]
     done: Callable[[str, bool], None]
 
 
@@ -64,7 +65,7 @@ def packed(scene: Scene, camera: Camera, image: Image, folder: Path) -> Parcel:
 def carry_out(stages: Stages, parcel: Parcel) -> Outcome:
     """Do the stages in a folder that is removed afterwards; what fails does not lose the files made before."""
     done: dict[str, bool] = {}
-    watch = Watch(lambda _: nullcontext(_nobody), done.__setitem__)
+    watch = Watch(lambda _: nullcontext(no_progress), done.__setitem__)
     with TemporaryDirectory(prefix="ommatid-", dir=scratch()) as temporary:
         folder = Path(temporary)
         for name, content in parcel.files.items():
@@ -96,7 +97,3 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 def _fill(path: Path, content: bytes) -> None:
     path.write_bytes(content)
-
-
-def _nobody(fraction: float) -> None:
-    del fraction

@@ -15,13 +15,13 @@ from scenes.files import fingerprint
 from scenes.model import Model
 from scenes.moderate import moderate
 from scenes.partial import Partial
+from scenes.progress import Progress, no_progress
 from scenes.scene import Scene, resolved
 from scenes.versions import versions
 
 from .ideal import ideal_matrix, ideal_model
 from .passes import rounding_variance
 from .points import Responses, from_points
-from .render import Progress, no_progress
 
 
 def made_from(scene: Scene, camera: Camera) -> str:

@@ -13,11 +13,11 @@ from scenes.camera import Camera
 from scenes.errors import InputError
 from scenes.model import Model
 from scenes.partial import partial_of
+from scenes.progress import Progress
 from scenes.scene import Scene, resolved
 from scenes.stack import Stack
 
 from . import calibrate, render
-from .render import Progress
 
 
 def kept_stack(

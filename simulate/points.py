@@ -21,10 +21,10 @@ from scipy import sparse
 from scenes.camera import Camera, LensType
 from scenes.errors import DeniedError
 from scenes.partial import Partial, State
+from scenes.progress import Progress, no_progress
 from scenes.scene import Scene
 
 from .passes import BATCHES, OverPasses, Plan, Tally, plan
-from .render import Progress, no_progress
 from .streams import sampler_seeds
 from .variant import choose
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -14,6 +13,7 @@ from scenes.camera import Camera
 from scenes.files import digest, fingerprint
 from scenes.moderate import moderate
 from scenes.partial import Partial
+from scenes.progress import Progress, no_progress
 from scenes.scene import Scene, resolved
 from scenes.stack import Stack
 from scenes.versions import versions
@@ -21,12 +21,6 @@ from scenes.versions import versions
 from .passes import OverPasses, Tally, plan, rounding_variance
 from .streams import sampler_seeds
 from .variant import choose
-
-Progress = Callable[[float], None]
-
-
-def no_progress(fraction: float) -> None:
-    """Report to nobody."""
 
 
 @dataclass(frozen=True)

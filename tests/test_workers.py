@@ -24,6 +24,7 @@ import pytest
 from distributed import LocalCluster
 
 from scenes import camera, exr, model, parcel, picture, scene, workers
+from scenes.cluster import NEVER
 from scenes.errors import DeniedError, InputError
 
 from .conftest import TINY, Command, Ended, shell
@@ -110,7 +111,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Generator[str]:
         scheduler_kwargs={"dashboard": False},
         local_directory=str(tmp_path_factory.mktemp("dask")),
         memory_limit=0,
-        silence_logs=workers.NEVER,
+        silence_logs=NEVER,
     ) as cluster:
         yield cluster.scheduler_address
 
@@ -125,7 +126,7 @@ def test_results_come_in_the_order_of_the_items(kind: dict[str, Any], address: s
     seen: list[float] = []
     options: dict[str, Any] = {**kind, "scheduler": address} if "scheduler" in kind else kind
     with workers.workers(**options) as pool:
-        found = pool.map(digits_and_worker, range(8), seen.append)
+        found = pool.map(digits_and_worker, range(8), seen.append, 8)
     assert [values for values, _ in found] == [digits(seed) for seed in range(8)]
     assert seen == [(count + 1) / 8 for count in range(8)]
     here = {number for _, number in found} == {os.getpid()}
@@ -144,15 +145,16 @@ def test_alone_one_item_is_done_after_the_other() -> None:
         told.append(f"work {item}")
         return item
 
-    for ended in workers.in_process().each(work, items()):
-        told.append(f"ended {ended.result()}")
+    with workers.workers() as alone:
+        for ended in alone.each(work, items()):
+            told.append(f"ended {ended.result()}")
     assert told == [f"{what} {item}" for item in range(3) for what in ("item", "work", "ended")]
 
 
 def test_threads_work_at_the_same_time() -> None:
     together = threading.Barrier(3)
     with workers.workers(threads=3) as pool:
-        assert pool.map(lambda _: together.wait(timeout=30) >= 0, range(3), lambda _: None) == [True] * 3
+        assert pool.map(lambda _: together.wait(timeout=30) >= 0, range(3), lambda _: None, 3) == [True] * 3
 
 
 @pytest.mark.parametrize("kind", [InputError, DeniedError, ZeroDivisionError])
@@ -160,7 +162,7 @@ def test_threads_work_at_the_same_time() -> None:
 def test_a_failure_is_the_same_here_and_there(kind: type[Exception], remote: bool, address: str) -> None:
     with workers.workers(address if remote else "") as pool:
         with pytest.raises(kind, match=r"^the picture is upside down; turn it$"):
-            pool.map(refuses, [None, kind, None], lambda _: None)
+            pool.map(refuses, [None, kind, None], lambda _: None, 3)
         ended = {one.place: one for one in pool.each(refuses, [None, kind, None])}
         assert (ended[0].result(), ended[2].result()) == ("fine", "fine")
         with pytest.raises(kind, match="upside down"):
@@ -170,14 +172,14 @@ def test_a_failure_is_the_same_here_and_there(kind: type[Exception], remote: boo
 def test_an_item_may_be_large(address: str) -> None:
     """Dask warns of large items, which are no mistake here; and warnings are failures."""
     with workers.workers(address) as pool:
-        [size] = pool.map(len, [bytes(20_000_000)], lambda _: None)
+        [size] = pool.map(len, [bytes(20_000_000)], lambda _: None, 1)
     assert size == 20_000_000
 
 
 def test_one_of_two_workers_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
     flag = tmp_path / "died"
     with workers.workers(count=2) as pool:
-        found = pool.map(partial(digits_of_one_that_dies_once, flag), range(8), lambda _: None)
+        found = pool.map(partial(digits_of_one_that_dies_once, flag), range(8), lambda _: None, 8)
     assert flag.exists()
     assert found == [digits(seed) for seed in range(8)]
 
@@ -199,7 +201,7 @@ def test_workers_on_this_machine_listen_to_this_machine_alone_and_leave_nothing(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
     before = dict(os.environ)
     with workers.workers(count=2) as pool:
-        pids = pool.map(partial(meets_the_other, tmp_path / "meeting"), range(2), lambda _: None)
+        pids = pool.map(partial(meets_the_other, tmp_path / "meeting"), range(2), lambda _: None, 2)
         processes = [psutil.Process(pid) for pid in pids]
         ports = [one for process in (*processes, psutil.Process()) for one in process.net_connections("inet")]
         listening = {one.laddr.ip for one in ports if one.status == psutil.CONN_LISTEN}
@@ -233,12 +235,12 @@ class Nobody(Executor):
 @pytest.mark.usefixtures("impatient")
 def test_nobody_waits_for_workers_that_have_left() -> None:
     with pytest.raises(DeniedError, match="no workers are left"):
-        workers.Workers(Nobody(), lambda: 0).map(digits, range(2), lambda _: None)
+        workers.Workers(Nobody(), lambda: 0).map(digits, range(2), lambda _: None, 2)
 
 
 def test_a_scheduler_that_goes_away_is_named() -> None:
     with pytest.raises(DeniedError, match="scheduler was lost"):
-        workers.Workers(Nobody(cancelled=True), lambda: 1).map(digits, range(2), lambda _: None)
+        workers.Workers(Nobody(cancelled=True), lambda: 1).map(digits, range(2), lambda _: None, 2)
 
 
 def test_workers_that_would_give_other_results_are_refused(address: str) -> None:
@@ -255,7 +257,7 @@ def test_a_scheduler_without_workers_is_refused() -> None:
     start: Any = LocalCluster
     options = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
     with (
-        start(n_workers=0, host="127.0.0.1", silence_logs=workers.NEVER, **options) as cluster,
+        start(n_workers=0, host="127.0.0.1", silence_logs=NEVER, **options) as cluster,
         pytest.raises(InputError, match=r"--scheduler .*has no workers; start some with `dask worker tcp://"),
         workers.workers(cluster.scheduler_address),
     ):

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from scenes.camera import derive
+from scenes.progress import no_progress
 from scenes.scene import read
 from simulate.passes import Plan
 from simulate.points import Sweep, entries_of, spacing
-from simulate.render import no_progress
 from simulate.rig import Rig
 from simulate.streams import sampler_seeds
 

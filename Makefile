@@ -12,7 +12,7 @@ demo: setup
 
 # One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
 test: setup
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: setup
 	$(BIN)/ruff check .

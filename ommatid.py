@@ -24,10 +24,13 @@ if TYPE_CHECKING:
     from reconstruct.accuracy import Prediction
     from scenes.batch import Batch
     from scenes.camera import Camera
+    from scenes.model import Model
     from scenes.parcel import Stages, Watch
     from scenes.picture import Image
     from scenes.progress import Progress
-    from scenes.scene import Noise, Scene
+    from scenes.recorded_frames import Bench
+    from scenes.scene import Scene
+    from scenes.sensor import Noise
     from scenes.stack import Stack
     from scenes.workers import Workers as Crew
 
@@ -50,6 +53,9 @@ Sets = Annotated[
 Lenses = Annotated[
     str, typer.Option("--lens", metavar="NAME,...", help="Keep these lens types; one named twice counts twice.")
 ]
+Complete = Annotated[
+    bool, typer.Option("--complete", help="Leave nothing out, however small its effect: render.complete=true.")
+]
 INTERRUPTED = 130  # what the parser makes of Ctrl-C
 
 Scheduler = Annotated[
@@ -61,6 +67,37 @@ Workers = Annotated[
     typer.Option("--workers", metavar="N", min=1, help="Share the scenes among N processes on this machine."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
+Dark = Annotated[
+    list[Path] | None,
+    typer.Option("--dark", metavar="FILE", help="Frame without light, or a folder; several are averaged."),
+]
+Flat = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--flat",
+        metavar="FILE",
+        help="Frame of a uniform target, or a folder: values become (image - dark)/(flat - dark).",
+    ),
+]
+FlatValue = Annotated[float, typer.Option("--flat-value", metavar="VALUE", help="Of the target of --flat, in f.")]
+Origin = Annotated[
+    str,
+    typer.Option(
+        "--origin",
+        metavar="ROW,COLUMN",
+        help="Pixel of the mosaic, from 0, where the first sub-image's patch has its top left corner;"
+        " absent: the mosaic's middle is the camera's axis.",
+    ),
+]
+Upright = Annotated[
+    bool | None,
+    typer.Option(
+        "--upright/--turned",
+        help="Whether sub-images are upright or turned by 180 degrees, as lenses turn them;"
+        " absent: those of a mosaic are turned, pictures of one sub-imager each are upright.",
+        show_default=False,
+    ),
+]
 
 
 @app.command()
@@ -71,15 +108,21 @@ def run(
     lens: Lenses = "",
     scheduler: Scheduler = "",
     workers: Workers = None,
+    complete: Complete = False,
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
+    sets = _complete(sets, complete)
 
     def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
-        from reconstruct.report import rows
+        from reconstruct import depth, report, study
 
         if not as_json:
-            _table(f"{scene.title or scene.source.stem}: {folder}", rows(description))
+            _table(f"{scene.title or scene.source.stem}: {folder}", report.rows(description))
+            if "depth" in description:
+                _table("Error against distance", depth.rows(description["depth"]))
+            if "study" in description:
+                _table("The same stack with other ideas of H", study.rows(description["study"]))
         return description
 
     _each(scenes, output, _batch(sets, lens, stages_of_run, tell), scheduler, workers, as_json)
@@ -93,9 +136,11 @@ def render(
     lens: Lenses = "",
     scheduler: Scheduler = "",
     workers: Workers = None,
+    complete: Complete = False,
     as_json: Json = False,
 ) -> None:
     """Render the sub-images alone."""
+    sets = _complete(sets, complete)
 
     def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
         del scene
@@ -107,10 +152,12 @@ def render(
 def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
     from reconstruct.choice import choose
-    from reconstruct.results import kept_results
+    from reconstruct.report import write_run
+    from reconstruct.results import RUN, kept_results
     from simulate.kept import kept_model
 
-    choose(scene, camera, scene.calibration.method == "ideal")  # what memory does not hold is refused before any work
+    exact = scene.calibration.method == "ideal" and camera.boxed
+    choose(scene, camera, exact)  # what memory does not hold is refused before any work
     stack = _rendered(scene, camera, image, folder, watch)
     with watch.progress("calibrate") as progress:
         model, made = kept_model(folder / "model.npz", scene, camera, progress)
@@ -118,7 +165,30 @@ def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watc
     with watch.progress("reconstruct") as progress:
         description, made = kept_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     watch.done("reconstruct", made)
-    return description
+    more: dict[str, Any] = {}
+    if scene.world is not None:
+        from reconstruct.depth import of_run
+
+        more["depth"] = of_run(folder, camera)
+    if scene.study is not None:
+        more["study"] = _studied(scene, camera, stack, folder, watch)
+    if any(description.get(key) != value for key, value in more.items()):
+        write_run(folder / RUN, {**description, **more})
+    return {**description, **more}
+
+
+def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: Watch) -> list[dict[str, Any]]:
+    """The same stack with every idea of H that the scene's study names."""
+    from reconstruct.results import truth_beside
+    from reconstruct.study import kept_study
+    from scenes.progress import no_progress
+    from simulate.models import models
+
+    with watch.progress("study") as progress:
+        known = models(scene, camera, folder, no_progress)
+        cases, made = kept_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
+    watch.done("study", made)
+    return cases
 
 
 def stages_of_render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
@@ -128,8 +198,44 @@ def stages_of_render(scene: Scene, camera: Camera, image: Image, folder: Path, w
 
 
 @app.command()
-def calibrate(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
-    """Find the observation matrix H alone."""
+def calibrate(
+    scene: SceneFile,
+    output: Output,
+    more: Annotated[
+        list[Path] | None, typer.Argument(metavar="IMAGE...", help="More images of --points.", show_default=False)
+    ] = None,
+    points: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--points",
+            metavar="IMAGE",
+            help="Recorded point sources: mosaics, a folder of them, or an NPY file of (count, rows, columns).",
+        ),
+    ] = None,
+    places: Annotated[
+        Path | None,
+        typer.Option(
+            "--places",
+            metavar="FILE",
+            help="CSV of image,row,column: the pixels of f that shone, from 0; absent: an image a pixel, by rows.",
+        ),
+    ] = None,
+    point_value: Annotated[float, typer.Option("--point-value", metavar="VALUE", help="Of the sources, in f.")] = 255,
+    dark: Dark = None,
+    flat: Flat = None,
+    flat_value: FlatValue = 255,
+    origin: Origin = "",
+    upright: Upright = None,
+    sets: Sets = None,
+    lens: Lenses = "",
+    complete: Complete = False,
+    as_json: Json = False,
+) -> None:
+    """Find the observation matrix H alone.
+
+    It is rendered or computed as the scene says; with --points it is told from recorded frames of a real camera.
+    """
+    sets = _complete(sets, complete)
     from scenes.camera import derive
     from scenes.files import refuse_output
     from scenes.scene import read
@@ -138,8 +244,16 @@ def calibrate(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses 
     refuse_output(output, scene)
     described = read(scene, sets or (), _names(lens))
     camera = derive(described)
-    with _progress("calibrate") as progress:
-        model, made = kept_model(output, described, camera, progress)
+    if points:
+        if lens:
+            raise InputError("--lens: recorded frames are of the whole camera; choose lens types in `reconstruct`")
+        bench = _bench(dark, flat, flat_value, origin, upright)
+        model, made = _told_by_points(described, camera, output, [*points, *(more or [])], bench, places, point_value)
+    elif more or places or dark or flat or origin:
+        raise InputError("calibrate: images, --places, --dark, --flat and --origin belong to --points; name its images")
+    else:
+        with _progress("calibrate") as progress:
+            model, made = kept_model(output, described, camera, progress)
     _say(f"calibrate: {_done(made)}, {output}")
     if as_json:
         facts = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
@@ -198,23 +312,70 @@ def reconstruct(
         _table(str(output), report.rows(description))
 
 
+@app.command("import")
+def import_(
+    scene: SceneFile,
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGE...",
+            help="One mosaic of the whole sensor, or a picture a sub-imager, in a folder or in order.",
+        ),
+    ],
+    output: Output,
+    dark: Dark = None,
+    flat: Flat = None,
+    flat_value: FlatValue = 255,
+    origin: Origin = "",
+    upright: Upright = None,
+    sets: Sets = None,
+    lens: Lenses = "",
+    as_json: Json = False,
+) -> None:
+    """Cut recorded frames of a real camera into a stack.
+
+    A mosaic is the sensor seen from behind the camera, rows downwards; its numbers are taken as they are.
+    """
+    from scenes import stack
+    from scenes.camera import derive
+    from scenes.files import refuse_output
+    from scenes.imported import imported, warnings
+    from scenes.recorded_frames import files_in
+    from scenes.scene import read
+
+    bench = _bench(dark, flat, flat_value, origin, upright)
+    refuse_output(output, scene, *(file for path in (*images, *bench.dark, *bench.flat) for file in files_in(path)))
+    described = read(scene, sets or ())
+    camera = derive(described)  # all of it: lens types that are left out stand on the sensor nevertheless
+    made, frames = imported(described, camera, images, bench)
+    made = made.restrict(_names(lens)) if lens else made
+    stack.write(output, made)
+    for warning in warnings(frames):
+        _say(f"import: {warning}")
+    _say(f"import: done, {output}")
+    if as_json:
+        facts = {"sub_images": len(made.camera.sub_imagers), "beside_pixels": frames.layout.beside}
+        _print_json({"file": str(output), **facts, **made.record})
+
+
 @app.command()
 def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
     """Expected error, rank and null space of H.
 
     From Eq. 5 and the ideal model: nothing is rendered.
     """
-    from dataclasses import asdict
-
     from reconstruct import accuracy
+    from scenes.camera import derive
     from scenes.scene import read
 
     described = read(scene, sets or (), _names(lens))
-    prediction = _predicted(described)
+    prediction, light = _predicted(described), _light(described, derive(described))
     if as_json:
-        _print_json(asdict(prediction))
-    else:
-        _table(described.title or scene.stem, accuracy.rows(prediction))
+        _print_json(prediction.describe() | ({} if light is None else {"light": light}))
+        return
+    _table(described.title or scene.stem, accuracy.rows(prediction))
+    for title, lines in _optics_sections([], light):
+        _table(title, lines)
 
 
 @app.command()
@@ -231,7 +392,6 @@ def design(
 
     Ranks magnifications by the expected error (Eq. 5) with each.
     """
-    from dataclasses import asdict
 
     from reconstruct.design import Choice, ranked, rows
     from scenes.candidates import magnifications, with_lens
@@ -250,7 +410,7 @@ def design(
             progress((place + 1) / len(wanted))
     choices = ranked(choices)
     if as_json:
-        _print_json({"before": asdict(before), "candidates": [asdict(choice) for choice in choices]})
+        _print_json({"before": before.describe(), "candidates": [choice.describe() for choice in choices]})
     else:
         _table(f"{described.title or scene.stem}: what one more lens type would bring", rows(before, choices))
 
@@ -300,8 +460,11 @@ def stability(output: Folder = Path("stability"), as_json: Json = False) -> None
 
 
 @app.command()
-def show(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
+def show(
+    scene: SceneFile, sets: Sets = None, lens: Lenses = "", complete: Complete = False, as_json: Json = False
+) -> None:
     """The geometry, the plan, and what is left out."""
+    sets = _complete(sets, complete)
     from reconstruct.choice import choose as choose_way
     from scenes.camera import derive
     from scenes.scene import read
@@ -310,13 +473,15 @@ def show(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json =
 
     described = read(scene, sets or (), _names(lens))
     camera = derive(described)
-    choice = choose_way(described, camera, described.calibration.method == "ideal")
-    description = describe(described, camera, choose(described.render.variant), choice.plan())
+    choice = choose_way(described, camera, described.calibration.method == "ideal" and camera.boxed)
+    optics, light = _optics(camera), _light(described, camera)
+    description = describe(described, camera, choose(described.render.variant), choice.plan(), optics, light)
     if as_json:
         _print_json(description)
-    else:
-        for title, lines in sections(description):
-            _table(title, lines)
+        return
+    geometry, *rest = sections(description)
+    for title, lines in (geometry, *_optics_sections(optics, light), *rest):
+        _table(title, lines)
 
 
 @app.command()
@@ -327,6 +492,8 @@ def export(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "
 
     refuse_output(output, scene)
     described, camera, image = _opened(scene, sets, lens)
+    if described.world is not None:
+        raise InputError(f"{scene}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
     picture = write(described, camera, image, output)
     sensors = [sub.name for sub in camera.sub_imagers]
     _say(f"{output} and {picture}: {len(sensors)} sensors; render one with: mitsuba -m scalar_rgb -s 0 {output}")
@@ -500,6 +667,10 @@ def _opened(path: Path, sets: list[str] | None, lens: str) -> tuple[Scene, Camer
 
     scene = read(path, sets or (), _names(lens))
     camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
+    if scene.world is not None:
+        from simulate.world import files
+
+        files(scene)
     return scene, camera, load(scene)
 
 
@@ -513,13 +684,63 @@ def _predicted(scene: Scene) -> Prediction:
     from simulate.ideal import ideal_matrix, ideal_model
 
     camera = derive(scene)
-    choice = choose(scene, camera, exact=True)
-    noise, shape = scene.noise, (camera.rows, camera.columns)
-    actual = noise.variance + noise.quantisation_variance if noise else 0.0
+    choice = choose(scene, camera, exact=camera.boxed)
+    actual, shape = _foreseen_noise(scene, camera), (camera.rows, camera.columns)
+    if choice.way == "fit":
+        raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.way != "dense":
         return predict_large(choice, ideal_model(scene, camera), actual)
     prior = prior_of(scene.prior, shape, camera.target_pitch)
-    return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape)
+    tolerated = None
+    if camera.tolerance is not None and camera.boxed:
+        from reconstruct.tolerance import cost
+
+        tolerated = partial(cost, camera=camera, prior=prior)
+    return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape, tolerated)
+
+
+def _optics(camera: Camera) -> list[dict[str, Any]]:
+    """What lenses that are more than pinholes do to sharpness."""
+    if all(kind.glass.pinhole for kind in camera.types):
+        return []
+    from simulate.lens_report import describe
+
+    return describe(camera)
+
+
+def _light(scene: Scene, camera: Camera) -> dict[str, Any] | None:
+    """The electrons that each lens type's pixels collect, where they are counted."""
+    if scene.sensor is None:
+        return None
+    from scenes.photons import summary
+    from simulate.response import response
+
+    return summary(scene, camera, response(scene, camera))
+
+
+def _optics_sections(
+    optics: list[dict[str, Any]], light: dict[str, Any] | None
+) -> list[tuple[str, list[tuple[str, str]]]]:
+    found: list[tuple[str, list[tuple[str, str]]]] = []
+    if optics:
+        from simulate.lens_report import words
+
+        found.append(("Optics", [(f"lens type {one['lens']}", words(one)) for one in optics]))
+    if light is not None:
+        from scenes.photons import rows
+
+        found.append(("Electrons", rows(light)))
+    return found
+
+
+def _foreseen_noise(scene: Scene, camera: Camera) -> Any:
+    """Variance of every measurement, one number or an array: with a [sensor] that of light of the prior's mean."""
+    if scene.sensor is not None:
+        from scenes.photons import predicted_noise
+        from simulate.response import response
+
+        return predicted_noise(scene, camera, response(scene, camera))
+    return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0
 
 
 def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> Stack:
@@ -539,12 +760,56 @@ def _say_done(folder: Path, stage: str, made: bool) -> None:
     _say(f"{stage}: {_done(made)}" + (f", {folder / 'stack.exr'}" if stage == "render" else ""))
 
 
+def _bench(
+    dark: list[Path] | None, flat: list[Path] | None, flat_value: float, origin: str, upright: bool | None
+) -> Bench:
+    """What the options say of how frames were recorded. Raises InputError for what cannot be."""
+    from scenes.recorded_frames import Bench
+
+    corner = None
+    if origin:
+        try:
+            row, column = (int(number) for number in origin.split(","))
+        except ValueError as error:
+            raise InputError(f"--origin: expected ROW,COLUMN, such as 12,8, got '{origin}'") from error
+        corner = row, column
+    _refuse_no_value("--flat-value", flat_value)
+    return Bench(tuple(dark or ()), tuple(flat or ()), flat_value, corner, upright)
+
+
+def _refuse_no_value(option: str, value: float) -> None:
+    if not 0 < value < float("inf"):
+        raise InputError(f"{option}: expected a value above 0, such as 255, got {value:g}")
+
+
+def _told_by_points(
+    scene: Scene, camera: Camera, output: Path, points: list[Path], bench: Bench, places: Path | None, value: float
+) -> tuple[Model, bool]:
+    """H told from recorded frames, written, with what the user should know of it."""
+    from scenes import imported, model, recorded_points
+    from scenes.files import refuse_output
+    from scenes.recorded_frames import files_in
+
+    _refuse_no_value("--point-value", value)
+    read = [file for path in (*points, *bench.dark, *bench.flat) for file in files_in(path)]
+    refuse_output(output, *read, *([] if places is None else [places]))
+    told = recorded_points.from_recorded_points(scene, camera, points, bench, places, value)
+    model.write(output, told.model)
+    for warning in (*imported.dead(told.frames), *recorded_points.warnings(told)):
+        _say(f"calibrate: {warning}")
+    return told.model, True
+
+
 def _region(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
     try:
         row, column, rows, columns = (int(number) for number in (text or "0,0,1,1").split(","))
     except ValueError as error:
         raise InputError(f"--region: expected ROW,COLUMN,ROWS,COLUMNS, such as 8,8,4,4, got '{text}'") from error
     return (row, column), (rows, columns)
+
+
+def _complete(sets: list[str] | None, complete: bool) -> list[str]:
+    return [*(sets or []), *(["render.complete=true"] if complete else [])]
 
 
 def _names(lens: str) -> tuple[str, ...]:

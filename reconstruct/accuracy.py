@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from math import isfinite
 from typing import Any, cast
 
@@ -11,12 +12,12 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from scenes.errors import InputError
-from scenes.scene import Estimator
+from scenes.estimation import Estimator
 
 from .estimator import factorise
 from .expected import expected_error, widths
-from .forms.form import Vector
-from .forms.svd import svd
+from .forms.form import Form, Vector
+from .forms.svd import Svd, svd
 from .prior import Prior
 from .problem import Problem
 
@@ -89,6 +90,7 @@ class Prediction:
 
     rank, null_space, condition : of H, None for frames
     degrees_of_freedom : trace of A H;  resolution : median width of the averaging kernel, in pixels of f
+    misalignment : the part of `mse` that the camera's tolerance brings, None where there is none or it is not known
     """
 
     measurements: int
@@ -102,29 +104,47 @@ class Prediction:
     degrees_of_freedom: float
     resolution: float | None
     method: str
+    misalignment: float | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """In JSON's types; what a tolerance brings only where there is one."""
+        found = asdict(self)
+        if self.misalignment is None:
+            del found["misalignment"]
+        return found
 
 
 def predict(
-    matrix: sparse.csr_array, prior: Prior, actual: float, estimator: Estimator, shape: tuple[int, int]
+    matrix: sparse.csr_array,
+    prior: Prior,
+    actual: float | Vector,
+    estimator: Estimator,
+    shape: tuple[int, int],
+    tolerated: Callable[[Form], Vector] | None = None,
 ) -> Prediction:
     """Expected squared error for noise of variance `actual`; the estimator expects what it is told, else the same.
 
+    actual : of every measurement the same, or (M,); NaN where a measurement tells nothing and is left out
+    tolerated : what misalignment adds, (N,), where there is a tolerance and the estimator has noise to expect
     Without any noise the error is the limit of Eq. 5: the prior's part in the null space of H.
     Raises InputError where the estimator is to find the noise from a stack, or where no form is right.
     """
+    matrix, noise = _telling(matrix, actual)
     measurements, unknowns = matrix.shape
     seen = observability(matrix)
     if estimator.noise_variance == "fit":
         raise InputError("estimator.noise_variance 'fit' takes a recorded stack; set a number to predict without one")
-    believed = actual if estimator.noise_variance is None else float(estimator.noise_variance)
-    if believed > 0:
-        problem = Problem(matrix, prior, np.full(measurements, believed))
-        form, solver = factorise(problem, estimator.method, estimator.tolerance)
-        expected = expected_error(form, {"noise": np.full(measurements, actual)})
+    told = estimator.noise_variance
+    believed = noise if told is None else np.full(measurements, float(told))
+    if (believed > 0).all():
+        form, solver = factorise(Problem(matrix, prior, believed), estimator.method, estimator.tolerance)
+        expected = expected_error(form, {"noise": noise})
         method, variance, resolved = solver.method, expected.variance, expected.resolved
+        more = None if tolerated is None else tolerated(form)
     else:
-        limit = svd(Problem(matrix, prior, np.ones(measurements)))
-        method, variance, resolved = limit.name, limit.expected_variance(0.0, actual), limit.resolved()
+        limit, more = svd(Problem(matrix, prior, np.ones(measurements))), None
+        method, variance, resolved = limit.name, _in_the_limit(limit, noise), limit.resolved()
+    variance = variance if more is None else variance + more
     mse, width = float(variance.mean()), float(np.median(widths(resolved)))
     return Prediction(
         measurements,
@@ -138,7 +158,26 @@ def predict(
         float(resolved.sum()),
         width if isfinite(width) else None,
         method,
+        None if more is None else float(more.mean()),
     )
+
+
+def _telling(matrix: sparse.csr_array, actual: float | Vector) -> tuple[sparse.csr_array, Vector]:
+    """H and the noise of the measurements that tell something."""
+    if not isinstance(actual, np.ndarray):
+        return matrix, np.full(matrix.shape[0], actual)
+    telling = np.isfinite(actual)
+    return (matrix, actual) if telling.all() else (sparse.csr_array(matrix[telling]), actual[telling])
+
+
+def _in_the_limit(limit: Svd, noise: Vector) -> Vector:
+    """Eq. 5 of an estimator that believes what it sees, (N,); `limit` is of noise 1, `noise` what it really is."""
+    if not np.ptp(noise):
+        return limit.expected_variance(0.0, float(noise.max(initial=0.0)))
+    spread, rank = limit.problem.prior.spread, limit.rank
+    unseen = np.square(spread(limit.right[:, rank:])).sum(axis=1)
+    gain = spread(limit.right[:, :rank] / limit.values[:rank]) @ limit.left.T
+    return np.asarray(unseen + np.square(gain) @ noise)
 
 
 def rows(prediction: Prediction) -> list[tuple[str, str]]:
@@ -151,11 +190,18 @@ def rows(prediction: Prediction) -> list[tuple[str, str]]:
         ("unknowns", str(prediction.unknowns)),
         *_rank_rows(prediction),
         ("expected squared error (Eq. 5)", f"{prediction.mse:.6g} a pixel, a deviation of {deviation:.3g} of 255"),
+        *_misalignment_rows(prediction),
         (f"  without a border of {prediction.trim} pixels", inner),
         ("degrees of freedom", f"{prediction.degrees_of_freedom:.6g} of {prediction.unknowns}"),
         ("resolution, median", width),
         ("form of the estimator", prediction.method),
     ]
+
+
+def _misalignment_rows(prediction: Prediction) -> list[tuple[str, str]]:
+    if prediction.misalignment is None:
+        return []
+    return [("  of it by misalignment", f"{prediction.misalignment:.6g}, within camera.tolerance and on trust")]
 
 
 def _rank_rows(prediction: Prediction) -> list[tuple[str, str]]:

@@ -10,6 +10,7 @@ from scenes.camera import Camera
 from scenes.errors import InputError
 from scenes.scene import Scene
 
+from .aligned import Aligned, Robust
 from .dense import Dense
 from .framed import Framed
 from .memory import free_memory, needed_memory
@@ -21,7 +22,20 @@ BASE = 300_000_000  # bytes, of the program itself and its libraries
 DENSE = 4000  # pixels, up to which the dense problem, exact and with every form, takes seconds
 TILES_ARE_WITHIN = 0.3  # posterior standard deviations of the exact answer, on average; 0.17 where types see all edges
 
-WAYS: dict[str, type[Way]] = {"dense": Dense, "tiles": Tiled, "frame": Framed}
+WAYS: dict[str, type[Way]] = {
+    "dense": Dense,
+    "robust": Robust,
+    "fit": Aligned,
+    "tiles": Tiled,
+    "frame": Framed,
+}
+WORDS = {
+    "dense": "one dense problem",
+    "robust": "one dense problem, misalignment as more noise",
+    "fit": "one dense problem, H found from the stack",
+    "tiles": "tile by tile",
+    "frame": "the whole frame at once",
+}
 
 
 @dataclass(frozen=True)
@@ -35,9 +49,8 @@ class Choice:
 
     def plan(self) -> dict[str, str]:
         """For people: what will run, and what it takes."""
-        words = {"dense": "one dense problem", "tiles": "tile by tile", "frame": "the whole frame at once"}
         return {
-            "method": words[self.way],
+            "method": WORDS[self.way],
             "why": self.why,
             "about": f"{max(self.seconds, 0.1):.2g} s and {max(self.memory, 10**8) / 1e9:.1f} GB",
         }
@@ -49,6 +62,8 @@ def choose(scene: Scene, camera: Camera, exact: bool) -> Choice:
     exact : whether H is that of a perfect camera
     """
     told, allowed = scene.estimator, allowed_memory(scene.estimator.memory)
+    if told.misalignment != "trust":
+        return _misaligned(scene, camera)
     sliding = all(slides(kind) for kind in camera.types)
     silent = told.noise_variance == 0 or (told.noise_variance is None and exact and not _noise(scene))
     if told.method == "tiles":
@@ -79,12 +94,28 @@ def choose(scene: Scene, camera: Camera, exact: bool) -> Choice:
     )
 
 
+def _misaligned(scene: Scene, camera: Camera) -> Choice:
+    """The way of an estimator that expects a misaligned camera."""
+    how = scene.estimator.misalignment
+    key = f"{scene.source}: estimator.misalignment '{how}'"
+    if camera.tolerance is None:
+        raise InputError(f"{key} needs to know what may be misaligned, got no [camera.tolerance]; add one")
+    if camera.unknowns > DENSE:
+        raise InputError(f"{key} serves up to {DENSE} pixels of f, got {camera.unknowns}; crop the target")
+    if not camera.boxed:
+        raise InputError(f"{key} serves pinholes and thin lenses in focus, got blurred or distorted ones; calibrate")
+    memory = _needed("dense", scene, camera, exact=False)
+    return Choice(how, f"estimator.misalignment is '{how}'", memory, _seconds("dense", scene, camera, exact=False))
+
+
 def allowed_memory(told: int | None) -> int:
     """Bytes that may be used: what the scene says, else half of what is free."""
     return free_memory() // 2 if told is None else told
 
 
 def _noise(scene: Scene) -> bool:
+    if scene.sensor is not None:
+        return True
     return scene.noise is not None and scene.noise.variance + scene.noise.quantisation_variance > 0
 
 

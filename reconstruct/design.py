@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,11 @@ class Choice:
     magnification: str
     expected: Prediction | None
     reason: str = ""
+
+    def describe(self) -> dict[str, Any]:
+        """In JSON's types."""
+        expected = None if self.expected is None else self.expected.describe()
+        return {"magnification": self.magnification, "expected": expected, "reason": self.reason}
 
 
 def ranked(choices: list[Choice]) -> list[Choice]:

@@ -78,7 +78,7 @@ def expected_error(
     by_column = sparse.csc_array(problem.matrix)
     total = np.sum(list(noise.values()), axis=0) if noise else np.zeros(measurements)
     missing, noisy, resolved, weights = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(measurements)
-    for place, some, u, negative in _columns(form, asked):
+    for place, some, u, negative in columns(form, asked):
         if truth is None:
             missing[place] = np.square(u).sum(axis=0)
         else:
@@ -104,7 +104,7 @@ def expected_given(form: Form, truth: Vector, noise_variance: Vector) -> Interva
     away = truth - problem.prior.mean
     bias = away - form.gain(problem.matrix @ away)
     trace = squares = 0.0
-    for _, _, _, negative in _columns(form, np.arange(problem.unknowns)):
+    for _, _, _, negative in columns(form, np.arange(problem.unknowns)):
         weighted = noise_variance[:, None] * negative
         trace += float(np.sum(weighted * negative))
         squares += float(np.square(form.gain(weighted)).sum())
@@ -143,7 +143,7 @@ def _noise_of_sum(form: Form, weights: Vector, noise_variance: Vector) -> tuple[
     return float(np.square(u).sum()), float(noise_variance @ np.square(negative[:, 0]))
 
 
-def _columns(form: Form, asked: Pixels) -> Iterator[tuple[slice, Pixels, Matrix, Matrix]]:
+def columns(form: Form, asked: Pixels) -> Iterator[tuple[slice, Pixels, Matrix, Matrix]]:
     """Some of the pixels asked for: u, (K, q), whose squares are the prior's part of Eq. 5, and -A^T e_i, (M, q)."""
     for start in range(0, asked.size, CHUNK):
         place = slice(start, min(start + CHUNK, asked.size))

@@ -12,37 +12,33 @@ from scenes.model import Model
 from .accuracy import TRIM, Prediction, trimmed
 from .choice import WAYS, Choice
 from .expected import widths
-from .way import Hands, Task
+from .noise import everywhere, of_used
+from .way import Hands, Task, Vector
 
 
-def predict_large(choice: Choice, model: Model, actual: float) -> Prediction:
+def predict_large(choice: Choice, model: Model, actual: float | Vector) -> Prediction:
     """Expected squared error for noise of variance `actual`; rank, null space and condition are not computed.
 
+    actual : of every measurement the same, or (M,); NaN where a measurement tells nothing and is left out
     Raises InputError where the estimator is to find what takes a stack, or has no noise to expect.
     """
     scene, camera = model.scene, model.camera
     told = scene.estimator.noise_variance
-    believed = actual if told is None else told
-    if isinstance(believed, str) or believed <= 0:
+    noise = actual if isinstance(actual, np.ndarray) else everywhere(actual, model.measurements)
+    used = np.isfinite(noise)
+    noise = of_used(noise, used)
+    believed = everywhere(told, noise.size) if isinstance(told, float) else noise
+    if told == "fit" or not (believed > 0).all():
         raise InputError(
             f"{camera.unknowns} pixels are predicted with noise alone; set noise.variance or estimator.noise_variance"
             " above 0"
         )
-    everywhere = (model.measurements,)
-    task = Task(
-        model,
-        model.forward(np.full(model.unknowns, scene.prior.mean)),
-        np.ones(everywhere, dtype=np.bool_),
-        np.broadcast_to(np.float64(believed), everywhere),
-        scene.prior,
-        scene.estimator,
-        scene.tiles,
-    )
-    noise = {"noise": np.broadcast_to(np.float64(actual), everywhere)}
-    outcome = WAYS[choice.way](task, Hands()).outcome(noise, None)
+    recorded = model.forward(np.full(model.unknowns, scene.prior.mean))
+    task = Task(model, recorded, used, believed, scene.prior, scene.estimator, scene.tiles)
+    outcome = WAYS[choice.way](task, Hands()).outcome({"noise": noise}, None)
     variance, width = outcome.expected.variance, float(np.median(widths(outcome.expected.resolved)))
     return Prediction(
-        measurements=model.measurements,
+        measurements=noise.size,
         unknowns=model.unknowns,
         rank=None,
         null_space=None,

@@ -21,14 +21,15 @@ from scenes.progress import Progress, no_progress
 from . import paper_figures as figures
 from .claims import Claim, errors, ranks
 from .claims_of_pictures import pictures
-from .paper_errors import ACTUAL, COMBINATIONS, SIDES, THREE, MatrixOf, Tile, Tiles, sweep, tiles
+from .paper_errors import ACTUAL, COMBINATIONS, SIDES, THREE, MatrixOf, Tile, Tiles, distortion, sweep, tiles
 from .paper_pictures import PHOTOGRAPH, Photograph, Record, Trials, cut, load, rehearse, seeds
 
 SIDE = 35  # of the photograph's tiles
 FRACTIONS = 3  # experiment by whose seed pixels get fractions
 SHOWN = 1e-4  # noise variance of the maps
+SMALLEST, BENT = 19, 1e-2  # side of the tile, and noise variance of the maps, of the figure of distortion
 CLAIMS = "claims.csv"
-FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig7")
+FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig7", "distortion")
 
 Row = Sequence[str | float]
 
@@ -41,7 +42,7 @@ def write_paper(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
-    """Write figures 2, 3, 4, 5 and 7, each as PNG and CSV, and the table of claims; say what was written and found.
+    """Write figures 2, 3, 4, 5, 7 and one of distortion, each as PNG and CSV, and the claims; say what was found.
 
     matrix_of : H, (M, N), of a perfect camera
     record : from the light, (M,), of a camera, the noise and its seed to recorded values, (M,)
@@ -59,8 +60,11 @@ def write_paper(
     progress(0.5)
     judged = [*errors(computed), *ranks(matrix_of), *pictures(found)]
     progress(0.8)
+    diverse = [computed[SMALLEST, THREE], *distortion(matrix_of)]
     _write_numbers(folder, computed, found, judged)
+    _write_table(folder / "distortion.csv", ("lenses", "measurements", "noise_variance", "mse"), _diverse(diverse))
     _write_figures(folder, computed, found)
+    figures.draw_distortion(folder / "distortion.png", diverse, BENT)
     progress(1.0)
     return {
         "folder": str(folder),
@@ -123,6 +127,11 @@ def _sides(computed: Tiles) -> Iterable[Row]:
         tile = computed[side, THREE]
         yield from ((side, *row[1:4]) for row in sweep(tile))
         yield from ((side, actual, actual, tile.mse(actual)) for actual in map(float, ACTUAL))
+
+
+def _diverse(shown: list[Tile]) -> Iterable[Row]:
+    for tile in shown:
+        yield from ((tile.name, tile.camera.measurements, actual, tile.mse(actual)) for actual in map(float, ACTUAL))
 
 
 def _measured(found: Photograph) -> Iterable[Row]:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from scenes import scene
+from scenes import estimation, scene
 from scenes.camera import Camera, derive
 
 from .accuracy import TRIM
@@ -35,6 +35,7 @@ COMBINATIONS = (TWICE, TWO, THREE)
 EXPECTED = (1e-6, 1e-4, 1e-2, 1.0)
 ACTUAL: Vector = np.logspace(-6, 2, 33)
 LEAST = 1e-6
+STRAIGHT = ("camera.lens.I.distortion=",)
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,18 @@ Tiles = dict[tuple[int, tuple[str, ...]], Tile]  # by side and lens types
 
 def tile(side: int, lenses: tuple[str, ...], matrix_of: MatrixOf) -> Tile:
     """A tile of the gallery with the named lens types; one named twice counts twice."""
-    camera = gallery(side, lenses)
-    paper = scene.Prior()
+    return decomposed(lenses, gallery(side, lenses), matrix_of)
+
+
+def distortion(matrix_of: MatrixOf) -> tuple[Tile, Tile]:
+    """The gallery's one lens type with distortion, and without."""
+    bent, straight = (derive(scene.read(GALLERY / "distorted.toml", changes)) for changes in ((), STRAIGHT))
+    return decomposed(("one type, distorted",), bent, matrix_of), decomposed(("one type",), straight, matrix_of)
+
+
+def decomposed(lenses: tuple[str, ...], camera: Camera, matrix_of: MatrixOf) -> Tile:
+    """The tile that a camera sees."""
+    paper = estimation.Prior()
     prior = independent(paper.mean, paper.variance, camera.unknowns)
     return Tile(lenses, camera, svd(Problem(matrix_of(camera), prior, np.ones(camera.measurements))))
 

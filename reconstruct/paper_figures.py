@@ -96,6 +96,29 @@ def _error_of_one(axes: Any, best: Vector) -> None:
     )
 
 
+def draw_distortion(path: Path, shown: list[Tile], noise: float) -> None:
+    """Error against noise of one lens type with and without distortion, beside three types; the error's maps."""
+    figure = _figure(14.5, 5.2)
+    axes, *panels = figure.subplots(1, 1 + len(shown), width_ratios=(1.9, *(1.0 for _ in shown)))
+    for tile, colour in zip(shown, KINDS, strict=True):
+        label = f"{tile.name}: {tile.camera.measurements} measurements"
+        axes.loglog(ACTUAL, [tile.mse(float(actual)) for actual in ACTUAL], color=colour, label=label)
+    axes.axvline(noise, color="0.5", lw=1.0, ls=":")
+    _axes(axes, "the estimator expects the noise that there is", NOISE, f"average {ERROR}")
+    axes.legend(fontsize=9, loc="lower right")
+    maps = [tile.matched(noise) for tile in shown]
+    scale = max(error.max() for error in maps if error.max() < 100 * maps[0].max())  # one, where they compare
+    for panel, tile, error in zip(panels, shown, maps, strict=True):
+        most = max(scale, error.max())
+        drawn = panel.imshow(error.reshape(tile.side, tile.side), cmap="viridis", vmin=0.0, vmax=most)
+        _axes(panel, f"{tile.name}\naverage {error.mean():.3g}", "column (target pixels)", "row (target pixels)")
+        panel.grid(visible=False)
+        bar = figure.colorbar(drawn, ax=panel, fraction=0.046, pad=0.03)
+        bar.set_label("expected squared error (squared units of f)")
+    figure.suptitle(f"Distortion as lens diversity; maps: expected squared error at noise variance {_power(noise)}")
+    _save(figure, path)
+
+
 def draw_photograph(path: Path, found: Photograph, side: int) -> None:
     """Fig. 7: measured errors of six tiles against noise and against bits, beside the prediction; the tiles above."""
     figure = _figure(13.0, 10.2)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scenes import picture, scene
 from scenes.camera import Camera
 from scenes.errors import InputError
-from scenes.scene import Noise
+from scenes.sensor import Noise
 
 from .forms.form import Matrix, Vector
 from .paper_errors import GALLERY, Tile

@@ -16,15 +16,18 @@ import numpy as np
 from scenes import exr
 from scenes.files import write_text
 from scenes.model import Model
+from scenes.needs import LeftOut
 from scenes.plan import left_out
 from scenes.scene import Scene
-from scenes.stack import Stack
+from scenes.show import why_left_out
+from scenes.stack import STRAIGHT, Stack
 from scenes.versions import versions
 
 from .estimator import Solver
 from .fit import Fit
 from .restore import MOST_FEIGNED, Restoration
 
+MOST_NAMED = 5  # sub-imagers, in a line of the table
 WARNING = (
     "the lens types leave pixels open on which the noise of H feigns information:"
     " raise calibration.samples, or take calibration.method = 'ideal' if the camera is"
@@ -50,10 +53,12 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
         "predicted_trimmed_mse": restoration.trimmed_mse,
         "budget": restoration.budget(),
     }
-    if restoration.error is not None and restoration.interval is not None:
-        error = {**asdict(restoration.error), "expected_given_truth": asdict(restoration.interval), **error}
+    if restoration.error is not None:
+        error = {**asdict(restoration.error), **error}
+    if restoration.interval is not None:
+        error["expected_given_truth"] = asdict(restoration.interval)
     stages = {
-        "render": _stage(stack.record),
+        "render": {**_how(stack.record), **_stage(stack.record)},
         "calibrate": {"method": model.record["method"], **_stage(model.record)},
         "reconstruct": {"seconds": restoration.seconds},
     }
@@ -65,12 +70,16 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
         "error": error,
         "solver": {"way": restoration.choice.way, **_solver(restoration.solver)},
         "diagnostics": _diagnostics(restoration),
-        "model": {**model.record.get("agreement", _unknown(model)), "feigned_information": restoration.feigned},
-        "skipped": [{"what": what, "why": why} for what, why in left_out(_as_run(stack, model))],
+        "model": {
+            **model.record.get("agreement", _unknown(model)),
+            "feigned_information": restoration.feigned,
+            **({"fit": model.record["fit"]} if "fit" in model.record else {}),
+        },
+        "skipped": [left.describe() for left in (*left_out(_as_run(stack, model), model.camera), *_of_world(stack))],
         "versions": {**model.record["versions"], **stack.record["versions"], **versions("scipy", "scikit-image")},
         "seeds": {
-            "scene": stack.record["seed"],
-            "data": stack.record["first_seed"],
+            "scene": stack.record.get("seed"),  # recorded frames have none
+            "data": stack.record.get("first_seed"),
             "calibration": model.record.get("first_seed"),
         },
     }
@@ -122,6 +131,13 @@ def _unknown(model: Model) -> dict[str, float | None]:
     return {"rms_difference_from_ideal": known, "max_z": None, "p_value": None}
 
 
+def _of_world(stack: Stack) -> tuple[LeftOut, ...]:
+    """What rendering left out once it had seen the world."""
+    if not stack.record.get(STRAIGHT):
+        return ()
+    return (LeftOut("light that bounces", "nothing in the world reflects any: paths have one segment"),)
+
+
 def _as_run(stack: Stack, model: Model) -> Scene:
     return stack.scene.model_copy(update={"calibration": model.scene.calibration})
 
@@ -129,6 +145,10 @@ def _as_run(stack: Stack, model: Model) -> Scene:
 def write_run(path: Path, description: dict[str, Any]) -> None:
     """Write run.json."""
     write_text(path, json.dumps(description, indent=2, allow_nan=False) + "\n")
+
+
+def _how(record: dict[str, Any]) -> dict[str, Any]:
+    return {"method": record["method"]} if "method" in record else {}
 
 
 def _stage(record: dict[str, Any]) -> dict[str, Any]:
@@ -145,10 +165,12 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         made += [stage["variant"]] if "variant" in stage else []
         if name == "reconstruct":
             made.append(f"{_way(description['solver'])}, {description['unknowns']} unknowns")
-        lines.append((f"{name}, seconds", ", ".join([f"{stage['seconds']:.2f}", *made])))
+        done = "import" if stage.get("method") == "imported" else name
+        lines.append((f"{done}, seconds", ", ".join([f"{stage['seconds']:.2f}", *made])))
     if "mse" in error:
-        given = error["expected_given_truth"]
         lines.append(("mean squared error, measured", f"{error['mse']:.4g}"))
+    if "expected_given_truth" in error:
+        given = error["expected_given_truth"]
         lines.append(
             ("  expected for this picture", f"{given['mse']:.4g} (99 %: {given['low']:.4g} to {given['high']:.4g})")
         )
@@ -173,10 +195,21 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
                 f"{difference}, largest z {agreement['max_z']:.1f}, p {agreement['p_value']:.2g}",
             )
         )
+    if "fit" in agreement:
+        lines.append(("H by a fit of its geometry", _fitted(agreement["fit"])))
     if agreement["feigned_information"] > MOST_FEIGNED:
         lines.append(("do not trust the predicted error", WARNING))
-    lines += [(f"left out: {skip['what']}", skip["why"]) for skip in description["skipped"]]
+    lines += [(f"left out: {skip['what']}", why_left_out(skip)) for skip in description["skipped"]]
     return lines
+
+
+def _fitted(fit: dict[str, Any]) -> str:
+    refused = fit["refused"]
+    told = f"{fit['accepted']} sub-imagers"
+    if not refused:
+        return told
+    named = ", ".join(refused[:MOST_NAMED]) + (f" and {len(refused) - MOST_NAMED} more" if refused[MOST_NAMED:] else "")
+    return f"{told}; as measured, since the fit is no good there: {named}"
 
 
 def _way(solver: dict[str, Any]) -> str:

@@ -1,7 +1,8 @@
 """From a recorded stack and a model to the image, its error bars, and where its error comes from.
 
 The noise that the estimator expects holds everything known: the sensor's, quantisation, the rendering's own variance,
-and what the uncertainty of H adds at a first estimate of the image. Dead and saturated pixels are left out.
+and what the uncertainty of H adds at a first estimate of the image. What a real sensor adds depends on the light, so it
+too is taken anew at the first estimate. Dead and saturated pixels are left out.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes import scene
+from scenes import estimation
 from scenes.errors import InputError
 from scenes.model import Model
 from scenes.progress import Progress, no_progress
@@ -26,22 +27,22 @@ from .estimator import Solver
 from .expected import ExpectedError, Interval
 from .fit import Fit, evidence, fit
 from .frame import NotReachedError
-from .way import Hands, Outcome, Task, Way, is_one_number, total
+from .noise import (
+    Usable,
+    depends_on_light,
+    everywhere,
+    noise_at_first,
+    noise_given,
+    refuse_fit_of_sensor,
+    usable_pixels,
+)
+from .way import Hands, Outcome, Task, Way, total
 
 Vector = NDArray[np.float64]
 
 MOST_FEIGNED = 0.05  # of what is believed of a pixel on average: above it the expected error is not to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
 KEPT = ("rendering", "calibration")  # noise that stays known when the rest of it is to be found
-
-
-@dataclass(frozen=True)
-class Usable:
-    """Which of the M sensor pixels are used, and how many are not, and why."""
-
-    used: NDArray[np.bool_]
-    dead: int
-    saturated: int
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Restoration:
 
     outcome: Outcome
     choice: Choice
-    prior: scene.Prior
+    prior: estimation.Prior
     trimmed_mse: float | None
     residual: Residual | None
     shape: tuple[int, int]
@@ -102,7 +103,7 @@ class Restoration:
     def budget(self) -> dict[str, float]:
         """Parts of the expected squared error by their cause; they add up to it, an absent effect brings 0."""
         parts = {"null_space": self.expected.missing, **self.expected.parts}
-        return {name: parts.get(name, 0.0) for name in BUDGET}
+        return {name: parts.get(name, 0.0) for name in BUDGET} | parts
 
     def region(self, corner: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
         """Mean of the estimate in a region and its expected deviation (Eq. 5). Raises InputError if it lies outside."""
@@ -134,16 +135,6 @@ def refuse_strangers(stack: Stack, model: Model, names: tuple[Path | str, Path |
             )
 
 
-def usable_pixels(stack: Stack) -> Usable:
-    """Which pixels tell something: not those that are no number (dead), nor those at the level of saturation."""
-    alive = np.isfinite(stack.values) & np.isfinite(stack.variance)
-    noise = stack.scene.noise
-    full = np.zeros_like(alive)
-    if noise is not None and noise.saturation is not None:
-        full = alive & (stack.values >= np.float32(noise.saturation))  # the stack holds float32
-    return Usable(alive & ~full, int(np.sum(~alive)), int(np.sum(full)))
-
-
 def restore(
     stack: Stack,
     model: Model,
@@ -154,8 +145,10 @@ def restore(
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 
     truth : (N,) or None;  workers : who does tiles, absent: threads of this process
-    Raises InputError if memory does not suffice, or if no way is right to what the scene asks.
+    Raises InputError if memory does not suffice, if no way is right to what the scene asks, or if the noise of a
+    [sensor] is to be fitted.
     """
+    refuse_fit_of_sensor(stack)
     choice = choose(stack.scene, model.camera, model.exact)
     hands = Hands(workers, progress)
     try:
@@ -168,20 +161,18 @@ def restore(
 
 def _restored(stack: Stack, model: Model, truth: Vector | None, choice: Choice, hands: Hands) -> Restoration:
     start = perf_counter()
-    usable = usable_pixels(stack)
-    noise = {name: _of_used(variances, usable.used) for name, variances in known_noise(stack).items()}
+    usable = usable_pixels(stack, model)
     prior, told = _first_prior(stack), stack.scene.estimator.noise_variance
-    uncertain, way = bool(model.variance.any()), None
-    if uncertain:
-        noise["calibration"] = model.prior_spread(np.full(model.unknowns, prior.variance))[usable.used]
+    noise, way = noise_at_first(stack, model, usable, prior), None
+    if depends_on_light(stack, model):
         way = _way(choice, stack, model, usable, prior, noise, hands)
-        noise["calibration"] = model.spread(way.image)[usable.used]
+        noise = noise_given(way.image, stack, model, usable, noise)
     found = _fitted(stack, model, usable, prior, noise)
-    if found is not None and uncertain:
+    if found is not None and model.variance.any():
         # What the uncertainty of H adds was taken at an image that the first prior had left noisy.
         told_prior, told_noise = _with_fit(stack, prior, noise, found)
         better = _way(choice, stack, model, usable, told_prior, told_noise, hands)
-        noise["calibration"] = model.spread(better.image)[usable.used]
+        noise = noise_given(better.image, stack, model, usable, noise)
         found = _fitted(stack, model, usable, prior, noise)
     if found is not None:
         prior, noise = _with_fit(stack, prior, noise, found)
@@ -206,28 +197,7 @@ def _restored(stack: Stack, model: Model, truth: Vector | None, choice: Choice, 
     )
 
 
-def known_noise(stack: Stack) -> dict[str, Vector]:
-    """Variances, (M,), of what is known of the noise before anything is estimated; absent effects have no entry."""
-    noise = {"rendering": stack.variance}
-    described = stack.scene.noise
-    if described is not None and described.variance > 0:
-        noise["noise"] = _everywhere(described.variance, stack.values.size)
-    if described is not None and described.bits is not None:
-        noise["quantisation"] = _everywhere(described.quantisation_variance, stack.values.size)
-    return noise
-
-
-def _everywhere(number: float, count: int) -> Vector:
-    return np.broadcast_to(np.float64(number), (count,))  # stored once
-
-
-def _of_used(values: Vector, used: NDArray[np.bool_]) -> Vector:
-    if used.all():
-        return values
-    return _everywhere(float(values[0]), int(used.sum())) if is_one_number(values) else values[used]
-
-
-def _first_prior(stack: Stack) -> scene.Prior:
+def _first_prior(stack: Stack) -> estimation.Prior:
     """What is told of the prior; where that is to be found, the paper's."""
     described = stack.scene.prior
     return described.model_copy(update={"kind": "independent"}) if described.kind == "fit" else described
@@ -235,7 +205,7 @@ def _first_prior(stack: Stack) -> scene.Prior:
 
 def _expected_noise(stack: Stack, usable: Usable, noise: dict[str, Vector]) -> Vector:
     told = stack.scene.estimator.noise_variance
-    return _everywhere(told, int(usable.used.sum())) if isinstance(told, float) else total(noise)
+    return everywhere(told, int(usable.used.sum())) if isinstance(told, float) else total(noise)
 
 
 def _way(
@@ -243,7 +213,7 @@ def _way(
     stack: Stack,
     model: Model,
     usable: Usable,
-    prior: scene.Prior,
+    prior: estimation.Prior,
     noise: dict[str, Vector],
     hands: Hands,
 ) -> Way:
@@ -253,7 +223,9 @@ def _way(
     return WAYS[choice.way](task, hands)
 
 
-def _fitted(stack: Stack, model: Model, usable: Usable, prior: scene.Prior, noise: dict[str, Vector]) -> Fit | None:
+def _fitted(
+    stack: Stack, model: Model, usable: Usable, prior: estimation.Prior, noise: dict[str, Vector]
+) -> Fit | None:
     """The prior, and the noise if that is asked for, of largest marginal likelihood; None where nothing is asked."""
     described = stack.scene.prior
     asked = stack.scene.estimator.noise_variance == "fit"
@@ -266,8 +238,8 @@ def _fitted(stack: Stack, model: Model, usable: Usable, prior: scene.Prior, nois
 
 
 def _with_fit(
-    stack: Stack, prior: scene.Prior, noise: dict[str, Vector], found: Fit
-) -> tuple[scene.Prior, dict[str, Vector]]:
+    stack: Stack, prior: estimation.Prior, noise: dict[str, Vector], found: Fit
+) -> tuple[estimation.Prior, dict[str, Vector]]:
     """The prior and the noise once they are found; what was found stands for the noise that the scene describes."""
     if found.variance is not None and found.length is not None:
         length = found.length * stack.camera.target_pitch
@@ -275,7 +247,7 @@ def _with_fit(
         prior = prior.model_copy(update=update)
     if found.noise_variance is not None:
         kept = {name: noise[name] for name in KEPT if name in noise}
-        noise = {**kept, "noise": _everywhere(found.noise_variance, noise["rendering"].size)}
+        noise = {**kept, "noise": everywhere(found.noise_variance, noise["rendering"].size)}
     return prior, noise
 
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg, sparse
 
-from scenes.camera import Camera, LensType
+from scenes.camera import Camera
+from scenes.lens_type import LensType
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.float64]

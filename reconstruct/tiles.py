@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
-from scenes.scene import Estimator
+from scenes.estimation import Estimator
 
 from .estimator import FORMS, Solver, estimate
 from .expected import expected_error

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from scenes import scene
+from scenes import estimation
 from scenes.model import Model
 from scenes.progress import Progress, no_progress
 from scenes.workers import Workers
@@ -44,9 +44,9 @@ class Task:
     recorded: Vector
     used: NDArray[np.bool_]
     believed: Vector
-    prior: scene.Prior
-    told: scene.Estimator
-    tiles: scene.Tiles
+    prior: estimation.Prior
+    told: estimation.Estimator
+    tiles: estimation.Tiles
 
     @cached_property
     def complete(self) -> bool:

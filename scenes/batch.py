@@ -109,13 +109,17 @@ class _Parcels:
 
 
 def prepare(scene: Scene, image: Image, folder: Path) -> None:
-    """Make the folder of a scene, with the scene and its target in it. Raises InputError or DeniedError."""
+    """Make the folder of a scene, with the scene and its target in it. Raises InputError or DeniedError.
+
+    What a world truly looks like is rendered later.
+    """
     make_folder(folder)
     for name in ("scene.toml", TRUTH):
-        refuse_output(folder / name, scene.source, Path(scene.target.image))
+        refuse_output(folder / name, scene.source, *([Path(scene.target.image)] if scene.target.image else []))
     rows, columns = image.shape
     write(folder / "scene.toml", resolved(scene, (rows, columns)))
-    write_truth(folder / TRUTH, image)
+    if scene.world is None:
+        write_truth(folder / TRUTH, image)
 
 
 def _raise(error: Exception) -> Description:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from .camera import Camera, LensType
+from .camera import Camera
+from .lens_type import LensType
 
 Image = NDArray[np.float64]
 

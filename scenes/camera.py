@@ -9,77 +9,22 @@ types as listed, sub-imagers (k, l) by rows, then pixels by rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import cached_property
 from itertools import accumulate, pairwise
-from math import ceil, floor
+from math import ceil, floor, hypot
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .lens_type import Glass, LensType, SubImager
+from .lenses import Lens, Tolerance
 from .picture import shape
-from .scene import Lens, Scene
+from .scene import Scene
 
 MOST_MEASUREMENTS = 2**30
 MOST_SUB_IMAGERS = 2**14
-
-
-@dataclass(frozen=True)
-class LensType:
-    """An array of equal sub-imagers; `ratio` is m, the pixels of f that a sensor pixel covers along one axis."""
-
-    name: str
-    ratio: Fraction
-    array: tuple[int, int]
-    pixels: tuple[int, int]
-    step: Fraction
-    origin: tuple[int, int]
-
-    @property
-    def count(self) -> int:
-        """Number of sub-imagers."""
-        return self.array[0] * self.array[1]
-
-    @property
-    def measurements(self) -> int:
-        """Number of sensor pixels of all its sub-imagers."""
-        return self.count * self.pixels[0] * self.pixels[1]
-
-    def middle(self, window: tuple[Fraction, Fraction]) -> tuple[float, float]:
-        """Row and column of f in the middle of a sub-imager's view that begins at `window`."""
-        row, column = (start + self.ratio * count / 2 for start, count in zip(window, self.pixels, strict=True))
-        return float(row), float(column)
-
-    @property
-    def span(self) -> tuple[Fraction, Fraction]:
-        """Rows and columns of f that the array sees as a whole."""
-        return _span(self.ratio, self.array[0], self.pixels[0], self.step), _span(
-            self.ratio, self.array[1], self.pixels[1], self.step
-        )
-
-
-@dataclass(frozen=True)
-class SubImager:
-    """One lens and the patch of sensor behind it.
-
-    `window` is the row and column of f where its view begins; `lens` and `patch` are the (x, y) centres of the
-    lens and of the patch, `depth` the distance from the lens to the patch.
-    """
-
-    type: LensType
-    k: int
-    l: int  # noqa: E741  (the paper's letter)
-    window: tuple[Fraction, Fraction]
-    lens: tuple[float, float]
-    patch: tuple[float, float]
-    depth: float
-
-    @property
-    def name(self) -> str:
-        """Its name in a stack: type, k, l."""
-        return f"{self.type.name}.{self.k:02d}.{self.l:02d}"
 
 
 @dataclass(frozen=True)
@@ -93,6 +38,8 @@ class Camera:
     pixel_pitch: float
     lens_pitch: float
     types: tuple[LensType, ...]
+    wavelength: float | None = None
+    tolerance: Tolerance | None = None
 
     @property
     def unknowns(self) -> int:
@@ -109,8 +56,33 @@ class Camera:
         return self.distance * self.pixel_pitch / (float(kind.ratio) * self.target_pitch)
 
     def focal_length(self, kind: LensType) -> float:
-        """From the thin-lens equation, 1/focal_length = 1/distance + 1/depth."""
-        return 1.0 / (1.0 / self.distance + 1.0 / self.depth(kind))
+        """From the thin-lens equation, 1/focal_length = 1/focus + 1/depth."""
+        return 1.0 / (1.0 / self.focus(kind) + 1.0 / self.depth(kind))
+
+    def focus(self, kind: LensType) -> float:
+        """Distance that a type's lenses show sharp."""
+        return self.distance if kind.glass.focus is None else kind.glass.focus
+
+    @property
+    def corner(self) -> float:
+        """From the middle of the target to its corner: r = 1 of a distortion."""
+        return self.target_pitch * hypot(self.rows, self.columns) / 2
+
+    @property
+    def perfect(self) -> bool:
+        """Whether it is a set of pinholes that stand where they should: then H is a product of overlaps."""
+        return self.tolerance is None and all(kind.glass.pinhole for kind in self.types)
+
+    @property
+    def boxed(self) -> bool:
+        """Whether H of the camera as designed averages f over boxes: no distortion, and no blur that is known."""
+        return all(kind.glass.distortion is None and not self.blurs(kind) for kind in self.types)
+
+    def blurs(self, kind: LensType) -> bool:
+        """Whether a thin lens shows a point of the target as a disk: out of focus, or by diffraction."""
+        if kind.glass.aperture is None:
+            return False
+        return self.wavelength is not None or self.focus(kind) != self.distance
 
     @cached_property
     def sub_imagers(self) -> tuple[SubImager, ...]:
@@ -196,9 +168,12 @@ class Camera:
                     "array": list(kind.array),
                     "pixels": list(kind.pixels),
                     "step": str(kind.step),
+                    **kind.glass.describe(),
                 }
                 for place, kind in enumerate(self.types)
             },
+            **({} if self.wavelength is None else {"camera.wavelength": self.wavelength}),
+            **({} if self.tolerance is None else {"camera.tolerance": self.tolerance.model_dump(mode="json")}),
         }
 
 
@@ -217,6 +192,8 @@ def derive(scene: Scene) -> Camera:
         pixel_pitch=scene.camera.pixel_pitch,
         lens_pitch=scene.camera.lens_pitch,
         types=types,
+        wavelength=scene.camera.wavelength,
+        tolerance=scene.camera.tolerance,
     )
     for kind in types:
         if kind.count > MOST_SUB_IMAGERS:
@@ -228,10 +205,6 @@ def derive(scene: Scene) -> Camera:
         raise InputError(f"{scene.source}: the lens arrays have {camera.measurements} pixels, at most 2^30 are served")
     _refuse_overlap(camera, scene)
     return camera
-
-
-def _span(ratio: Fraction, count: int, pixels: int, step: Fraction) -> Fraction:
-    return ratio * pixels + (count - 1) * step
 
 
 def _lens_type(lens: Lens, rows: int, columns: int, scene: Scene) -> LensType:
@@ -250,9 +223,11 @@ def _lens_type(lens: Lens, rows: int, columns: int, scene: Scene) -> LensType:
             f"{scene.source}: camera.lens.{lens.name}.pixels asks for {pixels[0]} x {pixels[1]} pixels,"
             f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}"
         )
-    kind = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0))
+    surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # a file's name was replaced by what it holds
+    glass = Glass(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale)
+    kind = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), glass)
     origin = floor((rows - kind.span[0]) / 2), floor((columns - kind.span[1]) / 2)
-    return LensType(lens.name, ratio, lens.array, pixels, lens.step, origin)
+    return replace(kind, origin=origin)
 
 
 def _refuse_overlap(camera: Camera, scene: Scene) -> None:

@@ -35,10 +35,9 @@ from .scene import Scene, parse
 Vector = NDArray[np.float64]
 
 ENTRIES = ("indices", "indptr", "data")
-ALIKE, MOST_KINDS = (
-    200,
-    24,
-)  # pixels of like contrast, whose scatter is moderated together, at least; such groups, at most
+ALIKE = 200  # pixels of like contrast, at least, whose scatter is moderated together
+MOST_KINDS = 24  # such groups of a lens type, at most
+RECORDED = "recorded points"  # the method of a model whose every entry was read by itself
 NOWHERE = -1  # what a measurement sees that sees nothing: no window has it
 
 
@@ -74,8 +73,8 @@ class Model:
 
     @property
     def exact(self) -> bool:
-        """Whether H is that of a perfect camera."""
-        return self.record["method"] == "ideal"
+        """Whether H is that of a perfect camera of pinholes, and so follows from its geometry."""
+        return self.record["method"] == "ideal" and self.camera.boxed
 
     @cached_property
     def boxes(self) -> Boxes:
@@ -166,16 +165,22 @@ class Model:
         The errors of a row cancel in its sum, since all its entries share their rays, so what is left is about
         sum over j of var_ij (f_j - (H f)_i)^2. Neighbouring entries' errors cancel too, which smooth images notice:
         the scatter of H f over the batches, moderated among pixels of a lens type with like contrast, says by how much.
+        Entries of recorded points were read one by one, and nothing cancels: sum over j of var_ij f_j^2.
         """
         flat = np.asarray(image, dtype=np.float64).ravel()
         rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
-        away = flat[self.matrix.indices] - (self.matrix @ flat)[rows]
+        away = flat[self.matrix.indices]
+        if self.record["method"] != RECORDED:
+            away = away - (self.matrix @ flat)[rows]
         trend = self._row_sums(rows, self.variance * away**2)
         count = len(self.batches)
         if count < 2:
             return trend
         seen = sum((self._row_sums(rows, batch * away) ** 2 for batch in self.batches), np.zeros(self.measurements))
         seen /= count * (count - 1)
+        if self.record.get("fit"):
+            # Entries that a few fitted numbers make go together in ways that no sum over entries knows.
+            return seen
         for kind in self.camera.type_slices():
             place = kind.start + np.flatnonzero(trend[kind] > 0)
             # Strong contrast lets errors cancel otherwise than weak one does, so that like is compared with like.
@@ -240,7 +245,7 @@ def read(path: Path) -> Model:
         if "data" in arrays:
             matrix = sparse.csr_array((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
             matrix.check_format()
-        if matrix is None and record["method"] != "ideal":
+        if matrix is None and not (record["method"] == "ideal" and derive(scene).boxed):
             raise ValueError("it has no entries")
     except InputError:
         raise

@@ -24,10 +24,15 @@ LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray wei
 def load(scene: Scene) -> Image:
     """The target, (rows, columns), cropped as the scene says, in the precision of float32.
 
+    Zeros where a world takes the target's place: what it looks like is not known before it is rendered.
     Raises InputError if the picture is missing, unreadable, too small for the crop or holds NaN.
     """
     target = scene.target
     where = f"{scene.source}: target.image"
+    if target.image is None:
+        if target.shape is None:
+            raise InputError(f"{where} is absent, and so is target.shape, which would do for a [world]; name a picture")
+        return np.zeros(target.shape)
     picture = luminance(_pixels(target.image, where), where)
     if target.origin is None:
         if target.shape not in (None, picture.shape):
@@ -54,23 +59,33 @@ def shape(scene: Scene) -> tuple[int, int]:
     return rows, columns
 
 
-def write_truth(path: Path, image: Image) -> None:
-    """Write a target as OpenEXR, float32, channel Y."""
-    write(path, [Part("truth", {"Y": image.astype(np.float32)}, {})])
+def write_truth(path: Path, image: Image, depth: Image | None = None, record: dict[str, Any] | None = None) -> None:
+    """Write a target as OpenEXR, float32, channel Y; of a world also `depth` in mm, NaN where there is nothing."""
+    channels = {"Y": image.astype(np.float32)}
+    if depth is not None:
+        channels["depth"] = depth.astype(np.float32)
+    write(path, [Part("truth", channels, record or {})])
 
 
 def luminance(pixels: NDArray[Any], where: str) -> Image:
     """Any (rows, columns[, channels]) picture as one channel of values from 0 to 255. Raises InputError."""
+    numbers = grey(pixels, where)
+    if pixels.dtype == np.bool_:
+        return numbers * 255.0
+    if pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
+        return numbers
+    if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
+        return numbers / 257.0
+    raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
+
+
+def grey(pixels: NDArray[Any], where: str) -> Image:
+    """Any (rows, columns[, channels]) picture as one channel of the numbers that it holds. Raises InputError."""
     if pixels.ndim not in (2, 3) or pixels.size == 0 or (pixels.ndim == 3 and pixels.shape[2] not in (1, 2, 3, 4)):
         raise InputError(f"{where}: expected a picture of rows x columns, grey or colour, got shape {pixels.shape}")
-    if pixels.dtype == np.bool_:
-        values = pixels.astype(np.float64) * 255.0
-    elif pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
-        values = pixels.astype(np.float64)
-    elif pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
-        values = pixels.astype(np.float64) / 257.0
-    else:
+    if pixels.dtype.kind not in "buif":
         raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
+    values = pixels.astype(np.float64)
     if values.ndim == 2:
         return values
     channels = values.shape[2]
@@ -95,11 +110,11 @@ def _crop(picture: Image, scene: Scene) -> Image:
 
 def _pixels(image: str, where: str) -> NDArray[Any]:
     if image.startswith("photo:"):
-        return _decode(_shipped(image.removeprefix("photo:"), where), where)
+        return decode(_shipped(image.removeprefix("photo:"), where), where)
     path = Path(image)
     if not path.is_file():
         raise InputError(f"{where}: there is no picture {path}; name a PNG, TIFF, EXR or NPY file, or photo:camera")
-    return _decode(path, where)
+    return decode(path, where)
 
 
 def _shipped(name: str, where: str) -> Path:
@@ -113,7 +128,8 @@ def _shipped(name: str, where: str) -> Path:
     return known[name]
 
 
-def _decode(path: Path, where: str) -> NDArray[Any]:
+def decode(path: Path, where: str) -> NDArray[Any]:
+    """The numbers that a picture file holds, as they are. Raises InputError that begins with `where`."""
     kind = path.suffix.lower()
     if kind == ".exr":
         try:

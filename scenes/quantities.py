@@ -19,18 +19,42 @@ def _units() -> Any:
     return cast(Any, pint).UnitRegistry()
 
 
-def _length(value: object) -> float:
+def _in_units(value: object, unit: str, what: str, examples: tuple[str, str], *, signed: bool = False) -> float:
+    """A text such as "6 um" as a number of `unit`. Raises ValueError that says what was expected."""
     if isinstance(value, float | int) and not isinstance(value, bool):
-        raise ValueError(f'expected a length with its unit, such as "{value} mm", got the bare number {value}')
+        example = f"{value} {examples[0].split()[1]}"
+        raise ValueError(f'expected {what} with its unit, such as "{example}", got the bare number {value}')
     if not isinstance(value, str):
-        raise ValueError(f'expected a length with its unit, such as "1 mm", got {value!r}')
+        raise ValueError(f'expected {what} with its unit, such as "{examples[0]}", got {value!r}')
     try:
-        length = float(_units().Quantity(value).to("mm").magnitude)
+        number = float(_units().Quantity(value).to(unit).magnitude)
     except Exception as error:  # pint raises a dozen kinds, tokenize's among them
-        raise ValueError(f'expected a length with its unit, such as "6 um" or "1 m", got {value!r}') from error
-    if not 0 < length < float("inf"):
-        raise ValueError(f"expected a length above zero, got {value!r}")
-    return length
+        raise ValueError(
+            f'expected {what} with its unit, such as "{examples[1]}" or "{examples[0]}", got {value!r}'
+        ) from error
+    if not (number != 0 and abs(number) < float("inf")) or (number < 0 and not signed):
+        raise ValueError(f"expected {what} {'other than' if signed else 'above'} zero, got {value!r}")
+    return number
+
+
+def _length(value: object) -> float:
+    return _in_units(value, "mm", "a length", ("1 mm", "6 um"))
+
+
+def _radius(value: object) -> float:
+    return _in_units(value, "mm", "a radius of curvature", ("1 mm", "-800 um"), signed=True)
+
+
+def _time(value: object) -> float:
+    return _in_units(value, "s", "a time", ("10 ms", "0.5 s"))
+
+
+def _angle(value: object) -> float:
+    return _in_units(value, "rad", "an angle", ("1 deg", "2 mrad"))
+
+
+def _illuminance(value: object) -> float:
+    return _in_units(value, "lux", "an illuminance", ("500 lux", "1 klux"))
 
 
 def _ratio(value: object) -> Fraction:
@@ -73,6 +97,30 @@ Length = Annotated[
     BeforeValidator(_length),
     PlainSerializer(lambda value: f"{value!r} mm"),
     WithJsonSchema({"type": "string", "description": 'a length with its unit, such as "6 um"'}),
+]
+Radius = Annotated[
+    float,
+    BeforeValidator(_radius),
+    PlainSerializer(lambda value: f"{value!r} mm"),
+    WithJsonSchema({"type": "string", "description": 'a length with its unit and its sign, such as "-0.8 mm"'}),
+]
+Time = Annotated[
+    float,
+    BeforeValidator(_time),
+    PlainSerializer(lambda value: f"{value!r} s"),
+    WithJsonSchema({"type": "string", "description": 'a time with its unit, such as "10 ms"'}),
+]
+Angle = Annotated[
+    float,
+    BeforeValidator(_angle),
+    PlainSerializer(lambda value: f"{value!r} rad"),
+    WithJsonSchema({"type": "string", "description": 'an angle with its unit, such as "0.1 deg"'}),
+]
+Illuminance = Annotated[
+    float,
+    BeforeValidator(_illuminance),
+    PlainSerializer(lambda value: f"{value!r} lux"),
+    WithJsonSchema({"type": "string", "description": 'an illuminance, such as "500 lux"'}),
 ]
 _RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
 Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_text_of), _RATIO]

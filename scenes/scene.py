@@ -9,41 +9,31 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterable
-from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
 from .errors import InputError
+from .estimation import Estimator, Prior, Study, Tiles
 from .explain import explain
 from .files import write_text
+from .lenses import Camera
 from .override import apply_overrides, keep_lenses
-from .quantities import Corner, ExpectedNoise, Length, Magnification, Memory, Pair, Samples, Step, pair
+from .quantities import Corner, Length, Pair, Samples
+from .sensor import Noise, Sensor
+from .table import Table
 
-FULL_SCALE = 256.0
-LARGEST = 1e12  # of a value: files hold float32, and squares of values have to fit as well
 TRUTH = "truth.exr"
-LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+class Target(Table):
+    """The flat picture that the camera looks at, and the grid on which the image is to be recovered."""
 
-
-class Target(_Table):
-    """The flat picture that the camera looks at."""
-
-    image: str = Field(description='"photo:NAME" for one that scikit-image ships, or a PNG, TIFF, EXR or NPY file')
+    image: str | None = Field(
+        default=None,
+        description='"photo:NAME" for one that scikit-image ships, or a PNG, TIFF, EXR or NPY file; absent: a [world]',
+    )
     origin: Corner | None = Field(
         default=None, description="row and column where the crop starts; absent: the whole picture"
     )
@@ -52,163 +42,73 @@ class Target(_Table):
     distance: Length = Field(description="from the plane of the lenses to the target")
 
 
-class Lens(_Table):
-    """One lens type: an array of equal sub-imagers."""
+class World(Table):
+    """A Mitsuba scene behind the target or, where that has no picture, instead of it."""
 
-    name: str = Field(pattern=LENS_NAME)
-    magnification: Magnification = Field(description="image size over object size, at most 1")
-    array: Pair = Field(description="rows and columns of sub-imagers")
-    pixels: Literal["fit"] | Pair = Field(description='rows and columns of a sub-image, or "fit"')
-    step: Step = Field(default=Fraction(1), description="pixels of the target from one sub-imager's window to the next")
-
-    @field_validator("pixels", mode="before")
-    @classmethod
-    def _pixels(cls, value: object) -> object:
-        numbers: list[object] = list(value) if isinstance(value, list | tuple) else []  # type: ignore[arg-type]
-        if value == "fit" or (len(numbers) == 2 and all(type(n) is int and n >= 1 for n in numbers)):  # type: ignore[operator]
-            return pair(cast(object, value))
-        raise ValueError(f'expected two whole numbers of at least 1, such as [5, 5], or "fit", got {value!r}')
+    file: str = Field(description="a Mitsuba scene file: millimetres, the camera at the origin looking along +z, +y up")
+    white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that counts as a value of 255")
 
 
-class Camera(_Table):
-    """A flat sensor behind arrays of micro-lenses."""
-
-    pixel_pitch: Length = Field(description="side of one sensor pixel")
-    lens_pitch: Length = Field(description="from one lens's centre to the next")
-    lens: Annotated[tuple[Lens, ...], BeforeValidator(pair), Field(min_length=1)]
-
-    @model_validator(mode="after")
-    def _names_differ(self) -> Camera:
-        names = [lens.name for lens in self.lens]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"expected a name of its own for every lens type, got {name!r} twice")
-        return self
-
-
-class Noise(_Table):
-    """What the sensor adds to the light."""
-
-    variance: float = Field(
-        default=0.0, ge=0, le=LARGEST**2, description="Gaussian, in squared units of the target's values"
-    )
-    bits: int | None = Field(default=None, ge=1, le=24, description="of the recorded values; absent: no quantisation")
-    saturation: float | None = Field(
-        default=None,
-        ge=-LARGEST,
-        le=LARGEST,
-        description="recorded values stop here; pixels that reach it are left out; absent: none does",
-    )
-
-    @property
-    def level(self) -> float:
-        """Height of a quantisation level, full scale / 2^bits; 0 without quantisation."""
-        return 0.0 if self.bits is None else FULL_SCALE / 2**self.bits
-
-    @property
-    def quantisation_variance(self) -> float:
-        """Variance that rounding to levels adds, level^2 / 12 (Wood et al., section 5)."""
-        return self.level**2 / 12
-
-
-class Prior(_Table):
-    """What is known of the image before any light is recorded."""
-
-    kind: Literal["independent", "exponential", "power", "fit"] = Field(
-        default="independent",
-        description="how pixels go together: not at all; exp(-distance / length); a power of frequency; found by fit",
-    )
-    mean: float = Field(default=127.5, ge=-LARGEST, le=LARGEST)
-    variance: float = Field(default=5461.25, gt=0, le=LARGEST**2, description="of every pixel; kind fit finds it")
-    correlation_length: Length | None = Field(
-        default=None, description="on the target, of kind exponential; kind fit finds it"
-    )
-    exponent: float | None = Field(
-        default=None, ge=0, le=8, description="a of a power spectrum 1/frequency^a, of kind power; absent: 2"
-    )
-
-    @model_validator(mode="after")
-    def _only_what_the_kind_has(self) -> Prior:
-        if self.kind == "exponential" and self.correlation_length is None:
-            raise ValueError('kind "exponential" needs a correlation_length, such as "10 mm"')
-        if self.kind != "exponential" and self.correlation_length is not None:
-            raise ValueError(f'correlation_length belongs to kind "exponential", got kind "{self.kind}"')
-        if self.kind != "power" and self.exponent is not None:
-            raise ValueError(f'exponent belongs to kind "power", got kind "{self.kind}"')
-        return self
-
-
-class Estimator(_Table):
-    """How the image is estimated."""
-
-    noise_variance: ExpectedNoise | None = Field(
-        default=None, description='what the estimator expects; "fit": found from the stack; absent: all that is known'
-    )
-    method: Literal[
-        "auto",
-        "covariance",
-        "information",
-        "square-root-information",
-        "square-root-covariance",
-        "svd",
-        "dual",
-        "tiles",
-        "frame",
-    ] = Field(default="auto", description="a dense form, tiles, or the whole frame; auto: the cheapest that is right")
-    tolerance: float = Field(default=1e-8, gt=0, le=1, description="relative error that a dense form is allowed")
-    accuracy: float = Field(
-        default=0.01, gt=0, le=1, description="error that a frame is allowed, in its posterior standard deviations"
-    )
-    memory: Memory | None = Field(
-        default=None, description='never to be exceeded, such as "4 GB"; absent: half of what is free'
-    )
-
-
-class Tiles(_Table):
-    """How a frame is cut where it is reconstructed tile by tile."""
-
-    size: int = Field(default=35, ge=4, le=200, description="rows and columns of a tile, in pixels of the target")
-    overlap: int = Field(default=8, ge=0, description="border of a tile that its neighbours replace")
-
-    @model_validator(mode="after")
-    def _a_core_is_left(self) -> Tiles:
-        if 2 * self.overlap >= self.size:
-            raise ValueError(
-                f"tiles.overlap {self.overlap} leaves nothing of tiles of {self.size}; expected below half"
-            )
-        return self
-
-
-class Render(_Table):
+class Render(Table):
     """How the sub-images are rendered."""
 
     samples: Samples = 256
     seed: int = Field(default=0, ge=0, lt=2**63)
     variant: Literal["auto", "scalar_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
     sampler: Literal["multijitter", "independent"] = "multijitter"
+    complete: bool = Field(default=False, description="leave nothing out, however small its effect")
 
 
-class Calibration(_Table):
+class Calibration(Table):
     """How the observation matrix H is found."""
 
-    method: Literal["points", "ideal"] = "points"
+    method: Literal["points", "transport", "ideal"] = "points"
     samples: Samples = 256
+    fit: Literal["geometry"] | None = Field(
+        default=None, description='"geometry": a few numbers a sub-imager instead of the noise of its every entry'
+    )
+
+    @model_validator(mode="after")
+    def _something_to_fit(self) -> Calibration:
+        if self.fit is not None and self.method == "ideal":
+            raise ValueError("fit belongs to a calibrated H, got method 'ideal'; take 'points' or 'transport'")
+        return self
 
 
-class Scene(_Table):
+class Scene(Table):
     """A camera, its target and what is to be computed."""
 
     title: str = ""
     target: Target
     camera: Camera
+    world: World | None = None
     noise: Noise | None = None
+    sensor: Sensor | None = None
     prior: Prior = Prior()
     estimator: Estimator = Estimator()
     tiles: Tiles = Tiles()
     render: Render = Render()
     calibration: Calibration = Calibration()
+    study: Study | None = None
 
     _source: Path = PrivateAttr(default=Path("scene"))
+
+    @model_validator(mode="after")
+    def _tables_go_together(self) -> Scene:
+        if self.noise is not None and self.sensor is not None:
+            raise ValueError("expected [noise], an ideal sensor's, or [sensor], a real one's, got both; remove one")
+        if self.target.image is None and self.world is None:
+            raise ValueError("expected a picture to look at, target.image, or a Mitsuba scene, world.file, got neither")
+        if self.target.image is None and self.target.shape is None:
+            raise ValueError("a target without a picture needs target.shape, what is to be recovered, got none")
+        if self.sensor is not None:
+            for lens in self.camera.lens:
+                if lens.aperture is None and lens.surfaces is None:
+                    raise ValueError(
+                        f"a [sensor] counts electrons: expected an aperture or surfaces of lens type '{lens.name}',"
+                        " got a pinhole"
+                    )
+        return self
 
     @property
     def source(self) -> Path:
@@ -221,8 +121,14 @@ class Scene(_Table):
 
 
 def resolved(scene: Scene, shape: tuple[int, int]) -> Scene:
-    """The scene as a run's folder holds it: its target is the picture `truth.exr` beside it, whole."""
-    target = scene.target.model_copy(update={"image": TRUTH, "origin": None, "shape": shape})
+    """The scene as a run's folder holds it: its target is the picture `truth.exr` beside it, whole.
+
+    With a world, `truth.exr` shows that as well, so the target keeps its own picture, if it has one.
+    """
+    update: dict[str, Any] = {"image": TRUTH, "origin": None, "shape": shape}
+    if scene.world is not None:
+        update = {"shape": shape}
+    target = scene.target.model_copy(update=update)
     return _moved(scene.model_copy(update={"target": target}), scene.source)
 
 
@@ -266,11 +172,17 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
     scene = parse(data, source)
-    image = scene.target.image
-    if re.match(r"^photo:", image) or Path(image).is_absolute():
-        return scene
-    target = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
-    return _moved(scene.model_copy(update={"target": target}), source)
+    update: dict[str, Any] = {}
+    if any(lens.surfaces is not None for lens in scene.camera.lens):
+        from .lens_file import with_surfaces
+
+        update["camera"] = with_surfaces(scene.camera, source)
+    image, world = scene.target.image, scene.world
+    if image is not None and not re.match(r"^photo:", image):
+        update["target"] = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
+    if world is not None:
+        update["world"] = world.model_copy(update={"file": str((source.parent / world.file).resolve())})
+    return _moved(scene.model_copy(update=update), source)
 
 
 def write(path: Path, scene: Scene) -> None:

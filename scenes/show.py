@@ -11,8 +11,19 @@ from .plan import left_out
 from .scene import Scene
 
 
-def describe(scene: Scene, camera: Camera, variant: str, reconstruction: dict[str, Any]) -> dict[str, Any]:
-    """Geometry and plan in JSON's types; lengths are millimetres. `reconstruction` is the plan of its last stage."""
+def describe(
+    scene: Scene,
+    camera: Camera,
+    variant: str,
+    reconstruction: dict[str, Any],
+    optics: list[dict[str, Any]] | None = None,
+    light: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Geometry and plan in JSON's types; lengths are millimetres.
+
+    reconstruction : the plan of the last stage;  optics : what each lens type with an aperture does to sharpness
+    light : electrons that are collected, of a scene with a [sensor]
+    """
     seen = camera.types_seeing()
     fewer = {
         str(count): int(np.sum(seen == count)) for count in range(len(camera.types)) if bool(np.any(seen == count))
@@ -31,8 +42,10 @@ def describe(scene: Scene, camera: Camera, variant: str, reconstruction: dict[st
         "unknowns": camera.unknowns,
         "pixels_seen_by_fewer_types": fewer,
         "where": _where(camera),
+        **({"optics": optics} if optics else {}),
+        **({"light": light} if light is not None else {}),
         "plan": _plan(scene, camera, variant, reconstruction),
-        "skipped": [{"what": what, "why": why} for what, why in left_out(scene)],
+        "skipped": [left.describe() for left in left_out(scene, camera)],
     }
 
 
@@ -74,6 +87,8 @@ def _plan(scene: Scene, camera: Camera, variant: str, reconstruction: dict[str, 
     }
     if scene.calibration.method == "points":
         plan["calibrate"] |= {"variant": variant, "samples": scene.calibration.samples, "sources": camera.unknowns}
+    if scene.calibration.method == "transport":
+        plan["calibrate"] |= {"variant": variant, "samples": scene.calibration.samples}
     return plan
 
 
@@ -98,7 +113,7 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
         (stage, ", ".join(f"{key} {value}" for key, value in does.items()))
         for stage, does in description["plan"].items()
     ]
-    skipped = [(skip["what"], skip["why"]) for skip in description["skipped"]]
+    skipped = [(skip["what"], why_left_out(skip)) for skip in description["skipped"]]
     title = description["title"] or "Camera"
     return [
         (title, geometry),
@@ -106,6 +121,12 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
         ("What will run", stages),
         ("What is left out, and why", skipped),
     ]
+
+
+def why_left_out(skip: dict[str, Any]) -> str:
+    """In words, with the bound on what it changes."""
+    bound = f"; no measurement changes by more than {skip['bound']:.2g}" if "bound" in skip else ""
+    return f"{skip['why']}{bound}"
 
 
 def _lens_words(kind: dict[str, Any]) -> str:

@@ -1,11 +1,14 @@
 """The recorded sub-images: one OpenEXR part each, with the variance of the rendering's mean.
 
-Sub-images are upright: row 0 looks at the top of the target. Values are in the units of the target's pixels.
+Sub-images are upright: row 0 looks at the top of the target. Values are in the units of the target's pixels. Where the
+scene has a [sensor], the file holds what that recorded, digital numbers and the means of dark and of flat frames, and
+values follow from it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,14 @@ from numpy.typing import NDArray
 from . import exr
 from .camera import Camera, derive
 from .errors import InputError
+from .recording import Recording
 from .scene import Scene, parse
+
+CHANNELS = ("Y", "variance")
+OF_A_SENSOR = ("dark", "flat")
+FLAT_VALUE = "flat_value"
+
+STRAIGHT = "straight"  # in a record: light that bounces was left out, since nothing in the world reflects any
 
 
 @dataclass(frozen=True)
@@ -23,6 +33,7 @@ class Stack:
     """All sub-images of one exposure: (M,) `values` and `variance` in the order of measurements.
 
     `record` says how they were made: samples, passes, seed, variant, seconds, versions, fingerprint.
+    `recording` is what the scene's [sensor] told; `values` are then its own, NaN for dead pixels.
     """
 
     scene: Scene
@@ -30,6 +41,7 @@ class Stack:
     values: NDArray[np.float64]
     variance: NDArray[np.float64]
     record: dict[str, Any]
+    recording: Recording | None = None
 
     def images(self) -> list[NDArray[np.float64]]:
         """One (rows, columns) array a sub-imager, in the order of the camera's."""
@@ -47,7 +59,15 @@ class Stack:
             camera=camera,
             values=self.values[kept],
             variance=self.variance[kept],
+            recording=None if self.recording is None else self.recording.restrict(kept),
         )
+
+
+def recorded(
+    scene: Scene, camera: Camera, recording: Recording, variance: NDArray[np.float64], record: dict[str, Any]
+) -> Stack:
+    """The stack of what a sensor recorded; `variance`, (M,), of the rendering's mean."""
+    return Stack(scene, camera, recording.values, variance, record, recording)
 
 
 def write(path: Path, stack: Stack) -> None:
@@ -66,12 +86,20 @@ def write(path: Path, stack: Stack) -> None:
         }
         if not parts:
             record |= {"scene": stack.scene.plain(), "record": stack.record}
+        if stack.recording is not None:
+            record[FLAT_VALUE] = float(stack.recording.flat_value[place][0])
         channels = {
-            "Y": stack.values[place].reshape(sub.type.pixels).astype(np.float32),
-            "variance": stack.variance[place].reshape(sub.type.pixels).astype(np.float32),
+            name: pixels[place].reshape(sub.type.pixels).astype(np.float32) for name, pixels in _channels(stack).items()
         }
         parts.append(exr.Part(sub.name, channels, record))
     exr.write(path, parts)
+
+
+def _channels(stack: Stack) -> dict[str, NDArray[np.float64]]:
+    recording = stack.recording
+    if recording is None:
+        return {"Y": stack.values, "variance": stack.variance}
+    return {"Y": recording.digital, "variance": stack.variance, "dark": recording.dark, "flat": recording.flat}
 
 
 def read(path: Path) -> Stack:
@@ -84,23 +112,35 @@ def read(path: Path) -> Stack:
     camera = derive(scene)
     if [part.name for part in parts] != [sub.name for sub in camera.sub_imagers]:
         raise InputError(f"{path}: its parts are not the sub-images that its scene describes; make it again")
+    names = CHANNELS if scene.sensor is None else CHANNELS + OF_A_SENSOR
     for part, sub in zip(parts, camera.sub_imagers, strict=True):
         shapes = {name: pixels.shape for name, pixels in part.channels.items()}
-        if shapes != {"Y": sub.type.pixels, "variance": sub.type.pixels}:
+        if shapes != dict.fromkeys(names, sub.type.pixels):
             raise InputError(
-                f"{path}: part '{part.name}' should hold Y and variance of {sub.type.pixels}, got {shapes}"
+                f"{path}: part '{part.name}' should hold {', '.join(names[:-1])} and {names[-1]} of"
+                f" {sub.type.pixels}, got {shapes}"
             )
     variance = _flat(parts, "variance")
     if (variance < 0).any():
         raise InputError(f"{path}: holds variances below 0; make it again")
-    return Stack(
-        scene=scene,
-        camera=camera,
-        values=_flat(parts, "Y"),
-        variance=variance,
-        record=first["record"],
-    )
+    if scene.sensor is None:
+        return Stack(scene, camera, _flat(parts, "Y"), variance, first["record"])
+    digital, dark, flat = (_flat(parts, name) for name in ("Y", *OF_A_SENSOR))
+    recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts))
+    return recorded(scene, camera, recording, variance, first["record"])
 
 
 def _flat(parts: list[exr.Part], channel: str) -> NDArray[np.float64]:
     return np.concatenate([part.channels[channel].ravel() for part in parts]).astype(np.float64)
+
+
+def _flat_values(path: Path, parts: list[exr.Part]) -> NDArray[np.float64]:
+    numbers = [part.record.get(FLAT_VALUE) for part in parts]
+    for part, number in zip(parts, numbers, strict=True):
+        if not isinstance(number, float) or not 0 < number < inf:
+            raise InputError(
+                f"{path}: part '{part.name}' should say {FLAT_VALUE}, the target of its flat frames, a number above 0,"
+                f" got {number!r}; make it again"
+            )
+    sizes = [part.channels["Y"].size for part in parts]
+    return np.repeat(np.array(numbers, dtype=np.float64), sizes)

@@ -14,6 +14,7 @@ from scenes.camera import Camera
 from scenes.files import fingerprint
 from scenes.model import Model
 from scenes.moderate import moderate
+from scenes.needs import needed
 from scenes.partial import Partial
 from scenes.progress import Progress, no_progress
 from scenes.scene import Scene, resolved
@@ -28,6 +29,7 @@ def made_from(scene: Scene, camera: Camera) -> str:
     """Fingerprint of everything that H depends on."""
     description: dict[str, Any] = {"camera": camera.describe(), "calibration": scene.calibration.model_dump()}
     if scene.calibration.method != "ideal":
+        description["simulated"] = needed(scene, camera)[0].describe()
         description["versions"] = versions("mitsuba")
         render = scene.render
         description["render"] = {"seed": render.seed, "variant": render.variant, "sampler": render.sampler}
@@ -46,8 +48,18 @@ def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress, pa
         model = ideal_model(kept, camera)
         record |= {"seconds": perf_counter() - start, "versions": versions("scipy")}
         return replace(model, record=record)
-    responses = from_points(scene, camera, progress, partial)
+    simulated = needed(scene, camera)[0]
+    if scene.calibration.method == "transport":
+        from .transport import from_transport
+
+        responses = from_transport(scene, simulated, progress)
+    else:
+        responses = from_points(scene, simulated, progress, partial)
     variance = settle(responses, camera)
+    if scene.calibration.fit == "geometry":
+        from .geometry_fit import fitted
+
+        responses, variance, record["fit"] = fitted(responses, variance, simulated)
     record |= {
         "seconds": perf_counter() - start,
         "seed": scene.render.seed,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.camera import Camera
-from scenes.scene import Noise
+from scenes.sensor import Noise
 
 from .streams import noise_generator
 

@@ -1,7 +1,8 @@
-"""H of a perfect camera in closed form: what share of a sensor pixel's footprint each pixel of f covers.
+"""H in closed form: what share of a sensor pixel's footprint each pixel of f covers.
 
-A footprint is a rectangle of m x m pixels of f, so H is a Kronecker product of two overlaps along one axis for
-every sub-imager (Wood et al., section 2).
+Through a pinhole a footprint is a rectangle of m x m pixels of f, so H is a Kronecker product of two overlaps along one
+axis for every sub-imager (Wood et al., section 2). Distorted and misaligned footprints come by exact area overlap,
+those blurred by defocus and diffraction from the blur's own transform.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from scenes.boxes import Boxes, overlap
-from scenes.camera import Camera, SubImager
+from scenes.camera import Camera
+from scenes.errors import InputError
+from scenes.lens_type import LensType, SubImager
 from scenes.model import Model
+from scenes.pose import pose, poses
 from scenes.scene import Scene
 
 MOST_STORED = 2**24  # entries of H; more follow from the scene each time
@@ -26,13 +30,57 @@ def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
 
 
 def ideal_matrix(camera: Camera) -> sparse.csr_array:
-    """H of all sub-imagers: (M, N)."""
-    return sparse.csr_array(sparse.vstack([sub_matrix(camera, sub) for sub in camera.sub_imagers], format="csr"))
+    """H of all sub-imagers as designed: (M, N).
+
+    Lenses of surfaces count as perfect ones in focus. Raises InputError for a lens type that is both distorted and
+    blurred, which has no closed form.
+    """
+    return sparse.csr_array(sparse.vstack([_type_matrix(camera, kind) for kind in camera.types], format="csr"))
+
+
+def _type_matrix(camera: Camera, kind: LensType) -> sparse.csr_array:
+    subs = [sub for sub in camera.sub_imagers if sub.type == kind]
+    blurred = camera.blurs(kind)
+    if kind.glass.distortion is not None:
+        from scenes import footprints
+
+        if blurred:
+            raise InputError(
+                f"camera.lens.{kind.name}: distortion with defocus or diffraction has no closed form; run with"
+                " calibration.method 'transport', or remove one of them"
+            )
+        parts = [footprints.sub_matrix(camera, sub, pose(sub)) for sub in subs]
+    elif blurred:
+        from scenes import blur
+
+        return blur.matrix(camera, kind, blur.blur_of(camera, kind))
+    else:
+        parts = [sub_matrix(camera, sub) for sub in subs]
+    return sparse.csr_array(sparse.vstack(parts, format="csr"))
+
+
+def true_matrix(camera: Camera) -> sparse.csr_array:
+    """H of all sub-imagers as the camera was put together, misaligned as its tolerance draws it: (M, N).
+
+    Raises InputError for blurred lenses, whose misaligned H has no closed form.
+    """
+    if camera.tolerance is None:
+        return ideal_matrix(camera)
+    if any(camera.blurs(kind) for kind in camera.types):
+        raise InputError("misaligned lenses with defocus or diffraction have no closed form; calibrate by transport")
+    from scenes import footprints
+
+    return footprints.matrix(camera, poses(camera))
 
 
 def ideal_model(scene: Scene, camera: Camera) -> Model:
-    """The ideal H as a model without uncertainty; stored only while it is small."""
-    matrix = ideal_matrix(camera) if Boxes(camera).entries <= MOST_STORED else None
+    """The ideal H as a model without uncertainty; of a perfect camera stored only while it is small."""
+    small = not camera.boxed or Boxes(camera).entries <= MOST_STORED
+    return exact_model(scene, camera, ideal_matrix(camera) if small else None, "ideal")
+
+
+def exact_model(scene: Scene, camera: Camera, matrix: sparse.csr_array | None, method: str) -> Model:
+    """A model without uncertainty."""
     entries = 0 if matrix is None else int(matrix.nnz)
     none: NDArray[np.float32] = np.zeros((0, entries), dtype=np.float32)
-    return Model(scene, camera, matrix, np.zeros(entries), none, {"method": "ideal"})
+    return Model(scene, camera, matrix, np.zeros(entries), none, {"method": method})

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scenes import model, stack
 from scenes.camera import Camera
 from scenes.errors import InputError
+from scenes.files import digest
 from scenes.model import Model
 from scenes.partial import partial_of
 from scenes.progress import Progress
-from scenes.scene import Scene, resolved
+from scenes.scene import TRUTH, Scene, resolved
 from scenes.stack import Stack
 
 from . import calibrate, render
@@ -23,18 +24,28 @@ from . import calibrate, render
 def kept_stack(
     path: Path, scene: Scene, camera: Camera, image: NDArray[np.float64], progress: Progress
 ) -> tuple[Stack, bool]:
-    """The stack at `path` as it is on disk, and whether it had to be rendered. Raises what rendering raises."""
+    """The stack at `path` as it is on disk, and whether it had to be rendered. Raises what rendering raises.
+
+    Where there is a world, what it truly looks like is kept beside the stack.
+    """
+    truth = image
+    if scene.world is not None:
+        from .truth import kept_truth
+
+        truth = kept_truth(path.with_name(TRUTH), scene, camera, image)
     try:
         old = stack.read(path)
     except InputError:  # missing, damaged or of another kind: to be made
         old = None
     if old is not None and old.record.get("fingerprint") == render.made_from(scene, camera, image):
         now = resolved(scene, (camera.rows, camera.columns))
-        if old.scene.plain() != now.plain():  # what the estimator is told may have changed, the values have not
-            stack.write(path, replace(old, scene=now))
+        record = {**old.record, "truth": digest(truth.astype(np.float32))}
+        if old.scene.plain() != now.plain() or old.record != record:
+            # What the estimator is told, or what it is compared with, may have changed; the values have not.
+            stack.write(path, replace(old, scene=now, record=record))
         return stack.read(path), False
     with partial_of(path, render.made_from(scene, camera, image)) as partial:
-        stack.write(path, render.render(scene, camera, image, progress, partial))
+        stack.write(path, render.render(scene, camera, image, progress, partial, truth))
     return stack.read(path), True
 
 

@@ -1,4 +1,4 @@
-"""How a ray leaves a sensor pixel through its lens.
+"""How a ray leaves a sensor point through an ideal lens.
 
 Plain functions of coordinates; the arrays may be NumPy's or Dr.Jit's. Lengths are millimetres, seen from the centre
 of the lens: the sensor at z = -depth, the target at z > 0. The image on the sensor is upside down, sub-images are
@@ -9,16 +9,26 @@ from __future__ import annotations
 
 from typing import Any
 
-from scenes.camera import Camera, SubImager
+
+def through_centre(x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
+    """Slopes dx/dz and dy/dz of the ray from (x, y, -depth) through the lens's centre, which no thin lens bends."""
+    return -x / depth, -y / depth
 
 
-def pixel_corner(camera: Camera, sub: SubImager, row: Any, column: Any) -> tuple[Any, Any]:
-    """(x, y) on the sensor, from the lens's centre, of the corner where pixel (row, column) begins."""
-    x = (sub.patch[0] - sub.lens[0]) + (column - sub.type.pixels[1] / 2) * camera.pixel_pitch
-    y = (sub.patch[1] - sub.lens[1]) + (row - sub.type.pixels[0] / 2) * camera.pixel_pitch
-    return x, y
+def through_thin_lens(slope: Any, place: Any, depth: Any, focal_length: Any) -> Any:
+    """Slope, along one axis, behind a thin lens of a ray that passes it at `place`.
+
+    `slope` is the one of the ray through the lens's centre. All rays of one sensor point meet where that one has gone
+    1/(1/focal_length - 1/depth) from the lens (the thin-lens equation).
+    """
+    return slope + place / depth - place / focal_length
 
 
-def through_pinhole(x: Any, y: Any, depth: Any) -> tuple[Any, Any, Any]:
-    """Direction, not normalised, of the ray from (x, y, -depth) through the lens's centre."""
-    return -x, -y, depth
+def falloff(x: Any, y: Any, place_x: Any, place_y: Any, depth: Any) -> Any:
+    """cos^4 of the angle at which the ray from (x, y, -depth) to a place on the lens leaves the sensor.
+
+    The irradiance that an element of the lens brings to the sensor: cos at the lens, cos at the sensor, and cos^2 for
+    the distance, in units of what it brings on the axis.
+    """
+    square = ((x - place_x) * (x - place_x) + (y - place_y) * (y - place_y)) / (depth * depth)
+    return 1 / ((1 + square) * (1 + square))

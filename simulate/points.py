@@ -1,30 +1,30 @@
 """Point sources: emitters of radiance 1 that fill one pixel of f, a grid of them at a time.
 
 The grid's spacing is wider than any sensor pixel's footprint, so every sensor pixel sees at most one of its sources,
-and sweeping the grid over all its places gives every pixel of f its turn: H column by column. Several grids shine at
-once, each so much brighter than the one before that the sum of a pixel's rays, every one of which brings back one
-source whole, tells how many came from each. All sweeps of one pass share a seed, so that the errors of a row of H
-cancel in its sum; none is shared with the data.
+and sweeping the grid over all its places gives every pixel of f its turn: H column by column. Through pinholes several
+grids shine at once, each so much brighter than the one before that the sum of a pixel's rays, every one of which brings
+back one source whole, tells how many came from each. All sweeps of one pass share a seed, so that the errors of a row
+of H cancel in its sum; none is shared with the data.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from fractions import Fraction
-from math import ceil, floor
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from scenes.camera import Camera, LensType
+from scenes.camera import Camera
 from scenes.errors import DeniedError
 from scenes.partial import Partial, State
 from scenes.progress import Progress, no_progress
 from scenes.scene import Scene
 
 from .passes import BATCHES, OverPasses, Plan, Tally, plan
+from .reach import Reach, reach_of
 from .streams import sampler_seeds
 from .variant import choose
 
@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 
 ROW_TOLERANCE = 1e-4  # float32 sums of up to 4096 samples are wrong by 4e-5
 STRAYS = 2  # rays of a sensor pixel that float32 may have rounded over the edge of the target
-EXACT = 2**22  # sums of whole numbers below it come out of float32, divided by their count, with less than 1/4 lost
-MARGIN = Fraction(1, 1024)  # pixels of f by which rays may land beside a footprint: far more than they are rounded
+
+
+# Rows of H of one group, the variances of their entries, (nnz,), and their batches, (batches, nnz).
+Part = tuple[sparse.csr_array, NDArray[np.float64], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,6 @@ class Responses(OverPasses):
     matrix: sparse.csr_array
     variance: NDArray[np.float64]
     batches: NDArray[np.float32]
-
-
-def spacing(kind: LensType) -> int:
-    """Pixels of f from one source to the next: a footprint and its margin touch at most ceil(m) + 2."""
-    return ceil(kind.ratio) + 2
 
 
 def grid(camera: Camera, apart: int, row: int, column: int) -> NDArray[np.float64]:
@@ -74,19 +71,19 @@ def from_points(
     variant = choose(scene.render.variant)
     work = plan(scene.calibration.samples)
     rig = Rig(camera, variant, scene.render.sampler, together=False)  # each type its own spacing
-    shares = {group: spacing(types[0]) ** 2 for group, types in rig.groups.items()}
+    sweeps = {group: Sweep(rig, group) for group in rig.groups}
+    shares = {group: sweep.reach.apart**2 for group, sweep in sweeps.items()}
     rows: list[sparse.csr_array] = []
     variances: list[NDArray[np.float64]] = []
     batches: list[NDArray[np.float32]] = []
     done, finished = 0, State()
     before = State() if partial is None else partial.state()
-    for group, types in rig.groups.items():
+    for group, sweep in sweeps.items():
         begun = done
 
         def report(fraction: float, begun: int = begun, share: int = shares[group]) -> None:
             progress((begun + fraction * share) / sum(shares.values()))
 
-        sweep = Sweep(rig, group)
         sweep.resume(before)
         while sweep.tally.count < work.passes:
             sweep.one_more(work, scene.render.seed, report)
@@ -94,21 +91,28 @@ def from_points(
                 partial.offer(lambda sweep=sweep, finished=finished: {**finished, **sweep.state()})
         finished = {**finished, **sweep.state()} if partial is not None else finished
         tally, means = sweep.tally, sweep.batches
-        matrix, order = entries_of(camera, rig.places(group), spacing(types[0]), tally.mean)
-        _check_rows(matrix, sweep.uniform.mean, ROW_TOLERANCE + STRAYS / work.total)
+        # Of a pixel that now and then gets no light at all nothing is known; so it has no entries.
+        lit = ~sweep.dark
+        matrix, order = entries_of(camera, sweep.reach, tally.mean * lit[:, None])
+        _check_rows(matrix, sweep.uniform.mean * lit, ROW_TOLERANCE + STRAYS / work.total)
         rows.append(matrix)
         variances.append(tally.variance.ravel()[order])
         batches.append((means.reshape(BATCHES, -1)[:, order] - matrix.data).astype(np.float32))
         done += shares[group]
-    stacked = sparse.csr_array(sparse.vstack(rows, format="csr"))
+    return responses_of(list(zip(rows, variances, batches, strict=True)), work, variant, scene.render.seed)
+
+
+def responses_of(parts: list[Part], work: Plan, variant: str, seed: int) -> Responses:
+    """The responses of all groups from those of each, in their order."""
+    rows, variances, batches = zip(*parts, strict=True)
     return Responses(
-        matrix=stacked,
+        matrix=sparse.csr_array(sparse.vstack(rows, format="csr")),
         variance=np.concatenate(variances),
         batches=np.concatenate(batches, axis=1),
         passes=work.passes,
         samples=work.samples,
         variant=variant,
-        first_seed=sampler_seeds(scene.render.seed, "calibration", 0, work.passes)(0),
+        first_seed=sampler_seeds(seed, "calibration", 0, work.passes)(0),
     )
 
 
@@ -121,47 +125,59 @@ class Sweep:
 
     def __init__(self, rig: Rig, group: str) -> None:
         """Before the first pass."""
-        self._rig, self._group, self._apart = rig, group, spacing(rig.groups[group][0])
-        shape = rig.places(group).stop - rig.places(group).start, self._apart**2
+        self._rig, self._group, self.reach = rig, group, reach_of(rig, group)
+        shape = self.reach.row.size, self.reach.apart**2
         self.tally, self.uniform = Tally(*shape), Tally(shape[0])
+        self.dark = np.zeros(shape[0], dtype=np.bool_)
         self.batches = np.zeros((BATCHES, *shape), dtype=np.float32)
 
     def state(self) -> State:
         """All of it, to be kept."""
         tallies = {**self.tally.state(self._group), **self.uniform.state(f"{self._group}.uniform")}
-        return {**tallies, f"{self._group}.batches": self.batches}
+        return {**tallies, f"{self._group}.batches": self.batches, f"{self._group}.dark": self.dark}
 
     def resume(self, state: State) -> None:
         """Go on where a kept one stopped, if there is one."""
         self.tally.resume(self._group, state)
         self.uniform.resume(f"{self._group}.uniform", state)
         self.batches = state.get(f"{self._group}.batches", self.batches)
+        self.dark = state.get(f"{self._group}.dark", self.dark)
 
     def one_more(self, work: Plan, seed: int, progress: Progress) -> None:
         """The next pass."""
         number, camera = self.tally.count, self._rig.camera
-        places, levels = self._apart**2, brightness(work.samples)
+        apart = self.reach.apart
+        places, levels = apart**2, brightness(work.samples, self._rig.exact if self._rig.even else 0)
         values = np.empty(self.tally.mean.shape)
         pass_seeds = sampler_seeds(seed, "calibration", number, work.passes)
         for first in range(0, places, self._rig.channels * levels.size):
             several = range(first, min(first + self._rig.channels * levels.size, places))
             together = [several[start : start + levels.size] for start in range(0, len(several), levels.size)]
-            self._rig.show(*(_shining(camera, self._apart, some, levels) for some in together))
-            readings = self._rig.expose(self._group, work.samples, pass_seeds)
+            self._rig.show(*(_shining(camera, apart, some, levels) for some in together))
+            readings = self._read(work.samples, pass_seeds)
             for some, reading in zip(together, readings, strict=False):
-                values[:, some] = told_apart(reading, work.samples, levels)[:, : len(some)]
+                alone = reading[:, None] if levels.size == 1 else told_apart(reading, work.samples, levels)
+                values[:, some] = alone[:, : len(some)]
             progress((number + several.stop / places) / work.passes)
         self._rig.show(np.ones((camera.rows, camera.columns)))
-        self.uniform.add(self._rig.expose(self._group, work.samples, pass_seeds)[0])
+        self.uniform.add(self._read(work.samples, pass_seeds)[0])
         self.batches[number % BATCHES] += (values * (BATCHES / work.passes)).astype(np.float32)
         self.tally.add(values)
 
+    def _read(self, samples: int, seeds: Callable[[int], int]) -> NDArray[np.float64]:
+        found = self._rig.expose(self._group, samples, seeds)
+        self.dark |= np.isnan(found[0])
+        return np.nan_to_num(found)
 
-def brightness(samples: int) -> NDArray[np.int64]:
-    """Radiances of grids that shine together: powers of more than `samples`, as many as float32 adds up exactly."""
+
+def brightness(samples: int, exact: int) -> NDArray[np.int64]:
+    """Radiances of grids that shine together: powers of more than `samples`, as many as add up exactly.
+
+    exact : below which sums of whole numbers come out whole, 0 where rays do not bring back sources whole
+    """
     base = 1 << samples.bit_length()
     levels = [1]
-    while samples * sum([*levels, levels[-1] * base]) < EXACT:
+    while samples * sum([*levels, levels[-1] * base]) < exact:
         levels.append(levels[-1] * base)
     return np.array(levels)
 
@@ -175,7 +191,7 @@ def told_apart(readings: NDArray[np.float64], samples: int, levels: NDArray[np.i
     whole = np.rint(sums)
     if np.abs(sums - whole).max(initial=0.0) > 0.3:
         raise DeniedError("calibration: rays bring back parts of point sources; this should not happen here")
-    base = int(levels[1]) if levels.size > 1 else 2 * EXACT
+    base = int(levels[1])
     return (whole.astype(np.int64)[:, None] // levels % base) / samples
 
 
@@ -196,13 +212,13 @@ def _check_rows(matrix: sparse.csr_array, uniform: NDArray[np.float64], toleranc
 
 
 def entries_of(
-    camera: Camera, places: slice, apart: int, readings: NDArray[np.float64]
+    camera: Camera, reach: Reach, readings: NDArray[np.float64]
 ) -> tuple[sparse.csr_array, NDArray[np.int64]]:
     """Give each reading to the one source near its pixel's footprint, and drop what no light has hit.
 
     Returns the rows of H, and which of the flattened readings became its entries.
     """
-    row, column = (start[places] for start in _first_touched(camera))
+    row, column, apart = reach.row, reach.column, reach.apart
     swept = np.arange(apart)
     source_row = row[:, None] + (swept - row[:, None]) % apart
     source_column = column[:, None] + (swept - column[:, None]) % apart
@@ -215,17 +231,3 @@ def entries_of(
     shape = (readings.shape[0], camera.unknowns)
     matrix = sparse.csr_array((readings.ravel()[hit[order]], (pixel[order], unknown[order])), shape=shape)
     return matrix, hit[order]
-
-
-def _first_touched(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of the first pixel of f that rays of each sensor pixel can reach, rounding included: (M,) each."""
-    rows: list[NDArray[np.int64]] = []
-    columns: list[NDArray[np.int64]] = []
-    for sub in camera.sub_imagers:
-        first = [
-            np.array([floor(start + sub.type.ratio * number - MARGIN) for number in range(count)], dtype=np.int64)
-            for start, count in zip(sub.window, sub.type.pixels, strict=True)
-        ]
-        rows.append(np.repeat(first[0], sub.type.pixels[1]))
-        columns.append(np.tile(first[1], sub.type.pixels[0]))
-    return np.concatenate(rows), np.concatenate(columns)

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from scenes.camera import Camera
 from scenes.files import digest, fingerprint
 from scenes.moderate import moderate
+from scenes.needs import needed, without_shot_noise
 from scenes.partial import Partial
 from scenes.progress import Progress, no_progress
+from scenes.recording import Recording
 from scenes.scene import Scene, resolved
-from scenes.stack import Stack
+from scenes.stack import STRAIGHT, Stack, recorded
 from scenes.versions import versions
 
 from .passes import OverPasses, Tally, plan, rounding_variance
@@ -25,19 +27,31 @@ from .variant import choose
 
 @dataclass(frozen=True)
 class Rendering(OverPasses):
-    """Light on every sensor pixel, (M,): the mean of the passes, and the variance of that mean from their scatter."""
+    """Light on every sensor pixel, (M,): the mean of the passes, and the variance of that mean from their scatter.
+
+    straight : whether light that bounces in a world was left out, since nothing there reflects any
+    """
 
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
+    straight: bool
 
 
 def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
     """Fingerprint of everything that the values of a stack depend on."""
+    world: dict[str, Any] = {}
+    if scene.world is not None:
+        from .world import describe
+
+        world = {"world": describe(scene)}
     return fingerprint(
         {
+            **world,
             "camera": camera.describe(),
+            "simulated": needed(scene, camera)[0].describe(),
             "target": digest(image.astype(np.float32)),
             "noise": scene.noise.model_dump() if scene.noise else None,
+            "sensor": scene.sensor.model_dump() if scene.sensor else None,
             "render": scene.render.model_dump(),
             "versions": versions("mitsuba"),
         }
@@ -59,7 +73,8 @@ def light(
 
     variant = choose(scene.render.variant)
     work = plan(scene.render.samples)
-    rig = Rig(camera, variant, scene.render.sampler)
+    around = None if scene.world is None else scene
+    rig = Rig(needed(scene, camera)[0], variant, scene.render.sampler, around=around)
     rig.show(image)
     tally = Tally(camera.measurements)
     if partial is not None:
@@ -80,6 +95,7 @@ def light(
         first_seed=sampler_seeds(scene.render.seed, "data", 0, work.passes)(0),
         mean=tally.mean,
         variance=tally.variance,
+        straight=rig.straight,
     )
 
 
@@ -89,9 +105,11 @@ def render(
     image: NDArray[np.float64],
     progress: Progress = no_progress,
     partial: Partial | None = None,
+    truth: NDArray[np.float64] | None = None,
 ) -> Stack:
-    """Render and record the sub-images of `image`, (rows, columns).
+    """Render and record the sub-images of `image`, (rows, columns), on the target.
 
+    truth : what the estimate is compared with; absent: the image
     The variance of each pixel's mean is drawn towards its sub-image's and never below float32's rounding.
     Raises InputError if the variant asked for does not work here.
     """
@@ -99,19 +117,33 @@ def render(
     rendering = light(scene, camera, image, progress, partial)
     floor = rounding_variance(rendering.mean, rendering.samples)
     variance = np.concatenate([moderate(rendering.variance[place], rendering.passes) for place in camera.slices()])
+    record: dict[str, Any] = {
+        "fingerprint": made_from(scene, camera, image),
+        "truth": digest((image if truth is None else truth).astype(np.float32)),
+        "seconds": perf_counter() - start,
+        "seed": scene.render.seed,
+        "sampler": scene.render.sampler,
+        **rendering.record(),
+        **({STRAIGHT: True} if rendering.straight else {}),
+        "versions": versions("mitsuba", "drjit", "OpenEXR"),
+    }
+    kept, variance = resolved(scene, (camera.rows, camera.columns)), np.maximum(variance, floor)
+    if scene.sensor is not None:
+        return recorded(kept, camera, _exposed(scene, camera, rendering.mean), variance, record)
     values = rendering.mean
     if scene.noise is not None:
         from .expose import expose, generators
 
         values = expose(values, scene.noise, generators(camera, scene.render.seed), camera.slices())
-    record: dict[str, Any] = {
-        "fingerprint": made_from(scene, camera, image),
-        "truth": digest(image.astype(np.float32)),
-        "seconds": perf_counter() - start,
-        "seed": scene.render.seed,
-        "sampler": scene.render.sampler,
-        **rendering.record(),
-        "versions": versions("mitsuba", "drjit", "OpenEXR"),
-    }
-    kept = resolved(scene, (camera.rows, camera.columns))
-    return Stack(kept, camera, values, np.maximum(variance, floor), record)
+    return Stack(kept, camera, values, variance, record)
+
+
+def _exposed(scene: Scene, camera: Camera, light: NDArray[np.float64]) -> Recording:
+    from .emva import record
+    from .response import response
+
+    assert scene.sensor is not None
+    dark = np.isnan(light)  # no light can reach these pixels; so they are dead, and known by their flat
+    freed = np.where(dark, 0.0, response(scene, camera))
+    shot = without_shot_noise(scene, camera) is None
+    return record(np.where(dark, 0.0, light), freed, scene.sensor, camera, scene.render.seed, shot)

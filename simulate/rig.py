@@ -1,9 +1,9 @@
 """The camera and its target in Mitsuba: a picture on the target goes in, what every sensor pixel reads comes out.
 
-On llvm and cuda one sensor of our own holds the whole camera; on scalar, where sensors written in Python are
-unusably slow, a stock `perspective` sensor a sub-imager does. (A stock `batch` is no faster there, and gives now and
-then a ray to the wrong sub-imager: film coordinates are float32 and can round up to the next one's.) Lengths are
-millimetres.
+On llvm and cuda the rays of all pixels start at once (`Eye`) and Mitsuba's integrator follows them; on scalar, where a
+ray at a time would have to go through Python, a stock `perspective` sensor a sub-imager does. (A stock `batch` is no
+faster there, and gives now and then a ray to the wrong sub-imager: film coordinates are float32 and can round up to
+the next one's.) Around the target, or instead of it, there may be a whole world. Lengths are millimetres.
 """
 
 # pyright: basic
@@ -11,75 +11,191 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import atan, degrees
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Camera, LensType, SubImager
+from scenes.camera import Camera
+from scenes.errors import InputError
+from scenes.lens_type import LensType, SubImager
+from scenes.scene import Scene
 
-from . import optics
-from .variant import activate
+from .variant import activate, remedy
+
+if TYPE_CHECKING:
+    from .eye import Eye
 
 BLOCK = 4  # scalar variants seed by block, and pick its size by the number of threads unless it is given
+EXACT_SUMS = 2**22, 2**50  # whole numbers below come out of float32 sums, and of float64 ones, with less than 1/4 lost
+MOST_TEXELS = 2**24  # that float32 can number
+FAR = 1e4  # in target's distances: how far a world is looked into by stock sensors
+WHITE = 255.0  # the value that the radiance called white is shown as
 
 
 class Rig:
     """A camera in front of an emissive target, ready to be exposed.
 
-    `groups` are the lens types that are exposed at once, by a name: the whole camera where that can be and is wanted
-    (`together`), else each lens type by itself. `channels` is how many pictures can be on the target at once, as its
-    colours.
+    `groups` are the lens types that are exposed at once, by a name: the whole camera where all are pinholes and that is
+    wanted (`together`), else each lens type by itself. `channels` is how many pictures can be on the target at once,
+    as its colours. `exact` is the number below which sums of whole numbers come out whole.
     """
 
-    def __init__(self, camera: Camera, variant: str, sampler: str = "multijitter", together: bool = True) -> None:
-        """Build the Mitsuba scene; the target is black until `show` puts a picture on it."""
+    def __init__(
+        self,
+        camera: Camera,
+        variant: str,
+        sampler: str = "multijitter",
+        together: bool = True,
+        around: Scene | None = None,
+    ) -> None:
+        """Build the Mitsuba scene; the target is black until `show` puts a picture on it.
+
+        around : whose world stands around the target or, where that has no picture, instead of it; absent: none does
+        Raises InputError for a camera that this variant cannot render, or a world that cannot be built.
+        """
+        refuse_slow(camera, variant)
         activate(variant)
         import mitsuba as mi
 
         self.camera = camera
-        self._jit = not variant.startswith("scalar")
+        fast = not variant.startswith("scalar")
         self.groups: dict[str, tuple[LensType, ...]] = {kind.name: (kind,) for kind in camera.types}
-        if self._jit and together:
+        if fast and together and all(kind.glass.pinhole for kind in camera.types):
             self.groups = {"camera": camera.types}
-        self.channels = 3 if variant.endswith("rgb") else 1
-        self._sensors: dict[str, dict[int, Any]] = {
-            group: self._sensors_of(group, types, sampler) for group, types in self.groups.items()
-        }
-        self._scene = mi.load_dict(scene_of(target_of(camera, self._black())))
+        self.channels = 3 if variant.endswith("rgb") and around is None else 1
+        self.exact = EXACT_SUMS[fast]
+        self._far = 2.0 if around is None else FAR
+        self._eyes: dict[str, Eye] = {}
+        self._sensors: dict[str, dict[int, Any]] = {}
+        if fast:
+            from .eye import Eye
+
+            self._eyes = {group: Eye(camera, types, sampler) for group, types in self.groups.items()}
+        else:
+            self._sensors = {group: self._sensors_of(types, sampler) for group, types in self.groups.items()}
+        self._unit = 1.0  # radiance of a value of 1
+        self.straight = False  # whether light that bounces in a world was left out
+        self._texels = "target.emitter.radiance.data"
+        if around is None:
+            self._scene = mi.load_dict(scene_of(target_of(camera, self._black())))
+            self._integrator: Any = self._scene.integrator()
+        else:
+            self._enter(around, variant)
         self._parameters = mi.traverse(self._scene)
 
+    @property
+    def even(self) -> bool:
+        """Whether every ray of a pixel stands for the same light."""
+        return all(eye.even for eye in self._eyes.values())
+
     def show(self, *images: NDArray[np.float64]) -> None:
-        """Put pictures, (rows, columns), at most `channels` of them, on the target; signed values are allowed."""
+        """Put pictures, (rows, columns), at most `channels` of them, on the target, if there is one.
+
+        Signed values are allowed.
+        """
         import mitsuba as mi
 
+        if not self._texels:
+            return
         texels = np.zeros((self.camera.rows, self.camera.columns, self.channels), dtype=np.float32)
         for channel, image in enumerate(images):
-            texels[..., channel] = image
-        self._parameters["target.emitter.radiance.data"] = mi.TensorXf(texels)
+            texels[..., channel] = image * self._unit
+        self._parameters[self._texels] = mi.TensorXf(texels)
         self._parameters.update()
 
     def expose(self, group: str, samples: int, seed: Callable[[int], int]) -> NDArray[np.float64]:
         """What the sensor pixels of a group read of each picture, (channels, pixels in the order of measurements).
 
-        samples : rays a pixel, at most a few thousand, since the renderer's sums are float32
+        A uniform target without an end reads its own value: the light of a pixel's rays is divided by what they would
+        bring from there. Pixels that no light can reach read NaN.
+        samples : rays a pixel
         seed : the sampler's seed by the place of a sensor: of a group where a group is one sensor, else a sub-imager
         """
         import mitsuba as mi
 
+        if self._eyes:
+            rays = self._eyes[group].rays(samples, seed(list(self.groups).index(group)))
+            light = self._follow(group, rays.ray)
+            if rays.weight is None:
+                return rays.sums(light)[0][None] / rays.samples / self._unit
+            brought, reach = rays.sums(light * rays.weight, rays.weight)
+            unseen = np.full(reach.size, np.nan)
+            return np.divide(brought, reach * self._unit, out=unseen, where=reach > 0)[None]
         images: list[NDArray[np.float64]] = []
         for place, sensor in self._sensors[group].items():
-            rendered: Any = mi.render(self._scene, sensor=sensor, spp=samples, seed=seed(place))  # pyright: ignore
+            choices: Any = {"sensor": sensor, "integrator": self._integrator, "spp": samples, "seed": seed(place)}
+            rendered: Any = mi.render(self._scene, **choices)
             images.append(np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1))
-        return np.concatenate(images, axis=1)[:, : sum(kind.measurements for kind in self.groups[group])]
+        return np.concatenate(images, axis=1) / self._unit
 
-    def _sensors_of(self, group: str, types: tuple[LensType, ...], sampler: str) -> dict[int, Any]:
+    def depths(self, eye: Camera, seed: int) -> NDArray[np.float64]:
+        """Distance along z of what a pinhole camera's only sub-imager sees at a point of each pixel, (pixels,).
+
+        Infinite where it sees no surface. Surfaces that let light through are seen like any other.
+        """
         import mitsuba as mi
 
-        if self._jit:
-            return {list(self.groups).index(group): _one_sensor(self.camera, types, sampler)}
+        (sub,) = eye.sub_imagers
+        sensor = mi.load_dict(stock_sensor(eye, sub, "independent", 1, far=FAR))
+        places = mi.load_dict({"type": "aov", "aovs": "place:position", "block_size": BLOCK})
+        choices: Any = {"sensor": sensor, "integrator": places, "spp": 1, "seed": seed}
+        rendered: Any = mi.render(self._scene, **choices)
+        z = np.array(rendered, dtype=np.float64)[..., -1].ravel()
+        return np.where(z > 0, z, np.inf)
+
+    def hits(
+        self, group: str, samples: int, seed: Callable[[int], int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64] | None]:
+        """Which pixel of f each ray of a group's pixels meets, (pixels, samples), -1 beside the target; and its weight.
+
+        The rays are those of `expose` with the same samples and seed. Only on the fast backends.
+        """
+        import drjit as dr
+
+        if self.camera.unknowns >= MOST_TEXELS:
+            raise InputError(f"a target of {self.camera.unknowns} pixels: rays are told apart on at most 2^24")
+        self.show(np.arange(1.0, self.camera.unknowns + 1).reshape(self.camera.rows, self.camera.columns))
+        rays = self._eyes[group].rays(samples, seed(list(self.groups).index(group)))
+        met = self._scene.ray_intersect(rays.ray)
+        shining = met.emitter(self._scene).eval(met, met.is_valid()).x
+        dr.eval(shining, rays.weight)
+        texels = np.rint(np.array(shining)).astype(np.int64) - 1
+        weight = None if rays.weight is None else np.array(rays.weight, dtype=np.float64).reshape(-1, rays.samples)
+        return texels.reshape(-1, rays.samples), weight
+
+    def gathered(self, group: str, samples: int, seed: Callable[[int], int]) -> NDArray[np.float64]:
+        """Mean weight of each pixel's rays, (pixels,): the light that reaches it from a uniform world, relative."""
+        eye = self._eyes[group]
+        rays = eye.rays(samples, seed(list(self.groups).index(group)))
+        return np.ones(eye.pixels) if rays.weight is None else rays.sums(rays.weight)[0] / rays.samples
+
+    def tail(self, group: str) -> float:
+        """Pixels of f by which rare rays of a group may land further out than others."""
+        return self._eyes[group].lens.tail
+
+    def _follow(self, group: str, ray: Any) -> Any:
+        """Radiance along each ray."""
+        return self._integrator.sample(self._scene, self._eyes[group].sampler, ray, None, True)[0].x
+
+    def _enter(self, around: Scene, variant: str) -> None:
+        """Take a world for the scene, and the target into it, if it has a picture."""
+        import mitsuba as mi
+
+        from .world import TARGET, stage
+
+        assert around.world is not None
+        self._unit = around.world.white / WHITE
+        shown = around.target.image is not None
+        staged = stage(around, variant, mi.load_dict(target_of(self.camera, self._black())) if shown else None)
+        self._scene, self._integrator, self.straight = staged.scene, staged.integrator, staged.straight
+        self._texels = f"{TARGET}.{self._texels.partition('.')[2]}" if shown else ""
+
+    def _sensors_of(self, types: tuple[LensType, ...], sampler: str) -> dict[int, Any]:
+        import mitsuba as mi
+
         return {
-            place: mi.load_dict(stock_sensor(self.camera, sub, sampler, 16, self.channels))
+            place: mi.load_dict(stock_sensor(self.camera, sub, sampler, 16, self.channels, self._far))
             for place, sub in enumerate(self.camera.sub_imagers)
             if sub.type in types
         }
@@ -100,6 +216,12 @@ class Rig:
         raise KeyError(group)
 
 
+def refuse_slow(camera: Camera, variant: str) -> None:
+    """Raise InputError where a camera is more than a set of pinholes and the backend is the slow one."""
+    if variant.startswith("scalar") and not camera.perfect:
+        raise InputError(f"lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}")
+
+
 def scene_of(target: dict[str, Any]) -> dict[str, Any]:
     """A Mitsuba scene with the emissive target and no sensor: light goes straight, nothing bounces."""
     return {"type": "scene", "integrator": {"type": "path", "max_depth": 1, "block_size": BLOCK}, "target": target}
@@ -114,8 +236,11 @@ def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
     return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": texture}}
 
 
-def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int, channels: int = 1) -> dict[str, Any]:
-    """One sub-imager as Mitsuba's own `perspective` with a shifted principal point."""
+def stock_sensor(
+    camera: Camera, sub: SubImager, sampler: str, samples: int, channels: int = 1, far: float = 2.0
+) -> dict[str, Any]:
+    """One sub-imager as Mitsuba's own `perspective` with a shifted principal point; it sees as far as `far` times the
+    target's distance."""
     import mitsuba as mi
 
     rows, columns = sub.type.pixels
@@ -128,7 +253,7 @@ def stock_sensor(camera: Camera, sub: SubImager, sampler: str, samples: int, cha
         "fov_axis": "x",
         "fov": 2 * degrees(atan(width / 2 / camera.distance)),
         "near_clip": camera.distance * 1e-3,
-        "far_clip": camera.distance * 2,
+        "far_clip": camera.distance * far,
         "principal_point_offset_x": -(x - lens_x) / width,
         "principal_point_offset_y": -(y - lens_y) / height,
         "to_world": mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0]),
@@ -162,86 +287,3 @@ def texture_of(source: dict[str, Any]) -> dict[str, Any]:
         "to_uv": upright,
         **source,
     }
-
-
-def _one_sensor(camera: Camera, types: tuple[LensType, ...], sampler: str) -> Any:
-    """All sub-imagers of some lens types as one sensor: a film pixel a measurement, looked up in tables."""
-    import drjit as dr
-    import mitsuba as mi
-
-    # Powers of two: film coordinates come divided by the film's size, which then costs no digit.
-    bits = max(sum(kind.measurements for kind in types) - 1, 1).bit_length()
-    height = 1 << (bits // 2)
-    width = 1 << (bits - bits // 2)
-    tables = _tables(camera, types, width * height)
-
-    class CompoundEye(mi.Sensor):
-        def __init__(self, properties: Any) -> None:
-            super().__init__(properties)
-            self.tables = [mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in tables]
-            self.pixel = float(camera.pixel_pitch)
-            dr.make_opaque(self.tables)
-
-        def sample_ray(
-            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
-        ) -> tuple[Any, Any]:
-            del wavelength, aperture
-            across, down = position.x * width, position.y * height
-            column, row = _pixel(across, down, width, height)
-            index = mi.UInt32(row) * width + mi.UInt32(column)
-            corner_x, corner_y, lens_x, lens_y, depth = (dr.gather(mi.Float, t, index, active) for t in self.tables)
-            x = corner_x + (across - column) * self.pixel
-            y = corner_y + (down - row) * self.pixel
-            ray = dr.zeros(mi.Ray3f)
-            ray.o = mi.Point3f(lens_x, lens_y, 0)
-            ray.d = dr.normalize(mi.Vector3f(*optics.through_pinhole(x, y, depth)))
-            ray.time = time
-            ray.maxt = dr.largest(mi.Float)
-            return ray, mi.Spectrum(1)
-
-        def sample_ray_differential(
-            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
-        ) -> tuple[Any, Any]:
-            # The default traces three rays for a footprint that a texture read at its nearest texel never uses.
-            ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
-            return mi.RayDifferential3f(ray), weight
-
-        def bbox(self) -> Any:
-            return mi.ScalarBoundingBox3f()
-
-    properties = mi.Properties()
-    properties["film"] = mi.load_dict(film(width, height))
-    properties["sampler"] = mi.load_dict({"type": sampler, "sample_count": 16})
-    return CompoundEye(properties)
-
-
-def _pixel(across: Any, down: Any, width: int, height: int) -> tuple[Any, Any]:
-    """Column and row of the film's pixel that a ray is for, not of the one that its coordinates may round up to.
-
-    The renderer adds a pixel's number to an offset from 0 to 1 in float32; once in some hundred thousand rays the sum
-    is the next pixel's number, which another sub-imager may have. Rays come in the order of pixels, which settles it;
-    where they do not, the coordinates have to do.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    lanes, pixels = dr.width(across), width * height
-    column, row = dr.minimum(dr.floor(across), width - 1), dr.minimum(dr.floor(down), height - 1)
-    if lanes % pixels == 0:
-        number = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, lanes // pixels)
-        by_order = mi.Float(number % width), mi.Float(number // width)
-        near = (dr.abs(across - by_order[0] - 0.5) < 0.51) & (dr.abs(down - by_order[1] - 0.5) < 0.51)
-        column, row = dr.select(near, by_order[0], column), dr.select(near, by_order[1], row)
-    return column, row
-
-
-def _tables(camera: Camera, types: tuple[LensType, ...], size: int) -> NDArray[np.float64]:
-    """(5, size): x and y of each pixel's corner from its lens, the lens's x and y, the depth; the last one repeated."""
-    columns: list[NDArray[np.float64]] = []
-    for sub in (sub for sub in camera.sub_imagers if sub.type in types):
-        row, column = (place.ravel() for place in np.indices(sub.type.pixels))
-        x, y = optics.pixel_corner(camera, sub, row, column)
-        same = np.ones_like(x)
-        columns.append(np.stack([x, y, same * sub.lens[0], same * sub.lens[1], same * sub.depth]))
-    known = np.concatenate(columns, axis=1)
-    return np.concatenate([known, np.repeat(known[:, -1:], size - known.shape[1], axis=1)], axis=1)

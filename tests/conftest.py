@@ -11,8 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 import ommatid as program
+
+settings.register_profile("any machine", deadline=None)  # no test depends on how fast a machine is
+settings.load_profile("any machine")
 
 TINY = """
 title = "Tiny"

@@ -9,8 +9,9 @@ from scipy import sparse
 from reconstruct.accuracy import compare, observability, predict, trimmed
 from reconstruct.prior import independent
 from scenes.camera import derive
-from scenes.scene import Estimator, read
-from scenes.scene import Prior as PriorTable
+from scenes.estimation import Estimator
+from scenes.estimation import Prior as PriorTable
+from scenes.scene import read
 from simulate.ideal import ideal_matrix
 
 from .examples import GALLERY

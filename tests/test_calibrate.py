@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from scenes.picture import load
 from scenes.scene import Scene
 from simulate import calibrate, points
 from simulate.ideal import ideal_matrix, ideal_model
+from simulate.reach import Reach, of_pinholes
 
 from .examples import scene
 
@@ -32,7 +35,7 @@ def test_no_two_sources_of_a_grid_reach_one_sensor_pixel() -> None:
     for kind in camera.types:
         rows = ideal[start : start + kind.measurements]
         start += kind.measurements
-        apart = points.spacing(kind)
+        apart = of_pinholes(camera, kind).apart
         lit = np.zeros((23, 23))
         for row in range(apart):
             for column in range(apart):
@@ -52,8 +55,13 @@ def test_rows_sum_to_what_a_uniform_target_reads() -> None:
 def test_a_source_given_to_the_wrong_pixel_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     described = small()
     camera = derive(described)
-    right = points._first_touched  # pyright: ignore[reportPrivateUsage]
-    monkeypatch.setattr(points, "_first_touched", lambda camera: tuple(part + 3 for part in right(camera)))
+    right = points.reach_of
+
+    def wrong(rig: Any, group: str) -> Reach:
+        found = right(rig, group)
+        return replace(found, row=found.row + 3, column=found.column + 3)
+
+    monkeypatch.setattr(points, "reach_of", wrong)
     with pytest.raises(DeniedError, match="uniform"):
         points.from_points(described, camera)
 

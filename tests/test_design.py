@@ -11,7 +11,7 @@ from reconstruct.prior import independent
 from scenes.camera import derive
 from scenes.candidates import magnifications, with_lens
 from scenes.errors import InputError
-from scenes.scene import Estimator
+from scenes.estimation import Estimator
 from simulate.ideal import ideal_matrix
 
 from .conftest import Command

@@ -12,7 +12,7 @@ from reconstruct.prior import spectrum_of
 from reconstruct.selected import frame_variances, inverse_diagonal
 from reconstruct.sliding import sliding
 from scenes.boxes import Boxes
-from scenes.scene import Prior
+from scenes.estimation import Prior
 from simulate.ideal import ideal_matrix
 
 from .examples import Lenses

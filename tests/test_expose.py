@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenes.scene import Noise
+from scenes.sensor import Noise
 from simulate.expose import expose, generators, quantise
 from simulate.streams import Purpose, noise_generator, sampler_seeds
 

@@ -15,8 +15,8 @@ from reconstruct.likelihood import Evidence
 from reconstruct.prior import Prior, exponential, independent, prior_of
 from reconstruct.problem import Problem
 from scenes.errors import InputError
+from scenes.estimation import Prior as Table
 from scenes.picture import load
-from scenes.scene import Prior as Table
 from simulate.ideal import ideal_matrix
 
 from .examples import camera, scene

@@ -11,7 +11,7 @@ from reconstruct.frame import Frame
 from reconstruct.prior import lag_distances, spectrum_of
 from scenes.boxes import Boxes
 from scenes.errors import InputError
-from scenes.scene import Prior
+from scenes.estimation import Prior
 from simulate.ideal import ideal_matrix
 
 from .examples import Lenses

@@ -21,7 +21,7 @@ from reconstruct.paper_errors import THREE, TWICE, TWO, Line, Tile, Tiles, tile,
 from reconstruct.paper_pictures import Cut, Photograph, cut, load, measure, rehearse, seeds
 from scenes.camera import Camera
 from scenes.errors import InputError
-from scenes.scene import Noise
+from scenes.sensor import Noise
 from simulate.expose import expose, generators
 from simulate.ideal import ideal_matrix
 
@@ -191,7 +191,7 @@ def test_every_axis_has_a_name(written: Written) -> None:
 
 def test_everything_is_written_and_nothing_else(written: Written) -> None:
     assert {path.name for path in written.folder.iterdir()} == set(written.description["files"])
-    assert set(written.figures) == {"fig2", "fig3", "fig4", "fig5", "fig7"}
+    assert set(written.figures) == {"fig2", "fig3", "fig4", "fig5", "fig7", "distortion"}
     json.dumps(written.description, allow_nan=False)
 
 

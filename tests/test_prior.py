@@ -9,7 +9,7 @@ import pytest
 
 from reconstruct.prior import Prior, exponential, independent, prior_of
 from scenes.errors import InputError
-from scenes.scene import Prior as Table
+from scenes.estimation import Prior as Table
 from scenes.scene import parse
 
 from .examples import scene

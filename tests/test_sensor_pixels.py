@@ -20,7 +20,8 @@ from scenes.camera import derive
 from scenes.errors import InputError
 from scenes.model import Model
 from scenes.picture import load
-from scenes.scene import Noise, Scene
+from scenes.scene import Scene
+from scenes.sensor import Noise
 from scenes.stack import Stack
 from simulate.expose import expose, generators
 from simulate.ideal import ideal_model

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from scenes import exr, stack
+from scenes.camera import derive
 from scenes.errors import InputError
-from scenes.stack import Stack
+from scenes.recording import Recording
+from scenes.sensor import Sensor
+from scenes.stack import Stack, recorded
 
 from .examples import THREE, camera, scene
 
@@ -20,6 +23,23 @@ def example(seed: int = 0) -> Stack:
     values = rng.normal(100, 50, one.measurements).astype(np.float32).astype(np.float64)
     variance = rng.uniform(1e-9, 1, one.measurements).astype(np.float32).astype(np.float64)
     return Stack(scene(lenses=THREE), one, values, variance, {"seed": seed, "note": 'ü "quoted"'})
+
+
+def of_a_sensor(seed: int = 0) -> Stack:
+    """Digital numbers of a real sensor, one of its pixels dead."""
+    rng, first = np.random.default_rng(seed), example(seed)
+    thin = tuple(lens.model_copy(update={"aperture": 0.1}) for lens in first.scene.camera.lens)
+    told = Sensor.model_validate({"illuminance": "500 lux", "exposure": "1 ms", "black_level": 10.0})
+    changes = {"sensor": told, "camera": first.scene.camera.model_copy(update={"lens": thin})}
+    described = first.scene.model_copy(update=changes)
+    one = derive(described)
+    dark = rng.normal(10, 1, one.measurements).astype(np.float32).astype(np.float64)
+    flat = dark + np.repeat([1000.0, 2000.0, 1500.0], [kind.measurements for kind in one.types])
+    flat[5] = dark[5]
+    level = np.repeat([1000 / 7, 1000 / 3, np.pi], [kind.measurements for kind in one.types])
+    digital = rng.integers(0, 4096, one.measurements).astype(np.float64)
+    flat = flat.astype(np.float32).astype(np.float64)
+    return recorded(described, one, Recording(told, digital, dark, flat, level), first.variance, first.record)
 
 
 def test_write_then_read_is_the_identity(tmp_path: Path) -> None:
@@ -99,3 +119,43 @@ def test_restrict_keeps_the_pixels_of_the_named_types() -> None:
     np.testing.assert_array_equal(kept.values, np.concatenate([first.values[:225], first.values[450:]]))
     with pytest.raises(InputError, match="'D'"):
         first.restrict(("D",))
+
+
+def test_a_sensors_recording_survives_being_stored(tmp_path: Path) -> None:
+    """What is read is what was written, values included; writing that gives the same file again."""
+    first = of_a_sensor()
+    stack.write(tmp_path / "stack.exr", first)
+    again = stack.read(tmp_path / "stack.exr")
+    assert first.recording is not None
+    assert again.recording is not None
+    assert again.recording.sensor == first.recording.sensor
+    for name in ("digital", "dark", "flat", "flat_value"):
+        np.testing.assert_array_equal(getattr(again.recording, name), getattr(first.recording, name))
+    np.testing.assert_array_equal(again.values, first.values)
+    assert np.flatnonzero(np.isnan(again.values)).tolist() == [5]
+    stack.write(tmp_path / "again.exr", again)
+    assert (tmp_path / "again.exr").read_bytes() == (tmp_path / "stack.exr").read_bytes()
+    names = set(exr.read(tmp_path / "stack.exr")[0].channels)
+    assert names == {"Y", "variance", "dark", "flat"}
+    np.testing.assert_array_equal(
+        exr.read(tmp_path / "stack.exr")[0].channels["Y"].ravel(), first.recording.digital[:25]
+    )
+    kept, whole = again.restrict(("A", "C")), first.restrict(("A", "C"))
+    assert kept.recording is not None
+    assert kept.recording.digital.size == kept.camera.measurements == 481
+    np.testing.assert_array_equal(kept.values, whole.values)
+    np.testing.assert_array_equal(kept.recording.values, kept.values)
+
+
+def test_a_sensors_stack_without_its_frames_is_refused(tmp_path: Path) -> None:
+    path, first = tmp_path / "stack.exr", of_a_sensor()
+    stack.write(path, Stack(first.scene, first.camera, first.values, first.variance, first.record))
+    with pytest.raises(InputError, match="should hold Y, variance, dark and flat"):
+        stack.read(path)
+    stack.write(path, first)
+    parts = exr.read(path)
+    for wrong in (None, "7", 0.0, -1.0):
+        parts[3].record["flat_value"] = wrong
+        exr.write(path, parts)
+        with pytest.raises(InputError, match=r"part 'A\.01\.00' should say flat_value"):
+            stack.read(path)

@@ -14,8 +14,9 @@ from reconstruct.dense import Dense
 from reconstruct.tiled import Tiled
 from reconstruct.tiles import cut
 from reconstruct.way import Hands, Task
+from scenes.estimation import Tiles
 from scenes.model import Model
-from scenes.scene import Scene, Tiles
+from scenes.scene import Scene
 from scenes.workers import workers
 from simulate.ideal import ideal_matrix, ideal_model
 

@@ -1,6 +1,7 @@
 """What our ways to render, to calibrate and to estimate gain, and over what: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` measures one part alone; the parts are `rendering`, `forms` and `frames`.
+`python -m tests.benchmarks frames` measures one part alone; the parts are `rendering`, `lenses`, `forms` and
+`frames`.
 Nothing here asserts a speed. Other load slows both sides of a ratio alike, so ratios are to be compared, not times.
 """
 
@@ -26,6 +27,9 @@ from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
 from .forms import NOISE, form_rows
 from .frame_tables import bandwidth_table, frames_table, growth_table
+from .lenses import SAMPLES as BUNDLE
+from .lenses import SIDE, lens_rows, transport_rows
+from .lenses import VARIANT as LENSES
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
@@ -96,7 +100,27 @@ def _frames() -> Iterator[Table]:
         yield table()
 
 
-PARTS: dict[str, Callable[[], Iterator[Table]]] = {"rendering": _rendering, "forms": _forms, "frames": _frames}
+def _lenses() -> Iterator[Table]:
+    table = Table(title="Real lenses, and calibration by transport", show_lines=True)
+    for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
+        table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
+    reason = blocked(LENSES)
+    if reason:
+        table.caption = f"All was left out: {reason}."
+    else:
+        for row in lens_rows():
+            _add(table, f"{SIDE} x {SIDE} pixels\n{BUNDLE} samples a pixel", row)
+        for row in transport_rows(SCENES / "tile19.toml"):
+            _add(table, "calibration: tile19\n1024 samples", row)
+    yield table
+
+
+PARTS: dict[str, Callable[[], Iterator[Table]]] = {
+    "rendering": _rendering,
+    "lenses": _lenses,
+    "forms": _forms,
+    "frames": _frames,
+}
 
 
 def _add(table: Table, what: str, row: Row) -> None:

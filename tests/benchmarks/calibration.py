@@ -17,7 +17,7 @@ from scenes.camera import derive
 from scenes.progress import no_progress
 from scenes.scene import read
 from simulate.passes import Plan
-from simulate.points import Sweep, entries_of, spacing
+from simulate.points import Sweep, entries_of
 from simulate.rig import Rig
 from simulate.streams import sampler_seeds
 
@@ -65,11 +65,11 @@ def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
 def by_grids(rig: Rig, seed: int) -> sparse.csr_array:
     """H, (M, N), by one pass of grids, the uniform target for its check included."""
     rows: list[sparse.csr_array] = []
-    for group, types in rig.groups.items():
+    for group in rig.groups:
         swept = Sweep(rig, group)
         swept.one_more(PASS, seed, no_progress)
         tally = swept.tally
-        rows.append(entries_of(rig.camera, rig.places(group), spacing(types[0]), tally.mean)[0])
+        rows.append(entries_of(rig.camera, swept.reach, tally.mean)[0])
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 
 

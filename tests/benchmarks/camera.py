@@ -36,7 +36,7 @@ def camera_rows(scene_file: Path, variant: str, samples: int) -> list[Row]:
         # There our rig is a loop of stock sensors itself.
         ways = {"Rig: as many stock sensors": ours, stock: loop}
     else:
-        ways = {"Rig: one sensor": ours, stock: loop, f"{len(camera.types)} `batch` sensors": batches}
+        ways = {"Rig: all rays at once": ours, stock: loop, f"{len(camera.types)} `batch` sensors": batches}
     readings = [way(0) for way in ways.values()]  # and so each is warm
     seconds = alternate(list(ways.values()), REPEATS)
     names = list(ways)

@@ -1,0 +1,30 @@
+"""Several ideas of one camera's H, for a study: each is made only where it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from scenes.camera import Camera
+from scenes.model import Model
+from scenes.progress import Progress
+from scenes.scene import Scene, resolved
+
+from .ideal import exact_model, ideal_model, true_matrix
+from .kept import kept_model
+
+
+def models(scene: Scene, camera: Camera, folder: Path, progress: Progress) -> dict[str, Callable[[], Model]]:
+    """What makes each model that the scene's study names; calibrated ones are kept in `folder`."""
+    assert scene.study is not None
+    return {name: partial(_made, name, scene, camera, folder, progress) for name in scene.study.models}
+
+
+def _made(name: str, scene: Scene, camera: Camera, folder: Path, progress: Progress) -> Model:
+    kept = resolved(scene, (camera.rows, camera.columns))
+    if name in ("points", "transport"):
+        told = scene.calibration.model_copy(update={"method": name})
+        alone = "model.npz" if name == scene.calibration.method else f"model.{name}.npz"
+        return kept_model(folder / alone, scene.model_copy(update={"calibration": told}), camera, progress)[0]
+    return exact_model(kept, camera, true_matrix(camera), "true") if name == "true" else ideal_model(kept, camera)

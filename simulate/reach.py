@@ -1,0 +1,70 @@
+"""Which pixels of f the rays of each sensor pixel can reach: as far as grids of point sources have to stand apart.
+
+For pinholes that stand where they should this follows from the geometry; for every other lens some rays are sent ahead.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from math import ceil, floor
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.camera import Camera
+from scenes.lens_type import LensType
+
+if TYPE_CHECKING:
+    from .rig import Rig
+
+MARGIN = Fraction(1, 1024)  # pixels of f by which rays may land beside a footprint: far more than they are rounded
+SCOUTS = 1024  # rays a pixel that are sent ahead
+BESIDE = 2  # pixels of f by which others may land beside those
+
+
+@dataclass(frozen=True)
+class Reach:
+    """The first row and column of f that each pixel of a group may see, (pixels,) each, and how many at most."""
+
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    apart: int
+
+
+def reach_of(rig: Rig, group: str) -> Reach:
+    """Of the pixels of a group of the rig, which is one lens type."""
+    (kind,) = rig.groups[group]
+    if rig.camera.perfect:
+        return of_pinholes(rig.camera, kind)
+    return _scouted(rig, group)
+
+
+def of_pinholes(camera: Camera, kind: LensType) -> Reach:
+    """Of a lens type of a perfect camera: a footprint and its margin touch at most ceil(m) + 2 pixels."""
+    rows: list[NDArray[np.int64]] = []
+    columns: list[NDArray[np.int64]] = []
+    for sub in (sub for sub in camera.sub_imagers if sub.type == kind):
+        first = [
+            np.array([floor(start + kind.ratio * number - MARGIN) for number in range(count)], dtype=np.int64)
+            for start, count in zip(sub.window, kind.pixels, strict=True)
+        ]
+        rows.append(np.repeat(first[0], kind.pixels[1]))
+        columns.append(np.tile(first[1], kind.pixels[0]))
+    return Reach(np.concatenate(rows), np.concatenate(columns), ceil(kind.ratio) + 2)
+
+
+def _scouted(rig: Rig, group: str) -> Reach:
+    camera = rig.camera
+    texels, _ = rig.hits(group, SCOUTS, lambda place: place)  # bounds alone: these rays are not used again
+    seen = texels >= 0
+    beside = BESIDE + ceil(rig.tail(group))
+    ends: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    for size, places in zip((camera.rows, camera.columns), np.divmod(texels, camera.columns), strict=True):
+        first = np.where(seen, places, size).min(axis=1)
+        last = np.where(seen, places, -1).max(axis=1)
+        ends.append((np.clip(first - beside, 0, size - 1), np.clip(last + beside, 0, size - 1)))
+    apart = max(int((last - first).max()) + 1 for first, last in ends)
+    return Reach(ends[0][0], ends[1][0], apart)

@@ -1,0 +1,100 @@
+"""H from rays alone: every ray of a sensor pixel brings its weight to the pixel of f that it meets.
+
+What point sources show one after the other, the rays know at once: row i of H is where the rays of pixel i land. They
+are those that point sources are seen by, with the same seeds, and are summed in float64, so that both give the same H.
+Light is reversible; what follows a ray from the sensor is the light that comes back on it (Veach 1997, section 4.5).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from scenes.camera import Camera
+from scenes.errors import InputError
+from scenes.progress import Progress, no_progress
+from scenes.scene import Scene
+
+from .passes import BATCHES, Plan, plan
+from .points import Part, Responses, responses_of
+from .streams import sampler_seeds
+from .variant import choose, remedy
+
+if TYPE_CHECKING:
+    from .rig import Rig
+
+
+class Entries(NamedTuple):
+    """Of one pass: where in H, pixel * N + texel, rising; what stands there; (pixels,) which get no light at all."""
+
+    where: NDArray[np.int64]
+    values: NDArray[np.float64]
+    dark: NDArray[np.bool_]
+
+
+def from_transport(scene: Scene, camera: Camera, progress: Progress = no_progress) -> Responses:
+    """Trace all rays of all passes. Raises InputError where only Mitsuba's slow backend works."""
+    from .rig import Rig
+
+    variant = choose(scene.render.variant)
+    if variant.startswith("scalar"):
+        raise InputError(
+            f"{scene.source}: calibration.method 'transport' needs Mitsuba's fast backend, got {variant}; {remedy()}"
+        )
+    work = plan(scene.calibration.samples)
+    rig = Rig(camera, variant, scene.render.sampler, together=False)
+    parts: list[Part] = []
+    for place, group in enumerate(rig.groups):
+        passes: list[Entries] = []
+        for number in range(work.passes):
+            passes.append(one_pass(rig, group, work, number, scene.render.seed))
+            progress((place + (number + 1) / work.passes) / len(rig.groups))
+        parts.append(_joined(passes, (rig.groups[group][0].measurements, camera.unknowns)))
+    return responses_of(parts, work, variant, scene.render.seed)
+
+
+def one_pass(rig: Rig, group: str, work: Plan, number: int, seed: int) -> Entries:
+    """The entries of H that the rays of one pass make."""
+    from .transport_kernels import collected  # pyright: ignore[reportUnknownVariableType]
+
+    texels, weights = rig.hits(group, work.samples, sampler_seeds(seed, "calibration", number, work.passes))
+    weights = np.ones(texels.shape) if weights is None else weights
+    counts, columns, sums = collected(texels, weights)
+    pixel = np.repeat(np.arange(counts.size), counts)
+    brought = weights.sum(axis=1)
+    return Entries(pixel * rig.camera.unknowns + columns, sums / brought[pixel], brought == 0)
+
+
+def _joined(passes: list[Entries], shape: tuple[int, int]) -> Part:
+    """Mean over the passes, the variance of that mean, and the deviations of batches of passes from it.
+
+    Of a pixel that now and then gets no light at all nothing is known; so it has no entries.
+    """
+    dark = np.logical_or.reduce([one.dark for one in passes])
+    if dark.any():
+        passes = [_lit(one, ~dark[one.where // shape[1]]) for one in passes]
+    places = np.unique(np.concatenate([one.where for one in passes]))
+    total, squares = np.zeros(places.size), np.zeros(places.size)
+    batches = np.zeros((BATCHES, places.size))
+    spread: list[tuple[NDArray[np.intp], NDArray[np.float64]]] = []
+    for number, (where, values, _) in enumerate(passes):
+        found = np.searchsorted(places, where)
+        total[found] += values
+        batches[number % BATCHES, found] += values * (BATCHES / len(passes))
+        spread.append((found, values))
+    mean = total / len(passes)
+    for found, values in spread:
+        away = -mean
+        away[found] += values
+        squares += np.square(away)
+    pixel, texel = np.divmod(places, shape[1])
+    starts = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=shape[0]))])
+    matrix = sparse.csr_array((mean, texel, starts), shape=shape)
+    return matrix, squares / (len(passes) * (len(passes) - 1)), (batches - mean).astype(np.float32)
+
+
+def _lit(one: Entries, kept: NDArray[np.bool_]) -> Entries:
+    return Entries(one.where[kept], one.values[kept], one.dark)

@@ -1,0 +1,140 @@
+"""Rays through five surfaces against Mitsuba's own `thinlens` on the same film; transport against point sources.
+
+All look at the same picture with the same number of rays. Our thin lens and Mitsuba's have to show the same; the five
+surfaces, a cemented achromat and a singlet, differ by their aberrations.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from math import atan, degrees
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.camera import Camera, derive
+from scenes.scene import Scene, parse, read
+from simulate.points import from_points
+from simulate.rig import Rig, film, scene_of, target_of, texture_of
+from simulate.transport import from_transport
+
+from .alternation import Row, alternate
+
+VARIANT, SAMPLER = "llvm_ad_mono", "independent"
+SIDE, SAMPLES, REPEATS = 128, 256, 7
+APERTURE = 0.4  # mm
+AIM_OF_RAYS, AIM_OF_TRANSPORT = 1 / 3, 100.0
+FIVE = [
+    {"radius": "1.6 mm", "thickness": "0.5 mm", "glass": "N-BK7", "semi_diameter": "0.3 mm"},
+    {"radius": "-1.1 mm", "thickness": "0.25 mm", "glass": "N-SF11", "semi_diameter": "0.3 mm"},
+    {"radius": "-2.6 mm", "thickness": "0.1 mm", "semi_diameter": "0.3 mm"},
+    {"thickness": "0.3 mm", "glass": "N-BK7", "semi_diameter": "0.2 mm", "stop": True},
+    {"radius": "-4 mm", "semi_diameter": "0.3 mm"},
+]
+
+
+def scene_with(lens: dict[str, Any]) -> Scene:
+    """One sub-imager of SIDE x SIDE pixels."""
+    kind = {"name": "I", "magnification": "1/2", "array": [1, 1], "pixels": [SIDE, SIDE], **lens}
+    target = {"image": "photo:camera", "origin": [0, 0], "shape": [2 * SIDE] * 2}
+    return parse(
+        {
+            "target": {**target, "pixel_pitch": "1 mm", "distance": "1 m"},
+            "camera": {"pixel_pitch": "6 um", "lens_pitch": "2 mm", "lens": [kind]},
+            "render": {"complete": True},
+        },
+        Path("benchmark"),
+    )
+
+
+def lens_rows() -> list[Row]:
+    """Ours through surfaces, and as a thin lens, against Mitsuba's."""
+    from scenes.picture import load
+
+    described = scene_with({"surfaces": FIVE})
+    picture, camera = load(described), derive(described)
+    thin = derive(scene_with({"aperture": f"{APERTURE} mm"}))
+    ways: list[Callable[[int], Any]] = [_ours(camera, picture), _ours(thin, picture), _thinlens(thin, picture)]
+    images = [way(0) for way in ways]
+    seconds = alternate(ways, REPEATS)
+    rays = SIDE * SIDE * SAMPLES / 1e6
+    name = f"Mitsuba's thinlens, {rays / np.median(seconds[2]):.0f} million rays a second"
+    return [
+        Row(
+            VARIANT,
+            f"{what}, {rays / np.median(mine):.0f} million",
+            name,
+            mine,
+            seconds[2],
+            aim,
+            _apart(image, images[2]),
+        )
+        for what, mine, image, aim in (
+            ("five surfaces", seconds[0], images[0], AIM_OF_RAYS),
+            ("our thin lens", seconds[1], images[1], None),
+        )
+    ]
+
+
+def transport_rows(scene_file: Path) -> list[Row]:
+    """Calibration of a tile through lenses out of focus, and of its pinholes."""
+    rows: list[Row] = []
+    for what, keys in (("pinholes", ()), ("lenses out of focus", ('aperture="0.4 mm"', 'focus="800 mm"'))):
+        changes = [f"camera.lens.{name}.{key}" for name in ("I", "II", "III") for key in keys]
+        scene = read(scene_file, ["calibration.samples=1024", "render.complete=true", *changes])
+        camera = derive(scene)
+        ways = [partial(_by, way, scene, camera) for way in (from_transport, from_points)]
+        matrices = [way(0).matrix for way in ways]
+        apart = abs(matrices[0] - matrices[1]).max() / matrices[1].max()
+        seconds = alternate(ways, 3)
+        check = f"H differs by {apart:.1g} of its largest entry"
+        aim = AIM_OF_TRANSPORT if keys else None
+        rows.append(Row(VARIANT, f"transport, {what}", "point sources", seconds[0], seconds[1], aim, check))
+    return rows
+
+
+def _by(way: Callable[[Scene, Camera], Any], scene: Scene, camera: Camera, seed: int) -> Any:
+    del seed  # the scene's own: both ways are to give the same H
+    return way(scene, camera)
+
+
+def _ours(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
+    rig = Rig(camera, VARIANT, SAMPLER)
+    rig.show(picture)
+    return lambda seed: rig.expose("I", SAMPLES, lambda _: seed)[0].reshape(SIDE, SIDE)
+
+
+def _thinlens(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
+    import mitsuba as mi
+
+    texture = texture_of({"bitmap": mi.Bitmap(picture.astype(np.float32)[..., None])})
+    integrator = {"type": "path", "max_depth": 1}
+    stage = mi.load_dict({**scene_of(target_of(camera, texture)), "integrator": integrator})
+    sensor = mi.load_dict(
+        {
+            "type": "thinlens",
+            "fov": 2 * degrees(atan(camera.columns * camera.target_pitch / 2 / camera.distance)),
+            "aperture_radius": APERTURE / 2,
+            "focus_distance": camera.distance,
+            "near_clip": 1.0,
+            "far_clip": 2 * camera.distance,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0]),
+            "film": film(SIDE, SIDE),
+            "sampler": {"type": SAMPLER, "sample_count": SAMPLES},
+        }
+    )
+
+    def render(seed: int) -> NDArray[np.float64]:
+        found: Any = mi.render(stage, sensor=sensor, spp=SAMPLES, seed=seed)  # pyright: ignore
+        return np.array(found, dtype=np.float64)[..., 0]
+
+    return render
+
+
+def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> str:
+    away = one - other
+    return f"pixels differ by {np.sqrt((away**2).mean()):.2g} RMS, {np.abs(away).max():.2g} at most, of 255"

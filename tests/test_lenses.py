@@ -1,0 +1,103 @@
+"""Whole runs through lenses and sensors that are more than the paper's: what is measured is what was promised."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reconstruct.noise import usable_pixels
+from reconstruct.restore import restore
+from scenes import stack as stacks
+from scenes.camera import derive
+from scenes.picture import load
+from scenes.scene import Scene, parse
+from simulate.calibrate import calibrate
+from simulate.render import render
+from simulate.response import response
+
+from .examples import THREE, Lenses, needs, scene
+
+BIPLANE = [
+    {"thickness": "5 mm", "semi_diameter": "0.1 mm"},  # a baffle, far before the lens
+    {"radius": "1.0333 mm", "thickness": "0.3 mm", "index": 1.5, "semi_diameter": "0.1 mm", "stop": True},
+    {"semi_diameter": "0.2 mm"},
+]
+SENSOR = {"illuminance": "300 lux", "exposure": "10 ms", "read_noise": 3, "gain": 0.5, "black_level": 40, "prnu": 0.01}
+
+
+def built(lens: dict[str, Any], lenses: Lenses = THREE, shape: tuple[int, int] = (19, 19), **tables: Any) -> Scene:
+    """A scene whose every lens type is this one, calibrated by transport."""
+    calibration = {"method": "transport", "samples": 1024}
+    data = scene(shape, lenses, render={"samples": 1024}, calibration=calibration).plain()
+    for described in data["camera"]["lens"]:
+        described.update(lens)
+    return parse({**data, **tables}, Path("test.toml"))
+
+
+@pytest.mark.parametrize(
+    ("lens", "tables"),
+    [
+        ({"aperture": "0.4 mm", "focus": "700 mm"}, {"noise": {"variance": 1.0}}),
+        ({"distortion": [0.05, 0.0]}, {"noise": {"variance": 1.0}}),
+        ({"aperture": "0.4 mm", "focus": "900 mm"}, {"sensor": SENSOR}),
+        ({"surfaces": BIPLANE[1:]}, {"sensor": SENSOR}),
+    ],
+    ids=["defocus", "distortion", "sensor", "surfaces and sensor"],
+)
+def test_the_measured_error_is_the_promised_one(lens: dict[str, Any], tables: dict[str, Any], tmp_path: Path) -> None:
+    needs("llvm_ad_mono")
+    described = built(lens, **tables)
+    camera, truth = derive(described), load(described)
+    stacks.write(tmp_path / "stack.exr", render(described, camera, truth))
+    stack = stacks.read(tmp_path / "stack.exr")
+    assert (stack.recording is not None) == ("sensor" in tables)
+    found = restore(stack, calibrate(described, camera), truth.ravel())
+    assert found.error is not None
+    assert found.interval is not None
+    assert found.interval.low < found.error.mse < found.interval.high
+
+
+def test_pixels_that_no_light_can_reach_are_dead() -> None:
+    """A baffle cuts the corners off the field: they are NaN, their rows of H are empty, and the estimate knows."""
+    needs("llvm_ad_mono")
+    described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
+    camera, truth = derive(described), load(described)
+    stack, model = render(described, camera, truth), calibrate(described, camera)
+    dark = np.isnan(stack.values)
+    picture = dark.reshape(25, 25)
+    assert picture[0, 0]
+    assert picture[-1, -1]
+    assert not picture[12, 12]
+    sums = np.asarray(model.matrix.sum(axis=1)).ravel()
+    inner = sums.reshape(25, 25)[2:-2, 2:-2]  # at the target's edges some light comes from beside it
+    assert ((inner == 0) | (np.abs(inner - 1) < 1e-9)).all(), "what is known of a pixel is known wholly"
+    assert sums[0] == sums[-1] == 0
+    assert usable_pixels(stack).dead == dark.sum() > 40
+    assert usable_pixels(stack, model).dead >= dark.sum()
+    with_sensor = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), sensor=SENSOR)
+    assert (response(with_sensor, camera)[dark] < 0.1 * response(with_sensor, camera).max()).all()
+    counted = render(with_sensor, camera, truth)
+    assert np.isnan(counted.values[dark]).all()
+
+
+def test_what_a_lens_type_collects_is_what_the_rendering_shows() -> None:
+    """Electrons from traced solid angles against the light that rendered rays bring: within 1 per cent."""
+    needs("llvm_ad_mono")
+    from simulate.rig import Rig
+    from simulate.streams import sampler_seeds
+
+    described = built({"surfaces": BIPLANE[1:]}, sensor=SENSOR)
+    camera = derive(described)
+    freed = response(described, camera)
+    rig = Rig(camera, "llvm_ad_mono", together=False)
+    for group in rig.groups:
+        light = rig.gathered(group, 1024, sampler_seeds(0, "data", 0, 1))
+        np.testing.assert_allclose(
+            light / light.mean(), freed[rig.places(group)] / freed[rig.places(group)].mean(), rtol=0.02
+        )
+    # A smaller magnification gathers more: the same f-number for all types, so the same light on a pixel.
+    means = [freed[place].mean() for place in camera.type_slices()]
+    assert max(means) / min(means) == pytest.approx(1, abs=0.05)

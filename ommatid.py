@@ -158,6 +158,10 @@ def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watc
 
     exact = scene.calibration.method == "ideal" and camera.boxed
     choose(scene, camera, exact)  # what memory does not hold is refused before any work
+    if scene.study is not None:
+        from reconstruct.study import refuse
+
+        refuse(scene, camera)
     stack = _rendered(scene, camera, image, folder, watch)
     with watch.progress("calibrate") as progress:
         model, made = kept_model(folder / "model.npz", scene, camera, progress)
@@ -347,6 +351,8 @@ def import_(
     refuse_output(output, scene, *(file for path in (*images, *bench.dark, *bench.flat) for file in files_in(path)))
     described = read(scene, sets or ())
     camera = derive(described)  # all of it: lens types that are left out stand on the sensor nevertheless
+    if lens and not camera.perfect:
+        raise InputError(f"--lens {lens}: lenses that are more than pinholes are imported all; choose in `reconstruct`")
     made, frames = imported(described, camera, images, bench)
     made = made.restrict(_names(lens)) if lens else made
     stack.write(output, made)
@@ -373,7 +379,10 @@ def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Jso
     if as_json:
         _print_json(prediction.describe() | ({} if light is None else {"light": light}))
         return
-    _table(described.title or scene.stem, accuracy.rows(prediction))
+    lines, tolerance = accuracy.rows(prediction), described.camera.tolerance
+    if tolerance is not None and prediction.misalignment is None and described.estimator.misalignment == "trust":
+        lines.append(("misalignment", "not in these numbers: what it adds is known for small targets and no blur"))
+    _table(described.title or scene.stem, lines)
     for title, lines in _optics_sections([], light):
         _table(title, lines)
 
@@ -692,7 +701,7 @@ def _predicted(scene: Scene) -> Prediction:
         return predict_large(choice, ideal_model(scene, camera), actual)
     prior = prior_of(scene.prior, shape, camera.target_pitch)
     tolerated = None
-    if camera.tolerance is not None and camera.boxed:
+    if camera.tolerance is not None and camera.stays_sharp and scene.estimator.misalignment == "trust":
         from reconstruct.tolerance import cost
 
         tolerated = partial(cost, camera=camera, prior=prior)

@@ -120,16 +120,17 @@ def predict(
     actual: float | Vector,
     estimator: Estimator,
     shape: tuple[int, int],
-    tolerated: Callable[[Form], Vector] | None = None,
+    tolerated: Callable[[Form, NDArray[np.bool_]], Vector] | None = None,
 ) -> Prediction:
     """Expected squared error for noise of variance `actual`; the estimator expects what it is told, else the same.
 
     actual : of every measurement the same, or (M,); NaN where a measurement tells nothing and is left out
-    tolerated : what misalignment adds, (N,), where there is a tolerance and the estimator has noise to expect
+    tolerated : what misalignment adds, (N,), given which measurements tell something; where there is a tolerance and
+        the estimator has noise to expect
     Without any noise the error is the limit of Eq. 5: the prior's part in the null space of H.
     Raises InputError where the estimator is to find the noise from a stack, or where no form is right.
     """
-    matrix, noise = _telling(matrix, actual)
+    matrix, noise, telling = _telling(matrix, actual)
     measurements, unknowns = matrix.shape
     seen = observability(matrix)
     if estimator.noise_variance == "fit":
@@ -140,7 +141,7 @@ def predict(
         form, solver = factorise(Problem(matrix, prior, believed), estimator.method, estimator.tolerance)
         expected = expected_error(form, {"noise": noise})
         method, variance, resolved = solver.method, expected.variance, expected.resolved
-        more = None if tolerated is None else tolerated(form)
+        more = None if tolerated is None else tolerated(form, telling)
     else:
         limit, more = svd(Problem(matrix, prior, np.ones(measurements))), None
         method, variance, resolved = limit.name, _in_the_limit(limit, noise), limit.resolved()
@@ -162,12 +163,11 @@ def predict(
     )
 
 
-def _telling(matrix: sparse.csr_array, actual: float | Vector) -> tuple[sparse.csr_array, Vector]:
-    """H and the noise of the measurements that tell something."""
-    if not isinstance(actual, np.ndarray):
-        return matrix, np.full(matrix.shape[0], actual)
-    telling = np.isfinite(actual)
-    return (matrix, actual) if telling.all() else (sparse.csr_array(matrix[telling]), actual[telling])
+def _telling(matrix: sparse.csr_array, actual: float | Vector) -> tuple[sparse.csr_array, Vector, NDArray[np.bool_]]:
+    """H and the noise of the measurements that tell something, and which those are."""
+    noise = actual if isinstance(actual, np.ndarray) else np.full(matrix.shape[0], actual)
+    telling = np.isfinite(noise)
+    return (matrix if telling.all() else sparse.csr_array(matrix[telling])), noise[telling], telling
 
 
 def _in_the_limit(limit: Svd, noise: Vector) -> Vector:

@@ -63,7 +63,7 @@ def choose(scene: Scene, camera: Camera, exact: bool) -> Choice:
     """
     told, allowed = scene.estimator, allowed_memory(scene.estimator.memory)
     if told.misalignment != "trust":
-        return _misaligned(scene, camera)
+        return _misaligned(scene, camera, exact, allowed)
     sliding = all(slides(kind) for kind in camera.types)
     silent = told.noise_variance == 0 or (told.noise_variance is None and exact and not _noise(scene))
     if told.method == "tiles":
@@ -94,17 +94,27 @@ def choose(scene: Scene, camera: Camera, exact: bool) -> Choice:
     )
 
 
-def _misaligned(scene: Scene, camera: Camera) -> Choice:
-    """The way of an estimator that expects a misaligned camera."""
-    how = scene.estimator.misalignment
+def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Choice:
+    """The way of an estimator that expects a misaligned camera, and begins with H as designed."""
+    how, form = scene.estimator.misalignment, scene.estimator.method
     key = f"{scene.source}: estimator.misalignment '{how}'"
     if camera.tolerance is None:
         raise InputError(f"{key} needs to know what may be misaligned, got no [camera.tolerance]; add one")
     if camera.unknowns > DENSE:
         raise InputError(f"{key} serves up to {DENSE} pixels of f, got {camera.unknowns}; crop the target")
-    if not camera.boxed:
+    if not (camera.boxed and camera.stays_sharp):
         raise InputError(f"{key} serves pinholes and thin lenses in focus, got blurred or distorted ones; calibrate")
-    memory = _needed("dense", scene, camera, exact=False)
+    if form in ("tiles", "frame"):
+        raise InputError(f"{key} takes a dense form, got estimator.method '{form}'; set that to 'auto'")
+    if not exact:
+        raise InputError(f"{key} begins with H as designed, got a calibrated one; set calibration.method to 'ideal'")
+    largest = max(kind.pixels[0] * kind.pixels[1] for kind in camera.types)
+    blocks = 3 * 8 * camera.measurements * (largest + camera.unknowns)  # of Rv, and H whitened by them
+    memory = _needed("dense", scene, camera, exact=False) + blocks
+    if memory > allowed:
+        raise InputError(
+            f"{key} needs {memory / 1e9:.1f} GB, {allowed / 1e9:.1f} GB are allowed; raise estimator.memory"
+        )
     return Choice(how, f"estimator.misalignment is '{how}'", memory, _seconds("dense", scene, camera, exact=False))
 
 

@@ -13,11 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenes.camera import Camera
+from scenes.errors import InputError
 from scenes.files import fingerprint, write_text
 from scenes.model import Model
 from scenes.progress import Progress, no_progress
+from scenes.scene import Scene
 from scenes.stack import Stack
 
+from .choice import choose
 from .restore import restore
 
 NUMBERS, TABLE = "study.json", "study.csv"
@@ -47,6 +51,20 @@ class Case:
     low: float | None
     high: float | None
     seconds: float
+
+
+def refuse(scene: Scene, camera: Camera) -> None:
+    """Raise InputError where a study names what this camera cannot be reconstructed with, before any work."""
+    assert scene.study is not None
+    for name in scene.study.models:
+        how = MISALIGNMENT.get(name, "trust")
+        told = scene.estimator.model_copy(update={"misalignment": how})
+        choose(scene.model_copy(update={"estimator": told}), camera, camera.boxed)
+        if name == "true" and camera.tolerance is not None and not camera.stays_sharp:
+            raise InputError(
+                f"{scene.source}: study.models: the 'true' H of misaligned lenses with surfaces or blur has no closed"
+                " form; leave it out"
+            )
 
 
 def studied(

@@ -11,7 +11,10 @@ E[D] being other than 0 since footprints that begin on the edges of pixels blur 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from scenes.camera import Camera
@@ -22,16 +25,20 @@ from .misaligned import robust_noise
 from .prior import Prior
 
 
-def cost(form: Form, camera: Camera, prior: Prior) -> Vector:
-    """The addition to Eq. 5, (N,); `form` is of all measurements with the camera's designed H."""
+def cost(form: Form, telling: NDArray[np.bool_], camera: Camera, prior: Prior) -> Vector:
+    """The addition to Eq. 5, (N,); `form` is of the camera's designed H, of the measurements `telling`, (M,)."""
     told = robust_noise(camera, prior)
-    shift, places = sparse.csr_array(told.matrix - form.problem.matrix), camera.slices()  # E[D]
+    shift = sparse.csr_array(told.matrix[telling] - form.problem.matrix)  # E[D]
+    kept = [telling[place] for place in camera.slices()]
+    ends = np.cumsum([0, *(int(some.sum()) for some in kept)])
+    places = [slice(int(first), int(last)) for first, last in pairwise(ends)]
+    blocks = [block[np.ix_(some, some)] for block, some in zip(told.covariances, kept, strict=True)]
     found = np.empty(form.problem.unknowns)
     for place, _, u, negative in columns(form, np.arange(form.problem.unknowns)):
         moved = shift.T @ negative
         on_average = prior.gather(moved)
         about_it = np.zeros(negative.shape[1])
-        for rows, block in zip(places, told.covariances, strict=True):
+        for rows, block in zip(places, blocks, strict=True):
             about_it += np.sum(negative[rows] * (block @ negative[rows]), axis=0)
         found[place] = about_it + np.square(on_average).sum(axis=0) + np.square(prior.mean @ moved)
         found[place] += 2 * np.sum(u * on_average, axis=0)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from .camera import Camera
-from .errors import DeniedError
+from .errors import DeniedError, InputError
 from .files import make_folder, refuse_output
 from .parcel import Outcome, Parcel, Stages, Watch, carry_out, packed, unpack
 from .picture import Image, write_truth
@@ -54,6 +54,10 @@ class Batch:
         for path, folder in folders.items():
             try:
                 scene, _, image = self.opened(path)
+                if scheduler and scene.world is not None:
+                    raise InputError(
+                        f"{path}: the files of a [world] do not travel to other machines; leave out --scheduler"
+                    )
                 prepare(scene, image, folder)
                 scenes[path] = scene
             except Exception as error:

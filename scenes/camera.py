@@ -40,6 +40,7 @@ class Camera:
     types: tuple[LensType, ...]
     wavelength: float | None = None
     tolerance: Tolerance | None = None
+    across: int | None = None  # columns of sub-imagers, those of types that were left out later among them
 
     @property
     def unknowns(self) -> int:
@@ -84,6 +85,15 @@ class Camera:
             return False
         return self.wavelength is not None or self.focus(kind) != self.distance
 
+    @property
+    def stays_sharp(self) -> bool:
+        """Whether footprints of misaligned sub-imagers are known in closed form: no surfaces, and no blur."""
+        moved = self.tolerance is not None and (self.tolerance.focal_length or self.tolerance.tilt)
+        return not any(
+            kind.glass.surfaces is not None or self.blurs(kind) or (kind.glass.aperture is not None and moved)
+            for kind in self.types
+        )
+
     @cached_property
     def sub_imagers(self) -> tuple[SubImager, ...]:
         """Every sub-imager, in the order of measurements."""
@@ -98,8 +108,8 @@ class Camera:
     def sub_imager(self, place: int, k: int, l: int) -> SubImager:  # noqa: E741
         """Sub-imager (k, l) of the lens type that stands at `place` in the list; types stand side by side."""
         kind = self.types[place]
-        across = sum(other.array[1] for other in self.types)
-        left = sum(other.array[1] for other in self.types[:place])
+        across = sum(other.array[1] for other in self.types) if self.across is None else self.across
+        left = sum(other.array[1] for other in self.types[:place]) if kind.left is None else kind.left
         x = ((across - 1) / 2 - (left + l)) * self.lens_pitch
         y = ((kind.array[0] - 1) / 2 - k) * self.lens_pitch
         return self._sub_imager(kind, k, l, (x, y))
@@ -172,6 +182,8 @@ class Camera:
                 }
                 for place, kind in enumerate(self.types)
             },
+            # Through pinholes it is all the same where the lenses stand.
+            **({} if self.perfect else {"camera.places": [self.across, *(kind.left for kind in self.types)]}),
             **({} if self.wavelength is None else {"camera.wavelength": self.wavelength}),
             **({} if self.tolerance is None else {"camera.tolerance": self.tolerance.model_dump(mode="json")}),
         }
@@ -184,6 +196,8 @@ def derive(scene: Scene) -> Camera:
     """
     rows, columns = shape(scene)
     types = tuple(_lens_type(lens, rows, columns, scene) for lens in scene.camera.lens)
+    lefts = list(accumulate((kind.array[1] for kind in types), initial=0))
+    types = tuple(replace(kind, left=left) for kind, left in zip(types, lefts, strict=False))
     camera = Camera(
         rows=rows,
         columns=columns,
@@ -194,6 +208,7 @@ def derive(scene: Scene) -> Camera:
         types=types,
         wavelength=scene.camera.wavelength,
         tolerance=scene.camera.tolerance,
+        across=lefts[-1],
     )
     for kind in types:
         if kind.count > MOST_SUB_IMAGERS:

@@ -29,8 +29,13 @@ def magnifications(text: str) -> list[Fraction]:
     return list(dict.fromkeys(ratios))
 
 
+GLASS = ("aperture", "focus", "distortion", "surfaces", "scale")
+
+
 def with_lens(scene: Scene, magnification: Fraction) -> Scene:
     """The scene with one more lens type: as many sub-imagers as a sensor pixel covers target pixels, each that fits.
+
+    Its lenses are such as those of the last type: their aperture, focus, distortion, or surfaces.
 
     Raises InputError where not one pixel of it fits the target.
     """
@@ -38,7 +43,9 @@ def with_lens(scene: Scene, magnification: Fraction) -> Scene:
     count = ceil(1 / magnification)
     taken = {lens["name"] for lens in data["camera"]["lens"]}
     name = next(name for name in [ADDED, *(f"{ADDED}-{number}" for number in range(2, MOST))] if name not in taken)
-    added = {"name": name, "magnification": str(magnification), "array": [count, count], "pixels": "fit"}
+    last = data["camera"]["lens"][-1]
+    glass = {key: last[key] for key in GLASS if key in last}  # else a pinhole would be compared with real lenses
+    added = {**glass, "name": name, "magnification": str(magnification), "array": [count, count], "pixels": "fit"}
     camera = {**data["camera"], "lens": [*data["camera"]["lens"], added]}
     return parse({**data, "camera": camera}, scene.source)
 

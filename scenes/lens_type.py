@@ -43,7 +43,10 @@ class Glass:
 
 @dataclass(frozen=True)
 class LensType:
-    """An array of equal sub-imagers; `ratio` is m, the pixels of f that a sensor pixel covers along one axis."""
+    """An array of equal sub-imagers; `ratio` is m, the pixels of f that a sensor pixel covers along one axis.
+
+    left : columns of sub-imagers of other types to its left, absent: of those that are listed before it
+    """
 
     name: str
     ratio: Fraction
@@ -52,6 +55,7 @@ class LensType:
     step: Fraction
     origin: tuple[int, int]
     glass: Glass = Glass()
+    left: int | None = None
 
     @property
     def count(self) -> int:

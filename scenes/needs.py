@@ -98,12 +98,13 @@ def without_shot_noise(scene: Scene, camera: Camera) -> LeftOut | None:
         return None
     from . import photons
 
-    response = float(photons.electrons(scene, camera).max())
-    if not shot_noise_hides(scene.sensor, WHITE * response):
+    response, sensor = photons.electrons(scene, camera), scene.sensor
+    counted = WHITE * response + sensor.dark_current * sensor.exposure
+    if not shot_noise_hides(sensor, WHITE * float(response.max())):
         return None
-    counted = WHITE * response + scene.sensor.dark_current * scene.sensor.exposure
-    why = f"{counted:.3g} electrons at most, whose shot noise hides below the read noise of {scene.sensor.read_noise:g}"
-    return LeftOut("shot noise", why, SURE * counted**0.5 / response)
+    most = f"{float(counted.max()):.3g} electrons at most"
+    why = f"{most}, whose shot noise hides below the read noise of {sensor.read_noise:g}"
+    return LeftOut("shot noise", why, SURE * float(np.max(np.sqrt(counted) / response)))
 
 
 def _as_pinhole(glass: Glass) -> Glass:
@@ -136,6 +137,8 @@ def _without_aperture(camera: Camera, kind: LensType, contrast: float, allowed: 
     """None where a type's aperture is needed, or where there is none."""
     if kind.glass.aperture is None or camera.wavelength is not None:
         return None
+    if camera.tolerance is not None and (camera.tolerance.focal_length or camera.tolerance.tilt):
+        return None  # which put sub-imagers out of focus
     from .blur import Blur, blur_of
 
     blur = blur_of(camera, kind)
@@ -162,8 +165,8 @@ def _change(camera: Camera, kind: LensType, less: object) -> Change:
     blur = blur_of(camera, kind)
     margin = ceil(blur.reach) + 1
     side = ceil(kind.ratio) + 1 + 2 * margin
-    alone = replace(kind, array=(1, 1), pixels=(1, 1), origin=(margin, margin))
-    small = replace(camera, rows=side, columns=side, types=(alone,))
+    alone = replace(kind, array=(1, 1), pixels=(1, 1), origin=(margin, margin), left=None)
+    small = replace(camera, rows=side, columns=side, types=(alone,), across=None)
     row = sparse.csr_array(matrix(small, alone, blur) - matrix(small, alone, less)).data
     most = WHITE * max(float(row[row > 0].sum()), -float(row[row < 0].sum()))
     return Change(most, float(np.square(row).sum()))

@@ -64,10 +64,17 @@ def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress, pa
         "seconds": perf_counter() - start,
         "seed": scene.render.seed,
         **responses.record(),
-        "agreement": agreement(responses.matrix, variance, camera, responses.passes),
+        **_compared(responses, variance, camera),
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
     return Model(kept, camera, responses.matrix, variance, responses.batches, record)
+
+
+def _compared(responses: Responses, variance: NDArray[np.float64], camera: Camera) -> dict[str, Any]:
+    """How far H lies from the ideal one, where that has a closed form."""
+    if any(kind.glass.distortion is not None and camera.blurs(kind) for kind in camera.types):
+        return {}
+    return {"agreement": agreement(responses.matrix, variance, camera, responses.passes)}
 
 
 def settle(responses: Responses, camera: Camera) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from scenes.files import write_whole
 from scenes.picture import write_truth
 from scenes.scene import Scene
 
-from .rig import scene_of, stock_sensor, target_of, texture_of
+from .stock import scene_of, stock_sensor, target_of, texture_of
 from .variant import activate
 
 
@@ -23,6 +23,11 @@ def export(scene: Scene, camera: Camera, image: NDArray[np.float64], path: Path)
 
     Returns the picture's path. Raises InputError unless `path` ends in .xml, DeniedError for a full disk.
     """
+    if not camera.perfect:
+        raise InputError(
+            f"{scene.source}: stock sensors of Mitsuba are pinholes where they should be, so lenses that are more, or a"
+            " [camera.tolerance], cannot be exported; remove them with --set"
+        )
     if path.suffix != ".xml":
         raise InputError(f"{path}: expected the name of a Mitsuba scene, ending in .xml")
     activate("scalar_rgb")

@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.camera import Camera
+from scenes.errors import InputError
 from scenes.lens_type import LensType
 from scenes.pose import corner_offset, poses
 
 from .lens import Lens, ThinLens
+
+MOST_LANES = 2**31
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,11 @@ class Eye:
         samples = self.sampler.sample_count()
         self.sampler.set_samples_per_wavefront(samples)
         lanes = self.pixels * samples
+        if lanes >= MOST_LANES:
+            raise InputError(
+                f"{self.pixels} sensor pixels with {samples} samples in one pass are {lanes} rays at once, at most 2^31"
+                " are served; ask for fewer samples, or crop the target"
+            )
         self.sampler.seed(seed, lanes)
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, samples)
         corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in self._tables)

@@ -66,8 +66,8 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
     """
     if camera.tolerance is None:
         return ideal_matrix(camera)
-    if any(camera.blurs(kind) for kind in camera.types):
-        raise InputError("misaligned lenses with defocus or diffraction have no closed form; calibrate by transport")
+    if not camera.stays_sharp:
+        raise InputError("misaligned lenses with surfaces, defocus or diffraction have no closed form; calibrate them")
     from scenes import footprints
 
     return footprints.matrix(camera, poses(camera))

@@ -52,7 +52,7 @@ def ideal_camera(camera: Camera, finer: int = 1) -> Camera:
     whole = LensType(
         "truth", Fraction(1, finer), (1, 1), (camera.rows * finer, camera.columns * finer), Fraction(1), (0, 0)
     )
-    return replace(camera, types=(whole,), wavelength=None, tolerance=None)
+    return replace(camera, types=(whole,), wavelength=None, tolerance=None, across=None)
 
 
 def truth(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Truth:

@@ -20,6 +20,7 @@ import numpy as np
 from scenes.errors import InputError
 from scenes.scene import Scene
 
+from .stock import BLOCK
 from .variant import activate
 
 TARGET = "ommatid_target"  # the rectangle's name in the world: a name that its file will not have given
@@ -115,17 +116,11 @@ def stage(scene: Scene, variant: str, target: Any | None) -> Staged:
         raise InputError(f"{where} has no emitter, so all is black; add one, such as <emitter type='constant'/>")
     if not followed:
         straight = not (scene.render.complete or bounces(built))
-        path = {"type": "path", "max_depth": 1 if straight else DEEPEST, "block_size": _block()}
+        path = {"type": "path", "max_depth": 1 if straight else DEEPEST, "block_size": BLOCK}
         return Staged(built, mi.load_dict(path), straight)
     if not isinstance(built.integrator(), mi.SamplingIntegrator):
         raise InputError(f"{where}: its integrator does not follow rays from a camera; expected one such as 'path'")
     return Staged(built, built.integrator())
-
-
-def _block() -> int:
-    from .rig import BLOCK
-
-    return BLOCK
 
 
 def _adapt(state: Any, folder: Path) -> bool:
@@ -148,7 +143,7 @@ def _adapt(state: Any, folder: Path) -> bool:
             if beside.is_file():
                 props["filename"] = str(beside)
         if node.type == mi.ObjectType.Integrator and props.plugin_name() != BACKWARDS:
-            props["block_size"] = _block()
+            props["block_size"] = BLOCK
     return followed
 
 

@@ -12,9 +12,12 @@ from reconstruct.noise import usable_pixels
 from reconstruct.restore import restore
 from scenes import stack as stacks
 from scenes.camera import derive
+from scenes.errors import InputError
 from scenes.picture import load
 from scenes.scene import Scene, parse
 from simulate.calibrate import calibrate
+from simulate.export import export
+from simulate.ideal import ideal_matrix
 from simulate.render import render
 from simulate.response import response
 
@@ -101,3 +104,36 @@ def test_what_a_lens_type_collects_is_what_the_rendering_shows() -> None:
     # A smaller magnification gathers more: the same f-number for all types, so the same light on a pixel.
     means = [freed[place].mean() for place in camera.type_slices()]
     assert max(means) / min(means) == pytest.approx(1, abs=0.05)
+
+
+def test_what_has_no_closed_form_is_calibrated_all_the_same() -> None:
+    """Distortion with defocus: H is there, only nothing to compare it with; and points see it as transport does."""
+    needs("llvm_ad_mono")
+    lens = {"aperture": "0.4 mm", "focus": "700 mm", "distortion": [0.05, 0.0]}
+    described = built(lens, (("1/3", [2, 2], [3, 3]),), (12, 12), noise={"variance": 1e-2})
+    model = calibrate(described, derive(described))
+    assert "agreement" not in model.record
+    assert model.matrix.sum(axis=1).max() == pytest.approx(1)
+
+
+def test_lens_types_that_are_left_out_leave_the_others_where_they_are() -> None:
+    """And a model of a camera that was made without them is not taken for theirs."""
+    described = built({"distortion": [0.05, 0.0]})
+    camera = derive(described)
+    some, kept = camera.restrict(("B",))
+    assert [sub.lens for sub in some.sub_imagers] == [sub.lens for sub in camera.sub_imagers if sub.type.name == "B"]
+    assert abs(ideal_matrix(some) - ideal_matrix(camera)[kept]).max() == 0
+    alone = derive(
+        described.model_copy(
+            update={"camera": described.camera.model_copy(update={"lens": described.camera.lens[1:2]})}
+        )
+    )
+    assert alone.describe() != some.describe()
+    pinholes = derive(scene(lenses=THREE))
+    assert pinholes.restrict(("B",))[0].describe() == derive(scene(lenses=THREE)).restrict(("B",))[0].describe()
+
+
+def test_more_than_pinholes_cannot_be_exported(tmp_path: Path) -> None:
+    described = built({"aperture": "0.4 mm"})
+    with pytest.raises(InputError, match="cannot be exported"):
+        export(described, derive(described), load(described), tmp_path / "lens.xml")

@@ -105,6 +105,7 @@ def test_what_matters_stays() -> None:
         ({"aperture": "0.4 mm", "focus": "970 mm"}, {}, {}),
         ({"aperture": "0.4 mm", "focus": "800 mm"}, {}, NOISY),
         ({"aperture": "0.4 mm"}, {"wavelength": "550 nm"}, NOISY),
+        ({"aperture": "0.4 mm"}, {"tolerance": {"focal_length": 0.01}}, NOISY),
     )
     for lens, more, tables in cases:
         described, camera = built(lens, more, TWO, **tables)

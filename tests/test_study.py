@@ -94,6 +94,38 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(how: str) -> None:
         restore(*recorded(large))
 
 
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"method": "tiles"}, "takes a dense form, got estimator.method 'tiles'"),
+        ({"memory": "1 MB"}, "are allowed; raise estimator.memory"),
+    ],
+)
+def test_other_keys_of_the_estimator_still_count(told: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        restore(*recorded(misaligned(estimator={"misalignment": "robust", **told})))
+
+
+def test_a_calibrated_h_is_not_thrown_away_in_silence() -> None:
+    stack, model, truth = recorded(misaligned("fit"))
+    calibrated = replace(model, record={**model.record, "method": "points"})
+    with pytest.raises(InputError, match="begins with H as designed, got a calibrated one"):
+        restore(stack, calibrated, truth)
+
+
+def test_a_study_that_cannot_end_does_not_begin() -> None:
+    for models, lens, words in (
+        (["ideal", "fitted"], {"aperture": "0.4 mm", "focus": "600 mm"}, "serves pinholes and thin lenses in focus"),
+        (["ideal", "true"], {"aperture": "0.4 mm", "focus": "600 mm"}, "the 'true' H of misaligned lenses"),
+    ):
+        data = misaligned().plain()
+        data["camera"]["lens"][0] |= lens
+        data["study"] = {"models": models}
+        described = parse(data, Path("test.toml"))
+        with pytest.raises(InputError, match=words):
+            study.refuse(described, derive(described))
+
+
 def test_a_study_is_kept_and_told(tmp_path: Path) -> None:
     stack, model, truth = recorded(misaligned())
     made: list[str] = []

@@ -22,6 +22,7 @@ from .test_ommatid import document
 
 NOISE = 0.1
 DRAWS = 300
+ALL = np.ones(1000, dtype=np.bool_)
 
 
 def drawn_to(position: str, seed: int = 0) -> Camera:
@@ -35,7 +36,7 @@ def test_it_is_the_mean_error_over_cameras_and_images(smooth: bool) -> None:
     paper = exponential(127.5, 5461.25, (12, 12), 6.0) if smooth else independent(127.5, 5461.25, 144)
     matrix = ideal_matrix(camera)
     form, _ = factorise(Problem(matrix, paper, np.full(camera.measurements, NOISE)), "auto", 1e-8)
-    added = float(cost(form, camera, paper).mean())
+    added = float(cost(form, ALL[: camera.measurements], camera, paper).mean())
     rng = np.random.default_rng(0)
     more: list[float] = []
     for seed in range(DRAWS):
@@ -54,7 +55,7 @@ def test_half_the_tolerance_costs_less_and_none_nothing() -> None:
     for position in ("80 nm", "40 nm", "1e-6 nm"):
         camera, prior = drawn_to(position), independent(127.5, 5461.25, 144)
         form, _ = factorise(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, NOISE)), "auto", 1e-8)
-        costs.append(float(cost(form, camera, prior).mean()))
+        costs.append(float(cost(form, ALL[: camera.measurements], camera, prior).mean()))
     assert 2 < costs[0] / costs[1] < 4.5, "squares, less what kinks make of them"
     assert costs[2] < 1e-6
 
@@ -74,3 +75,19 @@ def test_predict_says_it(tmp_path: Path, ommatid: Command, monkeypatch: pytest.M
     ended = ommatid("predict", *tile, *robust[:2], "--set", "estimator.misalignment=fit")
     assert ended.code == 2
     assert "recorded stack" in ended.err
+
+
+def test_predict_where_some_pixels_tell_nothing_or_nothing_is_known(ommatid: Command) -> None:
+    """Full pixels are left out of both; what has no closed form is said, not left out in silence."""
+    loose = ("--set", 'camera.tolerance.position="10 nm"')
+    aperture = [part for name in ["I", "II", "III"] for part in ("--set", f'camera.lens.{name}.aperture="0.4 mm"')]
+    sensor = ("--set", "noise=", "--set", 'sensor.illuminance="500 lux"', "--set", 'sensor.exposure="10 ms"')
+    bright = document(ommatid("predict", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
+    assert bright["measurements"] < 706
+    assert bright["misalignment"] > 0
+    lens = ommatid("predict", GALLERY / "doublet.toml", *loose)
+    assert lens.code == 0
+    assert "not in these numbers" in lens.out
+    assert "not in these numbers" not in ommatid("predict", GALLERY / "tile19.toml", *loose).out
+    ranked = document(ommatid("design", GALLERY / "tile19.toml", *aperture, *sensor, "--candidates", "1/2", "--json"))
+    assert ranked["candidates"][0]["expected"] is not None, "the added type has the aperture of the others"

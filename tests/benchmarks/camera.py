@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scenes.camera import Camera, derive
 from scenes.picture import load
 from scenes.scene import read
-from simulate.rig import Rig, film, scene_of, stock_sensor, target_of, texture_of
+from simulate.rig import Rig
+from simulate.stock import film, scene_of, stock_sensor, target_of, texture_of
 
 from .alternation import Row, alternate
 

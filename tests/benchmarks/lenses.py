@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scenes.camera import Camera, derive
 from scenes.scene import Scene, parse, read
 from simulate.points import from_points
-from simulate.rig import Rig, film, scene_of, target_of, texture_of
+from simulate.rig import Rig
+from simulate.stock import film, scene_of, target_of, texture_of
 from simulate.transport import from_transport
 
 from .alternation import Row, alternate

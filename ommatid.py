@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from scenes.errors import DeniedError, InputError
+from scenes.errors import DeniedError, InputError, naming
 
 if TYPE_CHECKING:
     from reconstruct.accuracy import Prediction
@@ -151,17 +151,18 @@ def render(
 
 def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
+    from reconstruct import study
     from reconstruct.choice import choose
     from reconstruct.report import write_run
     from reconstruct.results import RUN, kept_results
     from simulate.kept import kept_model
+    from simulate.refuse import refuse
 
     exact = scene.calibration.method == "ideal" and camera.boxed
+    refuse(scene, camera)
     choose(scene, camera, exact)  # what memory does not hold is refused before any work
     if scene.study is not None:
-        from reconstruct.study import refuse
-
-        refuse(scene, camera)
+        study.refuse(scene, camera)
     stack = _rendered(scene, camera, image, folder, watch)
     with watch.progress("calibrate") as progress:
         model, made = kept_model(folder / "model.npz", scene, camera, progress)
@@ -244,6 +245,7 @@ def calibrate(
     from scenes.files import refuse_output
     from scenes.scene import read
     from simulate.kept import kept_model
+    from simulate.refuse import refuse
 
     refuse_output(output, scene)
     described = read(scene, sets or (), _names(lens))
@@ -256,7 +258,9 @@ def calibrate(
     elif more or places or dark or flat or origin:
         raise InputError("calibrate: images, --places, --dark, --flat and --origin belong to --points; name its images")
     else:
-        with _progress("calibrate") as progress:
+        if described.calibration.method != "ideal":
+            refuse(described, camera)
+        with naming(scene), _progress("calibrate") as progress:
             model, made = kept_model(output, described, camera, progress)
     _say(f"calibrate: {_done(made)}, {output}")
     if as_json:
@@ -375,7 +379,8 @@ def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Jso
     from scenes.scene import read
 
     described = read(scene, sets or (), _names(lens))
-    prediction, light = _predicted(described), _light(described, derive(described))
+    with naming(scene):
+        prediction, light = _predicted(described), _light(described, derive(described))
     if as_json:
         _print_json(prediction.describe() | ({} if light is None else {"light": light}))
         return
@@ -483,7 +488,8 @@ def show(
     described = read(scene, sets or (), _names(lens))
     camera = derive(described)
     choice = choose_way(described, camera, described.calibration.method == "ideal" and camera.boxed)
-    optics, light = _optics(camera), _light(described, camera)
+    with naming(scene):
+        optics, light = _optics(camera), _light(described, camera)
     description = describe(described, camera, choose(described.render.variant), choice.plan(), optics, light)
     if as_json:
         _print_json(description)
@@ -755,9 +761,9 @@ def _foreseen_noise(scene: Scene, camera: Camera) -> Any:
 def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> Stack:
     from scenes.batch import prepare
     from simulate.kept import kept_stack
-    from simulate.variant import choose
+    from simulate.refuse import refuse
 
-    choose(scene.render.variant)
+    refuse(scene, camera, calibrates=False)
     prepare(scene, image, folder)
     with watch.progress("render") as progress:
         stack, made = kept_stack(folder / "stack.exr", scene, camera, image, progress)

@@ -114,7 +114,7 @@ def draw_distortion(path: Path, shown: list[Tile], noise: float) -> None:
         _axes(panel, f"{tile.name}\naverage {error.mean():.3g}", "column (target pixels)", "row (target pixels)")
         panel.grid(visible=False)
         bar = figure.colorbar(drawn, ax=panel, fraction=0.046, pad=0.03)
-        bar.set_label("expected squared error (squared units of f)")
+        bar.set_label("expected squared error")
     figure.suptitle(f"Distortion as lens diversity; maps: expected squared error at noise variance {_power(noise)}")
     _save(figure, path)
 

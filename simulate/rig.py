@@ -21,7 +21,7 @@ from scenes.lens_type import LensType
 from scenes.scene import Scene
 
 from .stock import BLOCK, scene_of, stock_sensor, target_of, texture_of
-from .variant import activate, remedy
+from .variant import activate, refuse_slow
 
 if TYPE_CHECKING:
     from .eye import Eye
@@ -213,9 +213,3 @@ class Rig:
                 return slice(start, start + sum(member.measurements for member in self.groups[group]))
             start += kind.measurements
         raise KeyError(group)
-
-
-def refuse_slow(camera: Camera, variant: str) -> None:
-    """Raise InputError where a camera is more than a set of pinholes and the backend is the slow one."""
-    if variant.startswith("scalar") and not camera.perfect:
-        raise InputError(f"lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}")

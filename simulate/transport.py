@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from scenes.camera import Camera
-from scenes.errors import InputError
 from scenes.progress import Progress, no_progress
 from scenes.scene import Scene
 
 from .passes import BATCHES, Plan, plan
 from .points import Part, Responses, responses_of
 from .streams import sampler_seeds
-from .variant import choose, remedy
+from .variant import choose, refuse_slow_transport
 
 if TYPE_CHECKING:
     from .rig import Rig
@@ -40,10 +39,7 @@ def from_transport(scene: Scene, camera: Camera, progress: Progress = no_progres
     from .rig import Rig
 
     variant = choose(scene.render.variant)
-    if variant.startswith("scalar"):
-        raise InputError(
-            f"{scene.source}: calibration.method 'transport' needs Mitsuba's fast backend, got {variant}; {remedy()}"
-        )
+    refuse_slow_transport(variant)
     work = plan(scene.calibration.samples)
     rig = Rig(camera, variant, scene.render.sampler, together=False)
     parts: list[Part] = []

@@ -13,9 +13,12 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from scenes.errors import InputError
+
+if TYPE_CHECKING:
+    from scenes.camera import Camera
 
 OLDEST_LLVM = (17, 0, 0)
 PATIENCE = 120  # seconds
@@ -84,6 +87,18 @@ def choose(requested: str) -> str:
     if reason:
         raise InputError(f"render.variant: expected one that works here, got '{requested}': {reason}; {remedy()}")
     return requested
+
+
+def refuse_slow(camera: Camera, variant: str) -> None:
+    """Raise InputError where a camera is more than a set of pinholes and the backend is the slow one."""
+    if variant.startswith("scalar") and not camera.perfect:
+        raise InputError(f"lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}")
+
+
+def refuse_slow_transport(variant: str) -> None:
+    """Raise InputError where calibration by transport is asked of the slow backend."""
+    if variant.startswith("scalar"):
+        raise InputError(f"calibration.method 'transport' needs Mitsuba's fast backend, got {variant}; {remedy()}")
 
 
 def activate(variant: str) -> None:

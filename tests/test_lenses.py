@@ -21,6 +21,7 @@ from simulate.ideal import ideal_matrix
 from simulate.render import render
 from simulate.response import response
 
+from .conftest import Command
 from .examples import THREE, Lenses, needs, scene
 
 BIPLANE = [
@@ -137,3 +138,29 @@ def test_more_than_pinholes_cannot_be_exported(tmp_path: Path) -> None:
     described = built({"aperture": "0.4 mm"})
     with pytest.raises(InputError, match="cannot be exported"):
         export(described, derive(described), load(described), tmp_path / "lens.xml")
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (
+            'camera.lens.I.surfaces=[{radius="-1 mm", thickness="0.1 mm", index=1.5, semi_diameter="0.1 mm"}, '
+            '{semi_diameter="0.1 mm"}]',
+            "expected a lens that collects light",
+        ),
+        ("camera.lens.I.distortion=[-0.9, 0]", "folds"),
+        ("calibration.method=transport", "needs Mitsuba's fast backend"),
+        ('camera.tolerance.rotation="1 deg"', "need Mitsuba's fast backend"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_there_is_a_file(
+    told: str, words: str, here: Path, ommatid: Command
+) -> None:
+    """The tiny scene renders on the slow backend. One sentence, which names the scene file."""
+    for command in (("run", "tiny.toml", "-o", "out"), ("calibrate", "tiny.toml", "-o", "h.npz")):
+        ended = ommatid(*command, "--set", told)
+        assert ended.code == 2
+        assert words in ended.err
+        assert "tiny.toml" in ended.err
+        assert len(ended.err.strip().splitlines()) == 1
+    assert [path.name for path in here.iterdir()] == ["tiny.toml"]

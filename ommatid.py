@@ -157,9 +157,14 @@ def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watc
     from reconstruct.results import RUN, kept_results
     from simulate.kept import kept_model
     from simulate.refuse import refuse
+    from simulate.variant import choose as choose_variant
+    from simulate.variant import refuse_slow_transport
 
     exact = scene.calibration.method == "ideal" and camera.boxed
     refuse(scene, camera)
+    if scene.study is not None and "transport" in scene.study.models:
+        with naming(scene.source):
+            refuse_slow_transport(choose_variant(scene.render.variant), "study.models")
     choose(scene, camera, exact)  # what memory does not hold is refused before any work
     if scene.study is not None:
         study.refuse(scene, camera)

@@ -206,7 +206,7 @@ def _misalignment_rows(prediction: Prediction) -> list[tuple[str, str]]:
 
 def _rank_rows(prediction: Prediction) -> list[tuple[str, str]]:
     if prediction.rank is None or prediction.condition is None:
-        return [("rank of H", "not computed for a frame of this size")]
+        return [("rank of H", "not computed for a frame, nor where misalignment counts as noise")]
     return [
         ("rank of H", str(prediction.rank)),
         ("null space", f"{prediction.null_space} dimensions"),

@@ -79,6 +79,8 @@ class Lens(Table):
             for name in ("aperture", "distortion"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} belongs to a thin lens; the surfaces of a real one say it, got both")
+            if self.focus is not None and isinstance(self.scale, float | int):
+                raise ValueError('a scale of surfaces says already what is sharp; take scale "fit", got focus too')
         elif self.scale is not None:
             raise ValueError("scale belongs to surfaces, got none")
         if self.focus is not None and self.aperture is None and self.surfaces is None:

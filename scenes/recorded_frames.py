@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ Grid = NDArray[np.float64]
 KINDS = (".png", ".tif", ".tiff", ".exr", ".npy")
 TIE = 1e-6  # sensor pixels by which a place half way between two pixels may be computed wrongly
 DARK, FLAT = "dark frames", "flat frames"
-COLOURS = 4  # channels of a picture, at most: more are pages of a TIFF
+TIFF = (".tif", ".tiff")
+COLOURS = 4  # channels of a picture, at most: more are pictures one after the other
 
 
 @dataclass(frozen=True)
@@ -181,12 +182,28 @@ def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
         raise InputError(f"{path}: expected {what} as PNG, TIFF, EXR or NPY files, whose numbers are the sensor's")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file among the {what}")
+    pages = _pages(path) if path.suffix.lower() in TIFF else []
+    if pages:
+        return pages
     pixels = decode(path, what)
-    several = pixels.ndim == 3 and (path.suffix.lower() == ".npy" or pixels.shape[2] > COLOURS)
+    # A last axis of up to four is one of colours; a sensor has more columns.
+    several = pixels.ndim == 3 and pixels.shape[2] > COLOURS
     pictures = list(pixels) if several else [pixels]
     if not pictures or pixels.dtype.kind not in "uif":
         raise InputError(f"{path}: expected whole or floating-point numbers, got {pixels.dtype}, {pixels.shape}")
     return pictures
+
+
+def _pages(path: Path) -> list[NDArray[Any]]:
+    """The pages of a TIFF that has several, whoever wrote it; else none, and it is read as any picture."""
+    import tifffile
+
+    try:
+        with cast(Any, tifffile).TiffFile(path) as file:
+            pages = [page.asarray() for page in file.pages] if len(file.pages) > 1 else []
+    except Exception:  # the library has kinds of its own; what is damaged is said where single pictures are read
+        return []
+    return pages if all(page.dtype.kind in "uif" for page in pages) else []
 
 
 def patches(camera: Camera) -> Grid:

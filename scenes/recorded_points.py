@@ -32,6 +32,7 @@ Vector = NDArray[np.float64]
 Grid = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
+UNLIKE_ONE = 0.2  # by which rows of H may miss the sum of 1 before it is said
 MARGIN = 2.0  # pixels of f around an ideal footprint
 CHANCE = 0.01  # that anything beyond all footprints is taken for light when all of it is noise
 UNKNOWN = 1.0  # variance of an entry whose sensor pixel told nothing: it is a share, so anything up to 1
@@ -89,10 +90,16 @@ def from_recorded_points(
     """
     start = perf_counter()
     frames = read_frames(camera, images, bench, mosaics=True)
+    if scene.sensor is not None and (frames.dark is None or frames.flat is None):
+        raise InputError(
+            f"{scene.source}: a [sensor] has dark and flat frames, by which points too are told; give them with --dark"
+            " and --flat, or remove [sensor]"
+        )
     shown = swept(camera, frames.files) if places is None else read_places(places, camera, frames.files)
     readings = _readings(scene, frames, value)
     known, beyond, stray = _sorted_out(camera, shown, frames.files, readings)
     _refuse_unseen(camera, shown, places)
+    _refuse_several(camera, shown, places)
     step = np.nan_to_num(frames.scale / value)
     photons = step * (0.0 if scene.sensor is None else scene.sensor.gain)
     variance = _variance(camera, known, beyond, step if frames.whole else 0.0 * step, photons)
@@ -124,9 +131,25 @@ def _refuse_unseen(camera: Camera, shown: list[Whole], places: Path | None) -> N
         )
 
 
+def _refuse_several(camera: Camera, shown: list[Whole], places: Path | None) -> None:
+    """Where footprints are not those of pinholes, sources that shine together cannot be told apart by them."""
+    if not (camera.boxed and camera.stays_sharp) and any(len(one) > 1 for one in shown):
+        raise InputError(
+            f"{places}: several points in an image are told apart by the footprints of pinholes, which this camera's"
+            " lenses do not have; record one point an image"
+        )
+
+
 def warnings(calibrated: Calibrated) -> list[str]:
     """What the user should know, a sentence each."""
     said: list[str] = []
+    sums = np.asarray(calibrated.model.matrix.sum(axis=1)).ravel()
+    whole = float(np.median(sums[sums > 0])) if (sums > 0).any() else 0.0
+    if abs(whole - 1) > UNLIKE_ONE:
+        said.append(
+            f"all points together give a sensor pixel {whole:.3g} of the value of one, expected about 1: look at"
+            " --point-value, and take dark and flat frames with --dark and --flat"
+        )
     if calibrated.once:
         said.append(
             "every point was recorded once, so that the variance of H holds the noise of the dark and not that of"

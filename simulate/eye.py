@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.camera import Camera
-from scenes.errors import InputError
 from scenes.lens_type import LensType
 from scenes.pose import corner_offset, poses
 
 from .lens import Lens, ThinLens
 
-MOST_LANES = 2**31
+MOST_RAYS = 2**24  # that start together: some hundred bytes each
 
 
 @dataclass(frozen=True)
@@ -63,22 +62,22 @@ class Eye:
         """Whether every ray stands for the same light."""
         return not self.lens.weighs
 
-    def rays(self, samples: int, seed: int) -> Rays:
-        """`samples` rays of each pixel, in the order of pixels; the sampler stays ready for what they meet."""
+    def blocks(self, samples: int) -> list[slice]:
+        """Its pixels, in their order, in blocks whose rays start together and fit into memory."""
+        several = max(1, MOST_RAYS // samples)
+        return [slice(first, min(first + several, self.pixels)) for first in range(0, self.pixels, several)]
+
+    def rays(self, samples: int, seed: int, block: slice) -> Rays:
+        """`samples` rays of each pixel of a block; the sampler stays ready for what they meet."""
         import drjit as dr
         import mitsuba as mi
 
         self.sampler.set_sample_count(samples)
         samples = self.sampler.sample_count()
         self.sampler.set_samples_per_wavefront(samples)
-        lanes = self.pixels * samples
-        if lanes >= MOST_LANES:
-            raise InputError(
-                f"{self.pixels} sensor pixels with {samples} samples in one pass are {lanes} rays at once, at most 2^31"
-                " are served; ask for fewer samples, or crop the target"
-            )
-        self.sampler.seed(seed, lanes)
-        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, samples)
+        lanes = (block.stop - block.start) * samples
+        self.sampler.seed(_seed_of(seed, block), lanes)
+        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, samples) + dr.opaque(mi.UInt32, block.start)
         corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in self._tables)
         at = self.sampler.next_2d() * self._pitch
         if axes:
@@ -93,6 +92,11 @@ class Eye:
         ray.d = dr.normalize(mi.Vector3f(*way))
         ray.maxt = dr.largest(mi.Float)
         return Rays(ray, weight, samples)
+
+
+def _seed_of(seed: int, block: slice) -> int:
+    """Of a block: the first has the seed itself, the others what it makes of where they begin."""
+    return seed if block.start == 0 else int(np.random.SeedSequence([seed, block.start]).generate_state(1)[0])
 
 
 def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[NDArray[np.float64]]:

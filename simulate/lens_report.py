@@ -34,7 +34,8 @@ def describe(camera: Camera) -> list[dict[str, Any]]:
     lens : its name;  focal_length, f_number;  working_f_number : of the cone of light at the sensor
     airy_diameter : of the first dark ring on the sensor;  airy_pixels : in sensor pixels
     near, far : between which a target is blurred over less than a sensor pixel; no depth of field: both None
-    spot_axis, spot_corner : root mean square radius on the sensor, on the axis and at the farthest sensor point
+    spot_axis, spot_corner : root mean square radius on the sensor, on the axis and at the farthest sensor point, None
+        where no light arrives
     focus, sharpest : the distance that paraxial rays show sharp, and the one with the smallest spot on the axis
     """
     kinds = [kind for kind in camera.types if kind.glass.aperture is not None or kind.glass.surfaces is not None]
@@ -47,8 +48,8 @@ def words(found: dict[str, Any]) -> str:
     def mm(value: float | None) -> str:
         return "infinity" if value is None else f"{value:.4g} mm"
 
-    def um(value: float) -> str:
-        return f"{value * 1e3:.3g} um"
+    def um(value: float | None) -> str:
+        return "no light" if value is None else f"{value * 1e3:.3g} um"
 
     sharp = f"sharp from {mm(found['near'])} to {mm(found['far'])}"
     if found["near"] is None:
@@ -106,8 +107,8 @@ def _real(camera: Camera, kind: LensType) -> dict[str, Any]:
         "f_number": lens.f_number,
         **_diffraction(camera, lens.working_f_number(depth)),
         **_range(depth_of_field(depth, vergence, 2 * entrance.radius, camera.pixel_pitch, before)),
-        "spot_axis": _spot(*axis, camera.distance) * depth / camera.distance,
-        "spot_corner": _spot(*corner, camera.distance) * depth / camera.distance,
+        "spot_axis": _on_sensor(_spot(*axis, camera.distance), depth / camera.distance),
+        "spot_corner": _on_sensor(_spot(*corner, camera.distance), depth / camera.distance),
         "focus": 1 / vergence if vergence > 0 else None,
         "sharpest": _sharpest(*axis),
     }
@@ -126,7 +127,8 @@ def _bundle(camera: Camera, kind: LensType, lens: Prescription, height: float) -
     """Where the rays of a sensor point cross the plane of the lenses, (2, rays), their slopes and their weights."""
     numbers = path(lens, exit_disk_of(camera, kind, lens))
     (x, y), (u, v, w), weight = trace(numbers, 0.0, height, *spread(RAYS), camera.depth(kind))
-    return np.array([x, y]), np.array([u / w, v / w]), weight / weight.sum()
+    brought = float(weight.sum())
+    return np.array([x, y]), np.array([u / w, v / w]), weight / brought if brought > 0 else weight
 
 
 def _moment(one: Array, other: Array, weight: Array) -> float:
@@ -134,13 +136,21 @@ def _moment(one: Array, other: Array, weight: Array) -> float:
     return float(np.sum(weight * (one - means[0]) * (other - means[1])))
 
 
-def _spot(places: Array, slopes: Array, weight: Array, distance: float) -> float:
-    """Root mean square radius about the centre, on a target at a distance."""
+def _spot(places: Array, slopes: Array, weight: Array, distance: float) -> float | None:
+    """Root mean square radius about the centre, on a target at a distance; None where no light arrives."""
+    if not weight.any():
+        return None
     landed = places + distance * slopes
     return sqrt(_moment(landed, landed, weight))
 
 
+def _on_sensor(spot: float | None, shrink: float) -> float | None:
+    return None if spot is None else spot * shrink
+
+
 def _sharpest(places: Array, slopes: Array, weight: Array) -> float | None:
     """The distance z with the smallest spot over z: the spot's square over z^2 is a parabola in 1 / z."""
+    if not weight.any():
+        return None
     vergence = -_moment(places, slopes, weight) / _moment(places, places, weight)
     return 1 / vergence if vergence > 0 else None

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from .rig import Rig
 
 MARGIN = Fraction(1, 1024)  # pixels of f by which rays may land beside a footprint: far more than they are rounded
-SCOUTS = 1024  # rays a pixel that are sent ahead,
-MOST_RAYS, FEWEST = 2**22, 16  # about so many at once, and at least so many a pixel
+SCOUTS = 1024  # rays a pixel that are sent ahead
 BESIDE = 2  # pixels of f by which others may land beside those
 
 
@@ -60,15 +59,14 @@ def of_pinholes(camera: Camera, kind: LensType) -> Reach:
 def _scouted(rig: Rig, group: str) -> Reach:
     camera = rig.camera
     sizes, (kind,) = (camera.rows, camera.columns), rig.groups[group]
-    several = int(np.clip(MOST_RAYS // kind.measurements, FEWEST, SCOUTS))
     first = [np.full(kind.measurements, size) for size in sizes]
     last = [np.full(kind.measurements, -1) for _ in sizes]
-    for number in range(ceil(SCOUTS / several)):
-        texels, _ = rig.hits(group, several, lambda _, number=number: number)  # bounds: not used for anything else
+    for block in rig.blocks(group, SCOUTS):
+        texels, _ = rig.hits(group, SCOUTS, lambda place: place, block)  # bounds: not used for anything else
         seen = texels >= 0
         for axis, places in enumerate(np.divmod(texels, camera.columns)):
-            first[axis] = np.minimum(first[axis], np.where(seen, places, sizes[axis]).min(axis=1))
-            last[axis] = np.maximum(last[axis], np.where(seen, places, -1).max(axis=1))
+            first[axis][block] = np.where(seen, places, sizes[axis]).min(axis=1)
+            last[axis][block] = np.where(seen, places, -1).max(axis=1)
     beside = BESIDE + ceil(rig.tail(group))
     ends = [
         (np.clip(low - beside, 0, size - 1), np.clip(high + beside, 0, size - 1))

@@ -19,8 +19,7 @@ def refuse(scene: Scene, camera: Camera, calibrates: bool = True) -> None:
         variant = choose(scene.render.variant)
         refuse_lenses(camera)
         refuse_slow(needed(scene, camera)[0], variant)
-        models = scene.study.models if scene.study is not None else ()
-        if calibrates and "transport" in (scene.calibration.method, *models):
+        if calibrates and scene.calibration.method == "transport":
             refuse_slow_transport(variant)
 
 

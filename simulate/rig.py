@@ -24,7 +24,7 @@ from .stock import BLOCK, scene_of, stock_sensor, target_of, texture_of
 from .variant import activate, refuse_slow
 
 if TYPE_CHECKING:
-    from .eye import Eye
+    from .eye import Eye, Rays
 
 EXACT_SUMS = 2**22, 2**50  # whole numbers below come out of float32 sums, and of float64 ones, with less than 1/4 lost
 MOST_TEXELS = 2**24  # that float32 can number
@@ -114,19 +114,29 @@ class Rig:
         import mitsuba as mi
 
         if self._eyes:
-            rays = self._eyes[group].rays(samples, seed(list(self.groups).index(group)))
-            light = self._follow(group, rays.ray)
-            if rays.weight is None:
-                return rays.sums(light)[0][None] / rays.samples / self._unit
-            brought, reach = rays.sums(light * rays.weight, rays.weight)
-            unseen = np.full(reach.size, np.nan)
-            return np.divide(brought, reach * self._unit, out=unseen, where=reach > 0)[None]
+            blocks = self.blocks(group, samples)
+            return np.concatenate([self._seen(group, self._rays(group, samples, seed, one)) for one in blocks])[None]
         images: list[NDArray[np.float64]] = []
         for place, sensor in self._sensors[group].items():
             choices: Any = {"sensor": sensor, "integrator": self._integrator, "spp": samples, "seed": seed(place)}
             rendered: Any = mi.render(self._scene, **choices)
             images.append(np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1))
         return np.concatenate(images, axis=1) / self._unit
+
+    def blocks(self, group: str, samples: int) -> list[slice]:
+        """The pixels of a group whose rays start together, block by block. Only on the fast backends."""
+        return self._eyes[group].blocks(samples)
+
+    def _rays(self, group: str, samples: int, seed: Callable[[int], int], block: slice) -> Rays:
+        return self._eyes[group].rays(samples, seed(list(self.groups).index(group)), block)
+
+    def _seen(self, group: str, rays: Rays) -> NDArray[np.float64]:
+        """What the pixels of these rays read: (pixels of the block,)."""
+        light = self._follow(group, rays.ray)
+        if rays.weight is None:
+            return rays.sums(light)[0] / rays.samples / self._unit
+        brought, reach = rays.sums(light * rays.weight, rays.weight)
+        return np.divide(brought, reach * self._unit, out=np.full(reach.size, np.nan), where=reach > 0)
 
     def depths(self, eye: Camera, seed: int) -> NDArray[np.float64]:
         """Distance along z of what a pinhole camera's only sub-imager sees at a point of each pixel, (pixels,).
@@ -144,9 +154,9 @@ class Rig:
         return np.where(z > 0, z, np.inf)
 
     def hits(
-        self, group: str, samples: int, seed: Callable[[int], int]
+        self, group: str, samples: int, seed: Callable[[int], int], block: slice
     ) -> tuple[NDArray[np.int64], NDArray[np.float64] | None]:
-        """Which pixel of f each ray of a group's pixels meets, (pixels, samples), -1 beside the target; and its weight.
+        """Which pixel of f each ray of a block's pixels meets, (pixels, samples), -1 beside the target; and its weight.
 
         The rays are those of `expose` with the same samples and seed. Only on the fast backends.
         """
@@ -155,7 +165,7 @@ class Rig:
         if self.camera.unknowns >= MOST_TEXELS:
             raise InputError(f"a target of {self.camera.unknowns} pixels: rays are told apart on at most 2^24")
         self.show(np.arange(1.0, self.camera.unknowns + 1).reshape(self.camera.rows, self.camera.columns))
-        rays = self._eyes[group].rays(samples, seed(list(self.groups).index(group)))
+        rays = self._rays(group, samples, seed, block)
         met = self._scene.ray_intersect(rays.ray)
         shining = met.emitter(self._scene).eval(met, met.is_valid()).x
         dr.eval(shining, rays.weight)
@@ -165,9 +175,13 @@ class Rig:
 
     def gathered(self, group: str, samples: int, seed: Callable[[int], int]) -> NDArray[np.float64]:
         """Mean weight of each pixel's rays, (pixels,): the light that reaches it from a uniform world, relative."""
-        eye = self._eyes[group]
-        rays = eye.rays(samples, seed(list(self.groups).index(group)))
-        return np.ones(eye.pixels) if rays.weight is None else rays.sums(rays.weight)[0] / rays.samples
+        eye, found = self._eyes[group], list[NDArray[np.float64]]()
+        if eye.even:
+            return np.ones(eye.pixels)
+        for block in self.blocks(group, samples):
+            rays = self._rays(group, samples, seed, block)
+            found.append(rays.sums(rays.weight)[0] / rays.samples)
+        return np.concatenate(found)
 
     def tail(self, group: str) -> float:
         """Pixels of f by which rare rays of a group may land further out than others."""

@@ -43,20 +43,21 @@ def from_transport(scene: Scene, camera: Camera, progress: Progress = no_progres
     work = plan(scene.calibration.samples)
     rig = Rig(camera, variant, scene.render.sampler, together=False)
     parts: list[Part] = []
-    for place, group in enumerate(rig.groups):
+    blocks = [(group, block) for group in rig.groups for block in rig.blocks(group, work.samples)]
+    for place, (group, block) in enumerate(blocks):
         passes: list[Entries] = []
         for number in range(work.passes):
-            passes.append(one_pass(rig, group, work, number, scene.render.seed))
-            progress((place + (number + 1) / work.passes) / len(rig.groups))
-        parts.append(_joined(passes, (rig.groups[group][0].measurements, camera.unknowns)))
+            passes.append(one_pass(rig, group, block, work, number, scene.render.seed))
+            progress((place + (number + 1) / work.passes) / len(blocks))
+        parts.append(_joined(passes, (block.stop - block.start, camera.unknowns)))
     return responses_of(parts, work, variant, scene.render.seed)
 
 
-def one_pass(rig: Rig, group: str, work: Plan, number: int, seed: int) -> Entries:
-    """The entries of H that the rays of one pass make."""
+def one_pass(rig: Rig, group: str, block: slice, work: Plan, number: int, seed: int) -> Entries:
+    """The entries of H, of the pixels of a block, that the rays of one pass make."""
     from .transport_kernels import collected  # pyright: ignore[reportUnknownVariableType]
 
-    texels, weights = rig.hits(group, work.samples, sampler_seeds(seed, "calibration", number, work.passes))
+    texels, weights = rig.hits(group, work.samples, sampler_seeds(seed, "calibration", number, work.passes), block)
     weights = np.ones(texels.shape) if weights is None else weights
     counts, columns, sums = collected(texels, weights)
     pixel = np.repeat(np.arange(counts.size), counts)
@@ -72,24 +73,27 @@ def _joined(passes: list[Entries], shape: tuple[int, int]) -> Part:
     dark = np.logical_or.reduce([one.dark for one in passes])
     if dark.any():
         passes = [_lit(one, ~dark[one.where // shape[1]]) for one in passes]
-    places = np.unique(np.concatenate([one.where for one in passes]))
-    total, squares = np.zeros(places.size), np.zeros(places.size)
+    matrix = sparse.csr_array(shape, dtype=np.float64)
+    for one in passes:
+        matrix = sparse.csr_array(matrix + _matrix(one, shape))
+    matrix.data /= len(passes)
+    mean: NDArray[np.float64] = matrix.data
+    places = np.repeat(np.arange(shape[0]), np.diff(matrix.indptr)) * shape[1] + matrix.indices
+    squares = np.zeros(places.size)
     batches = np.zeros((BATCHES, places.size))
-    spread: list[tuple[NDArray[np.intp], NDArray[np.float64]]] = []
     for number, (where, values, _) in enumerate(passes):
         found = np.searchsorted(places, where)
-        total[found] += values
         batches[number % BATCHES, found] += values * (BATCHES / len(passes))
-        spread.append((found, values))
-    mean = total / len(passes)
-    for found, values in spread:
         away = -mean
         away[found] += values
         squares += np.square(away)
-    pixel, texel = np.divmod(places, shape[1])
-    starts = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=shape[0]))])
-    matrix = sparse.csr_array((mean, texel, starts), shape=shape)
     return matrix, squares / (len(passes) * (len(passes) - 1)), (batches - mean).astype(np.float32)
+
+
+def _matrix(one: Entries, shape: tuple[int, int]) -> sparse.csr_array:
+    pixel, texel = np.divmod(one.where, shape[1])
+    starts = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=shape[0]))])
+    return sparse.csr_array((one.values, texel, starts), shape=shape)
 
 
 def _lit(one: Entries, kept: NDArray[np.bool_]) -> Entries:

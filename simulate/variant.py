@@ -95,10 +95,10 @@ def refuse_slow(camera: Camera, variant: str) -> None:
         raise InputError(f"lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}")
 
 
-def refuse_slow_transport(variant: str) -> None:
-    """Raise InputError where calibration by transport is asked of the slow backend."""
+def refuse_slow_transport(variant: str, key: str = "calibration.method") -> None:
+    """Raise InputError where calibration by transport is asked, by a key, of the slow backend."""
     if variant.startswith("scalar"):
-        raise InputError(f"calibration.method 'transport' needs Mitsuba's fast backend, got {variant}; {remedy()}")
+        raise InputError(f"{key} 'transport' needs Mitsuba's fast backend, got {variant}; {remedy()}")
 
 
 def activate(variant: str) -> None:

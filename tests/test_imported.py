@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from math import floor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,15 +16,17 @@ from numpy.typing import NDArray
 from scipy import sparse, stats
 from skimage import io
 
-from scenes import exr, model, stack
+from scenes import exr, model, recorded_points, stack
 from scenes.camera import Camera, derive
+from scenes.errors import InputError
 from scenes.photon_transfer import background, photon_transfer, rounding
 from scenes.picture import write_truth
-from scenes.recorded_frames import Bench, patches, read_frames
+from scenes.recorded_frames import Bench, patches, pictures_of, read_frames
 from scenes.scene import read
 from simulate.ideal import ideal_matrix, ideal_model
 
 from .conftest import Command
+from .examples import camera as paper_camera
 from .examples import familywise
 
 Array = NDArray[Any]
@@ -639,3 +642,33 @@ def test_lens_types_that_are_left_out_stand_on_the_sensor_nevertheless(bench: Ca
     assert ommatid("import", "scene.toml", "m.npy", "-o", "s.exr", "--lens", "II").code == 0
     expected = values[bench.type_slices()[1]].astype(np.float32)
     np.testing.assert_array_equal(stack.read(Path("s.exr")).values, expected)
+
+
+@pytest.mark.parametrize("pages", [2, 3, 4, 5])
+@pytest.mark.parametrize("contiguous", [True, False])
+def test_every_page_of_a_tiff_is_a_picture(pages: int, contiguous: bool, tmp_path: Path) -> None:
+    """Three or four are no colours, and pages that are series of their own are pages too."""
+    import tifffile
+
+    frames = np.arange(pages * 600, dtype=np.uint16).reshape(pages, 20, 30)
+    with cast(Any, tifffile).TiffWriter(tmp_path / "dark.tif") as file:
+        for frame in frames:
+            file.write(frame, contiguous=contiguous, photometric="minisblack")
+    found = pictures_of(tmp_path / "dark.tif", "dark frames")
+    assert len(found) == pages
+    np.testing.assert_array_equal(np.array(found), frames)
+
+
+def test_a_colour_array_is_one_picture(tmp_path: Path) -> None:
+    np.save(tmp_path / "colour.npy", np.zeros((20, 30, 3), dtype=np.uint8))
+    assert [one.shape for one in pictures_of(tmp_path / "colour.npy", "images")] == [(20, 30, 3)]
+
+
+def test_points_that_shine_together_are_not_told_apart_by_footprints_that_are_not_theirs() -> None:
+    camera = paper_camera()
+    several = [np.array([[0, 0], [9, 9]])]
+    recorded_points._refuse_several(camera, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]
+    glass = replace(camera.types[0].glass, distortion=(0.1, 0.0))
+    bent = replace(camera, types=(replace(camera.types[0], glass=glass),))
+    with pytest.raises(InputError, match="record one point an image"):
+        recorded_points._refuse_several(bent, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]

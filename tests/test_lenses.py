@@ -15,6 +15,7 @@ from scenes.camera import derive
 from scenes.errors import InputError
 from scenes.picture import load
 from scenes.scene import Scene, parse
+from simulate import lens_report
 from simulate.calibrate import calibrate
 from simulate.export import export
 from simulate.ideal import ideal_matrix
@@ -164,3 +165,12 @@ def test_what_cannot_work_is_refused_before_there_is_a_file(
         assert "tiny.toml" in ended.err
         assert len(ended.err.strip().splitlines()) == 1
     assert [path.name for path in here.iterdir()] == ["tiny.toml"]
+
+
+def test_a_corner_without_light_is_said_and_is_no_number() -> None:
+    """JSON has no NaN, and a table no `nan um`."""
+    described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
+    (found,) = lens_report.describe(derive(described))
+    assert found["spot_corner"] is None
+    assert found["spot_axis"] > 0
+    assert "no light at the corner" in lens_report.words(found)

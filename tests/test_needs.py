@@ -78,7 +78,7 @@ def test_it_draws_fewer_random_numbers_and_compiles_no_lens(kind: str) -> None:
         drawn = [0]
         for eye in rig._eyes.values():  # pyright: ignore[reportPrivateUsage]
             eye.sampler = Counting(eye.sampler, drawn)
-            eye.rays(16, 0)
+            eye.rays(16, 0, eye.blocks(16)[0])
         counts.append(drawn[0] // len(rig.groups))
     assert counts[0] == 1, "the place in the pixel and nothing else"
     assert counts[1] == (3 if kind == "hardly diffracting" else 2)

@@ -86,3 +86,26 @@ def test_progress_ends_at_one() -> None:
     from_transport(described, camera, told.append)
     assert told == sorted(told)
     assert told[-1] == pytest.approx(1.0)
+
+
+def test_pixels_in_blocks_give_the_same_picture_with_other_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where memory does not hold all rays at once: transport is still points, and blocks are not alike."""
+    needs("llvm_ad_mono")
+    from simulate import eye
+
+    one = (("1/3", [1, 1], [4, 4]),)
+    tables = {"calibration": {"samples": 64}, "render": {"samples": 4096, "variant": "llvm_ad_mono"}}
+    described, camera = built({}, {}, one, (12, 12), **tables)
+    flat = load(described)
+    flat[:, :6] = flat[:, 6:] = np.arange(12.0)[:, None] * np.ones(6)
+    whole = light(described, camera, flat)
+    monkeypatch.setattr(eye, "MOST_RAYS", 4 * 256)
+    pieces = light(described, camera, flat)
+    assert_student(pieces.mean - whole.mean, pieces.variance + whole.variance, whole.passes)
+    assert (pieces.mean[:4] == whole.mean[:4]).all(), "the first block has the seed itself"
+    assert (pieces.mean[4:] != whole.mean[4:]).any()
+    assert (light(described, camera, flat).mean == pieces.mean).all(), "and all of them always the same"
+    monkeypatch.setattr(eye, "MOST_RAYS", 4 * 4)
+    by_rays, by_points = from_transport(described, camera), from_points(described, camera)
+    assert abs(by_rays.matrix - by_points.matrix).max() < 1e-12
+    np.testing.assert_allclose(by_rays.variance, by_points.variance, rtol=1e-9, atol=1e-15)

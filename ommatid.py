@@ -99,6 +99,27 @@ Upright = Annotated[
     ),
 ]
 
+MoreImages = Annotated[
+    list[Path] | None, typer.Argument(metavar="IMAGE...", help="More images of --points.", show_default=False)
+]
+Points = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--points",
+        metavar="IMAGE",
+        help="Recorded point sources: mosaics, a folder of them, or an NPY file of (count, rows, columns).",
+    ),
+]
+Places = Annotated[
+    Path | None,
+    typer.Option(
+        "--places",
+        metavar="FILE",
+        help="CSV of image,row,column: the pixels of f that shone, from 0; absent: an image a pixel, by rows.",
+    ),
+]
+PointValue = Annotated[float, typer.Option("--point-value", metavar="VALUE", help="Of the sources, in f.")]
+
 
 @app.command()
 def run(
@@ -166,8 +187,7 @@ def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watc
         with naming(scene.source):
             refuse_slow_transport(choose_variant(scene.render.variant), "study.models")
     choose(scene, camera, exact)  # what memory does not hold is refused before any work
-    if scene.study is not None:
-        study.refuse(scene, camera)
+    study.refuse(scene, camera)
     stack = _rendered(scene, camera, image, folder, watch)
     with watch.progress("calibrate") as progress:
         model, made = kept_model(folder / "model.npz", scene, camera, progress)
@@ -211,26 +231,10 @@ def stages_of_render(scene: Scene, camera: Camera, image: Image, folder: Path, w
 def calibrate(
     scene: SceneFile,
     output: Output,
-    more: Annotated[
-        list[Path] | None, typer.Argument(metavar="IMAGE...", help="More images of --points.", show_default=False)
-    ] = None,
-    points: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--points",
-            metavar="IMAGE",
-            help="Recorded point sources: mosaics, a folder of them, or an NPY file of (count, rows, columns).",
-        ),
-    ] = None,
-    places: Annotated[
-        Path | None,
-        typer.Option(
-            "--places",
-            metavar="FILE",
-            help="CSV of image,row,column: the pixels of f that shone, from 0; absent: an image a pixel, by rows.",
-        ),
-    ] = None,
-    point_value: Annotated[float, typer.Option("--point-value", metavar="VALUE", help="Of the sources, in f.")] = 255,
+    more: MoreImages = None,
+    points: Points = None,
+    places: Places = None,
+    point_value: PointValue = 255,
     dark: Dark = None,
     flat: Flat = None,
     flat_value: FlatValue = 255,

@@ -55,8 +55,7 @@ class Case:
 
 def refuse(scene: Scene, camera: Camera) -> None:
     """Raise InputError where a study names what this camera cannot be reconstructed with, before any work."""
-    assert scene.study is not None
-    for name in scene.study.models:
+    for name in () if scene.study is None else scene.study.models:
         how = MISALIGNMENT.get(name, "trust")
         told = scene.estimator.model_copy(update={"misalignment": how})
         choose(scene.model_copy(update={"estimator": told}), camera, camera.boxed)
@@ -97,13 +96,10 @@ def kept_study(
 
     models : by name, made only where they are needed
     """
-    wanted = fingerprint([list(models), stack.record, stack.scene.plain()])
-    try:
-        old = json.loads((folder / NUMBERS).read_text(encoding="utf-8"))
-        if old["fingerprint"] == wanted and (folder / TABLE).is_file():
-            return list(old["cases"]), False
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+    wanted = fingerprint([list(models), stack.record, stack.scene.plain(), truth is not None])
+    old = _standing(folder)
+    if old is not None and old["fingerprint"] == wanted:
+        return list(old["cases"]), False
     cases: list[dict[str, Any]] = []
     for name, make in models.items():
         cases.append(asdict(studied(stack, name, make(), truth)))
@@ -115,6 +111,15 @@ def kept_study(
     write_text(folder / TABLE, text.getvalue())
     write_text(folder / NUMBERS, json.dumps({"fingerprint": wanted, "cases": cases}, indent=2) + "\n")
     return cases, True
+
+
+def _standing(folder: Path) -> dict[str, Any] | None:
+    """study.json of a folder that has both files of a study, whole; else None."""
+    try:
+        old: dict[str, Any] = json.loads((folder / NUMBERS).read_text(encoding="utf-8"))
+        return old if (folder / TABLE).is_file() and {"fingerprint", "cases"} <= old.keys() else None
+    except (OSError, ValueError, AttributeError):
+        return None
 
 
 def rows(cases: list[dict[str, Any]]) -> list[tuple[str, str]]:

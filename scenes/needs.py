@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import ceil, hypot
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import sparse
@@ -18,6 +18,9 @@ from .camera import Camera
 from .lens_type import Glass, LensType
 from .scene import Scene
 from .sensor import Sensor
+
+if TYPE_CHECKING:
+    from .blur import Blur
 
 MOST_DISK = 1 / 20  # of a pixel of f: a disk of defocus that may be left out
 MOST_AIRY = 1 / 5  # of a sensor pixel: an Airy disk, to its first dark ring, that may be left out
@@ -59,7 +62,7 @@ def needed(scene: Scene, camera: Camera) -> tuple[Camera, tuple[LeftOut, ...]]:
     allowed = MOST_OF_NOISE * noise_variance(scene, camera)
     found: list[LeftOut] = []
     if camera.wavelength is not None:
-        airy = _without_diffraction(camera, scene.prior.variance, allowed)
+        airy = _without_diffraction(camera, camera.wavelength, scene.prior.variance, allowed)
         if airy is not None:
             camera = replace(camera, wavelength=None)
             found.append(airy)
@@ -111,18 +114,17 @@ def _as_pinhole(glass: Glass) -> Glass:
     return Glass(distortion=glass.distortion)
 
 
-def _without_diffraction(camera: Camera, contrast: float, allowed: float) -> LeftOut | None:
+def _without_diffraction(camera: Camera, wavelength: float, contrast: float, allowed: float) -> LeftOut | None:
     """None where diffraction is needed, by one lens type at least."""
     from .blur import blur_of
 
-    assert camera.wavelength is not None
     widest = most = 0.0
     for kind in camera.types:
         if kind.glass.surfaces is not None:
             return None
         if kind.glass.aperture is None:
             continue
-        disk = 2 * FIRST_ZERO * camera.wavelength * camera.depth(kind) / kind.glass.aperture / camera.pixel_pitch
+        disk = 2 * FIRST_ZERO * wavelength * camera.depth(kind) / kind.glass.aperture / camera.pixel_pitch
         if disk >= MOST_AIRY:
             return None
         change = _change(camera, kind, replace(blur_of(camera, kind), airy=0.0))
@@ -157,11 +159,10 @@ def _without_aperture(camera: Camera, kind: LensType, contrast: float, allowed: 
     return LeftOut(what, why, change.most + WHITE / 2 * uneven)
 
 
-def _change(camera: Camera, kind: LensType, less: object) -> Change:
+def _change(camera: Camera, kind: LensType, less: Blur) -> Change:
     """What another blur changes in a row of H, of a pixel far from the target's edges."""
-    from .blur import Blur, blur_of, matrix
+    from .blur import blur_of, matrix
 
-    assert isinstance(less, Blur)
     blur = blur_of(camera, kind)
     margin = ceil(blur.reach) + 1
     side = ceil(kind.ratio) + 1 + 2 * margin

@@ -121,4 +121,5 @@ def lens_of(camera: Camera, kind: LensType) -> Lens:
         from .real_lens import RealLens
 
         return RealLens(camera, kind)
-    return Lens(camera, kind) if kind.glass.aperture is None else ThinLens(camera, kind)
+    aperture = kind.glass.aperture
+    return Lens(camera, kind) if aperture is None else ThinLens(camera, kind, aperture)

@@ -54,14 +54,13 @@ class ThinLens(Lens):
 
     weighs = True
 
-    def __init__(self, camera: Camera, kind: LensType) -> None:
-        """Of a lens type with an aperture."""
+    def __init__(self, camera: Camera, kind: LensType, aperture: float) -> None:
+        """Of a lens type with an aperture of this diameter."""
         super().__init__(camera, kind)
         import drjit as dr
         import mitsuba as mi
 
-        assert kind.glass.aperture is not None
-        self._radius = dr.opaque(mi.Float, kind.glass.aperture / 2)
+        self._radius = dr.opaque(mi.Float, aperture / 2)
         self._focal = dr.opaque(mi.Float, camera.focal_length(kind))
         self._radii = None
         if camera.wavelength is not None:

@@ -17,8 +17,8 @@ from .kept import kept_model
 
 def models(scene: Scene, camera: Camera, folder: Path, progress: Progress) -> dict[str, Callable[[], Model]]:
     """What makes each model that the scene's study names; calibrated ones are kept in `folder`."""
-    assert scene.study is not None
-    return {name: partial(_made, name, scene, camera, folder, progress) for name in scene.study.models}
+    names = () if scene.study is None else scene.study.models
+    return {name: partial(_made, name, scene, camera, folder, progress) for name in names}
 
 
 def _made(name: str, scene: Scene, camera: Camera, folder: Path, progress: Progress) -> Model:

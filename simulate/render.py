@@ -17,6 +17,7 @@ from scenes.partial import Partial
 from scenes.progress import Progress, no_progress
 from scenes.recording import Recording
 from scenes.scene import Scene, resolved
+from scenes.sensor import Sensor
 from scenes.stack import STRAIGHT, Stack, recorded
 from scenes.versions import versions
 
@@ -129,7 +130,7 @@ def render(
     }
     kept, variance = resolved(scene, (camera.rows, camera.columns)), np.maximum(variance, floor)
     if scene.sensor is not None:
-        return recorded(kept, camera, _exposed(scene, camera, rendering.mean), variance, record)
+        return recorded(kept, camera, _exposed(scene, scene.sensor, camera, rendering.mean), variance, record)
     values = rendering.mean
     if scene.noise is not None:
         from .expose import expose, generators
@@ -138,12 +139,11 @@ def render(
     return Stack(kept, camera, values, variance, record)
 
 
-def _exposed(scene: Scene, camera: Camera, light: NDArray[np.float64]) -> Recording:
+def _exposed(scene: Scene, sensor: Sensor, camera: Camera, light: NDArray[np.float64]) -> Recording:
     from .emva import record
     from .response import response
 
-    assert scene.sensor is not None
     dark = np.isnan(light)  # no light can reach these pixels; so they are dead, and known by their flat
     freed = np.where(dark, 0.0, response(scene, camera))
     shot = without_shot_noise(scene, camera) is None
-    return record(np.where(dark, 0.0, light), freed, scene.sensor, camera, scene.render.seed, shot)
+    return record(np.where(dark, 0.0, light), freed, sensor, camera, scene.render.seed, shot)

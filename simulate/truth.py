@@ -111,11 +111,11 @@ def kept_truth(path: Path, scene: Scene, camera: Camera, image: NDArray[np.float
     """The truth as `path` holds it, rendered where it is not there or was made from something else."""
     wanted = truth_from(scene, camera, image)
     try:
-        old = read(path)[0]
-        if old.record.get("fingerprint") == wanted:
-            return old.channels["Y"].astype(np.float64)
-    except (InputError, KeyError):  # missing, damaged or of another kind: to be made
-        pass
+        (old,) = read(path)
+    except (InputError, ValueError):  # missing, damaged or of another kind: to be made
+        old = None
+    if old is not None and old.record.get("fingerprint") == wanted and "Y" in old.channels:
+        return old.channels["Y"].astype(np.float64)
     made = truth(scene, camera, image)
     record = {"fingerprint": wanted, "samples": made.samples, "variance": float(made.variance.mean())}
     write_truth(path, made.image, made.depth, record)

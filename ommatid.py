@@ -1,4 +1,4 @@
-"""The command line: a shell over scenes, simulate and reconstruct, which do the work and meet in files.
+"""The command line: a shell over scenes, simulate, reconstruct and the chain of both, which do the work.
 
 Results go to stdout, as tables or with --json as one document; progress and what went wrong go to stderr.
 Exit code 0, or 2 for a scene, option or file to mend, 1 for what the machine denies. Heavy imports stand inside the
@@ -21,17 +21,14 @@ import typer
 from scenes.errors import DeniedError, InputError, naming
 
 if TYPE_CHECKING:
-    from reconstruct.accuracy import Prediction
     from scenes.batch import Batch
     from scenes.camera import Camera
     from scenes.model import Model
     from scenes.parcel import Stages, Watch
-    from scenes.picture import Image
     from scenes.progress import Progress
     from scenes.recorded_frames import Bench
     from scenes.scene import Scene
     from scenes.sensor import Noise
-    from scenes.stack import Stack
     from scenes.workers import Workers as Crew
 
 app = typer.Typer(
@@ -133,6 +130,8 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
+    from chain import stages
+
     sets = _complete(sets, complete)
 
     def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
@@ -146,7 +145,7 @@ def run(
                 _table("The same stack with other ideas of H", study.rows(description["study"]))
         return description
 
-    _each(scenes, output, _batch(sets, lens, stages_of_run, tell), scheduler, workers, as_json)
+    _each(scenes, output, _batch(sets, lens, stages.run, tell), scheduler, workers, as_json)
 
 
 @app.command()
@@ -161,70 +160,15 @@ def render(
     as_json: Json = False,
 ) -> None:
     """Render the sub-images alone."""
+    from chain import stages
+
     sets = _complete(sets, complete)
 
     def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
         del scene
         return {"file": str(folder / "stack.exr"), **description}
 
-    _each(scenes, output, _batch(sets, lens, stages_of_render, tell), scheduler, workers, as_json)
-
-
-def stages_of_run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
-    """What `run` does of a scene, here or on a worker, and says of it."""
-    from reconstruct import study
-    from reconstruct.choice import choose
-    from reconstruct.report import write_run
-    from reconstruct.results import RUN, kept_results
-    from simulate.kept import kept_model
-    from simulate.refuse import refuse
-    from simulate.variant import choose as choose_variant
-    from simulate.variant import refuse_slow_transport
-
-    exact = scene.calibration.method == "ideal" and camera.boxed
-    refuse(scene, camera)
-    if scene.study is not None and "transport" in scene.study.models:
-        with naming(scene.source):
-            refuse_slow_transport(choose_variant(scene.render.variant), "study.models")
-    choose(scene, camera, exact)  # what memory does not hold is refused before any work
-    study.refuse(scene, camera)
-    stack = _rendered(scene, camera, image, folder, watch)
-    with watch.progress("calibrate") as progress:
-        model, made = kept_model(folder / "model.npz", scene, camera, progress)
-    watch.done("calibrate", made)
-    with watch.progress("reconstruct") as progress:
-        description, made = kept_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
-    watch.done("reconstruct", made)
-    more: dict[str, Any] = {}
-    if scene.world is not None:
-        from reconstruct.depth import of_run
-
-        more["depth"] = of_run(folder, camera)
-    if scene.study is not None:
-        more["study"] = _studied(scene, camera, stack, folder, watch)
-    if any(description.get(key) != value for key, value in more.items()):
-        write_run(folder / RUN, {**description, **more})
-    return {**description, **more}
-
-
-def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: Watch) -> list[dict[str, Any]]:
-    """The same stack with every idea of H that the scene's study names."""
-    from reconstruct.results import truth_beside
-    from reconstruct.study import kept_study
-    from scenes.progress import no_progress
-    from simulate.models import models
-
-    with watch.progress("study") as progress:
-        known = models(scene, camera, folder, no_progress)
-        cases, made = kept_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
-    watch.done("study", made)
-    return cases
-
-
-def stages_of_render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
-    """What `render` does of a scene, here or on a worker, and says of it."""
-    stack = _rendered(scene, camera, image, folder, watch)
-    return {"sub_images": len(camera.sub_imagers), **stack.record}
+    _each(scenes, output, _batch(sets, lens, stages.render, tell), scheduler, workers, as_json)
 
 
 @app.command()
@@ -383,13 +327,14 @@ def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Jso
 
     From Eq. 5 and the ideal model: nothing is rendered.
     """
+    from chain.prediction import electrons, predicted
     from reconstruct import accuracy
     from scenes.camera import derive
     from scenes.scene import read
 
     described = read(scene, sets or (), _names(lens))
     with naming(scene):
-        prediction, light = _predicted(described), _light(described, derive(described))
+        prediction, light = predicted(described), electrons(described, derive(described))
     if as_json:
         _print_json(prediction.describe() | ({} if light is None else {"light": light}))
         return
@@ -415,19 +360,19 @@ def design(
 
     Ranks magnifications by the expected error (Eq. 5) with each.
     """
-
+    from chain.prediction import predicted
     from reconstruct.design import Choice, ranked, rows
     from scenes.candidates import magnifications, with_lens
     from scenes.scene import read
 
     wanted = magnifications(candidates)
     described = read(scene, sets or (), _names(lens))
-    before = _predicted(described)
+    before = predicted(described)
     choices: list[Choice] = []
     with _progress("design") as progress:
         for place, magnification in enumerate(wanted):
             try:
-                choices.append(Choice(str(magnification), _predicted(with_lens(described, magnification))))
+                choices.append(Choice(str(magnification), predicted(with_lens(described, magnification))))
             except InputError as error:
                 choices.append(Choice(str(magnification), None, str(error).removeprefix(f"{scene}: ")))
             progress((place + 1) / len(wanted))
@@ -487,18 +432,19 @@ def show(
     scene: SceneFile, sets: Sets = None, lens: Lenses = "", complete: Complete = False, as_json: Json = False
 ) -> None:
     """The geometry, the plan, and what is left out."""
-    sets = _complete(sets, complete)
+    from chain.prediction import electrons
+    from chain.prediction import optics as optics_of
     from reconstruct.choice import choose as choose_way
     from scenes.camera import derive
     from scenes.scene import read
     from scenes.show import describe, sections
     from simulate.variant import choose
 
-    described = read(scene, sets or (), _names(lens))
+    described = read(scene, _complete(sets, complete), _names(lens))
     camera = derive(described)
     choice = choose_way(described, camera, described.calibration.method == "ideal" and camera.boxed)
     with naming(scene):
-        optics, light = _optics(camera), _light(described, camera)
+        optics, light = optics_of(camera), electrons(described, camera)
     description = describe(described, camera, choose(described.render.variant), choice.plan(), optics, light)
     if as_json:
         _print_json(description)
@@ -511,11 +457,12 @@ def show(
 @app.command()
 def export(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
     """Write a plain Mitsuba scene of stock sensors."""
+    from chain.stages import opened
     from scenes.files import refuse_output
     from simulate.export import export as write
 
     refuse_output(output, scene)
-    described, camera, image = _opened(scene, sets, lens)
+    described, camera, image = opened(scene, sets or (), _names(lens))
     if described.world is not None:
         raise InputError(f"{scene}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
     picture = write(described, camera, image, output)
@@ -626,13 +573,14 @@ def _batch(
     sets: list[str] | None, lens: str, stages: Stages, tell: Callable[[Scene, Path, dict[str, Any]], dict[str, Any]]
 ) -> Batch:
     """What is asked of every scene: changes, the stages, and what to tell the user when they are done."""
+    from chain.stages import facts, opened
     from scenes.batch import Batch
     from scenes.parcel import Watch
 
-    def opened(path: Path) -> tuple[Scene, Camera, Image]:
-        return _opened(path, sets, lens)
+    def watch(folder: Path) -> Watch:
+        return Watch(_progress, partial(_say_done, folder))
 
-    return Batch(opened, stages, lambda folder: Watch(_progress, partial(_say_done, folder)), tell, facts)
+    return Batch(lambda path: opened(path, sets or (), _names(lens)), stages, watch, tell, facts)
 
 
 def _each(paths: list[Path], output: Path, batch: Batch, scheduler: str, workers: int | None, as_json: bool) -> None:
@@ -657,18 +605,6 @@ def _each(paths: list[Path], output: Path, batch: Batch, scheduler: str, workers
         raise _Worst(worst)
 
 
-def facts(chosen: bool) -> dict[str, str]:
-    """What has to be the same on all machines for results to be the same; `chosen`: the variant is left to them."""
-    from scenes.versions import versions
-
-    found = versions("mitsuba", "drjit", "scipy")
-    if chosen:
-        from simulate.variant import choose
-
-        found["the variant that render.variant 'auto' stands for"] = choose("auto")
-    return found
-
-
 @contextmanager
 def _crew(scheduler: str, count: int | None) -> Generator[Crew | None]:
     """Workers for the tiles of a frame; none where they are done by threads of this process."""
@@ -681,65 +617,6 @@ def _crew(scheduler: str, count: int | None) -> Generator[Crew | None]:
     with workers(scheduler, count) as crew:
         crew.refuse_differences(partial(versions, "scipy"))
         yield crew
-
-
-def _opened(path: Path, sets: list[str] | None, lens: str) -> tuple[Scene, Camera, Image]:
-    """A scene, its camera and its target, all checked before anything is written."""
-    from scenes.camera import derive
-    from scenes.picture import load
-    from scenes.scene import read
-
-    scene = read(path, sets or (), _names(lens))
-    camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
-    if scene.world is not None:
-        from simulate.world import files
-
-        files(scene)
-    return scene, camera, load(scene)
-
-
-def _predicted(scene: Scene) -> Prediction:
-    """What Eq. 5 and the ideal model promise of a scene."""
-    from reconstruct.accuracy import predict
-    from reconstruct.choice import choose
-    from reconstruct.foresight import predict_large
-    from reconstruct.prior import prior_of
-    from scenes.camera import derive
-    from simulate.ideal import ideal_matrix, ideal_model
-
-    camera = derive(scene)
-    choice = choose(scene, camera, exact=camera.boxed)
-    actual, shape = _foreseen_noise(scene, camera), (camera.rows, camera.columns)
-    if choice.way == "fit":
-        raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
-    if choice.way != "dense":
-        return predict_large(choice, ideal_model(scene, camera), actual)
-    prior = prior_of(scene.prior, shape, camera.target_pitch)
-    tolerated = None
-    if camera.tolerance is not None and camera.stays_sharp and scene.estimator.misalignment == "trust":
-        from reconstruct.tolerance import cost
-
-        tolerated = partial(cost, camera=camera, prior=prior)
-    return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape, tolerated)
-
-
-def _optics(camera: Camera) -> list[dict[str, Any]]:
-    """What lenses that are more than pinholes do to sharpness."""
-    if all(kind.glass.pinhole for kind in camera.types):
-        return []
-    from simulate.lens_report import describe
-
-    return describe(camera)
-
-
-def _light(scene: Scene, camera: Camera) -> dict[str, Any] | None:
-    """The electrons that each lens type's pixels collect, where they are counted."""
-    if scene.sensor is None:
-        return None
-    from scenes.photons import summary
-    from simulate.response import response
-
-    return summary(scene, camera, response(scene, camera))
 
 
 def _optics_sections(
@@ -755,29 +632,6 @@ def _optics_sections(
 
         found.append(("Electrons", rows(light)))
     return found
-
-
-def _foreseen_noise(scene: Scene, camera: Camera) -> Any:
-    """Variance of every measurement, one number or an array: with a [sensor] that of light of the prior's mean."""
-    if scene.sensor is not None:
-        from scenes.photons import predicted_noise
-        from simulate.response import response
-
-        return predicted_noise(scene, camera, response(scene, camera))
-    return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0
-
-
-def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> Stack:
-    from scenes.batch import prepare
-    from simulate.kept import kept_stack
-    from simulate.refuse import refuse
-
-    refuse(scene, camera, calibrates=False)
-    prepare(scene, image, folder)
-    with watch.progress("render") as progress:
-        stack, made = kept_stack(folder / "stack.exr", scene, camera, image, progress)
-    watch.done("render", made)
-    return stack
 
 
 def _say_done(folder: Path, stage: str, made: bool) -> None:

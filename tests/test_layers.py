@@ -1,4 +1,5 @@
-"""Who may import whom: scenes neither half, reconstruct neither simulate nor Mitsuba, nobody Mitsuba but simulate."""
+"""Who may import whom: scenes neither half, reconstruct neither simulate nor Mitsuba, nobody Mitsuba but simulate,
+and both halves only the chain that joins them."""
 
 from __future__ import annotations
 
@@ -13,9 +14,10 @@ import pytest
 ROOT = Path(__file__).parent.parent
 RENDERER = {"mitsuba", "drjit"}
 FORBIDDEN = {
-    "scenes": {"simulate", "reconstruct", "ommatid", "tests"} | RENDERER,
-    "simulate": {"reconstruct", "ommatid", "tests"},
-    "reconstruct": {"simulate", "ommatid", "tests"} | RENDERER,
+    "scenes": {"simulate", "reconstruct", "chain", "ommatid", "tests"} | RENDERER,
+    "simulate": {"reconstruct", "chain", "ommatid", "tests"},
+    "reconstruct": {"simulate", "chain", "ommatid", "tests"} | RENDERER,
+    "chain": {"ommatid", "tests"} | RENDERER,
 }
 MODULES = [(package, path) for package in FORBIDDEN for path in sorted((ROOT / package).glob("**/*.py"))]
 

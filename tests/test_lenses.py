@@ -83,7 +83,8 @@ def test_pixels_that_no_light_can_reach_are_dead() -> None:
     assert usable_pixels(stack).dead == dark.sum() > 40
     assert usable_pixels(stack, model).dead >= dark.sum()
     with_sensor = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), sensor=SENSOR)
-    assert (response(with_sensor, camera)[dark] < 0.1 * response(with_sensor, camera).max()).all()
+    # Dark is where one of 16 passes of 64 rays brought nothing: a fifth of the light makes that a chance of 1e-5.
+    assert (response(with_sensor, camera)[dark] < 0.2 * response(with_sensor, camera).max()).all()
     counted = render(with_sensor, camera, truth)
     assert np.isnan(counted.values[dark]).all()
 

@@ -1,7 +1,7 @@
 """What our ways to render, to calibrate and to estimate gain, and over what: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` measures one part alone; the parts are `rendering`, `lenses`, `forms` and
-`frames`.
+`python -m tests.benchmarks frames` measures one part alone; the parts are `rendering`, `lenses`,
+`leaving-out`, `forms` and `frames`.
 Nothing here asserts a speed. Other load slows both sides of a ratio alike, so ratios are to be compared, not times.
 """
 
@@ -27,6 +27,9 @@ from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
 from .forms import NOISE, form_rows
 from .frame_tables import bandwidth_table, frames_table, growth_table
+from .leaving_out import SAMPLES as EACH
+from .leaving_out import SIDE as WIDE
+from .leaving_out import leaving_out_rows
 from .lenses import SAMPLES as BUNDLE
 from .lenses import SIDE, lens_rows, transport_rows
 from .lenses import VARIANT as LENSES
@@ -115,9 +118,23 @@ def _lenses() -> Iterator[Table]:
     yield table
 
 
+def _leaving_out() -> Iterator[Table]:
+    table = Table(title="What leaving out saves", show_lines=True)
+    for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
+        table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
+    reason = blocked(LENSES)
+    if reason:
+        table.caption = f"All was left out: {reason}."
+    else:
+        for row in leaving_out_rows():
+            _add(table, f"{WIDE} x {WIDE}, three types\n{EACH} samples a pixel", row)
+    yield table
+
+
 PARTS: dict[str, Callable[[], Iterator[Table]]] = {
     "rendering": _rendering,
     "lenses": _lenses,
+    "leaving-out": _leaving_out,
     "forms": _forms,
     "frames": _frames,
 }

@@ -25,6 +25,7 @@ from .sensor import Noise, Sensor
 from .table import Table
 
 TRUTH = "truth.exr"
+Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
 
 
 class Target(Table):
@@ -55,7 +56,9 @@ class Render(Table):
     samples: Samples = 256
     seed: int = Field(default=0, ge=0, lt=2**63)
     variant: Literal["auto", "scalar_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
-    sampler: Literal["multijitter", "independent"] = "multijitter"
+    sampler: Sampler = Field(
+        default="multijitter", description="how rays are spread; stratified ones round samples up to what fits them"
+    )
     complete: bool = Field(default=False, description="leave nothing out, however small its effect")
 
 

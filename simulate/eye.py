@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from scenes.camera import Camera
 from scenes.lens_type import LensType
 from scenes.pose import corner_offset, poses
+from scenes.scene import Sampler
 
 from .lens import Lens, ThinLens
+from .samplers import fitting
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
 
@@ -44,12 +46,13 @@ class Rays:
 class Eye:
     """All sub-imagers of some lens types: one type, or several that are all pinholes."""
 
-    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: str) -> None:
+    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: Sampler) -> None:
         """Put the tables of its pixels where the renderer finds them; a variant of the fast kind has to be active."""
         import drjit as dr
         import mitsuba as mi
 
-        self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": 16})
+        self._spread: Sampler = sampler
+        self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": fitting(sampler, 16)})
         self.pixels = sum(kind.measurements for kind in types)
         self.lens = lens_of(camera, types[0])
         rows = _tables(camera, types)
@@ -64,16 +67,17 @@ class Eye:
 
     def blocks(self, samples: int) -> list[slice]:
         """Its pixels, in their order, in blocks whose rays start together and fit into memory."""
-        several = max(1, MOST_RAYS // samples)
+        several = max(1, MOST_RAYS // fitting(self._spread, samples))
         return [slice(first, min(first + several, self.pixels)) for first in range(0, self.pixels, several)]
 
     def rays(self, samples: int, seed: int, block: slice) -> Rays:
-        """`samples` rays of each pixel of a block; the sampler stays ready for what they meet."""
+        """`samples` rays of each pixel of a block, or as many more as fit the sampler, which stays ready for what they
+        meet. Every pixel has its own stream of every sampler: Mitsuba seeds by the first lane of each wavefront."""
         import drjit as dr
         import mitsuba as mi
 
+        samples = fitting(self._spread, samples)
         self.sampler.set_sample_count(samples)
-        samples = self.sampler.sample_count()
         self.sampler.set_samples_per_wavefront(samples)
         lanes = (block.stop - block.start) * samples
         self.sampler.seed(_seed_of(seed, block), lanes)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, isqrt
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scenes.partial import State
+from scenes.scene import Sampler
+
+from .samplers import fitting
 
 Vector = NDArray[np.float64]
 
@@ -31,12 +34,10 @@ class Plan:
         return self.passes * self.samples
 
 
-def plan(samples: int) -> Plan:
-    """Divide `samples` a pixel over at least 16 passes, rounding up to a grid that a stratified sampler can fill."""
+def plan(samples: int, sampler: Sampler = "multijitter") -> Plan:
+    """Divide `samples` a pixel over at least 16 passes, rounding up to a grid that the sampler can fill."""
     passes = max(FEWEST_PASSES, BATCHES * ceil(samples / MOST_SAMPLES / BATCHES))
-    each = ceil(samples / passes)
-    side = isqrt(each)
-    return Plan(passes, side * ceil(each / side))
+    return Plan(passes, fitting(sampler, ceil(samples / passes)))
 
 
 @dataclass(frozen=True)

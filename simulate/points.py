@@ -69,7 +69,7 @@ def from_points(
     from .rig import Rig
 
     variant = choose(scene.render.variant)
-    work = plan(scene.calibration.samples)
+    work = plan(scene.calibration.samples, scene.render.sampler)
     rig = Rig(camera, variant, scene.render.sampler, together=False)  # each type its own spacing
     sweeps = {group: Sweep(rig, group) for group in rig.groups}
     shares = {group: sweep.reach.apart**2 for group, sweep in sweeps.items()}

@@ -73,7 +73,7 @@ def light(
     from .rig import Rig
 
     variant = choose(scene.render.variant)
-    work = plan(scene.render.samples)
+    work = plan(scene.render.samples, scene.render.sampler)
     around = None if scene.world is None else scene
     rig = Rig(needed(scene, camera)[0], variant, scene.render.sampler, around=around)
     rig.show(image)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scenes.camera import Camera
 from scenes.errors import InputError
 from scenes.lens_type import LensType
-from scenes.scene import Scene
+from scenes.scene import Sampler, Scene
 
 from .stock import BLOCK, scene_of, stock_sensor, target_of, texture_of
 from .variant import activate, refuse_slow
@@ -44,7 +44,7 @@ class Rig:
         self,
         camera: Camera,
         variant: str,
-        sampler: str = "multijitter",
+        sampler: Sampler = "multijitter",
         together: bool = True,
         around: Scene | None = None,
     ) -> None:
@@ -204,7 +204,7 @@ class Rig:
         self._scene, self._integrator, self.straight = staged.scene, staged.integrator, staged.straight
         self._texels = f"{TARGET}.{self._texels.partition('.')[2]}" if shown else ""
 
-    def _sensors_of(self, types: tuple[LensType, ...], sampler: str) -> dict[int, Any]:
+    def _sensors_of(self, types: tuple[LensType, ...], sampler: Sampler) -> dict[int, Any]:
         import mitsuba as mi
 
         return {

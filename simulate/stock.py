@@ -8,6 +8,9 @@ from typing import Any
 
 from scenes.camera import Camera
 from scenes.lens_type import SubImager
+from scenes.scene import Sampler
+
+from .samplers import fitting
 
 BLOCK = 4  # scalar variants seed by block, and pick its size by the number of threads unless it is given
 
@@ -27,7 +30,7 @@ def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
 
 
 def stock_sensor(
-    camera: Camera, sub: SubImager, sampler: str, samples: int, channels: int = 1, far: float = 2.0
+    camera: Camera, sub: SubImager, sampler: Sampler, samples: int, channels: int = 1, far: float = 2.0
 ) -> dict[str, Any]:
     """One sub-imager as Mitsuba's own `perspective` with a shifted principal point; it sees as far as `far` times the
     target's distance."""
@@ -48,7 +51,7 @@ def stock_sensor(
         "principal_point_offset_y": -(y - lens_y) / height,
         "to_world": mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0]),
         "film": film(columns, rows, channels),
-        "sampler": {"type": sampler, "sample_count": samples},
+        "sampler": {"type": sampler, "sample_count": fitting(sampler, samples)},
     }
 
 

@@ -40,7 +40,7 @@ def from_transport(scene: Scene, camera: Camera, progress: Progress = no_progres
 
     variant = choose(scene.render.variant)
     refuse_slow_transport(variant)
-    work = plan(scene.calibration.samples)
+    work = plan(scene.calibration.samples, scene.render.sampler)
     rig = Rig(camera, variant, scene.render.sampler, together=False)
     parts: list[Part] = []
     blocks = [(group, block) for group in rig.groups for block in rig.blocks(group, work.samples)]

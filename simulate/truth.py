@@ -25,6 +25,7 @@ from scenes.scene import Scene
 from scenes.versions import versions
 
 from .passes import Plan, Tally, plan
+from .samplers import filling
 from .variant import choose
 from .world import describe
 
@@ -85,11 +86,12 @@ def truth(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Truth:
 
 def _plan(scene: Scene, camera: Camera) -> Plan:
     """TRUER times the samples of a sensor pixel, in passes of a size that memory holds."""
-    work = plan(TRUER * scene.render.samples)
+    work = plan(TRUER * scene.render.samples, scene.render.sampler)
     most = max(1, MOST_RAYS // camera.unknowns)
     if work.samples <= most:
         return work
-    return Plan(ceil(work.total / most), most)
+    each = filling(scene.render.sampler, most)
+    return Plan(ceil(work.total / each), each)
 
 
 def truth_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:

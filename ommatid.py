@@ -428,6 +428,35 @@ def stability(output: Folder = Path("stability"), as_json: Json = False) -> None
 
 
 @app.command()
+def bench(
+    scene: SceneFile,
+    output: Folder = Path("out"),
+    seconds: Annotated[
+        float, typer.Option("--seconds", metavar="N", min=1, help="That it may take; what does not fit is left out.")
+    ] = 240,
+    sets: Sets = None,
+    lens: Lenses = "",
+    as_json: Json = False,
+) -> None:
+    """Error against run time of every stage.
+
+    Measures samplers, methods and ways with more and more samples, and recommends the cheapest that reach the noise.
+    """
+    from chain.bench import bench as measured
+    from chain.bench import rows
+    from chain.stages import opened
+
+    described, camera, image = opened(scene, sets or (), _names(lens))
+    with _progress("bench") as progress:
+        table, made = measured(described, camera, image, output, seconds, progress)
+    _say(f"bench: {_done(made)}, {output / 'bench.json'}")
+    if as_json:
+        _print_json(table.describe())
+    else:
+        _table(f"Error against run time: {table.title}", rows(table))
+
+
+@app.command()
 def show(
     scene: SceneFile, sets: Sets = None, lens: Lenses = "", complete: Complete = False, as_json: Json = False
 ) -> None:

@@ -7,9 +7,11 @@ too is taken anew at the first estimate. Dead and saturated pixels are left out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +41,7 @@ from .noise import (
 from .way import Hands, Outcome, Task, Way, total
 
 Vector = NDArray[np.float64]
+Found = TypeVar("Found")
 
 MOST_FEIGNED = 0.05  # of what is believed of a pixel on average: above it the expected error is not to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
@@ -148,19 +151,47 @@ def restore(
     Raises InputError if memory does not suffice, if no way is right to what the scene asks, or if the noise of a
     [sensor] is to be fitted.
     """
+    return _reaching(stack, model, lambda choice: _restored(stack, model, truth, choice, Hands(workers, progress)))
+
+
+def way_of(stack: Stack, model: Model, progress: Progress = no_progress) -> Way:
+    """The way that `restore` goes, its estimate found, but not its error bars, which take most of the time.
+
+    Raises InputError as `restore` does.
+    """
+
+    def gone(choice: Choice) -> Way:
+        way = _told(stack, model, choice, Hands(progress=progress)).way
+        _ = way.image  # only now it shows whether this way reaches what was asked
+        return way
+
+    return _reaching(stack, model, gone)
+
+
+def _reaching(stack: Stack, model: Model, work: Callable[[Choice], Found]) -> Found:
+    """Work done in the way that is chosen; by tiles where a frame that nobody asked for does not get there."""
     refuse_fit_of_sensor(stack)
     choice = choose(stack.scene, model.camera, model.exact)
-    hands = Hands(workers, progress)
     try:
-        return _restored(stack, model, truth, choice, hands)
+        return work(choice)
     except NotReachedError as error:
         if stack.scene.estimator.method != "auto":
             raise
-        return _restored(stack, model, truth, replace(choice, way="tiles", why=str(error)), hands)
+        return work(replace(choice, way="tiles", why=str(error)))
 
 
-def _restored(stack: Stack, model: Model, truth: Vector | None, choice: Choice, hands: Hands) -> Restoration:
-    start = perf_counter()
+@dataclass(frozen=True)
+class _Told:
+    """What the estimator is told in the end, and the way that it goes with it."""
+
+    way: Way
+    usable: Usable
+    prior: estimation.Prior
+    noise: dict[str, Vector]
+    fit: Fit | None
+
+
+def _told(stack: Stack, model: Model, choice: Choice, hands: Hands) -> _Told:
     usable = usable_pixels(stack, model)
     prior, told = _first_prior(stack), stack.scene.estimator.noise_variance
     noise, way = noise_at_first(stack, model, usable, prior), None
@@ -178,18 +209,25 @@ def _restored(stack: Stack, model: Model, truth: Vector | None, choice: Choice, 
         prior, noise = _with_fit(stack, prior, noise, found)
     if way is None or found is not None or told is None:
         way = _way(choice, stack, model, usable, prior, noise, hands)
+    return _Told(way, usable, prior, noise, found)
+
+
+def _restored(stack: Stack, model: Model, truth: Vector | None, choice: Choice, hands: Hands) -> Restoration:
+    start = perf_counter()
+    told = _told(stack, model, choice, hands)
+    way, usable, noise = told.way, told.usable, told.noise
     outcome = way.outcome(noise, truth)
     shape = (model.camera.rows, model.camera.columns)
     return Restoration(
         outcome=outcome,
         choice=choice,
-        prior=prior,
+        prior=told.prior,
         trimmed_mse=trimmed(outcome.expected.variance, shape),
         residual=_residual(outcome, way.task.believed),
         shape=shape,
         usable=usable,
         noise=noise,
-        fit=found,
+        fit=told.fit,
         feigned=_feigned(model, usable, way.task.believed, outcome.expected),
         seconds=perf_counter() - start,
         truth=truth,

@@ -21,6 +21,7 @@ from .errors import InputError
 from .files import write_text
 
 JSON, CSV = "bench.json", "bench.csv"
+ALONE = "alone"  # the setting of a dense form without refinement, which no scene can ask for
 LOW, HIGH = 0.1, 0.9  # the quantiles that go with a median
 
 Stage = Literal["render", "calibrate", "reconstruct"]
@@ -104,6 +105,7 @@ class BenchTable:
     """All of bench.json.
 
     scene : fingerprint of what is measured;  fingerprint : of that and of the versions it was measured with
+    against : what renderings and calibrations were held against;  noise_deviation : of the sensor, in values of f
     budget : seconds that were allowed;  seconds : that all cells took
     recommended : the cheapest setting that reaches the noise floor, a table a stage
     """
@@ -114,6 +116,8 @@ class BenchTable:
     camera: dict[str, Any]
     machine: dict[str, Any]
     versions: dict[str, str]
+    against: str
+    noise_deviation: float
     budget: float
     seconds: float
     cells: tuple[Cell, ...]

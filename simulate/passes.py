@@ -92,7 +92,9 @@ class Tally:
 
     @property
     def variance(self) -> Vector:
-        """Unbiased variance of that mean, from the scatter of the passes alone."""
+        """Unbiased variance of that mean, from the scatter of the passes alone; NaN of a single one."""
+        if self.count < 2:
+            return np.full_like(self._mean, np.nan)
         return self._squares / (self.count * (self.count - 1))
 
 

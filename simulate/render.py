@@ -21,7 +21,7 @@ from scenes.sensor import Sensor
 from scenes.stack import STRAIGHT, Stack, recorded
 from scenes.versions import versions
 
-from .passes import OverPasses, Tally, plan, rounding_variance
+from .passes import OverPasses, Plan, Tally, plan, rounding_variance
 from .streams import sampler_seeds
 from .variant import choose
 
@@ -65,15 +65,17 @@ def light(
     image: NDArray[np.float64],
     progress: Progress = no_progress,
     partial: Partial | None = None,
+    work: Plan | None = None,
 ) -> Rendering:
     """Render the light alone, before the sensor. Raises InputError if the variant asked for does not work here.
 
     partial : where passes that are done are kept and found again
+    work : passes and their samples; absent: as the scene's samples ask
     """
     from .rig import Rig
 
     variant = choose(scene.render.variant)
-    work = plan(scene.render.samples, scene.render.sampler)
+    work = plan(scene.render.samples, scene.render.sampler) if work is None else work
     around = None if scene.world is None else scene
     rig = Rig(needed(scene, camera)[0], variant, scene.render.sampler, around=around)
     rig.show(image)
@@ -116,8 +118,6 @@ def render(
     """
     start = perf_counter()
     rendering = light(scene, camera, image, progress, partial)
-    floor = rounding_variance(rendering.mean, rendering.samples)
-    variance = np.concatenate([moderate(rendering.variance[place], rendering.passes) for place in camera.slices()])
     record: dict[str, Any] = {
         "fingerprint": made_from(scene, camera, image),
         "truth": digest((image if truth is None else truth).astype(np.float32)),
@@ -128,10 +128,23 @@ def render(
         **({STRAIGHT: True} if rendering.straight else {}),
         "versions": versions("mitsuba", "drjit", "OpenEXR"),
     }
-    kept, variance = resolved(scene, (camera.rows, camera.columns)), np.maximum(variance, floor)
+    return exposed(scene, camera, rendering.mean, settled(rendering, camera), record)
+
+
+def settled(rendering: Rendering, camera: Camera) -> NDArray[np.float64]:
+    """(M,) variances of the mean, each drawn towards its sub-image's and never below float32's rounding."""
+    floor = rounding_variance(rendering.mean, rendering.samples)
+    moderated = [moderate(rendering.variance[place], rendering.passes) for place in camera.slices()]
+    return np.maximum(np.concatenate(moderated), floor)
+
+
+def exposed(
+    scene: Scene, camera: Camera, light: NDArray[np.float64], variance: NDArray[np.float64], record: dict[str, Any]
+) -> Stack:
+    """What the scene's sensor records of light, (M,), whose variances are known; noise by the scene's seed."""
+    kept, values = resolved(scene, (camera.rows, camera.columns)), light
     if scene.sensor is not None:
-        return recorded(kept, camera, _exposed(scene, scene.sensor, camera, rendering.mean), variance, record)
-    values = rendering.mean
+        return recorded(kept, camera, _exposed(scene, scene.sensor, camera, light), variance, record)
     if scene.noise is not None:
         from .expose import expose, generators
 

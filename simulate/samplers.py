@@ -6,9 +6,13 @@ recorded is what was used.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import isqrt
 
+from scenes.camera import Camera
 from scenes.scene import Sampler
+
+IN_THE_LIMIT = 64  # samples in a pass: with fewer, strata that hold a corner are not few beside those along an edge
 
 
 def fitting(sampler: Sampler, samples: int) -> int:
@@ -41,3 +45,29 @@ def filling(sampler: Sampler, most: int) -> int:
     """The largest number of samples, no more than `most`, that fills a sampler's grid; where there is none, the
     least."""
     return next((one for one in range(most, 0, -1) if fitting(sampler, one) == one), fitting(sampler, 1))
+
+
+@dataclass(frozen=True)
+class Law:
+    """How the error of a mean over rays falls with their number, d log error / d log samples, as far as theory says.
+
+    least : samples in one pass from which on the law holds
+    """
+
+    slope: float | None
+    why: str
+    least: int = 1
+
+
+def law(sampler: Sampler, camera: Camera) -> Law:
+    """Of a sampler in front of the lenses of a camera and a flat target, which is constant over each of its pixels."""
+    if sampler == "independent":
+        return Law(-0.5, "independent samples: the variance of a mean of n is 1/n of one's")
+    if not all(kind.glass.pinhole for kind in camera.types):
+        why = "rays differ in four or six numbers, and the sampler stratifies them only two by two"
+        return Law(None, why, IN_THE_LIMIT)
+    if sampler == "ldsampler":
+        why = "theory bounds it alone: by order of log(n)/n (Koksma and Hlawka), which is no slope"
+        return Law(None, why, IN_THE_LIMIT)
+    why = "of n strata only those along edges, some n^1/2, err: n^1/2 / n^2 of variance (Mitchell 1996), for large n"
+    return Law(-0.75, why, IN_THE_LIMIT)

@@ -22,6 +22,12 @@ def sampler_seeds(seed: int, purpose: Purpose, number: int, passes: int) -> Call
     return lambda sensor: (start + 2 * (sensor * passes + number) + odd) % 2**32
 
 
+def repeat_seed(seed: int, what: str, repeat: int) -> int:
+    """A seed as a scene's for repeat `repeat` of a measurement called `what`: its streams are none of the scene's."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(b"bench"), zlib.crc32(what.encode()), repeat))
+    return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
 def noise_generator(seed: int, name: str, k: int, l: int) -> np.random.Generator:  # noqa: E741
     """The generator of sub-imager (k, l) of the lens type `name`, which no other shares."""
     sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()), k, l))

@@ -115,6 +115,13 @@ def activate(variant: str) -> None:
         logger.set_log_level(mi.LogLevel.Warn)
 
 
+def release() -> None:
+    """Give back the memory that the renderer keeps for its next work, if it has been loaded."""
+    dr = sys.modules.get("drjit")
+    if dr is not None:
+        dr.flush_malloc_cache()
+
+
 INTERRUPTED = "Received interrupt signal"  # on which whoever asked for it hears the command line's own sentence
 _APPENDERS: dict[str, Any] = {}
 

@@ -1,0 +1,191 @@
+"""Error against run time of every stage of a scene: what `bench` measures, writes, draws and recommends."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any, cast
+
+import numpy as np
+
+from reconstruct.bench_figure import write_figures
+from reconstruct.slopes import recommend, slope
+from scenes import bench_file
+from scenes.bench_file import JSON, BenchTable, Cell, Curve, LeftOut
+from scenes.camera import Camera
+from scenes.cheapest import Finished, Job, measure, name_of
+from scenes.errors import InputError, naming
+from scenes.files import digest, fingerprint, make_folder
+from scenes.picture import Image
+from scenes.progress import Progress
+from scenes.scene import Sampler, Scene
+from scenes.versions import versions
+from simulate.curves import REFERENCE, right
+from simulate.passes import FEWEST_PASSES
+from simulate.refuse import refuse
+from simulate.samplers import law
+
+from .bench_jobs import Subject, jobs
+
+PARTIAL = ".bench.partial.jsonl"
+FLAT = {"render": 1e-5 * 255, "calibrate": 1e-5}  # errors below which float32 shows, and no slope
+SETTING_UP = 0.02  # of the progress: the reference, and what the noise alone leaves
+
+
+def bench(
+    scene: Scene, camera: Camera, image: Image, folder: Path, seconds: float, progress: Progress
+) -> tuple[BenchTable, bool]:
+    """The table of a scene, and whether anything had to be measured for it; what stands in `folder` is not repeated.
+
+    seconds : that it may take; cells that do not fit are left out
+    Raises InputError for a scene that cannot be measured, and where `folder` holds the table of another scene.
+    """
+    start = perf_counter()
+    scene = _as_measured(scene)
+    _refuse(scene, camera)
+    what = _described(scene, camera, image)
+    made = fingerprint([what, versions("mitsuba", "drjit", "scipy")])
+    old = _standing(folder, what)
+    if old is not None and old.fingerprint == made and not (old.budget < seconds and any(o.late for o in old.left_out)):
+        return old, False
+    make_folder(folder)
+    finished = Finished(folder / PARTIAL, made)
+    if old is not None and old.fingerprint == made:
+        for cell in old.cells:
+            finished.cells.setdefault(name_of(cell), cell)
+        finished.seconds = max(finished.seconds, old.seconds)
+    with naming(scene.source):
+        found = right(scene, camera, image, folder, lambda done: progress(SETTING_UP * done))
+        subject = Subject(scene, camera, image, found)
+        told, left_out = jobs(subject)
+    spent = perf_counter() - start
+    late = measure(told, seconds, finished, lambda done: progress(SETTING_UP + (1 - SETTING_UP) * done), spent)
+    left_out += [LeftOut(name, why) for name, why in finished.refused.items()]
+    total = finished.seconds + spent
+    table = _table(subject, told, finished, [*left_out, *late], (what, made, seconds, total))
+    write_figures(folder, table)
+    bench_file.write(folder, table)
+    finished.remove()
+    (folder / REFERENCE).unlink(missing_ok=True)
+    return table, True
+
+
+def _as_measured(scene: Scene) -> Scene:
+    """Without what the cells set themselves; a misaligned camera is one whose H was calibrated."""
+    estimator = scene.estimator.model_copy(update={"misalignment": "trust"})
+    return scene.model_copy(update={"estimator": estimator, "study": None})
+
+
+def _refuse(scene: Scene, camera: Camera) -> None:
+    if scene.world is not None:
+        raise InputError(
+            f"{scene.source}: bench measures flat targets, got a [world]; remove it, or take another scene"
+        )
+    refuse(scene, camera, calibrates=False)
+
+
+def _described(scene: Scene, camera: Camera, image: Image) -> str:
+    """Fingerprint of what is measured, whatever samples and methods the scene itself asks for."""
+    tables = scene.plain()
+    for table, keys in {"render": ("samples", "variant"), "calibration": ("samples", "method", "fit")}.items():
+        tables[table] = {key: value for key, value in tables[table].items() if key not in keys}
+    for name in ("title", "target"):
+        tables.pop(name, None)
+    return fingerprint([camera.describe(), tables, digest(image.astype("float32"))])
+
+
+def _standing(folder: Path, what: str) -> BenchTable | None:
+    path = folder / JSON
+    if not path.exists():
+        return None
+    try:
+        old = bench_file.read(path)
+    except InputError:  # damaged: to be made again
+        return None
+    if old.scene != what:
+        raise InputError(
+            f"{path}: is of another scene, '{old.title}', or of other values of its keys; choose another folder with -o"
+        )
+    return old
+
+
+def _table(
+    subject: Subject,
+    told: Sequence[Job],
+    finished: Finished,
+    left_out: list[LeftOut],
+    numbers: tuple[str, str, float, float],
+) -> BenchTable:
+    cells = [finished.cells[job.name] for job in told if job.name in finished.cells]
+    what, made, budget, total = numbers
+    return BenchTable(
+        title=subject.scene.title or subject.scene.source.stem,
+        scene=what,
+        fingerprint=made,
+        camera=subject.camera.describe(),
+        machine={"cores": os.cpu_count(), "system": platform.platform(), "load": os.getloadavg()[0]},
+        versions=versions("mitsuba", "drjit", "scipy"),
+        against=subject.right.words,
+        noise_deviation=_noise_deviation(subject),
+        budget=budget,
+        seconds=total,
+        cells=tuple(cells),
+        curves=tuple(curves(cells, subject.camera)),
+        recommended=recommend(cells, subject.floor),
+        left_out=tuple(left_out),
+    )
+
+
+def _noise_deviation(subject: Subject) -> float:
+    """Root mean square of what the sensor adds to exact light, in values of f."""
+    away = subject.stack(0).values - subject.right.light
+    return float(np.sqrt(np.nanmean(np.square(away))))
+
+
+def curves(cells: Sequence[Cell], camera: Camera) -> list[Curve]:
+    """The slope of each way of rendering and calibrating, beside what theory says."""
+    found: list[Curve] = []
+    for stage, limit in FLAT.items():
+        ways = dict.fromkeys((cell.way, cell.variant) for cell in cells if cell.stage == stage)
+        for way, variant in ways:
+            sampler = cast(Sampler, way.split(", ")[-1])
+            theory = law(sampler, camera)
+            least = theory.least if theory.least == 1 else theory.least * FEWEST_PASSES
+            alike = [one for one in cells if (one.stage, one.way, one.variant) == (stage, way, variant)]
+            fitted = slope([one for one in alike if (one.samples or 0) >= least and one.error.median > limit])
+            told: dict[str, Any] = {"stage": stage, "way": way, "variant": variant, "theory": theory.slope}
+            if fitted is None:
+                why = f"{theory.why}; fewer than three cells to fit, or errors that are rounding alone"
+                found.append(Curve(**told, slope=None, slope_deviation=None, why=why, agrees=None))
+                continue
+            agrees = None if theory.slope is None else fitted.agrees(theory.slope)
+            why = theory.why if least == 1 else f"{theory.why}, fitted from {least} samples on"
+            found.append(Curve(**told, slope=fitted.value, slope_deviation=fitted.deviation, why=why, agrees=agrees))
+    return found
+
+
+def rows(table: BenchTable) -> list[tuple[str, str]]:
+    """The lines of the printed table: slopes, what is recommended, and what was left out."""
+    lines: list[tuple[str, str]] = []
+    for curve in table.curves:
+        if curve.slope is None or curve.slope_deviation is None:
+            continue
+        beside = "" if curve.theory is None else f", theory {curve.theory:g}"
+        verdict = "" if curve.agrees is None else (": agrees" if curve.agrees else ": does not agree")
+        name = f"slope, {curve.stage} {curve.way}, {curve.variant}"
+        lines.append((name, f"{curve.slope:.3f} ± {curve.slope_deviation:.3f}{beside}{verdict}"))
+    for stage in bench_file.STAGES:
+        best = table.recommended.get(stage)
+        if best is not None:
+            words = ", ".join(str(value) for key, value in best.items() if key != "seconds" and value)
+            samples = " samples" if stage != "reconstruct" else ""
+            lines.append((f"recommended, {stage}", f"{words}{samples}, {best['seconds']:.2g} s"))
+    lines.append(("why", str(table.recommended["why"])))
+    lines.append(("cells", f"{len(table.cells)} in {table.seconds:.0f} s, held against {table.against}"))
+    late = sum(one.late for one in table.left_out)
+    if late:
+        lines.append(("left out", f"{late} cells that did not fit into {table.budget:g} s; raise --seconds"))
+    return lines

@@ -1,0 +1,196 @@
+"""The cells that `bench` measures of a scene: every sampler, method and way, with what each repeat of one does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from time import perf_counter
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruct.precision import Exact, Setting, exact, settings
+from reconstruct.restore import way_of
+from reconstruct.way import Task
+from scenes.bench_file import LeftOut
+from scenes.camera import Camera
+from scenes.cheapest import FEWER, REPEATS, Job, Repeat
+from scenes.model import Model
+from scenes.peak import Cost, costed
+from scenes.scene import Sampler, Scene
+from scenes.stack import Stack
+from simulate import curves
+from simulate.curves import Right
+from simulate.passes import plan
+from simulate.streams import repeat_seed
+from simulate.variant import PREFERENCE, blocked, release
+
+Image = NDArray[np.float64]
+Method = Literal["points", "transport"]
+Result = TypeVar("Result")
+
+SAMPLES = tuple(4**power for power in range(1, 8))  # a pixel, 4 to 16384
+SAMPLERS: tuple[Sampler, ...] = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
+RAYS = {"scalar_rgb": 5e6, "llvm_ad_mono": 3e7, "cuda_ad_mono": 3e8}  # a second, about: only an order to begin with
+READY = {"scalar_rgb": 0.02, "llvm_ad_mono": 0.03, "cuda_ad_mono": 0.05}  # seconds before the first ray, about
+TWICE = 2  # estimates that a calibrated H takes: its uncertainty adds noise that the first one shows
+POINTS = 12.0  # renderings that point sources take, in units of one, about
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The scene that is measured: its camera, its target, and what is right of both."""
+
+    scene: Scene
+    camera: Camera
+    image: Image
+    right: Right
+
+    def noise(self, repeat: int) -> Scene:
+        """The scene with the sensor's noise of a repeat, which all cells share."""
+        return self._seeded("noise", repeat)
+
+    def seed(self, name: str, repeat: int) -> int:
+        """Of the rays of a cell's repeat."""
+        return repeat_seed(self.scene.render.seed, name, repeat)
+
+    def stack(self, repeat: int) -> Stack:
+        """Exact light, recorded."""
+        return curves.stack_of_right(self.noise(repeat), self.camera, self.right)
+
+    def squares(self, image: Image) -> float:
+        """Mean squared error of an estimate, (N,)."""
+        return float(np.mean(np.square(image - self.image.ravel())))
+
+    def brought(self, stack: Stack, model: Model, repeat: int) -> float:
+        """Mean squared error of the estimate from a stack with a model, freed of this noise's luck.
+
+        It is that of the floor, times what it is more than exact light and exact H make of the same noise.
+        """
+        return self.freed(self.squares(way_of(stack, model).image), repeat)
+
+    def freed(self, squares: float, repeat: int) -> float:
+        """The same of a mean squared error with the noise of a repeat."""
+        own = self.floors[repeat]
+        return squares / own * self.floor if own > 0 else squares
+
+    @cached_property
+    def _alone(self) -> tuple[list[float], float]:
+        start = perf_counter()
+        stacks = map(self.stack, range(REPEATS))
+        found = [self.squares(way_of(stack, self.right.model).image) for stack in stacks]
+        return found, (perf_counter() - start) / REPEATS
+
+    @property
+    def floors(self) -> list[float]:
+        """Mean squared errors with exact light and exact H, by repeat."""
+        return self._alone[0]
+
+    @property
+    def solving(self) -> float:
+        """Seconds that each of them took."""
+        return self._alone[1]
+
+    @property
+    def floor(self) -> float:
+        """Their median: what the noise alone leaves."""
+        return float(np.median(self.floors))
+
+    def _seeded(self, what: str, repeat: int) -> Scene:
+        render = self.scene.render.model_copy(update={"seed": self.seed(what, repeat)})
+        return self.scene.model_copy(update={"render": render})
+
+
+def jobs(subject: Subject) -> tuple[list[Job], list[LeftOut]]:
+    """All cells, and what cannot be measured here, with the reason."""
+    working = [variant for variant in PREFERENCE if not blocked(variant)]
+    left_out = [LeftOut(variant, blocked(variant)) for variant in PREFERENCE if variant not in working]
+    if not subject.camera.perfect and "scalar_rgb" in working:
+        working.remove("scalar_rgb")
+        left_out.append(LeftOut("scalar_rgb", "lenses that are more than pinholes need a fast backend"))
+    found = [*_renderings(subject, working), *_calibrations(subject, working)]
+    estimates, refused = _estimates(subject)
+    return [*found, *estimates], [*left_out, *refused]
+
+
+def _renderings(subject: Subject, variants: list[str]) -> list[Job]:
+    found: dict[str, Job] = {}
+    for variant in variants:
+        for sampler in SAMPLERS:
+            for asked in SAMPLES:
+                job = _rendering(subject, variant, sampler, asked)
+                found.setdefault(job.name, job)  # where several counts are rounded up to one
+    return list(found.values())
+
+
+def _rendering(subject: Subject, variant: str, sampler: Sampler, asked: int) -> Job:
+    work = curves.work_of(asked, sampler)
+    name = f"render {sampler} {variant} {work.total}"
+
+    def one(repeat: int) -> Repeat:
+        scene = curves.with_rendering(subject.scene, sampler, variant, asked, subject.seed(name, repeat))
+        rendering, cost = _costed(lambda: curves.rendered(scene, subject.camera, subject.image))
+        error = curves.error_of_light(rendering, subject.right)
+        stack = curves.stack_of(subject.noise(repeat), subject.camera, rendering, error)
+        return Repeat(error, cost, subject.brought(stack, subject.right.model, repeat) if repeat < FEWER else None)
+
+    guess = READY[variant] + work.total * subject.camera.measurements / RAYS[variant] + subject.solving
+    setting = f"{work.passes} pass{'es' if work.passes > 1 else ''} of {work.samples}"
+    return Job("render", sampler, variant, work.total, setting, guess, one)
+
+
+def _calibrations(subject: Subject, variants: list[str]) -> list[Job]:
+    own, found = subject.scene.render.sampler, dict[str, Job]()
+    for variant in variants:
+        rays: tuple[Sampler, ...] = () if variant.startswith("scalar") else SAMPLERS
+        methods: list[tuple[Method, Sampler]] = [("points", own), *(("transport", sampler) for sampler in rays)]
+        for method, sampler in methods:
+            for asked in SAMPLES[1:]:  # fewer than there are passes cannot be asked for
+                job = _calibration(subject, variant, method, sampler, asked)
+                found.setdefault(job.name, job)
+    return list(found.values())
+
+
+def _calibration(subject: Subject, variant: str, method: Method, sampler: Sampler, asked: int) -> Job:
+    work, way = plan(asked, sampler), f"{method}, {sampler}"
+    name = f"calibrate {way} {variant} {work.total}"
+
+    def one(repeat: int) -> Repeat:
+        seed = subject.seed(name, repeat)
+        scene = curves.with_calibration(subject.scene, method, sampler, variant, asked, seed)
+        model, cost = _costed(lambda: curves.calibrated(scene, subject.camera))
+        error = curves.error_of_model(model, subject.right)
+        return Repeat(error, cost, subject.brought(subject.stack(repeat), model, repeat) if repeat < FEWER else None)
+
+    each = work.total * subject.camera.measurements / RAYS[variant]
+    guess = 2 * READY[variant] + each * (POINTS if method == "points" else 1.0) + TWICE * subject.solving
+    return Job("calibrate", way, variant, work.total, f"{work.passes} passes of {work.samples}", guess, one)
+
+
+def _estimates(subject: Subject) -> tuple[list[Job], list[LeftOut]]:
+    answers: dict[int, tuple[Task, Exact]] = {}
+
+    def answer(repeat: int) -> tuple[Task, Exact]:
+        if repeat not in answers:
+            task = way_of(subject.stack(repeat), subject.right.model).task
+            known = answers[0][1].deviation if answers else None
+            answers[repeat] = task, exact(task, known)
+        return answers[repeat]
+
+    def job(setting: Setting) -> Job:
+        def one(repeat: int) -> Repeat:
+            task, right = answer(repeat)
+            image, cost = _costed(lambda: setting.image(task))
+            return Repeat(right.error(image), cost, subject.freed(subject.squares(image), repeat))
+
+        return Job("reconstruct", setting.way, None, None, setting.setting, setting.guess, one)
+
+    found, refused = settings(answer(0)[0])
+    return [job(setting) for setting in found], [LeftOut(*one) for one in refused]
+
+
+def _costed(work: Callable[[], Result]) -> tuple[Result, Cost]:
+    release()
+    return costed(work)

@@ -1,0 +1,141 @@
+"""What rendering and calibration come to with so many samples: against the closed form, else against many more rays.
+
+Every repeat has a seed of its own, and none of these streams is one of the scene's data or calibration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from scenes.camera import Camera
+from scenes.model import Model
+from scenes.needs import needed
+from scenes.progress import Progress, no_progress
+from scenes.scene import Sampler, Scene, resolved
+from scenes.stack import Stack
+
+from .calibrate import calibrate
+from .ideal import exact_model, ideal_model, true_matrix
+from .kept import kept_model
+from .passes import FEWEST_PASSES, Plan, plan
+from .render import Rendering, exposed, light, settled
+from .samplers import fitting
+from .streams import repeat_seed
+
+Vector = NDArray[np.float64]
+
+TRUER = 64  # times the samples of what is judged: then the reference brings less than a hundredth of the error
+REFERENCE = ".bench.reference.npz"
+MOST_SAMPLES = 2**14  # a pixel, of what is judged
+MOST_RAYS = 2**27  # of a reference: some ten seconds where lenses are traced surface by surface
+
+
+@dataclass(frozen=True)
+class Right:
+    """What renderings and calibrations are held against: H as it truly is, or as very many rays show it.
+
+    light : (M,) what the sensor pixels truly read of the image;  spread : (M,) its variance, 0 of a closed form
+    words : for people
+    """
+
+    model: Model
+    light: Vector
+    spread: Vector
+    words: str
+
+
+def closed(camera: Camera) -> bool:
+    """Whether H of a camera as it stands has a closed form."""
+    for kind in camera.types:
+        blurred = camera.blurs(kind)
+        if kind.glass.surfaces is not None or (blurred and kind.glass.distortion is not None):
+            return False
+    return camera.tolerance is None or camera.stays_sharp
+
+
+def right(
+    scene: Scene, camera: Camera, image: NDArray[np.float64], folder: Path, progress: Progress = no_progress
+) -> Right:
+    """The closed form where there is one; else H from 64 times the rays, or from as many as can be waited for.
+
+    Such a reference is kept in `folder`. Raises InputError where it takes a backend that does not work here.
+    """
+    simulated = needed(scene, camera)[0]
+    flat = image.ravel()
+    if closed(simulated):
+        kept = resolved(scene, (camera.rows, camera.columns))
+        perfect = camera.boxed and camera.tolerance is None
+        model = ideal_model(kept, camera) if perfect else exact_model(kept, camera, true_matrix(simulated), "true")
+        return Right(model, model.forward(flat), np.zeros(camera.measurements), "the closed form")
+    samples = min(TRUER * MOST_SAMPLES, MOST_RAYS // camera.measurements)
+    told = with_calibration(
+        scene, "transport", "multijitter", "auto", samples, repeat_seed(scene.render.seed, "right", 0)
+    )
+    model, _ = kept_model(folder / REFERENCE, told, camera, progress)
+    return Right(model, model.forward(flat), model.spread(flat), f"a reference of {model.record['samples']} samples")
+
+
+def with_rendering(scene: Scene, sampler: Sampler, variant: str, samples: int, seed: int) -> Scene:
+    """The scene rendered so."""
+    return _changed(scene, "render", sampler=sampler, variant=variant, samples=samples, seed=seed)
+
+
+def with_calibration(
+    scene: Scene, method: Literal["points", "transport"], sampler: Sampler, variant: str, samples: int, seed: int
+) -> Scene:
+    """The scene calibrated so."""
+    told = _changed(scene, "render", sampler=sampler, variant=variant, seed=seed)
+    return _changed(told, "calibration", method=method, samples=samples, fit=None)
+
+
+def _changed(scene: Scene, table: str, **update: Any) -> Scene:
+    return scene.model_copy(update={table: getattr(scene, table).model_copy(update=update)})
+
+
+def work_of(samples: int, sampler: Sampler) -> Plan:
+    """As renderings divide them over passes; fewer samples than the fewest passes are those of a single one."""
+    return plan(samples, sampler) if samples >= FEWEST_PASSES else Plan(1, fitting(sampler, samples))
+
+
+def rendered(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Rendering:
+    """The light alone, as `run` renders it."""
+    return light(scene, camera, image, work=work_of(scene.render.samples, scene.render.sampler))
+
+
+def error_of_light(rendering: Rendering, right: Right) -> float:
+    """Root mean square over sensor pixels, in values of f; what the reference itself errs by is taken out."""
+    squares = np.square(rendering.mean - right.light) - right.spread
+    return float(np.sqrt(max(np.nanmean(squares), 0.0)))
+
+
+def stack_of(scene: Scene, camera: Camera, rendering: Rendering, error: float) -> Stack:
+    """The rendering as the scene's sensor records it, with noise by the scene's seed.
+
+    error : stands for the variance that a single pass does not know of itself
+    """
+    several = rendering.passes > 1
+    variance = settled(rendering, camera) if several else np.full(camera.measurements, error**2)
+    return exposed(scene, camera, rendering.mean, variance, {})
+
+
+def stack_of_right(scene: Scene, camera: Camera, right: Right) -> Stack:
+    """Exact light as the scene's sensor records it."""
+    return exposed(scene, camera, right.light, np.zeros(camera.measurements), {})
+
+
+def calibrated(scene: Scene, camera: Camera) -> Model:
+    """H as `run` finds it."""
+    return calibrate(scene, camera)
+
+
+def error_of_model(model: Model, right: Right) -> float:
+    """Root mean square over the entries of the right H; what the reference itself errs by is taken out."""
+    away = sparse.csr_array(model.matrix - right.model.matrix)
+    squares = float(np.square(away.data).sum()) - float(right.model.variance.sum())
+    return float(np.sqrt(max(squares, 0.0) / right.model.entries))

@@ -247,10 +247,9 @@ def _spread(panel: Any, labels: Sequence[Label], wider: float) -> None:
     places = [float((np.log(value) - low) / (high - low)) for _, value, _, _ in rising]
     apart = [LINE * (1 + words.count("\n")) for _, _, words, _ in rising]
     for place, (x, y, words, colour) in zip(_moved_apart(places, apart), rising, strict=True):
-        panel.annotate(
-            words, (x, y), xytext=(1.03 / wider, place), textcoords="axes fraction", va="center", fontsize=8.5,
-            color=colour, arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "alpha": 0.6, "relpos": (0, 0.5)},
-        )  # fmt: skip
+        leader = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "alpha": 0.6, "relpos": (0, 0.5)}
+        text = {"textcoords": "axes fraction", "va": "center", "fontsize": 8.5, "color": colour}
+        panel.annotate(words, (x, y), xytext=(1.03 / wider, place), arrowprops=leader, **text)
 
 
 def _moved_apart(places: Sequence[float], apart: Sequence[float]) -> list[float]:

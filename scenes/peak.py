@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
@@ -32,7 +31,6 @@ def costed(work: Callable[[], Result]) -> tuple[Result, Cost]:
 
 def _forget() -> bool:
     """Let the peak begin anew; whether the system does."""
-    gc.collect()
     try:
         ctypes.CDLL(None).malloc_trim(0)  # what was freed goes back, or it would hide as much of what the work takes
         FORGET.write_text("5", encoding="ascii")

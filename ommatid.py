@@ -198,7 +198,7 @@ def calibrate(
     from scenes.files import refuse_output
     from scenes.scene import read
     from simulate.kept import kept_model
-    from simulate.refuse import refuse
+    from simulate.refuse import refuse, refuse_memory
 
     refuse_output(output, scene)
     described = read(scene, sets or (), _names(lens))
@@ -213,6 +213,8 @@ def calibrate(
     else:
         if described.calibration.method != "ideal":
             refuse(described, camera)
+        with naming(scene):
+            refuse_memory(described, camera)
         with naming(scene), _progress("calibrate") as progress:
             model, made = kept_model(output, described, camera, progress)
     _say(f"calibrate: {_done(made)}, {output}")

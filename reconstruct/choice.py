@@ -8,12 +8,13 @@ from math import ceil
 
 from scenes.camera import Camera
 from scenes.errors import InputError
+from scenes.memory import free_memory
 from scenes.scene import Scene
 
 from .aligned import Aligned, Robust
 from .dense import Dense
 from .framed import Framed
-from .memory import free_memory, needed_memory
+from .memory import needed_memory
 from .sliding import slides
 from .tiled import Tiled
 from .way import Way
@@ -119,8 +120,9 @@ def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Choi
 
 
 def allowed_memory(told: int | None) -> int:
-    """Bytes that may be used: what the scene says, else half of what is free."""
-    return free_memory() // 2 if told is None else told
+    """Bytes that may be used: what the scene says, else half of what is free; never more than that."""
+    free = free_memory()
+    return free // 2 if told is None else min(told, free)
 
 
 def _noise(scene: Scene) -> bool:

@@ -17,6 +17,7 @@ from math import log10
 import numpy as np
 
 from scenes.errors import InputError
+from scenes.memory import free_memory
 
 from .certificate import Refined, refine, variance_error
 from .corrected import Corrected
@@ -27,7 +28,7 @@ from .forms.information import information
 from .forms.square_root_covariance import square_root_covariance
 from .forms.square_root_information import square_root_information
 from .forms.svd import svd
-from .memory import free_memory, needed_memory
+from .memory import needed_memory
 from .problem import Problem
 from .residuals import Exact
 

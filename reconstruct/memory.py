@@ -1,9 +1,6 @@
-"""What the dense forms of the estimator need of memory, and what there is."""
+"""What the dense forms of the estimator need of memory."""
 
 from __future__ import annotations
-
-import os
-from pathlib import Path
 
 
 def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bool = False) -> int:
@@ -18,12 +15,3 @@ def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bo
         "dual": 5 * measurements * both + 4 * both * unknowns,
     }
     return 8 * (matrix[form] + (4 * unknowns**2 if correlated else 0))
-
-
-def free_memory() -> int:
-    """Bytes that can be had without swapping; where the system does not say, what is built in."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

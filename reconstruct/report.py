@@ -76,7 +76,11 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
             **({"fit": model.record["fit"]} if "fit" in model.record else {}),
         },
         "skipped": [left.describe() for left in (*left_out(_as_run(stack, model), model.camera), *_of_world(stack))],
-        "versions": {**model.record["versions"], **stack.record["versions"], **versions("scipy", "scikit-image")},
+        "versions": {
+            **model.record.get("versions", {}),
+            **stack.record.get("versions", {}),
+            **versions("scipy", "scikit-image"),
+        },
         "seeds": {
             "scene": stack.record.get("seed"),  # recorded frames have none
             "data": stack.record.get("first_seed"),

@@ -27,11 +27,16 @@ from scipy import sparse
 
 from .camera import Camera
 from .displacement import QUANTILES, TAIL, airy_end, moments, quantiles, slopes
+from .errors import InputError
 from .lens_type import LensType
+from .memory import refuse_beyond
 
 Numbers = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
+MOST_REACH = 1000  # pixels of f
+MOST_RINGS = 1000  # of a disk of defocus, in units of the Airy pattern: minutes of work
+TABLES = 6  # arrays of the size of the transfer function, beside the matrix
 SIGNS = np.array([1, -1, -1, 1])  # of D
 
 
@@ -81,7 +86,7 @@ class Blur:
 def blur_of(camera: Camera, kind: LensType) -> Blur:
     """The blur of a lens type's thin lenses: aperture |1 - distance / focus| wide, Airy's where there is a wavelength.
 
-    Raises ValueError for a lens of surfaces, whose blur is no disk.
+    Raises ValueError for a lens of surfaces, whose blur is no disk, InputError for more blur than can be computed.
     """
     if kind.glass.surfaces is not None:
         raise ValueError(f"lens type '{kind.name}' has surfaces; expected a pinhole or a thin lens")
@@ -91,7 +96,18 @@ def blur_of(camera: Camera, kind: LensType) -> Blur:
     disk = aperture * abs(1 - camera.distance / camera.focus(kind)) / camera.target_pitch
     turn = 0.0 if camera.wavelength is None else camera.wavelength * camera.distance / np.pi
     weight = (aperture / (2 * camera.depth(kind))) ** 2 if disk else 0.0
-    return Blur(disk, turn / (aperture * camera.target_pitch), weight)
+    blur = Blur(disk, turn / (aperture * camera.target_pitch), weight)
+    if blur.reach > MOST_REACH:
+        raise InputError(
+            f"camera.lens.{kind.name}: rays land up to {blur.reach:.3g} pixels of f beside where a pinhole's would, at"
+            f" most {MOST_REACH} are served; mend its aperture or its focus"
+        )
+    if blur.airy and disk > MOST_RINGS * blur.airy:
+        raise InputError(
+            f"camera.lens.{kind.name}: the disk of defocus is {disk / blur.airy:.3g} times as wide as what diffraction"
+            " adds, which no pixel tells; remove camera.wavelength"
+        )
+    return blur
 
 
 def matrix(camera: Camera, kind: LensType, blur: Blur) -> sparse.csr_array:
@@ -106,6 +122,9 @@ def matrix(camera: Camera, kind: LensType, blur: Blur) -> sparse.csr_array:
     unit = lcm(kind.ratio.denominator, kind.step.denominator)
     down, across = (_axis(camera, kind, blur, axis, unit) for axis in (0, 1))
     known = np.unique(np.abs(np.concatenate([down.apart.ravel(), across.apart.ravel()])))  # both sides look alike
+    refuse_beyond(
+        TABLES * 8 * known.size**2, f"camera.lens.{kind.name}: its blur", "take rounder ratios, or less of it"
+    )
     gap = np.maximum(known - unit - int(kind.ratio * unit), 0) / (2 * unit)
     lit = np.hypot.outer(gap, gap) < max(blur.reach, np.finfo(float).tiny)
     table = np.where(lit, transfer(float(kind.ratio), known, unit, blur), 0.0)

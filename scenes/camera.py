@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .lens_type import Glass, LensType, SubImager
 from .lenses import Lens, Tolerance
+from .memory import refuse_beyond
 from .picture import shape
 from .scene import Scene
 
 MOST_MEASUREMENTS = 2**30
 MOST_SUB_IMAGERS = 2**14
+PLANES = 4  # arrays of the target's or the sensor's size that everything has to hold
 
 
 @dataclass(frozen=True)
@@ -216,6 +218,8 @@ def derive(scene: Scene) -> Camera:
                 f"{scene.source}: camera.lens.{kind.name}.array has {kind.count} sub-imagers, at most"
                 f" {MOST_SUB_IMAGERS} a lens type are served; use fewer"
             )
+    needed = PLANES * 8 * (camera.unknowns + camera.measurements)
+    refuse_beyond(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
     if camera.measurements > MOST_MEASUREMENTS:
         raise InputError(f"{scene.source}: the lens arrays have {camera.measurements} pixels, at most 2^30 are served")
     _refuse_overlap(camera, scene)

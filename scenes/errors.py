@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,21 @@ class InputError(ValueError):
 
 class DeniedError(OSError):
     """What the machine refuses, such as space on the disk; the command line answers with exit code 1."""
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
+_SHORT.maxlevel = 3
+
+
+def shown(value: object) -> str:
+    """What came, as Python writes it, shortened to what a sentence can hold."""
+    return _SHORT.repr(value)
+
+
+def short(text: str) -> str:
+    """A text, shortened to what a sentence can hold."""
+    return shown(text)[1:-1] if len(text) > _SHORT.maxstring else text
 
 
 @contextmanager

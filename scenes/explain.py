@@ -8,6 +8,8 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from .errors import short, shown
+
 
 def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]) -> str:
     """The first thing wrong with `data`, as a sentence without the file's name."""
@@ -39,7 +41,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel]) -> str:
     kind = problem["type"]
     location = problem["loc"] if kind == "extra_forbidden" else _trim(problem["loc"])
-    key = _dotted(location, data)
+    key = short(_dotted(location, data))
     if kind == "extra_forbidden":
         keys = known_keys(model)
         bare = ".".join(part for part in location if isinstance(part, str))
@@ -55,13 +57,15 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
         "String should match", "expected text that matches"
     )
     if "got" not in message:
-        message = f"{message}, got {problem['input']!r}"
+        message = f"{message}, got {shown(problem['input'])}"
     return f"{key}: {message}" if key else message
 
 
 def _trim(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
     # pydantic appends the branch of a union or the kind of a tuple: these are no keys of the file.
-    return tuple(part for part in location if isinstance(part, int) or part.isidentifier() or "-" in part)
+    return tuple(
+        part for part in location if isinstance(part, int) or part.isidentifier() or ("-" in part and "[" not in part)
+    )
 
 
 def _dotted(location: tuple[int | str, ...], data: Any) -> str:

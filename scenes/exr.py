@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .files import digest, fingerprint, write_whole
+from .memory import refuse_beyond
 
 ATTRIBUTE = "ommatid"
 
@@ -96,6 +97,7 @@ def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | N
         raise InputError(f"{path}: no such file")
     try:
         with _quiet():
+            refuse_beyond(_promised(path), f"{path}: to read it", "take a smaller one, or free some memory")
             file = OpenEXR.File(str(path), separate_channels=True)
         return [
             (
@@ -105,8 +107,22 @@ def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | N
             )
             for part in file.parts
         ]
-    except (RuntimeError, ValueError, TypeError, UnicodeDecodeError) as error:
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected an OpenEXR file, got one that cannot be read ({error})") from error
+
+
+def _promised(path: Path) -> int:
+    """Bytes of all channels as the headers tell, twice: the library's copy and ours."""
+    import OpenEXR
+
+    total = 0
+    for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts:
+        first, last = part.header["dataWindow"]
+        columns, rows = (int(high) - int(low) + 1 for low, high in zip(first, last, strict=True))
+        total += 2 * 4 * rows * columns * len(part.header["channels"])
+    return total
 
 
 def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], attribute: str | None) -> Part:
@@ -118,7 +134,7 @@ def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], at
         seal = record.pop("seal")
         intact = fingerprint(record) == seal
         pixels = record.pop("sha256")
-    except (ValueError, KeyError, AttributeError, TypeError) as error:
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise InputError(f"{where} has a damaged attribute '{ATTRIBUTE}'; make the file again") from error
     if not intact or not channels or _seal(channels) != pixels:
         raise InputError(f"{where} does not match its checksum; the file is cut short or altered, make it again")

@@ -13,14 +13,13 @@ Source: M. Pharr, W. Jakob, G. Humphreys, Physically Based Rendering, section 6.
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationError
 
-from . import glass
-from .errors import InputError
+from . import glass, toml
+from .errors import InputError, short
 from .explain import explain
 from .lenses import Camera, Surface
 from .quantities import pair
@@ -76,8 +75,8 @@ def with_surfaces(camera: Camera, source: Path) -> Camera:
 
 def _from_toml(text: str, path: Path) -> tuple[Surface, ...]:
     try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        data = toml.loads(text)
+    except ValueError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from error
     try:
         return LensFile.model_validate(data).surfaces
@@ -110,7 +109,7 @@ def _numbers(words: list[str], path: Path, number: int) -> list[float]:
         except ValueError:
             value = float("nan")
         if not abs(value) < 1e9:
-            raise InputError(f"{path}, line {number}: expected numbers ({COLUMNS}), got '{word}'")
+            raise InputError(f"{path}, line {number}: expected numbers ({COLUMNS}), got '{short(word)}'")
         values.append(value)
     return values
 
@@ -131,4 +130,7 @@ def _surface(values: list[float], before: float, *, last: bool, place: str) -> S
     if index > 1:
         listed["index"] = index
     listed["stop"] = radius == 0 and (index == 0 or index == before == 1)
-    return Surface.model_validate(listed)
+    try:
+        return Surface.model_validate(listed)
+    except ValidationError as error:
+        raise InputError(f"{place}: {explain(error, listed, Surface)}") from error

@@ -7,9 +7,11 @@ from typing import Annotated, Literal, cast
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from .quantities import Angle, Length, Magnification, Pair, Radius, Step, pair
+from .errors import shown
+from .quantities import Angle, Length, Magnification, Pair, Radius, Step, file_name, pair
 from .table import Table
 
+Distortion = Annotated[float, Field(ge=-1000, le=1000)]
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
 
@@ -55,7 +57,7 @@ class Lens(Table):
     step: Step = Field(default=Fraction(1), description="pixels of the target from one sub-imager's window to the next")
     aperture: Length | None = Field(default=None, description="diameter of a thin lens; absent: a pinhole")
     focus: Length | None = Field(default=None, description="distance that is shown sharp; absent: the target's")
-    distortion: Annotated[tuple[float, float], BeforeValidator(pair)] | None = Field(
+    distortion: Annotated[tuple[Distortion, Distortion], BeforeValidator(pair)] | None = Field(
         default=None, description="k1, k2: magnification times 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner"
     )
     surfaces: Annotated[tuple[Surface, ...], BeforeValidator(pair), Field(min_length=1)] | str | None = Field(
@@ -71,7 +73,14 @@ class Lens(Table):
         numbers: list[object] = list(value) if isinstance(value, list | tuple) else []  # type: ignore[arg-type]
         if value == "fit" or (len(numbers) == 2 and all(type(n) is int and n >= 1 for n in numbers)):  # type: ignore[operator]
             return pair(cast(object, value))
-        raise ValueError(f'expected two whole numbers of at least 1, such as [5, 5], or "fit", got {value!r}')
+        raise ValueError(
+            f'expected two whole numbers of at least 1, such as [5, 5], or "fit", got {shown(cast(object, value))}'
+        )
+
+    @field_validator("surfaces")
+    @classmethod
+    def _a_file(cls, value: object) -> object:
+        return file_name(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _one_kind_of_lens(self) -> Lens:

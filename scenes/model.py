@@ -10,9 +10,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,12 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from . import npz
 from .boxes import Boxes
 from .camera import Camera, derive
-from .errors import InputError
+from .errors import InputError, short
 from .files import digest, write_whole
 from .moderate import moderate
+from .record import checked
 from .scene import Scene, parse
+from .table import LARGEST
 
 Vector = NDArray[np.float64]
 
@@ -240,18 +240,20 @@ def read(path: Path) -> Model:
     try:
         content = json.loads(description)
         scene = parse(content["scene"], path)
-        record = content["record"]
+        record = checked(content["record"])
+        method = record["method"]
+        camera = derive(scene)
         matrix, shape = None, tuple(arrays["shape"].tolist())
         if "data" in arrays:
-            matrix = sparse.csr_array((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
-            matrix.check_format()
-        if matrix is None and not (record["method"] == "ideal" and derive(scene).boxed):
+            matrix = _checked(arrays, shape)
+        elif not (method == "ideal" and camera.boxed):
             raise ValueError("it has no entries")
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise InputError(f"{path}: holds no usable observation matrix ({error}); calibrate again") from error
-    camera = derive(scene)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(
+            f"{path}: holds no usable observation matrix ({short(str(error))}); calibrate again"
+        ) from error
     expected = (camera.measurements, camera.unknowns)
     entries = np.shape(arrays.get("data", ()))
     if shape != expected or not arrays["variance"].shape == entries == arrays["batches"].shape[1:]:
@@ -259,34 +261,38 @@ def read(path: Path) -> Model:
     return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
 
 
+def _checked(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
+    """H from its parts. Raises ValueError where they are no matrix in rows, or hold what is no number."""
+    for name, kinds in (("data", "f"), ("variance", "f"), ("batches", "f"), ("indices", "i"), ("indptr", "i")):
+        if arrays[name].dtype.kind not in kinds or not (np.abs(arrays[name]) <= LARGEST**2).all():
+            raise ValueError(f"{name} of {arrays[name].dtype} holds what is no number of its kind")
+    if (arrays["variance"] < 0).any():
+        raise ValueError("a variance is below 0")
+    if len(shape) != 2:
+        raise ValueError(f"its shape is {shape}")
+    matrix = sparse.csr_array((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
+    matrix.check_format(full_check=True)
+    return matrix
+
+
 def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    names = ("shape", "variance", "batches")
     try:
-        # numpy leaves a damaged file open, so we open it
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays: dict[str, NDArray[Any]] = {name: file[name] for name in names}
-            if file["format"][()] != b"boxes":
-                arrays |= {name: file[name] for name in ENTRIES}
-            record = json.loads(str(file["ommatid"][()]))
-            description, seal = record["description"], record["sha256"]
-    except _UNREADABLE as error:
-        reason = "it holds pickled objects" if "pickle" in str(error) else str(error)
+        found = npz.read(path)
+        names = ["shape", "variance", "batches", *(ENTRIES if found["format"][()] != b"boxes" else ())]
+        arrays = {name: found[name] for name in names}
+        record = json.loads(str(found["ommatid"][()]))
+        description, seal = record["description"], record["sha256"]
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         raise InputError(
-            f"{path}: expected a model that ommatid wrote, got one that cannot be read: {reason}"
+            f"{path}: expected a model that ommatid wrote, got one that cannot be read: {short(str(error))}"
         ) from error
     if _seal(arrays, description) != seal:
         raise InputError(f"{path}: does not match its checksum; the file is damaged, calibrate again")
     return arrays, description
-
-
-# What numpy, zipfile and json raise for damaged files: RuntimeError for an encrypted one, TokenError for a header
-# that is no Python.
-_UNREADABLE = (
-    *(ValueError, KeyError, IndexError, TypeError, OSError, EOFError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
-)
 
 
 def _seal(arrays: dict[str, NDArray[Any]], description: str) -> str:

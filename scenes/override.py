@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
-import tomllib
 from collections.abc import Iterable
 from typing import Any
 
-from .errors import InputError
+from . import toml
+from .errors import InputError, short
+
+MOST_NAMED = 10  # lens types in a sentence
 
 
 def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
@@ -16,11 +18,14 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str,
     The value is read as TOML, else as text. Raises InputError if the key's table does not exist.
     """
     changed = copy.deepcopy(data)
-    for override in overrides:
-        key, equals, text = override.partition("=")
+    for written in overrides:
+        key, equals, text = written.partition("=")
+        override = short(written)
         if not equals or not key.strip():
             raise InputError(f"--set {override}: expected KEY=VALUE, such as noise.variance=1e-6")
         *tables, last = [part.strip() for part in key.split(".")]
+        if len(tables) > toml.DEEPEST:
+            raise InputError(f"--set {override}: its key goes deeper than {toml.DEEPEST} tables")
         table: Any = changed
         for name in tables:
             table = _inside(table, name, override)
@@ -46,8 +51,8 @@ def _inside(table: Any, name: str, override: str) -> Any:
 
 def _value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return toml.loads(f"value = {text}")["value"]
+    except ValueError:
         return text.strip()
 
 
@@ -75,5 +80,7 @@ def _by_name(lenses: list[Any]) -> dict[str, Any]:
     return {str(lens.get("name")): lens for lens in lenses if isinstance(lens, dict)}  # type: ignore[union-attr]
 
 
-def _names(lenses: Iterable[Any]) -> str:
-    return ", ".join(f"'{name}'" for name in lenses) or "none"
+def _names(lenses: Iterable[str]) -> str:
+    known = [f"'{short(name)}'" for name in lenses]
+    more = [f"{len(known) - MOST_NAMED} more"] if len(known) > MOST_NAMED else []
+    return ", ".join([*known[:MOST_NAMED], *more]) or "none"

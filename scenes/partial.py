@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import npz
 from .errors import DeniedError
 from .files import write_whole
 
@@ -33,9 +33,8 @@ class Partial:
     def state(self) -> State:
         """What an earlier run left, if it was of the same; else nothing."""
         try:
-            with self._path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-                found = {name: file[name] for name in file.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+            found = npz.read(self._path)
+        except ValueError:
             return {}
         return found if str(found.pop("fingerprint", "")) == self._fingerprint else {}
 

@@ -6,14 +6,18 @@ Colour becomes luminance, 8 bits stay as they are, 16 bits are divided by 257, f
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import npz, tiff
 from .errors import InputError
 from .exr import Part, read_channels, write
+from .memory import refuse_beyond
 from .scene import Scene
 
 Image = NDArray[np.float64]
@@ -32,6 +36,7 @@ def load(scene: Scene) -> Image:
     if target.image is None:
         if target.shape is None:
             raise InputError(f"{where} is absent, and so is target.shape, which would do for a [world]; name a picture")
+        refuse_beyond(prod(target.shape) * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one")
         return np.zeros(target.shape)
     picture = luminance(_pixels(target.image, where), where)
     if target.origin is None:
@@ -44,7 +49,7 @@ def load(scene: Scene) -> Image:
         crop = picture
     else:
         crop = _crop(picture, scene)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         rounded = crop.astype(np.float32).astype(np.float64)  # the precision of the renderer and of truth.exr
     if not np.isfinite(rounded).all():
         raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
@@ -141,16 +146,36 @@ def decode(path: Path, where: str) -> NDArray[Any]:
         if not {"R", "G", "B"} <= channels.keys():
             raise InputError(f"{where}: {path} has channels {', '.join(channels)}; expected Y, or R, G and B")
         return np.stack([channels[name] for name in "RGB"], axis=-1)
-    if kind not in (".npy", ".png", ".jpg", ".jpeg", ".tif", ".tiff"):
+    if kind not in _READERS:
         raise InputError(f"{where}: expected a PNG, TIFF, EXR or NPY file, got {path}")
     try:
-        if kind == ".npy":
-            return np.load(path, allow_pickle=False)
-        from skimage import io
-
-        imread: Any = io.imread  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-        return np.asarray(imread(path))
+        return _READERS[kind](path)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
     except Exception as error:  # every decoder raises kinds of its own
         raise InputError(
             f"{where}: {path} could not be read as a picture; it is damaged or another kind of file"
         ) from error
+
+
+def _scanned(path: Path) -> NDArray[Any]:
+    """A PNG or JPEG picture. Pillow has a limit to its size, and warns below it; here there is that of memory."""
+    from PIL import Image
+    from skimage import io
+
+    imread: Any = io.imread  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        with Image.open(path, formats=("PNG", "JPEG")) as opened:
+            needed = tiff.BYTES * prod(opened.size) * len(opened.getbands())
+        refuse_beyond(needed, f"{path}: to read it", "take a smaller picture, or free some memory")
+        return np.asarray(imread(path))
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
+    ".npy": npz.array,
+    **dict.fromkeys((".tif", ".tiff"), tiff.picture),
+    **dict.fromkeys((".png", ".jpg", ".jpeg"), _scanned),
+}

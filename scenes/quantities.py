@@ -5,11 +5,23 @@ Lengths become millimetres here and nowhere else.
 
 from __future__ import annotations
 
+import os
+import re
 from fractions import Fraction
 from functools import cache
 from typing import Annotated, Any, cast
 
-from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WithJsonSchema
+
+from .errors import shown
+
+LONGEST = 80  # characters of a quantity: whatever its library does with each, it is done at once
+NUMBER = r"[-+]?(\d[\d_]*\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
+UNIT = r"[^\W\d]+((\*\*|\^)-?\d|[²³])?"
+QUANTITY = re.compile(rf"\s*{NUMBER}(\s*/\s*{NUMBER})?\s*\*?\s*{UNIT}(\s*[*/]\s*{UNIT})*\s*")
+RATIO = re.compile(rf"\s*{NUMBER}(/\d+)?\s*")
+EXTREME = 1e15  # of millimetres, seconds, radians or lux: beyond, squares and ratios leave what floats can tell
+LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes that systems take
 
 
 @cache
@@ -19,21 +31,33 @@ def _units() -> Any:
     return cast(Any, pint).UnitRegistry()
 
 
+def _quantity(text: str, unit: str) -> float:
+    """A number and its unit, in another unit. Raises an exception of one of many kinds.
+
+    The library computes what stands in a text, 9**9**9 for weeks; so nothing but a number and units goes there.
+    """
+    if len(text) > LONGEST or QUANTITY.fullmatch(text) is None:
+        raise ValueError("neither a number nor a unit")
+    return float(_units().Quantity(text).to(unit).magnitude)
+
+
 def _in_units(value: object, unit: str, what: str, examples: tuple[str, str], *, signed: bool = False) -> float:
     """A text such as "6 um" as a number of `unit`. Raises ValueError that says what was expected."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         example = f"{value} {examples[0].split()[1]}"
         raise ValueError(f'expected {what} with its unit, such as "{example}", got the bare number {value}')
     if not isinstance(value, str):
-        raise ValueError(f'expected {what} with its unit, such as "{examples[0]}", got {value!r}')
+        raise ValueError(f'expected {what} with its unit, such as "{examples[0]}", got {shown(value)}')
     try:
-        number = float(_units().Quantity(value).to(unit).magnitude)
+        number = _quantity(value, unit)
     except Exception as error:  # pint raises a dozen kinds, tokenize's among them
         raise ValueError(
-            f'expected {what} with its unit, such as "{examples[1]}" or "{examples[0]}", got {value!r}'
+            f'expected {what} with its unit, such as "{examples[1]}" or "{examples[0]}", got {shown(value)}'
         ) from error
     if not (number != 0 and abs(number) < float("inf")) or (number < 0 and not signed):
-        raise ValueError(f"expected {what} {'other than' if signed else 'above'} zero, got {value!r}")
+        raise ValueError(f"expected {what} {'other than' if signed else 'above'} zero, got {shown(value)}")
+    if not 1 / EXTREME <= abs(number) <= EXTREME:
+        raise ValueError(f"expected {what} between {1 / EXTREME:g} and {EXTREME:g} {unit}, got {shown(value)}")
     return number
 
 
@@ -61,25 +85,28 @@ def _ratio(value: object) -> Fraction:
     try:
         if isinstance(value, bool) or not isinstance(value, str | int | float | Fraction):
             raise ValueError
-        ratio = Fraction(str(value))
+        text = str(value)
+        if len(text) > LONGEST or RATIO.fullmatch(text) is None:  # 1e-9999999999 would be a number of so many digits
+            raise ValueError
+        ratio = Fraction(text)
     except (ValueError, ZeroDivisionError) as error:
-        raise ValueError(f'expected a ratio such as "1/3" or 0.25, got {value!r}') from error
+        raise ValueError(f'expected a ratio such as "1/3" or 0.25, got {shown(value)}') from error
     if ratio.denominator > 10**6 or ratio.numerator > 10**6:
-        raise ValueError(f"expected a ratio of numbers up to a million, got {value!r}")
+        raise ValueError(f"expected a ratio of numbers up to a million, got {shown(value)}")
     return ratio
 
 
 def _magnification(value: object) -> Fraction:
     ratio = _ratio(value)
     if not 0 < ratio <= 1:
-        raise ValueError(f'expected a magnification above 0 and at most 1, such as "1/3", got {value!r}')
+        raise ValueError(f'expected a magnification above 0 and at most 1, such as "1/3", got {shown(value)}')
     return ratio
 
 
 def _step(value: object) -> Fraction:
     ratio = _ratio(value)
     if ratio < 0:
-        raise ValueError(f"expected a step of 0 or more pixels of the target, got {value!r}")
+        raise ValueError(f"expected a step of 0 or more pixels of the target, got {shown(value)}")
     return ratio
 
 
@@ -134,14 +161,25 @@ Samples = Annotated[int, Field(ge=16, le=2**24, description="per sensor pixel; r
 def _memory(value: object) -> int:
     if isinstance(value, str):
         try:
-            size = int(_units().Quantity(value).to("byte").magnitude)
+            size = int(_quantity(value, "byte"))
         except Exception as error:  # as for lengths
-            raise ValueError(f'expected an amount of memory such as "4 GB", got {value!r}') from error
+            raise ValueError(f'expected an amount of memory such as "4 GB", got {shown(value)}') from error
         if 0 < size < 2**63:
             return size
-    raise ValueError(f'expected an amount of memory with its unit, such as "4 GB", got {value!r}')
+    raise ValueError(f'expected an amount of memory with its unit, such as "4 GB", got {shown(value)}')
 
 
+def file_name(value: str) -> str:
+    """The name, if a file can have it. Raises ValueError that says what was expected."""
+    if "\0" in value or not value.strip():
+        raise ValueError(f"expected the name of a file, got {shown(value)}")
+    name = os.fsencode(value)
+    if len(name) > LONGEST_PATH or max(map(len, name.split(b"/"))) > LONGEST_NAME:
+        raise ValueError(f"expected the name of a file, got one of {len(name)} bytes, {shown(value)}")
+    return value
+
+
+FileName = Annotated[str, AfterValidator(file_name)]
 Memory = Annotated[
     int,
     BeforeValidator(_memory),
@@ -153,7 +191,7 @@ Memory = Annotated[
 def _expected_noise(value: object) -> object:
     if value == "fit" or (isinstance(value, float | int) and not isinstance(value, bool) and 0 <= value <= 1e24):
         return value if value == "fit" else float(cast(float, value))
-    raise ValueError(f'expected a variance from 0 to 1e24, or "fit", got {value!r}')
+    raise ValueError(f'expected a variance from 0 to 1e24, or "fit", got {shown(value)}')
 
 
 ExpectedNoise = Annotated[

@@ -12,11 +12,12 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import tiff
 from .camera import Camera
 from .errors import InputError
 from .picture import decode, grey
@@ -196,14 +197,13 @@ def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
 
 def _pages(path: Path) -> list[NDArray[Any]]:
     """The pages of a TIFF that has several, whoever wrote it; else none, and it is read as any picture."""
-    import tifffile
-
     try:
-        with cast(Any, tifffile).TiffFile(path) as file:
-            pages = [page.asarray() for page in file.pages] if len(file.pages) > 1 else []
+        pages = tiff.pages(path)
+    except InputError:
+        raise
     except Exception:  # the library has kinds of its own; what is damaged is said where single pictures are read
         return []
-    return pages if all(page.dtype.kind in "uif" for page in pages) else []
+    return pages if len(pages) > 1 and all(page.dtype.kind in "uif" for page in pages) else []
 
 
 def patches(camera: Camera) -> Grid:

@@ -7,20 +7,20 @@ belongs and an unknown key are errors.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
+from . import toml
 from .errors import InputError
 from .estimation import Estimator, Prior, Study, Tiles
 from .explain import explain
 from .files import write_text
 from .lenses import Camera
 from .override import apply_overrides, keep_lenses
-from .quantities import Corner, Length, Pair, Samples
+from .quantities import Corner, FileName, Length, Pair, Samples
 from .sensor import Noise, Sensor
 from .table import Table
 
@@ -31,7 +31,7 @@ Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "lds
 class Target(Table):
     """The flat picture that the camera looks at, and the grid on which the image is to be recovered."""
 
-    image: str | None = Field(
+    image: FileName | None = Field(
         default=None,
         description='"photo:NAME" for one that scikit-image ships, or a PNG, TIFF, EXR or NPY file; absent: a [world]',
     )
@@ -46,7 +46,9 @@ class Target(Table):
 class World(Table):
     """A Mitsuba scene behind the target or, where that has no picture, instead of it."""
 
-    file: str = Field(description="a Mitsuba scene file: millimetres, the camera at the origin looking along +z, +y up")
+    file: FileName = Field(
+        description="a Mitsuba scene file: millimetres, the camera at the origin looking along +z, +y up"
+    )
     white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that counts as a value of 255")
 
 
@@ -162,8 +164,8 @@ def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) 
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: could not be read as a scene file ({error})") from error
     try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        data = toml.loads(text)
+    except ValueError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from error
     return with_changes(data, path, overrides, lenses)
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from . import exr
 from .camera import Camera, derive
 from .errors import InputError
+from .record import checked
 from .recording import Recording
 from .scene import Scene, parse
 
@@ -108,6 +109,10 @@ def read(path: Path) -> Stack:
     first = parts[0].record
     if "scene" not in first or "record" not in first:
         raise InputError(f"{path}: expected a stack of sub-images, got another kind of OpenEXR file")
+    try:
+        record = checked(first["record"])
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; make it again") from error
     scene = parse(first["scene"], path)
     camera = derive(scene)
     if [part.name for part in parts] != [sub.name for sub in camera.sub_imagers]:
@@ -124,10 +129,10 @@ def read(path: Path) -> Stack:
     if (variance < 0).any():
         raise InputError(f"{path}: holds variances below 0; make it again")
     if scene.sensor is None:
-        return Stack(scene, camera, _flat(parts, "Y"), variance, first["record"])
+        return Stack(scene, camera, _flat(parts, "Y"), variance, record)
     digital, dark, flat = (_flat(parts, name) for name in ("Y", *OF_A_SENSOR))
     recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts))
-    return recorded(scene, camera, recording, variance, first["record"])
+    return recorded(scene, camera, recording, variance, record)
 
 
 def _flat(parts: list[exr.Part], channel: str) -> NDArray[np.float64]:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from math import ceil
+
 from scenes.camera import Camera
 from scenes.errors import naming
+from scenes.lens_type import LensType
+from scenes.memory import refuse_beyond
 from scenes.needs import needed
 from scenes.scene import Scene
 
 from .variant import choose, refuse_slow, refuse_slow_transport
+
+SENSOR, TARGET = 12 * 8, 6 * 8  # bytes a measurement and a pixel of f that a rendering takes
+ENTRY = 12 + 8 + 8 * 4  # bytes an entry of H: itself, its variance, its batches
+SWEPT = 3 * 8 + 8 * 4 + 10 * 8  # bytes a reading of a sensor pixel: tallies, batches, and sorting into entries
+BESIDE = 2  # pixels of f around a footprint
 
 
 def refuse(scene: Scene, camera: Camera, calibrates: bool = True) -> None:
@@ -16,11 +25,33 @@ def refuse(scene: Scene, camera: Camera, calibrates: bool = True) -> None:
     calibrates : whether H is to be found, not the light alone
     """
     with naming(scene.source):
+        refuse_memory(scene, camera, calibrates)
         variant = choose(scene.render.variant)
         refuse_lenses(camera)
         refuse_slow(needed(scene, camera)[0], variant)
         if calibrates and scene.calibration.method == "transport":
             refuse_slow_transport(variant)
+
+
+def refuse_memory(scene: Scene, camera: Camera, calibrates: bool = True) -> None:
+    """Raise InputError where memory does not hold a rendering or, if it `calibrates`, H with its uncertainty."""
+    rendering = SENSOR * camera.measurements + TARGET * camera.unknowns
+    refuse_beyond(rendering, "rendering", "make target.shape or the lens arrays smaller")
+    if not calibrates or (scene.calibration.method == "ideal" and camera.boxed):
+        return
+    seen = [kind.measurements * min(_seen(camera, kind), camera.unknowns) for kind in camera.types]
+    needed = ENTRY * sum(seen) + (SWEPT * max(seen) if scene.calibration.method == "points" else 0)
+    refuse_beyond(needed, f"H of {camera.measurements} x {camera.unknowns}", "crop the target or use fewer sub-imagers")
+
+
+def _seen(camera: Camera, kind: LensType) -> int:
+    """Pixels of f that a sensor pixel may see, about."""
+    across = ceil(kind.ratio) + BESIDE
+    if kind.glass.surfaces is None and camera.blurs(kind):
+        from scenes.blur import blur_of
+
+        across += 2 * ceil(blur_of(camera, kind).reach)
+    return across**2
 
 
 def refuse_lenses(camera: Camera) -> None:

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from scenes.bench_file import ALONE
 from scenes.errors import InputError
 from scenes.estimation import Tiles
+from scenes.memory import free_memory
 
 from .choice import DENSE
 from .dense import Dense
 from .estimator import FORMS, estimate
 from .forms.form import NotSolvableError
 from .framed import Framed
-from .memory import free_memory, needed_memory
+from .memory import needed_memory
 from .problem import Problem
 from .sliding import slides
 from .tiled import Tiled

@@ -5,6 +5,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from reconstruct.accuracy import Prediction, predict
 from reconstruct.choice import choose
 from reconstruct.foresight import predict_large
@@ -19,7 +22,7 @@ def predicted(scene: Scene) -> Prediction:
     """What Eq. 5 and the ideal model promise of a scene."""
     camera = derive(scene)
     choice = choose(scene, camera, exact=camera.boxed)
-    actual, shape = _foreseen_noise(scene, camera), (camera.rows, camera.columns)
+    actual, shape = foreseen_noise(scene, camera), (camera.rows, camera.columns)
     if choice.way == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.way != "dense":
@@ -33,7 +36,7 @@ def predicted(scene: Scene) -> Prediction:
     return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape, tolerated)
 
 
-def _foreseen_noise(scene: Scene, camera: Camera) -> Any:
+def foreseen_noise(scene: Scene, camera: Camera) -> float | NDArray[np.float64]:
     """Variance of every measurement, one number or an array: with a [sensor] that of light of the prior's mean."""
     if scene.sensor is not None:
         from scenes.photons import predicted_noise

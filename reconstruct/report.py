@@ -9,7 +9,7 @@ import json
 from dataclasses import asdict
 from math import exp, isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -156,7 +156,7 @@ def _how(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _stage(record: dict[str, Any]) -> dict[str, Any]:
-    keys = ("seconds", "samples", "passes", "sampler", "variant")
+    keys = ("seconds", "samples", "passes", "sampler", "variant", "rays", "reached", "not_reached", "auto")
     return {key: record[key] for key in keys if key in record}
 
 
@@ -165,7 +165,7 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     error, stages = description["error"], description["stages"]
     lines: list[tuple[str, str]] = []
     for name, stage in stages.items():
-        made = [f"{stage['samples']} samples a pixel in {stage['passes']} passes"] if "samples" in stage else []
+        made = [_samples(stage)] if "samples" in stage else []
         made += [stage["variant"]] if "variant" in stage else []
         if name == "reconstruct":
             made.append(f"{_way(description['solver'])}, {description['unknowns']} unknowns")
@@ -207,13 +207,28 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     return lines
 
 
+def _samples(stage: dict[str, Any]) -> str:
+    samples = stage["samples"]
+    if not isinstance(samples, dict):
+        return f"{samples} samples a pixel in {stage['passes']} passes"
+    fewest, most = (cast(dict[str, int], samples)[end] for end in ("minimum", "maximum"))
+    said = f"{fewest} to {most} samples a pixel, as many as were needed"
+    missed = list(stage.get("not_reached", {}))
+    if missed:
+        return f"{said}; too few for {_named(missed)}: {stage['not_reached'][missed[0]]}"
+    return said if stage.get("auto", {}).get("reached", True) else f"{said}; too few, no more are taken"
+
+
+def _named(names: list[str]) -> str:
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
+
+
 def _fitted(fit: dict[str, Any]) -> str:
     refused = fit["refused"]
     told = f"{fit['accepted']} sub-imagers"
     if not refused:
         return told
-    named = ", ".join(refused[:MOST_NAMED]) + (f" and {len(refused) - MOST_NAMED} more" if refused[MOST_NAMED:] else "")
-    return f"{told}; as measured, since the fit is no good there: {named}"
+    return f"{told}; as measured, since the fit is no good there: {_named(refused)}"
 
 
 def _way(solver: dict[str, Any]) -> str:

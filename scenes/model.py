@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -39,6 +39,19 @@ ALIKE = 200  # pixels of like contrast, at least, whose scatter is moderated tog
 MOST_KINDS = 24  # such groups of a lens type, at most
 RECORDED = "recorded points"  # the method of a model whose every entry was read by itself
 NOWHERE = -1  # what a measurement sees that sees nothing: no window has it
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Who says of a model whether its H is known well enough.
+
+    adds : what the uncertainty of H adds to the expected error of a reconstruction, relative to all the rest of it
+    by : fingerprint of what is reconstructed;  words : the same for people
+    """
+
+    adds: Callable[[Model], float]
+    by: str
+    words: str
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import os
 import re
 from fractions import Fraction
 from functools import cache
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
@@ -71,6 +71,11 @@ def _radius(value: object) -> float:
 
 def _time(value: object) -> float:
     return _in_units(value, "s", "a time", ("10 ms", "0.5 s"))
+
+
+def duration(text: str) -> float:
+    """Seconds, of a text such as "30 s", "30s" or "2 min". Raises ValueError that says what was expected."""
+    return _in_units(text, "s", "a time", ("30 s", "2 min"))
 
 
 def _angle(value: object) -> float:
@@ -155,7 +160,28 @@ Step = Annotated[Fraction, BeforeValidator(_step), PlainSerializer(_text_of), _R
 Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[tuple[Count, Count], BeforeValidator(pair)]
 Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(pair)]
-Samples = Annotated[int, Field(ge=16, le=2**24, description="per sensor pixel; rendered in 16 passes or more")]
+
+FEWEST_SAMPLES, MOST_SAMPLES = 16, 2**24
+
+
+def _samples(value: object) -> object:
+    if isinstance(value, int) and not isinstance(value, bool) and FEWEST_SAMPLES <= value <= MOST_SAMPLES:
+        return value
+    if value == AUTO:
+        return value
+    raise ValueError(
+        f'expected a whole number of samples from {FEWEST_SAMPLES} to {MOST_SAMPLES}, or "{AUTO}", got {value!r}'
+    )
+
+
+AUTO = "auto"  # samples: as many as are needed
+Samples = Annotated[
+    int | Literal["auto"],
+    BeforeValidator(_samples),
+    WithJsonSchema(
+        {"anyOf": [{"type": "integer", "minimum": FEWEST_SAMPLES, "maximum": MOST_SAMPLES}, {"const": AUTO}]}
+    ),
+]
 
 
 def _memory(value: object) -> int:

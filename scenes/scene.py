@@ -20,12 +20,13 @@ from .explain import explain
 from .files import write_text
 from .lenses import Camera
 from .override import apply_overrides, keep_lenses
-from .quantities import Corner, FileName, Length, Pair, Samples
+from .quantities import Corner, FileName, Length, Pair, Samples, Time
 from .sensor import Noise, Sensor
 from .table import Table
 
 TRUTH = "truth.exr"
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
+IN_PLACE_OF_AUTO = 1024  # samples, for what is no rendering of sub-images
 
 
 class Target(Table):
@@ -55,7 +56,13 @@ class World(Table):
 class Render(Table):
     """How the sub-images are rendered."""
 
-    samples: Samples = 256
+    samples: Samples = Field(
+        default=256,
+        description='per sensor pixel, in 16 passes or more; "auto": until their variance is a tenth of the sensor\'s',
+    )
+    time: Time | None = Field(
+        default=None, description='after which samples = "auto" stops, wherever it is; absent: it takes its time'
+    )
     seed: int = Field(default=0, ge=0, lt=2**63)
     variant: Literal["auto", "scalar_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
     sampler: Sampler = Field(
@@ -63,15 +70,36 @@ class Render(Table):
     )
     complete: bool = Field(default=False, description="leave nothing out, however small its effect")
 
+    @property
+    def counted(self) -> int:
+        """Samples where their number has to be known beforehand."""
+        return IN_PLACE_OF_AUTO if self.samples == "auto" else self.samples
+
+    @model_validator(mode="after")
+    def _time_to_spend(self) -> Render:
+        if self.time is not None and self.samples != "auto":
+            raise ValueError(f'time ends samples = "auto", got samples = {self.samples}; remove one of the two keys')
+        return self
+
 
 class Calibration(Table):
     """How the observation matrix H is found."""
 
     method: Literal["points", "transport", "ideal"] = "points"
-    samples: Samples = 256
+    samples: Samples = Field(
+        default=256,
+        description='per sensor pixel, in 16 passes or more; "auto": until H adds under a tenth to the expected error',
+    )
     fit: Literal["geometry"] | None = Field(
         default=None, description='"geometry": a few numbers a sub-imager instead of the noise of its every entry'
     )
+
+    @property
+    def counted(self) -> int:
+        """Samples where they are a number. Raises ValueError where they are not."""
+        if self.samples == "auto":
+            raise ValueError("expected a number of samples, got 'auto'")
+        return self.samples
 
     @model_validator(mode="after")
     def _something_to_fit(self) -> Calibration:
@@ -135,6 +163,11 @@ def resolved(scene: Scene, shape: tuple[int, int]) -> Scene:
         update = {"shape": shape}
     target = scene.target.model_copy(update=update)
     return _moved(scene.model_copy(update={"target": target}), scene.source)
+
+
+def replaced(scene: Scene, **tables: Any) -> Scene:
+    """The scene with some of its tables exchanged; its errors name the same file."""
+    return _moved(scene.model_copy(update=tables), scene.source)
 
 
 def parse(data: dict[str, Any], source: Path) -> Scene:

@@ -81,7 +81,7 @@ def _where(camera: Camera) -> list[str]:
 
 def _plan(scene: Scene, camera: Camera, variant: str, reconstruction: dict[str, Any]) -> dict[str, Any]:
     plan: dict[str, Any] = {
-        "render": {"variant": variant, "samples": scene.render.samples, "sensors": len(camera.sub_imagers)},
+        "render": {"variant": variant, "samples": _samples(scene), "sensors": len(camera.sub_imagers)},
         "calibrate": {"method": scene.calibration.method},
         "reconstruct": reconstruction,
     }
@@ -90,6 +90,11 @@ def _plan(scene: Scene, camera: Camera, variant: str, reconstruction: dict[str, 
     if scene.calibration.method == "transport":
         plan["calibrate"] |= {"variant": variant, "samples": scene.calibration.samples}
     return plan
+
+
+def _samples(scene: Scene) -> int | str:
+    ends = "" if scene.render.time is None else f" for {scene.render.time:g} s at most"
+    return f"{scene.render.samples}{ends}" if ends else scene.render.samples
 
 
 def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

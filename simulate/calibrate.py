@@ -12,7 +12,7 @@ from scipy import sparse, stats
 
 from scenes.camera import Camera
 from scenes.files import fingerprint
-from scenes.model import Model
+from scenes.model import Judge, Model
 from scenes.moderate import moderate
 from scenes.needs import needed
 from scenes.partial import Partial
@@ -22,12 +22,14 @@ from scenes.versions import versions
 
 from .ideal import ideal_matrix, ideal_model
 from .passes import rounding_variance
-from .points import Responses, from_points
+from .points import Plans, Responses, from_points
 
 
-def made_from(scene: Scene, camera: Camera) -> str:
-    """Fingerprint of everything that H depends on."""
+def made_from(scene: Scene, camera: Camera, judge: Judge | None = None) -> str:
+    """Fingerprint of everything that H depends on; `judge` where it says when to stop."""
     description: dict[str, Any] = {"camera": camera.describe(), "calibration": scene.calibration.model_dump()}
+    if judge is not None and goes_on(scene):
+        description["judged"] = judge.by
     if scene.calibration.method != "ideal":
         description["simulated"] = needed(scene, camera)[0].describe()
         description["versions"] = versions("mitsuba")
@@ -36,25 +38,60 @@ def made_from(scene: Scene, camera: Camera) -> str:
     return fingerprint(description)
 
 
-def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress, partial: Partial | None = None) -> Model:
+def calibrate(
+    scene: Scene,
+    camera: Camera,
+    progress: Progress = no_progress,
+    partial: Partial | None = None,
+    judge: Judge | None = None,
+) -> Model:
     """H as the scene's `calibration.method` finds it, with the variance of every entry and its record.
 
+    judge : says when to stop where the scene leaves the number of samples open
     Raises InputError if the variant asked for does not work here, DeniedError if a row fails its check.
     """
     start = perf_counter()
-    kept = resolved(scene, (camera.rows, camera.columns))
-    record: dict[str, Any] = {"fingerprint": made_from(scene, camera), "method": scene.calibration.method}
+    record: dict[str, Any] = {"fingerprint": made_from(scene, camera, judge), "method": scene.calibration.method}
     if scene.calibration.method == "ideal":
-        model = ideal_model(kept, camera)
+        model = ideal_model(resolved(scene, (camera.rows, camera.columns)), camera)
         record |= {"seconds": perf_counter() - start, "versions": versions("scipy")}
         return replace(model, record=record)
+    if goes_on(scene):
+        from .judged import calibrated_until
+
+        model = calibrated_until(scene, camera, judge, progress, partial)
+        return replace(model, record=model.record | record | {"seconds": perf_counter() - start})
+    model = once(scene, camera, progress, partial)
+    return replace(model, record=record | model.record)
+
+
+def goes_on(scene: Scene) -> bool:
+    """Whether the number of samples is left open."""
+    return scene.calibration.samples == "auto" and scene.calibration.method != "ideal"
+
+
+def once(
+    scene: Scene,
+    camera: Camera,
+    progress: Progress = no_progress,
+    partial: Partial | None = None,
+    plans: Plans | None = None,
+    exact: bool = False,
+) -> Model:
+    """H by rays or point sources, with so many samples as the scene or the plans of the lens types say.
+
+    exact : that sums are taken for float64, where they are
+    """
+    start, record = perf_counter(), dict[str, Any](method=scene.calibration.method)
     simulated = needed(scene, camera)[0]
     if scene.calibration.method == "transport":
         from .transport import from_transport
 
-        responses = from_transport(scene, simulated, progress)
+        responses = from_transport(scene, simulated, progress, plans)
     else:
-        responses = from_points(scene, simulated, progress, partial)
+        responses = from_points(scene, simulated, progress, partial, plans)
+    if exact:
+        responses = replace(responses, summed=1)
     variance = settle(responses, camera)
     if scene.calibration.fit == "geometry":
         from .geometry_fit import fitted
@@ -67,6 +104,7 @@ def calibrate(scene: Scene, camera: Camera, progress: Progress = no_progress, pa
         **_compared(responses, variance, camera),
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
+    kept = resolved(scene, (camera.rows, camera.columns))
     return Model(kept, camera, responses.matrix, variance, responses.batches, record)
 
 
@@ -84,7 +122,8 @@ def settle(responses: Responses, camera: Camera) -> NDArray[np.float64]:
     for place in camera.slices():
         stored = slice(int(starts[place.start]), int(starts[place.stop]))
         settled[stored] = moderate(responses.variance[stored], responses.passes)
-    return np.maximum(settled, rounding_variance(responses.matrix.data, responses.samples))
+    summed = responses.samples if responses.summed is None else responses.summed
+    return np.maximum(settled, rounding_variance(responses.matrix.data, summed))
 
 
 def agreement(matrix: sparse.csr_array, variance: NDArray[np.float64], camera: Camera, passes: int) -> dict[str, float]:
@@ -94,6 +133,8 @@ def agreement(matrix: sparse.csr_array, variance: NDArray[np.float64], camera: C
     """
     difference = sparse.csr_array(matrix - ideal_matrix(camera))
     entries = int(difference.nnz)
+    if not entries:
+        return {"rms_difference_from_ideal": 0.0, "max_z": 0.0, "p_value": 1.0}
     known = sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
     # Where no ray has hit there is no scatter either: such an entry counts as uncertain as the others are on average.
     unseen = float(variance.mean())

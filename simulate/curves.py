@@ -24,7 +24,7 @@ from .calibrate import calibrate
 from .ideal import exact_model, ideal_model, true_matrix
 from .kept import kept_model
 from .passes import FEWEST_PASSES, Plan, plan
-from .render import Rendering, exposed, light, settled
+from .render import Rendering, exposed, light
 from .samplers import fitting
 from .streams import repeat_seed
 
@@ -105,7 +105,7 @@ def work_of(samples: int, sampler: Sampler) -> Plan:
 
 def rendered(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Rendering:
     """The light alone, as `run` renders it."""
-    return light(scene, camera, image, work=work_of(scene.render.samples, scene.render.sampler))
+    return light(scene, camera, image, work=work_of(scene.render.counted, scene.render.sampler))
 
 
 def error_of_light(rendering: Rendering, right: Right) -> float:
@@ -120,7 +120,7 @@ def stack_of(scene: Scene, camera: Camera, rendering: Rendering, error: float) -
     error : stands for the variance that a single pass does not know of itself
     """
     several = rendering.passes > 1
-    variance = settled(rendering, camera) if several else np.full(camera.measurements, error**2)
+    variance = rendering.stated(camera) if several else np.full(camera.measurements, error**2)
     return exposed(scene, camera, rendering.mean, variance, {})
 
 

@@ -65,23 +65,33 @@ class Eye:
         """Whether every ray stands for the same light."""
         return not self.lens.weighs
 
-    def blocks(self, samples: int) -> list[slice]:
-        """Its pixels, in their order, in blocks whose rays start together and fit into memory."""
-        several = max(1, MOST_RAYS // fitting(self._spread, samples))
-        return [slice(first, min(first + several, self.pixels)) for first in range(0, self.pixels, several)]
+    def blocks(self, samples: int, pixels: int | None = None) -> list[slice]:
+        """Its pixels, or so many of them, in their order, in blocks whose rays start together and fit into memory."""
+        several, count = max(1, MOST_RAYS // samples), self.pixels if pixels is None else pixels
+        return [slice(first, min(first + several, count)) for first in range(0, count, several)]
 
-    def rays(self, samples: int, seed: int, block: slice) -> Rays:
-        """`samples` rays of each pixel of a block, or as many more as fit the sampler, which stays ready for what they
-        meet. Every pixel has its own stream of every sampler: Mitsuba seeds by the first lane of each wavefront."""
+    def rays(
+        self, samples: int, seed: int, block: slice, passes: int = 1, which: NDArray[np.int64] | None = None
+    ) -> Rays:
+        """`samples` rays of each pixel of a block in each pass, or as many more as fit the sampler, which stays ready
+        for what they meet. Every pixel has its own stream of every sampler, as every pass of it has: Mitsuba seeds by
+        the first lane of each wavefront.
+
+        Several passes start together, those of one pixel side by side.
+        which : pixels among which the block is one; absent: all
+        """
         import drjit as dr
         import mitsuba as mi
 
         samples = fitting(self._spread, samples)
         self.sampler.set_sample_count(samples)
         self.sampler.set_samples_per_wavefront(samples)
-        lanes = (block.stop - block.start) * samples
-        self.sampler.seed(_seed_of(seed, block), lanes)
-        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, samples) + dr.opaque(mi.UInt32, block.start)
+        lanes = (block.stop - block.start) * passes * samples
+        self.sampler.seed(seed, lanes)
+        each = dr.opaque(mi.UInt32, passes * samples)
+        index = dr.arange(mi.UInt32, lanes) // each + dr.opaque(mi.UInt32, block.start)
+        if which is not None:
+            index = dr.gather(mi.UInt32, mi.UInt32(which.astype(np.uint32)), index)
         corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in self._tables)
         at = self.sampler.next_2d() * self._pitch
         if axes:
@@ -96,11 +106,6 @@ class Eye:
         ray.d = dr.normalize(mi.Vector3f(*way))
         ray.maxt = dr.largest(mi.Float)
         return Rays(ray, weight, samples)
-
-
-def _seed_of(seed: int, block: slice) -> int:
-    """Of a block: the first has the seed itself, the others what it makes of where they begin."""
-    return seed if block.start == 0 else int(np.random.SeedSequence([seed, block.start]).generate_state(1)[0])
 
 
 def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[NDArray[np.float64]]:

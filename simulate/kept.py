@@ -12,7 +12,7 @@ from scenes import model, stack
 from scenes.camera import Camera
 from scenes.errors import InputError
 from scenes.files import digest
-from scenes.model import Model
+from scenes.model import Judge, Model
 from scenes.partial import partial_of
 from scenes.progress import Progress
 from scenes.scene import TRUTH, Scene, resolved
@@ -49,14 +49,20 @@ def kept_stack(
     return stack.read(path), True
 
 
-def kept_model(path: Path, scene: Scene, camera: Camera, progress: Progress) -> tuple[Model, bool]:
-    """The model at `path` as it is on disk, and whether it had to be calibrated. Raises what calibration raises."""
+def kept_model(
+    path: Path, scene: Scene, camera: Camera, progress: Progress, judge: Judge | None = None
+) -> tuple[Model, bool]:
+    """The model at `path` as it is on disk, and whether it had to be calibrated. Raises what calibration raises.
+
+    judge : says when to stop where the scene leaves the number of samples open
+    """
+    wanted = calibrate.made_from(scene, camera, judge)
     try:
         old = model.read(path)
     except InputError:
         old = None
-    if old is not None and old.record.get("fingerprint") == calibrate.made_from(scene, camera):
+    if old is not None and old.record.get("fingerprint") == wanted:
         return old, False
-    with partial_of(path, calibrate.made_from(scene, camera)) as partial:
-        model.write(path, calibrate.calibrate(scene, camera, progress, partial))
+    with partial_of(path, wanted) as partial:
+        model.write(path, calibrate.calibrate(scene, camera, progress, partial, judge))
     return model.read(path), True

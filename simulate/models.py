@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from scenes.camera import Camera
-from scenes.model import Model
+from scenes.model import Judge, Model
 from scenes.progress import Progress
 from scenes.scene import Scene, resolved
 
@@ -15,16 +15,18 @@ from .ideal import exact_model, ideal_model, true_matrix
 from .kept import kept_model
 
 
-def models(scene: Scene, camera: Camera, folder: Path, progress: Progress) -> dict[str, Callable[[], Model]]:
+def models(
+    scene: Scene, camera: Camera, folder: Path, progress: Progress, judge: Judge | None = None
+) -> dict[str, Callable[[], Model]]:
     """What makes each model that the scene's study names; calibrated ones are kept in `folder`."""
     names = () if scene.study is None else scene.study.models
-    return {name: partial(_made, name, scene, camera, folder, progress) for name in names}
+    return {name: partial(_made, name, scene, camera, folder, progress, judge) for name in names}
 
 
-def _made(name: str, scene: Scene, camera: Camera, folder: Path, progress: Progress) -> Model:
+def _made(name: str, scene: Scene, camera: Camera, folder: Path, progress: Progress, judge: Judge | None) -> Model:
     kept = resolved(scene, (camera.rows, camera.columns))
     if name in ("points", "transport"):
         told = scene.calibration.model_copy(update={"method": name})
         alone = "model.npz" if name == scene.calibration.method else f"model.{name}.npz"
-        return kept_model(folder / alone, scene.model_copy(update={"calibration": told}), camera, progress)[0]
+        return kept_model(folder / alone, scene.model_copy(update={"calibration": told}), camera, progress, judge)[0]
     return exact_model(kept, camera, true_matrix(camera), "true") if name == "true" else ideal_model(kept, camera)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil
+from fractions import Fraction
+from functools import cache
+from math import ceil, isqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +13,15 @@ from numpy.typing import NDArray
 from scenes.partial import State
 from scenes.scene import Sampler
 
-from .samplers import fitting
+from .samplers import filling, fitting
 
 Vector = NDArray[np.float64]
 
 BATCHES = 8  # passes are also averaged in this many batches, whose scatter shows how errors go together
 FEWEST_PASSES = 16
 MOST_SAMPLES = 4096  # in one pass: the renderer's sums are float32
+JITTERED: tuple[Sampler, ...] = ("multijitter", "stratified")  # one sample in every cell of a grid
+MOST_CELLS = 16  # along a side of a grid that fits the edges of pixels of f
 ROUNDING = 2.0**-24  # relative, of float32
 
 
@@ -38,6 +42,32 @@ def plan(samples: int, sampler: Sampler = "multijitter") -> Plan:
     """Divide `samples` a pixel over at least 16 passes, rounding up to a grid that the sampler can fill."""
     passes = max(FEWEST_PASSES, BATCHES * ceil(samples / MOST_SAMPLES / BATCHES))
     return Plan(passes, fitting(sampler, ceil(samples / passes)))
+
+
+def on_grid(samples: int, sampler: Sampler, cells: int = 1, most: int = MOST_SAMPLES) -> Plan:
+    """At least `samples` a pixel in passes, none of more than `most`: for squares, on a grid of a multiple of `cells`.
+
+    Where a pixel sees cells x cells whole pixels of f, such a grid puts equally many samples into each of them, and a
+    sampler that jitters within its cells gives the pixel's value without any error. Sides are few, 1, 2, 3, 4, 6, 8,
+    12, ... times `cells`: Mitsuba compiles for every one.
+    """
+    each = ceil(samples / FEWEST_PASSES)
+    times = ceil((isqrt(max(each - 1, 0)) + 1) / cells)
+    power = 1 << (times - 1).bit_length()
+    side = cells * (3 * power // 4 if power >= 4 and times <= 3 * power // 4 else power)
+    fits = side**2 if sampler in JITTERED else fitting(sampler, each)
+    if fits <= most:
+        return Plan(FEWEST_PASSES, fits)
+    fits = (max(isqrt(most) // cells, 1) * cells) ** 2 if sampler in JITTERED else _filling(sampler, most)
+    return Plan(max(FEWEST_PASSES, BATCHES * ceil(samples / fits / BATCHES)), fits)
+
+
+_filling = cache(filling)
+
+
+def cells_of(ratio: Fraction) -> int:
+    """Along one side of a sensor pixel that covers `ratio` pixels of f: into how many alike their edges can cut it."""
+    return ratio.numerator if ratio.numerator <= MOST_CELLS else 1
 
 
 @dataclass(frozen=True)
@@ -104,3 +134,9 @@ def rounding_variance(values: Vector, samples: int) -> Vector:
     A value of 0 is given the rounding of 1, since noise of exactly 0 has no inverse.
     """
     return ((np.abs(values) * (1 + samples / 8) + 1) * ROUNDING) ** 2
+
+
+def samples_within(values: Vector, variance: Vector) -> int:
+    """The most samples whose rounding, as `rounding_variance` has it, leaves no more than `variance`; 1 at least."""
+    sums = (np.sqrt(variance) / ROUNDING - 1) / np.maximum(np.abs(values), ROUNDING)
+    return max(int(8 * (float(sums.min()) - 1)), 1)

@@ -37,6 +37,7 @@ STRAYS = 2  # rays of a sensor pixel that float32 may have rounded over the edge
 
 # Rows of H of one group, the variances of their entries, (nnz,), and their batches, (batches, nnz).
 Part = tuple[sparse.csr_array, NDArray[np.float64], NDArray[np.float32]]
+Plans = dict[str, Plan]  # by the name of a group
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,14 @@ class Responses(OverPasses):
 
     `matrix` holds the means of its entries, `variance`, (nnz,), their variances from the scatter of the passes, and
     `batches`, (batches, nnz), deviations of the means of some passes from those of all.
+    Where the groups' passes differ, `samples` are the most. summed : of them, how many are added up in float32; absent:
+    all
     """
 
     matrix: sparse.csr_array
     variance: NDArray[np.float64]
     batches: NDArray[np.float32]
+    summed: int | None = None
 
 
 def grid(camera: Camera, apart: int, row: int, column: int) -> NDArray[np.float64]:
@@ -60,17 +64,22 @@ def grid(camera: Camera, apart: int, row: int, column: int) -> NDArray[np.float6
 
 
 def from_points(
-    scene: Scene, camera: Camera, progress: Progress = no_progress, partial: Partial | None = None
+    scene: Scene,
+    camera: Camera,
+    progress: Progress = no_progress,
+    partial: Partial | None = None,
+    plans: Plans | None = None,
 ) -> Responses:
     """Sweep grids of point sources over the target; nothing that light has hit is dropped.
 
-    partial : where passes that are done are kept and found again
+    partial : where passes that are done are kept and found again;  plans : of each group, absent: all as the scene says
     """
     from .rig import Rig
 
     variant = choose(scene.render.variant)
-    work = plan(scene.calibration.samples, scene.render.sampler)
     rig = Rig(camera, variant, scene.render.sampler, together=False)  # each type its own spacing
+    if plans is None:
+        plans = dict.fromkeys(rig.groups, plan(scene.calibration.counted, scene.render.sampler))
     sweeps = {group: Sweep(rig, group) for group in rig.groups}
     shares = {group: sweep.reach.apart**2 for group, sweep in sweeps.items()}
     rows: list[sparse.csr_array] = []
@@ -79,7 +88,7 @@ def from_points(
     done, finished = 0, State()
     before = State() if partial is None else partial.state()
     for group, sweep in sweeps.items():
-        begun = done
+        begun, work = done, plans[group]
 
         def report(fraction: float, begun: int = begun, share: int = shares[group]) -> None:
             progress((begun + fraction * share) / sum(shares.values()))
@@ -99,12 +108,14 @@ def from_points(
         variances.append(tally.variance.ravel()[order])
         batches.append((means.reshape(BATCHES, -1)[:, order] - matrix.data).astype(np.float32))
         done += shares[group]
-    return responses_of(list(zip(rows, variances, batches, strict=True)), work, variant, scene.render.seed)
+    parts = list(zip(rows, variances, batches, strict=True))
+    return responses_of(parts, plans, variant, scene.render.seed)
 
 
-def responses_of(parts: list[Part], work: Plan, variant: str, seed: int) -> Responses:
-    """The responses of all groups from those of each, in their order."""
+def responses_of(parts: list[Part], plans: Plans, variant: str, seed: int) -> Responses:
+    """The responses of all groups from those of each, in their order; all have as many passes."""
     rows, variances, batches = zip(*parts, strict=True)
+    work = max(plans.values(), key=lambda one: one.samples)
     return Responses(
         matrix=sparse.csr_array(sparse.vstack(rows, format="csr")),
         variance=np.concatenate(variances),

@@ -11,6 +11,7 @@ from scenes.memory import refuse_beyond
 from scenes.needs import needed
 from scenes.scene import Scene
 
+from .goal import refuse_no_goal
 from .variant import choose, refuse_slow, refuse_slow_transport
 
 SENSOR, TARGET = 12 * 8, 6 * 8  # bytes a measurement and a pixel of f that a rendering takes
@@ -29,6 +30,8 @@ def refuse(scene: Scene, camera: Camera, calibrates: bool = True) -> None:
         variant = choose(scene.render.variant)
         refuse_lenses(camera)
         refuse_slow(needed(scene, camera)[0], variant)
+        if scene.render.samples == "auto":
+            refuse_no_goal(scene)
         if calibrates and scene.calibration.method == "transport":
             refuse_slow_transport(variant)
 

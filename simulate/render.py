@@ -37,6 +37,11 @@ class Rendering(OverPasses):
     variance: NDArray[np.float64]
     straight: bool
 
+    def stated(self, camera: Camera) -> NDArray[np.float64]:
+        """The variance, (M,), drawn towards its sub-image's and never below float32's rounding."""
+        settled = np.concatenate([moderate(self.variance[place], self.passes) for place in camera.slices()])
+        return np.maximum(settled, rounding_variance(self.mean, self.samples))
+
 
 def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
     """Fingerprint of everything that the values of a stack depend on."""
@@ -53,7 +58,7 @@ def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
             "target": digest(image.astype(np.float32)),
             "noise": scene.noise.model_dump() if scene.noise else None,
             "sensor": scene.sensor.model_dump() if scene.sensor else None,
-            "render": scene.render.model_dump(),
+            "render": scene.render.model_dump(exclude_none=True),
             "versions": versions("mitsuba"),
         }
     )
@@ -74,6 +79,8 @@ def light(
     """
     from .rig import Rig
 
+    if scene.render.samples == "auto":
+        raise ValueError("expected a number of samples, got 'auto', which `light_until` renders")
     variant = choose(scene.render.variant)
     work = plan(scene.render.samples, scene.render.sampler) if work is None else work
     around = None if scene.world is None else scene
@@ -117,7 +124,12 @@ def render(
     Raises InputError if the variant asked for does not work here.
     """
     start = perf_counter()
-    rendering = light(scene, camera, image, progress, partial)
+    if scene.render.samples == "auto":
+        from .auto import light_until
+
+        rendering = light_until(scene, camera, image, progress, partial)
+    else:
+        rendering = light(scene, camera, image, progress, partial)
     record: dict[str, Any] = {
         "fingerprint": made_from(scene, camera, image),
         "truth": digest((image if truth is None else truth).astype(np.float32)),
@@ -128,14 +140,7 @@ def render(
         **({STRAIGHT: True} if rendering.straight else {}),
         "versions": versions("mitsuba", "drjit", "OpenEXR"),
     }
-    return exposed(scene, camera, rendering.mean, settled(rendering, camera), record)
-
-
-def settled(rendering: Rendering, camera: Camera) -> NDArray[np.float64]:
-    """(M,) variances of the mean, each drawn towards its sub-image's and never below float32's rounding."""
-    floor = rounding_variance(rendering.mean, rendering.samples)
-    moderated = [moderate(rendering.variance[place], rendering.passes) for place in camera.slices()]
-    return np.maximum(np.concatenate(moderated), floor)
+    return exposed(scene, camera, rendering.mean, rendering.stated(camera), record)
 
 
 def exposed(

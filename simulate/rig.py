@@ -20,7 +20,10 @@ from scenes.errors import InputError
 from scenes.lens_type import LensType
 from scenes.scene import Sampler, Scene
 
+from .passes import Plan
+from .samplers import fitting
 from .stock import BLOCK, scene_of, stock_sensor, target_of, texture_of
+from .streams import seed_of
 from .variant import activate, refuse_slow
 
 if TYPE_CHECKING:
@@ -57,6 +60,7 @@ class Rig:
         activate(variant)
         import mitsuba as mi
 
+        self._sampler: Sampler = sampler
         self.camera = camera
         fast = not variant.startswith("scalar")
         self.groups: dict[str, tuple[LensType, ...]] = {kind.name: (kind,) for kind in camera.types}
@@ -88,6 +92,10 @@ class Rig:
         """Whether every ray of a pixel stands for the same light."""
         return all(eye.even for eye in self._eyes.values())
 
+    def summed(self, samples: int) -> int:
+        """How many of a pixel's samples are added up in float32: none but one where sums are float64."""
+        return 1 if self._eyes else samples
+
     def show(self, *images: NDArray[np.float64]) -> None:
         """Put pictures, (rows, columns), at most `channels` of them, on the target, if there is one.
 
@@ -111,24 +119,51 @@ class Rig:
         samples : rays a pixel
         seed : the sampler's seed by the place of a sensor: of a group where a group is one sensor, else a sub-imager
         """
-        import mitsuba as mi
-
         if self._eyes:
             blocks = self.blocks(group, samples)
             return np.concatenate([self._seen(group, self._rays(group, samples, seed, one)) for one in blocks])[None]
         images: list[NDArray[np.float64]] = []
         for place, sensor in self._sensors[group].items():
-            choices: Any = {"sensor": sensor, "integrator": self._integrator, "spp": samples, "seed": seed(place)}
-            rendered: Any = mi.render(self._scene, **choices)
-            images.append(np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1))
+            images.append(self._film(sensor, samples, seed(place)))
         return np.concatenate(images, axis=1) / self._unit
+
+    def _film(self, sensor: Any, samples: int, seed: int) -> NDArray[np.float64]:
+        """Radiances that a stock sensor reads, (channels, pixels)."""
+        import mitsuba as mi
+
+        choices: Any = {"sensor": sensor, "integrator": self._integrator, "spp": samples, "seed": seed}
+        rendered: Any = mi.render(self._scene, **choices)
+        return np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1)
+
+    def expose_alone(
+        self, place: int, which: NDArray[np.int64], work: Plan, seed: Callable[[int], int]
+    ) -> NDArray[np.float64]:
+        """What some pixels of one sub-imager read in each of several passes, (passes, pixels), as `expose` has it.
+
+        place : of the sub-imager in the camera;  which : of its pixels; on the slow backends the others cost as much
+        seed : the sampler's seed by the number of a pass. They are no other sub-imager's, so that the values are the
+            same whoever else is exposed; on the fast backends, where the passes start together, the first counts
+        """
+        sub, whole = self.camera.sub_imagers[place], self.camera.slices()[place]
+        group = next(name for name, types in self.groups.items() if sub.type in types)
+        if not self._eyes:
+            sensor = self._sensors[group][place]
+            films = [self._film(sensor, work.samples, seed(number))[0, which] for number in range(work.passes)]
+            return np.stack(films) / self._unit
+        eye, among = self._eyes[group], which + (whole.start - self.places(group).start)
+        found: list[NDArray[np.float64]] = []
+        for block in eye.blocks(work.total, which.size):
+            rays = eye.rays(work.samples, seed_of(seed(0), block.start), block, work.passes, among)
+            found.append(self._seen(group, rays).reshape(-1, work.passes).T)
+        return np.concatenate(found, axis=1)
 
     def blocks(self, group: str, samples: int) -> list[slice]:
         """The pixels of a group whose rays start together, block by block. Only on the fast backends."""
-        return self._eyes[group].blocks(samples)
+        return self._eyes[group].blocks(fitting(self._sampler, samples))
 
     def _rays(self, group: str, samples: int, seed: Callable[[int], int], block: slice) -> Rays:
-        return self._eyes[group].rays(samples, seed(list(self.groups).index(group)), block)
+        first = seed(list(self.groups).index(group))
+        return self._eyes[group].rays(samples, seed_of(first, block.start), block)
 
     def _seen(self, group: str, rays: Rays) -> NDArray[np.float64]:
         """What the pixels of these rays read: (pixels of the block,)."""

@@ -28,6 +28,11 @@ def repeat_seed(seed: int, what: str, repeat: int) -> int:
     return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
+def seed_of(seed: int, start: int) -> int:
+    """Of a block: the first has the seed itself, the others what it makes of where they begin."""
+    return seed if start == 0 else int(np.random.SeedSequence([seed, start]).generate_state(1)[0])
+
+
 def noise_generator(seed: int, name: str, k: int, l: int) -> np.random.Generator:  # noqa: E741
     """The generator of sub-imager (k, l) of the lens type `name`, which no other shares."""
     sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()), k, l))

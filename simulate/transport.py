@@ -18,7 +18,7 @@ from scenes.progress import Progress, no_progress
 from scenes.scene import Scene
 
 from .passes import BATCHES, Plan, plan
-from .points import Part, Responses, responses_of
+from .points import Part, Plans, Responses, responses_of
 from .streams import sampler_seeds
 from .variant import choose, refuse_slow_transport
 
@@ -34,23 +34,30 @@ class Entries(NamedTuple):
     dark: NDArray[np.bool_]
 
 
-def from_transport(scene: Scene, camera: Camera, progress: Progress = no_progress) -> Responses:
-    """Trace all rays of all passes. Raises InputError where only Mitsuba's slow backend works."""
+def from_transport(
+    scene: Scene, camera: Camera, progress: Progress = no_progress, plans: Plans | None = None
+) -> Responses:
+    """Trace all rays of all passes. Raises InputError where only Mitsuba's slow backend works.
+
+    plans : of each group, absent: all as the scene says
+    """
     from .rig import Rig
 
     variant = choose(scene.render.variant)
     refuse_slow_transport(variant)
-    work = plan(scene.calibration.samples, scene.render.sampler)
     rig = Rig(camera, variant, scene.render.sampler, together=False)
     parts: list[Part] = []
-    blocks = [(group, block) for group in rig.groups for block in rig.blocks(group, work.samples)]
+    if plans is None:
+        plans = dict.fromkeys(rig.groups, plan(scene.calibration.counted, scene.render.sampler))
+    blocks = [(group, block) for group in rig.groups for block in rig.blocks(group, plans[group].samples)]
     for place, (group, block) in enumerate(blocks):
         passes: list[Entries] = []
+        work = plans[group]
         for number in range(work.passes):
             passes.append(one_pass(rig, group, block, work, number, scene.render.seed))
             progress((place + (number + 1) / work.passes) / len(blocks))
         parts.append(_joined(passes, (block.stop - block.start, camera.unknowns)))
-    return responses_of(parts, work, variant, scene.render.seed)
+    return responses_of(parts, plans, variant, scene.render.seed)
 
 
 def one_pass(rig: Rig, group: str, block: slice, work: Plan, number: int, seed: int) -> Entries:

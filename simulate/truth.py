@@ -86,7 +86,7 @@ def truth(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Truth:
 
 def _plan(scene: Scene, camera: Camera) -> Plan:
     """TRUER times the samples of a sensor pixel, in passes of a size that memory holds."""
-    work = plan(TRUER * scene.render.samples, scene.render.sampler)
+    work = plan(TRUER * scene.render.counted, scene.render.sampler)
     most = max(1, MOST_RAYS // camera.unknowns)
     if work.samples <= most:
         return work
@@ -103,7 +103,7 @@ def truth_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
             **kept,
             "picture": digest(image.astype(np.float32)),
             "world": describe(scene),
-            "render": scene.render.model_dump(),
+            "render": scene.render.model_dump(exclude_none=True),
             "versions": versions("mitsuba"),
         }
     )

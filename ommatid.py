@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
@@ -53,6 +54,7 @@ Lenses = Annotated[
 Complete = Annotated[
     bool, typer.Option("--complete", help="Leave nothing out, however small its effect: render.complete=true.")
 ]
+STARTED = perf_counter()  # from which --within counts
 INTERRUPTED = 130  # what the parser makes of Ctrl-C
 
 Scheduler = Annotated[
@@ -127,25 +129,30 @@ def run(
     scheduler: Scheduler = "",
     workers: Workers = None,
     complete: Complete = False,
+    within: Annotated[
+        str, typer.Option("--within", metavar="TIME", help='The best result that fits into a time, such as "30 s".')
+    ] = "",
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
-    from chain import stages
+    from chain import spend, stages
 
     sets = _complete(sets, complete)
+    does = _within(within, len(scenes), scheduler, workers) if within else stages.run
 
     def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
         from reconstruct import depth, report, study
 
         if not as_json:
-            _table(f"{scene.title or scene.source.stem}: {folder}", report.rows(description))
+            lines = report.rows(description) + spend.rows(description["spent"])
+            _table(f"{scene.title or scene.source.stem}: {folder}", lines)
             if "depth" in description:
                 _table("Error against distance", depth.rows(description["depth"]))
             if "study" in description:
                 _table("The same stack with other ideas of H", study.rows(description["study"]))
         return description
 
-    _each(scenes, output, _batch(sets, lens, stages.run, tell), scheduler, workers, as_json)
+    _each(scenes, output, _batch(sets, lens, does, tell), scheduler, workers, as_json)
 
 
 @app.command()
@@ -216,7 +223,12 @@ def calibrate(
         with naming(scene):
             refuse_memory(described, camera)
         with naming(scene), _progress("calibrate") as progress:
-            model, made = kept_model(output, described, camera, progress)
+            judge = None
+            if described.calibration.samples == "auto" and described.calibration.method != "ideal":
+                from chain.judges import by_prior
+
+                judge = by_prior(described, camera)
+            model, made = kept_model(output, described, camera, progress, judge)
     _say(f"calibrate: {_done(made)}, {output}")
     if as_json:
         facts = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
@@ -612,6 +624,19 @@ def _batch(
         return Watch(_progress, partial(_say_done, folder))
 
     return Batch(lambda path: opened(path, sets or (), _names(lens)), stages, watch, tell, facts)
+
+
+def _within(text: str, scenes: int, scheduler: str, workers: int | None) -> Stages:
+    """What is done of each scene where all of them together have a time, counted from the start of the program."""
+    if scheduler or workers is not None:
+        raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
+    from chain.within import turns
+    from scenes.quantities import duration
+
+    try:
+        return turns(duration(text), scenes, STARTED, _say)
+    except ValueError as error:
+        raise InputError(f"--within: {error}") from error
 
 
 def _each(paths: list[Path], output: Path, batch: Batch, scheduler: str, workers: int | None, as_json: bool) -> None:

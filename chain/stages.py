@@ -39,6 +39,9 @@ def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) 
     from reconstruct.report import write_run
     from reconstruct.results import RUN, kept_results
 
+    from .judges import by_stack
+    from .spend import spent
+
     exact = scene.calibration.method == "ideal" and camera.boxed
     refuse(scene, camera)
     if scene.study is not None and "transport" in scene.study.models:
@@ -48,12 +51,12 @@ def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) 
     study.refuse(scene, camera)
     stack = _rendered(scene, camera, image, folder, watch)
     with watch.progress("calibrate") as progress:
-        model, made = kept_model(folder / "model.npz", scene, camera, progress)
+        model, made = kept_model(folder / "model.npz", scene, camera, progress, by_stack(stack))
     watch.done("calibrate", made)
     with watch.progress("reconstruct") as progress:
         description, made = kept_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     watch.done("reconstruct", made)
-    more: dict[str, Any] = {}
+    more: dict[str, Any] = {"spent": spent(description, calibrated=scene.calibration.method != "ideal")}
     if scene.world is not None:
         from reconstruct.depth import of_run
 
@@ -94,8 +97,10 @@ def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: Wa
     from reconstruct.study import kept_study
     from simulate.models import models
 
+    from .judges import by_stack
+
     with watch.progress("study") as progress:
-        known = models(scene, camera, folder, no_progress)
+        known = models(scene, camera, folder, no_progress, by_stack(stack))
         cases, made = kept_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
     watch.done("study", made)
     return cases

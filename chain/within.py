@@ -1,0 +1,167 @@
+"""The best result that fits into a time: two runs with few samples, then one with as many as the rest of it holds.
+
+All of them are ordinary runs in the scene's own folder, so that a whole result stands there whatever happens.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+
+from reconstruct.report import write_run
+from reconstruct.results import RUN
+from scenes import model, stack
+from scenes.camera import Camera
+from scenes.parcel import Stages, Watch
+from scenes.picture import Image
+from scenes.scene import Scene, replaced, resolved
+
+from . import measured, spend, stages
+
+FEW = (256, 1024)  # samples of the runs that measure
+MOST = 2**20  # samples of either stage
+SPARE = 0.15  # of the time that is left: kept back, since measured times vary
+KEYS = ("render.samples", "calibration.samples")
+ROUND = 3.0  # times the least samples: what a first round of 'auto' takes
+COMPILED = 1.0  # seconds for a number of samples that Mitsuba has not met
+
+Clock = Callable[[], float]
+Samples = int | Literal["auto"]
+
+
+def turns(
+    seconds: float, scenes: int, started: float, say: Callable[[str], None], clock: Clock = perf_counter
+) -> Stages:
+    """What is done of each of several scenes that have `seconds` together from `started` on: alike of what is left."""
+    left = iter(range(scenes, 0, -1))
+
+    def does(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
+        rest = (seconds - (clock() - started)) / next(left)
+        begun = started if scenes == 1 else clock()
+        return run_within(scene, camera, image, folder, watch, seconds if scenes == 1 else rest, say, clock, begun)
+
+    return does
+
+
+def run_within(
+    scene: Scene,
+    camera: Camera,
+    image: Image,
+    folder: Path,
+    watch: Watch,
+    seconds: float,
+    say: Callable[[str], None],
+    clock: Clock = perf_counter,
+    begun: float | None = None,
+) -> dict[str, Any]:
+    """What `run` does of a scene with the samples that bring most within `seconds`, and says of it.
+
+    say : hears where even the least did not fit;  begun : when the time began to count, absent: now
+    """
+    begun = clock() if begun is None else begun
+    again = _again(folder, scene, camera, seconds)
+    if again is not None:
+        description = stages.run(
+            with_samples(scene, *(again["chosen"][key] for key in KEYS)), camera, image, folder, watch
+        )
+        return _told(folder, description, again)
+    few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
+    chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
+    description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun))
+    sampled = sum(few.seconds(stage) for stage in spend.STAGES)
+    rest = max(few.wall - sampled, few.seconds("reconstruct"))
+    if _needs_little(scene, camera):
+        if left > ROUND * sampled + few.seconds("reconstruct") + rest:
+            chosen = "auto", "auto"
+            description = stages.run(with_samples(scene, *chosen), camera, image, folder, watch)
+    elif (curves := measured.curves(folder, scene, camera)) is not None or left > 2 * few.wall:
+        if curves is None:
+            more = _measured(with_samples(scene, FEW[1], FEW[1]), camera, image, folder, watch, clock)
+            chosen, description, curves = (FEW[1], FEW[1]), more.description, _curves(scene, few, more)
+            left = (1 - SPARE) * (seconds - (clock() - begun))
+        error = description["error"]
+        floor = error["predicted_mse"] - sum(error["budget"][part] for part in spend.STAGES.values())
+        division = spend.divide(*curves, floor, left - rest - COMPILED, (MOST, MOST))
+        if division is not None and division.predicted_mse < error["predicted_mse"]:
+            chosen = division.render, division.calibrate
+            description = stages.run(with_samples(scene, *chosen), camera, image, folder, watch)
+    total = clock() - begun
+    if total > seconds:
+        what = "even the least" if chosen[0] == FEW[0] else "this"
+        say(f"{folder}: {what}, {chosen[0]} and {chosen[1]} samples a pixel, took {total:.1f} s of {seconds:g} s")
+    keys = dict(zip(KEYS, chosen, strict=True))
+    return _told(folder, description, {"within": seconds, "seconds": total, "chosen": keys})
+
+
+def with_samples(scene: Scene, rendering: Samples, calibration: Samples) -> Scene:
+    """The scene with these numbers of samples, and no time that would end a stage."""
+    render = scene.render.model_copy(update={"samples": rendering, "time": None})
+    calibrate = scene.calibration.model_copy(update={"samples": calibration})
+    return replaced(scene, render=render, calibration=calibrate)
+
+
+def _needs_little(scene: Scene, camera: Camera) -> bool:
+    """Whether grids of samples fit the edges of pixels of f, so that 'auto' comes to the noise floor at once."""
+    noise = scene.noise
+    silent = noise is None or noise.variance + noise.quantisation_variance == 0
+    return camera.boxed and scene.render.sampler == "multijitter" and not silent
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A run: what it says of itself, what it took, and variances that the stages' parts of the error go with."""
+
+    description: dict[str, Any]
+    wall: float
+    variance: dict[str, float]
+
+    def seconds(self, stage: str) -> float:
+        """What a stage took, when it was done."""
+        return float(self.description["stages"][stage]["seconds"])
+
+
+def _measured(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch, clock: Clock) -> Measured:
+    start = clock()
+    description = stages.run(scene, camera, image, folder, watch)
+    wall = clock() - start
+    found = model.read(folder / "model.npz")
+    spread = found.prior_spread(np.ones(found.unknowns)) if found.variance.any() else np.zeros(1)
+    light = stack.read(folder / "stack.exr").variance
+    return Measured(description, wall, {"render": float(np.nanmean(light)), "calibrate": float(np.nanmean(spread))})
+
+
+def _curves(scene: Scene, few: Measured, more: Measured) -> tuple[spend.Curve, spend.Curve]:
+    found: list[spend.Curve] = []
+    for stage, part in spend.STAGES.items():
+        if stage == "calibrate" and scene.calibration.method == "ideal":
+            found.append(spend.Curve(0.0, FEW[0], 1.0, 0.0, 0.0))
+            continue
+        ends = [(n, one.seconds(stage), one.variance[stage]) for n, one in zip(FEW, (few, more), strict=True)]
+        found.append(spend.curve(ends[0], ends[1], more.description["error"]["budget"][part]))
+    return found[0], found[1]
+
+
+def _again(folder: Path, scene: Scene, camera: Camera, seconds: float) -> dict[str, Any] | None:
+    """What an earlier run within the same time spent, if it was of the same scene."""
+    try:
+        old = json.loads((folder / RUN).read_text(encoding="utf-8"))["spent"]
+        rendering, calibration = (old["chosen"][key] for key in KEYS)
+        now = resolved(with_samples(scene, rendering, calibration), (camera.rows, camera.columns)).plain()
+        same = old["within"] == seconds and tomllib.loads((folder / "scene.toml").read_text("utf-8")) == now
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return {key: old[key] for key in ("within", "seconds", "chosen")} if same else None
+
+
+def _told(folder: Path, description: dict[str, Any], within: dict[str, Any]) -> dict[str, Any]:
+    """The description with what was spent, in run.json as well."""
+    description = {**description, "spent": {**description["spent"], **within}}
+    write_run(folder / RUN, description)
+    return description

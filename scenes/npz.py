@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import tokenize
+import warnings
 import zipfile
 import zlib
+from collections.abc import Generator
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 from typing import IO, Any
@@ -37,7 +40,7 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
         raise ValueError(_reason(error)) from error
     refuse_beyond(needed, f"{path}: to read it", "close other programs")
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        with _quiet(), path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except _UNREADABLE as error:
         raise ValueError(_reason(error)) from error
@@ -66,7 +69,8 @@ def header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Shape and type of the array whose NPY header a stream begins with. Raises ValueError for one that is none."""
     version = np.lib.format.read_magic(stream)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, kind = read_header(stream)
+    with _quiet():
+        shape, _, kind = read_header(stream)
     if any(count < 0 for count in shape):
         raise ValueError(f"a shape of {shape}")
     if kind.hasobject:
@@ -85,10 +89,18 @@ def array(path: Path) -> NDArray[Any]:
         raise ValueError(_reason(error)) from error
     refuse_beyond(3 * promised, f"{path}: to read it", "take a smaller one, or free some memory")
     try:
-        with path.open("rb") as stream:
+        with _quiet(), path.open("rb") as stream:
             return np.load(stream, allow_pickle=False)
     except _UNREADABLE as error:
         raise ValueError(_reason(error)) from error
+
+
+@contextmanager
+def _quiet() -> Generator[None]:
+    """Keep numpy's words about headers of other days off stderr."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _reason(error: BaseException) -> str:

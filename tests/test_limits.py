@@ -191,6 +191,13 @@ def test_an_array_that_promises_too_much(shape: str, tmp_path: Path) -> None:
         model.read(tmp_path / "a.npz")
 
 
+def test_headers_of_other_days_are_read_without_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "a.npy").write_bytes(npy_of("(2L, 4L)"))  # as Python 2 wrote them
+    assert picture.decode(tmp_path / "a.npy", "here").shape == (2, 4)
+    (tmp_path / "a.npy").write_bytes(npy_of("(8,)", "|a8"))
+    assert npz.array(tmp_path / "a.npy").shape == (8,)
+
+
 def png_of(rows: int, columns: int) -> bytes:
     """A PNG file whose header promises a size, and that holds next to nothing."""
 

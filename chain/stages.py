@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from scenes.batch import prepare
 from scenes.camera import Camera, derive
 from scenes.errors import naming
+from scenes.model import Model
 from scenes.parcel import Watch
 from scenes.picture import Image, load
 from scenes.progress import no_progress
@@ -62,6 +64,7 @@ def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) 
         more["study"] = _studied(scene, camera, stack, folder, watch)
     if any(description.get(key) != value for key, value in more.items()):
         write_run(folder / RUN, {**description, **more})
+    _told(camera, stack, model, folder, watch)
     return {**description, **more}
 
 
@@ -86,6 +89,16 @@ def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: W
         stack, made = kept_stack(folder / "stack.exr", scene, camera, image, progress)
     watch.done("render", made)
     return stack
+
+
+def _told(camera: Camera, stack: Stack, model: Model, folder: Path, watch: Watch) -> None:
+    """The run as a page."""
+    from reconstruct.page.kept import kept_page
+    from simulate.ideal import matrix_as_designed
+
+    with watch.progress("report"):
+        made = kept_page(folder, partial(matrix_as_designed, camera), stack, model)
+    watch.done("report", made)
 
 
 def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: Watch) -> list[dict[str, Any]]:

@@ -4,14 +4,14 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: demo test check bench setup llvm clean
+.PHONY: demo test check bench setup llvm browser clean
 
 demo: setup
 	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
 	@echo "Look at out/photo/overview.png; the numbers are in out/photo/run.json."
 
 # One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
-test: setup
+test: setup browser
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: setup
@@ -40,6 +40,16 @@ llvm: $(READY)
 	@$(FAST) || { [ -n "$(ROOT)" ] && command -v apt-get >/dev/null && echo "Installing libllvm19 ..." && \
 		$(ROOT) apt-get update -qq && $(ROOT) apt-get install -y -qq libllvm19; } >&2 2>/dev/null || true
 	@$(FAST) || echo "No LLVM 17 or newer here: rendering will be slow; .venv/bin/ommatid doctor says how to mend it."
+
+# Reports are tested in a browser; Debian's chromium is installed where that can be done without asking, else those
+# tests are skipped.
+BROWSER := command -v chromium || command -v chromium-browser || command -v google-chrome
+
+browser:
+	@{ $(BROWSER); } >/dev/null || { [ -n "$(ROOT)" ] && command -v apt-get >/dev/null && \
+		echo "Installing chromium ..." && $(ROOT) apt-get update -qq && \
+		$(ROOT) apt-get install -y -qq chromium; } >&2 2>/dev/null || true
+	@{ $(BROWSER); } >/dev/null || echo "No chromium here: tests of reports in a browser are skipped."
 
 clean:
 	rm -rf .venv out

@@ -152,7 +152,7 @@ def run(
                 _table("The same stack with other ideas of H", study.rows(description["study"]))
         return description
 
-    _each(scenes, output, _batch(sets, lens, does, tell), scheduler, workers, as_json)
+    _each(scenes, output, _batch(sets, lens, does, tell), scheduler, workers, as_json, index=True)
 
 
 @app.command()
@@ -639,24 +639,45 @@ def _within(text: str, scenes: int, scheduler: str, workers: int | None) -> Stag
         raise InputError(f"--within: {error}") from error
 
 
-def _each(paths: list[Path], output: Path, batch: Batch, scheduler: str, workers: int | None, as_json: bool) -> None:
-    """Do every scene of a batch, whatever happens to the others; then end with the worst exit code."""
+def _each(
+    paths: list[Path],
+    output: Path,
+    batch: Batch,
+    scheduler: str,
+    workers: int | None,
+    as_json: bool,
+    *,
+    index: bool = False,
+) -> None:
+    """Do every scene of a batch, whatever happens to the others; then end with the worst exit code.
+
+    index : whether a page of all of them is written
+    """
     stems = [path.stem for path in paths]
     for stem in stems:
         if stems.count(stem) > 1:
             raise InputError(f"{output / stem}: two scenes of the batch are called '{stem}'; rename one of them")
     folders = {path: output / path.stem for path in paths}
     results: dict[Path, dict[str, Any]] = {}
+    failures: dict[Path, str] = {}
     worst = 0
     for path, work in batch.works(folders, scheduler, workers):
         try:
             results[path] = {"scene": str(path), **work()}
         except Exception as error:
             code = _complain(error)
+            failures[path] = str(error) or type(error).__name__
             results[path] = {"scene": str(path), "error": str(error), "exit_code": code}
             worst = max(worst, code)
     if as_json:
         _print_json([results[path] for path in paths])
+    if index:
+        from reconstruct.page.index import kept_index
+
+        try:
+            kept_index(output, {folders[path]: failures.get(path, "") for path in paths})
+        except Exception as error:
+            worst = max(worst, _complain(error))
     if worst:
         raise _Worst(worst)
 
@@ -691,7 +712,8 @@ def _optics_sections(
 
 
 def _say_done(folder: Path, stage: str, made: bool) -> None:
-    _say(f"{stage}: {_done(made)}" + (f", {folder / 'stack.exr'}" if stage == "render" else ""))
+    files = {"render": "stack.exr", "report": "report.html"}
+    _say(f"{stage}: {_done(made)}" + (f", {folder / files[stage]}" if stage in files else ""))
 
 
 def _bench(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,13 @@ def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) 
 
 def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
+    description = results(scene, camera, image, folder, watch)
+    tell(camera, folder, watch)
+    return description
+
+
+def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
+    """All of a run but its page, and what run.json says of it."""
     from reconstruct import study
     from reconstruct.choice import choose
     from reconstruct.report import write_run
@@ -66,6 +74,16 @@ def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) 
     if any(description.get(key) != value for key, value in more.items()):
         write_run(folder / RUN, {**description, **more})
     return {**description, **more}
+
+
+def tell(camera: Camera, folder: Path, watch: Watch) -> None:
+    """Show the run whose results stand in a folder on a page."""
+    from reconstruct.page.kept import kept_page
+    from simulate.ideal import matrix_as_designed
+
+    with watch.progress("report"):
+        made = kept_page(folder, partial(matrix_as_designed, camera))
+    watch.done("report", made)
 
 
 def render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:

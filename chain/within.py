@@ -68,10 +68,10 @@ def run_within(
     begun = clock() if begun is None else begun
     again = _again(folder, scene, camera, seconds)
     if again is not None:
-        description = stages.run(
+        description = stages.results(
             with_samples(scene, *(again["chosen"][key] for key in KEYS)), camera, image, folder, watch
         )
-        return _told(folder, description, again)
+        return _told(camera, folder, watch, description, again)
     few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
     chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
     description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun))
@@ -80,7 +80,7 @@ def run_within(
     if _needs_little(scene, camera):
         if left > ROUND * sampled + few.seconds("reconstruct") + rest:
             chosen = "auto", "auto"
-            description = stages.run(with_samples(scene, *chosen), camera, image, folder, watch)
+            description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
     elif (curves := measured.curves(folder, scene, camera)) is not None or left > 2 * few.wall:
         if curves is None:
             more = _measured(with_samples(scene, FEW[1], FEW[1]), camera, image, folder, watch, clock)
@@ -91,13 +91,13 @@ def run_within(
         division = spend.divide(*curves, floor, left - rest - COMPILED, (MOST, MOST))
         if division is not None and division.predicted_mse < error["predicted_mse"]:
             chosen = division.render, division.calibrate
-            description = stages.run(with_samples(scene, *chosen), camera, image, folder, watch)
+            description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
     total = clock() - begun
     if total > seconds:
         what = "even the least" if chosen[0] == FEW[0] else "this"
         say(f"{folder}: {what}, {chosen[0]} and {chosen[1]} samples a pixel, took {total:.1f} s of {seconds:g} s")
     keys = dict(zip(KEYS, chosen, strict=True))
-    return _told(folder, description, {"within": seconds, "seconds": total, "chosen": keys})
+    return _told(camera, folder, watch, description, {"within": seconds, "seconds": total, "chosen": keys})
 
 
 def with_samples(scene: Scene, rendering: Samples, calibration: Samples) -> Scene:
@@ -129,7 +129,7 @@ class Measured:
 
 def _measured(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch, clock: Clock) -> Measured:
     start = clock()
-    description = stages.run(scene, camera, image, folder, watch)
+    description = stages.results(scene, camera, image, folder, watch)
     wall = clock() - start
     found = model.read(folder / "model.npz")
     spread = found.prior_spread(np.ones(found.unknowns)) if found.variance.any() else np.zeros(1)
@@ -160,8 +160,11 @@ def _again(folder: Path, scene: Scene, camera: Camera, seconds: float) -> dict[s
     return {key: old[key] for key in ("within", "seconds", "chosen")} if same else None
 
 
-def _told(folder: Path, description: dict[str, Any], within: dict[str, Any]) -> dict[str, Any]:
-    """The description with what was spent, in run.json as well."""
+def _told(
+    camera: Camera, folder: Path, watch: Watch, description: dict[str, Any], within: dict[str, Any]
+) -> dict[str, Any]:
+    """The description with what was spent, in run.json and on the run's page as well."""
     description = {**description, "spent": {**description["spent"], **within}}
     write_run(folder / RUN, description)
+    stages.tell(camera, folder, watch)
     return description

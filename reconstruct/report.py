@@ -9,7 +9,7 @@ import json
 from dataclasses import asdict
 from math import exp, isfinite
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -156,7 +156,18 @@ def _how(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _stage(record: dict[str, Any]) -> dict[str, Any]:
-    keys = ("seconds", "samples", "passes", "sampler", "variant", "rays", "reached", "not_reached", "auto")
+    keys = (
+        "seconds",
+        "samples",
+        "fewest_samples",
+        "passes",
+        "sampler",
+        "variant",
+        "rays",
+        "reached",
+        "not_reached",
+        "auto",
+    )
     return {key: record[key] for key in keys if key in record}
 
 
@@ -165,7 +176,7 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     error, stages = description["error"], description["stages"]
     lines: list[tuple[str, str]] = []
     for name, stage in stages.items():
-        made = [_samples(stage)] if "samples" in stage else []
+        made = [samples_of(stage)] if "samples" in stage else []
         made += [stage["variant"]] if "variant" in stage else []
         if name == "reconstruct":
             made.append(f"{_way(description['solver'])}, {description['unknowns']} unknowns")
@@ -207,12 +218,11 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     return lines
 
 
-def _samples(stage: dict[str, Any]) -> str:
-    samples = stage["samples"]
-    if not isinstance(samples, dict):
-        return f"{samples} samples a pixel in {stage['passes']} passes"
-    fewest, most = (cast(dict[str, int], samples)[end] for end in ("minimum", "maximum"))
-    said = f"{fewest} to {most} samples a pixel, as many as were needed"
+def samples_of(stage: dict[str, Any]) -> str:
+    """How many samples a stage took, in words."""
+    if "fewest_samples" not in stage:
+        return f"{stage['samples']} samples a pixel in {stage['passes']} passes"
+    said = f"{stage['fewest_samples']} to {stage['samples']} samples a pixel, as many as were needed"
     missed = list(stage.get("not_reached", {}))
     if missed:
         return f"{said}; too few for {_named(missed)}: {stage['not_reached'][missed[0]]}"

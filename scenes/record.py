@@ -8,7 +8,7 @@ from typing import Any, cast
 KINDS: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("method", "fingerprint", "truth", "variant", "sampler"), str),
     **dict.fromkeys(("versions", "agreement", "fit"), dict),
-    **dict.fromkeys(("seed", "first_seed", "samples", "passes"), int),
+    **dict.fromkeys(("seed", "first_seed", "samples", "fewest_samples", "passes"), int),
     "seconds": (int, float),
 }
 

@@ -266,10 +266,8 @@ class Rounds:
         subs = [sub.name for sub in self._camera.sub_imagers]
         missed = {name: one.ended for name, one in zip(subs, self.courses, strict=True) if one.ended != REACHED}
         return {
-            "samples": {
-                "minimum": min(course.fewest for course in self.courses),
-                "maximum": max(course.spent for course in self.courses),
-            },
+            "samples": max(course.spent for course in self.courses),
+            "fewest_samples": min(course.fewest for course in self.courses),
             "rays": self.rays,
             "reached": not missed,
             "not_reached": missed,

@@ -59,6 +59,16 @@ def _type_matrix(camera: Camera, kind: LensType) -> sparse.csr_array:
     return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
 
+def matrix_as_designed(camera: Camera, sub: SubImager) -> sparse.csr_array:
+    """H of one sub-imager, whatever its lens is: (its pixels, N). Raises as `ideal_matrix` does."""
+    kind = sub.type
+    if kind.glass.distortion is None and not camera.blurs(kind):
+        return sub_matrix(camera, sub)
+    size = kind.pixels[0] * kind.pixels[1]
+    first = (sub.k * kind.array[1] + sub.l) * size
+    return _type_matrix(camera, kind)[first : first + size]
+
+
 def true_matrix(camera: Camera) -> sparse.csr_array:
     """H of all sub-imagers as the camera was put together, misaligned as its tolerance draws it: (M, N).
 

@@ -63,7 +63,7 @@ def calibrated_until(
             break
     how = {"goal": GOAL, "adds": tried[-1]["adds"], "reached": tried[-1]["adds"] <= GOAL, "judged_by": judge.words}
     totals = [sum(one["samples"][name] for one in tried) for name in plans]
-    counted = {"samples": {"minimum": min(totals), "maximum": max(totals)}, "auto": {**how, "tried": tried}}
+    counted = {"samples": max(totals), "fewest_samples": min(totals), "auto": {**how, "tried": tried}}
     return replace(model, scene=_open(model.scene), record=model.record | counted)
 
 

@@ -29,8 +29,9 @@ FILES = {
     "estimate.png",
     "overview.png",
     "run.json",
+    "report.html",
 }
-MADE = ("stack.exr", "model.npz", "estimate.exr", "estimate.png", "overview.png", "run.json")
+MADE = ("stack.exr", "model.npz", "estimate.exr", "estimate.png", "overview.png", "run.json", "report.html")
 ASKED_FOR = 77
 
 
@@ -54,7 +55,7 @@ def document(ended: Ended) -> Any:
 
 def numbers(description: dict[str, Any]) -> dict[str, Any]:
     """What a reconstruction found, without what it was called and how long it took."""
-    told = {key: value for key, value in description.items() if key not in ("fingerprint", "scene", "file")}
+    told = {key: value for key, value in description.items() if key not in ("fingerprint", "scene", "file", "spent")}
     stages = {name: {**stage, "seconds": None} for name, stage in description["stages"].items()}
     return {**told, "stages": stages}
 
@@ -252,12 +253,13 @@ def done(ended: Ended) -> dict[str, bool]:
     """Which stages had to be done, by what stderr says."""
     assert ended.code == 0, ended.err
     lines = dict(line.split(": ", 1) for line in ended.err.splitlines())
-    assert set(lines) == {"render", "calibrate", "reconstruct"}
+    assert set(lines) == {"render", "calibrate", "reconstruct", "report"}
     assert all(said.startswith(("done", "up to date")) for said in lines.values())
     return {stage: said.startswith("done") for stage, said in lines.items()}
 
 
-NOTHING = {"render": False, "calibrate": False, "reconstruct": False}
+NOTHING = {"render": False, "calibrate": False, "reconstruct": False, "report": False}
+TOLD = {"reconstruct", "report"}  # what a page shows is new whenever the reconstruction is
 
 
 def test_a_repeated_run_does_nothing_again(kept: Path, ommatid: Command) -> None:
@@ -276,7 +278,7 @@ def test_another_expected_noise_redoes_the_reconstruction_alone(
     told = ("--set", "estimator.noise_variance=25")
     model = stamps(kept)["model.npz"]
     ended = ommatid("run", "tiny.toml", "-o", "out", *told)
-    assert done(ended) == {**NOTHING, "reconstruct": True}
+    assert done(ended) == {**NOTHING, **dict.fromkeys(TOLD, True)}
     assert stamps(kept)["model.npz"] == model
     assert_same_light(kept / "stack.exr", finished / "stack.exr")
     estimate = channels(kept / "estimate.exr")["estimate"]
@@ -290,12 +292,12 @@ def test_another_expected_noise_redoes_the_reconstruction_alone(
 @pytest.mark.parametrize(
     ("setting", "redone"),
     [
-        ("render.seed=1", {"render", "calibrate", "reconstruct"}),
-        ("render.samples=32", {"render", "reconstruct"}),
-        ("noise.variance=1", {"render", "reconstruct"}),
-        ("calibration.samples=32", {"calibrate", "reconstruct"}),
-        ("prior.mean=100", {"reconstruct"}),
-        ("target.origin=[90,200]", {"render", "reconstruct"}),
+        ("render.seed=1", {"render", "calibrate"} | TOLD),
+        ("render.samples=32", {"render"} | TOLD),
+        ("noise.variance=1", {"render"} | TOLD),
+        ("calibration.samples=32", {"calibrate"} | TOLD),
+        ("prior.mean=100", TOLD),
+        ("target.origin=[90,200]", {"render"} | TOLD),
     ],
 )
 def test_what_is_out_of_date_is_done_again(setting: str, redone: set[str], kept: Path, ommatid: Command) -> None:
@@ -312,10 +314,24 @@ def test_a_damaged_file_is_made_again(name: str, stage: str, kept: Path, finishe
     whole = (kept / name).read_bytes()
     (kept / name).write_bytes(whole[: len(whole) // 2])
     # What was made again took another time, which run.json has to say: the reconstruction follows.
-    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True, "reconstruct": True}
+    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True, **dict.fromkeys(TOLD, True)}
     assert_same_light(kept / "stack.exr", finished / "stack.exr")
     described = [json.loads((folder / "run.json").read_text(encoding="utf-8")) for folder in (kept, finished)]
     assert numbers(described[0]) == numbers(described[1])
+
+
+@pytest.mark.parametrize("left", [0, 2000, 100_000])
+def test_a_report_that_is_missing_or_cut_short_is_drawn_again_as_it_was(
+    left: int, kept: Path, ommatid: Command
+) -> None:
+    report = kept / "report.html"
+    whole = report.read_bytes()
+    if left:
+        report.write_bytes(whole[:left])
+    else:
+        report.unlink()
+    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, "report": True}
+    assert report.read_bytes() == whole
 
 
 # --- batches
@@ -332,7 +348,7 @@ def test_one_bad_scene_does_not_stop_the_others(here: Path, ommatid: Command) ->
     assert "magnification" in bad["error"]
     assert [line for line in ended.err.splitlines() if line.startswith("ommatid: ")] == [f"ommatid: {bad['error']}"]
     assert numbers(first) == numbers(last)
-    assert {path.name for path in (here / "out").iterdir()} == {"tiny", "last"}
+    assert {path.name for path in (here / "out").iterdir()} == {"tiny", "last", "index.html"}
     for stem in ("tiny", "last"):
         assert {path.name for path in (here / "out" / stem).iterdir()} == FILES
 

@@ -57,7 +57,7 @@ def test_every_command_works_as_it_is_written(fresh: Path) -> None:
     for words in found:
         assert complaint(words, fresh) == ""
     made = {path.name for path in (fresh / "out" / "mine").iterdir()}
-    listed = set(re.findall(r"`([a-z]+\.(?:png|exr|json|npz|toml))`", TEXT[TEXT.index("## The files of a run") :]))
+    listed = set(re.findall(r"`([a-z]+\.(?:png|exr|json|npz|toml|html))`", TEXT[TEXT.index("## The files of a run") :]))
     assert made <= listed
     assert {"overview.png", "run.json", "stack.exr", "model.npz", "scene.toml", "truth.exr"} <= listed
 

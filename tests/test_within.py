@@ -151,7 +151,7 @@ def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
         "render": Curve(0.5, 256, 1.0, 0.2, 1e-4),
         "calibrate": Curve(2.0, 256, 1.5, 0.4, 1e-3),
     }
-    ways = {"render": "independent", "calibrate": "points"}
+    ways = {"render": "independent", "calibrate": "points, independent"}
     cells = tuple(
         Cell(
             stage, ways[stage], "scalar_rgb", n, "", 3, always(1.0), always(law.seconds(n)), None, always(law.error(n))

@@ -384,13 +384,15 @@ def test_what_is_up_to_date_here_is_not_done_again_there(
     before = {path: path.stat().st_mtime_ns for path in made}
     ended = ommatid("run", *scenes, "-o", "out", "--scheduler", address)
     said = [line for line in ended.err.splitlines() if "up to date" not in line]
-    assert said == ["calibrate: done", "reconstruct: done"]
+    report = Path("out") / "seed2" / "report.html"
+    assert said == ["calibrate: done", "reconstruct: done", f"report: done, {report}"]
     changed = {path for path in before if path.stat().st_mtime_ns != before[path]}
     # What the new model was made from is as before, but the time that it took: run.json says another, estimate.exr
-    # another fingerprint. The picture is the same, and stays.
+    # another fingerprint, and so does the page. The picture is the same, and stays.
     assert {path.relative_to(here / "out").parts for path in changed} == {
         ("seed2", "estimate.exr"),
         ("seed2", "run.json"),
+        ("seed2", "report.html"),
     }
 
 
@@ -439,7 +441,7 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_processes(here: Path, scene
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as started:
         assert started.stderr is not None
-        for stage in ("render", "calibrate", "reconstruct"):
+        for stage in ("render", "calibrate", "reconstruct", "report"):
             assert started.stderr.readline().startswith(f"{stage}: done")
         children = psutil.Process(started.pid).children(recursive=True)
         os.killpg(started.pid, signal.SIGINT)

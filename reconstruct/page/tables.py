@@ -1,0 +1,121 @@
+"""The tables of a page: what ran, what was left out, geometry, seeds, versions, and what the run printed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from scenes.show import describe as show
+from scenes.show import why_left_out
+
+from .. import depth, report, study
+from .data import Run
+
+GAP = "\N{NO-BREAK SPACE}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A caption, the names of columns, and rows whose first cell is their header."""
+
+    caption: str
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+def plan(run: Run) -> Table:
+    """What ran, how, and how long."""
+    stages = run.description["stages"]
+    total = sum(stage["seconds"] for stage in stages.values()) or 1.0
+    rows = [
+        (name, _how(name, stage, run), f"{stage['seconds']:.3g}{GAP}s", f"{100 * stage['seconds'] / total:.0f}{GAP}%")
+        for name, stage in stages.items()
+    ]
+    return Table("What ran", ("stage", "how", "time", "share"), rows)
+
+
+def _how(name: str, stage: dict[str, Any], run: Run) -> str:
+    told = [str(stage["method"])] if "method" in stage else []
+    if "samples" in stage:
+        told.append(report.samples_of(stage))
+    told += [str(stage[key]) for key in ("sampler", "variant") if key in stage]
+    if name == "reconstruct":
+        solver = run.description["solver"]
+        told.append(f"{solver['method']}: {solver['why']}")
+    return ", ".join(told)
+
+
+def left_out(run: Run) -> Table:
+    """What was not computed, and why."""
+    rows = [(skip["what"], why_left_out(skip)) for skip in run.description["skipped"]]
+    return Table("What was left out", ("what", "why"), rows)
+
+
+def geometry(run: Run) -> tuple[Table, list[tuple[str, str]]]:
+    """A row a lens type, and the rest in names and values."""
+    described = show(run.stack.scene, run.stack.camera, "", {})
+    header = ("lens type", "magnification", "array", "pixels of a sub-image", "sees rows", "sees columns")
+    header += ("focal length", "sensor behind lens", "measurements")
+    rows = [
+        (
+            kind["name"],
+            kind["magnification"],
+            _times(kind["array"]),
+            _times(kind["pixels"]),
+            _range(kind["sees_rows"]),
+            _range(kind["sees_columns"]),
+            f"{kind['focal_length']:.4g} mm",
+            f"{kind['sensor_depth']:.4g} mm",
+            str(kind["measurements"]),
+        )
+        for kind in described["lens_types"]
+    ]
+    target, camera = described["target"], run.stack.camera
+    facts = [
+        ("target", f"{target['rows']} × {target['columns']} pixels, {target['height']:g} × {target['width']:g} mm"),
+        ("distance", f"{target['distance']:g} mm"),
+        ("pitch of sensor pixels", f"{1000 * camera.pixel_pitch:g} µm"),
+        ("pitch of lenses", f"{camera.lens_pitch:g} mm"),
+        *(
+            (f"pixels seen by {count} lens types", str(seen))
+            for count, seen in described["pixels_seen_by_fewer_types"].items()
+        ),
+        *(("edge", words) for words in described["where"]),
+    ]
+    return Table("Lens types", header, rows), facts
+
+
+def _times(pair: list[int]) -> str:
+    return f"{pair[0]}{GAP}×{GAP}{pair[1]}"
+
+
+def _range(ends: list[float]) -> str:
+    return f"{ends[0]:g} to {ends[1]:g}"
+
+
+def numbers(run: Run) -> Table:
+    """The table that `run` prints, without what stands elsewhere on the page."""
+    rows = [
+        (name.strip(), value)
+        for name, value in report.rows(run.description)
+        if not name.startswith("left out") and not name.startswith("    from ")
+    ]
+    return Table("The run in numbers", ("what", "how much"), list(rows))
+
+
+def further(run: Run) -> list[Table]:
+    """Error against distance, and the study, where there are any."""
+    found: list[Table] = []
+    if run.description.get("depth"):
+        found.append(Table("Error against distance", ("distance", "error"), list(depth.rows(run.description["depth"]))))
+    if run.description.get("study"):
+        caption = "The same stack with other ideas of H"
+        found.append(Table(caption, ("H", "error"), list(study.rows(run.description["study"]))))
+    return found
+
+
+def origins(run: Run) -> list[Table]:
+    """Seeds and versions, from which the run can be repeated."""
+    seeds = [(name, "none" if seed is None else str(seed)) for name, seed in run.description["seeds"].items()]
+    versions = [(name, str(release)) for name, release in run.description["versions"].items()]
+    return [Table("Seeds", ("of", "seed"), seeds), Table("Versions", ("package", "release"), versions)]

@@ -22,7 +22,7 @@ import typer
 from scenes.errors import DeniedError, InputError, naming
 
 if TYPE_CHECKING:
-    from scenes.batch import Batch
+    from scenes.batch import Batch, Member
     from scenes.camera import Camera
     from scenes.model import Model
     from scenes.parcel import Stages, Watch
@@ -51,6 +51,14 @@ Sets = Annotated[
 Lenses = Annotated[
     str, typer.Option("--lens", metavar="NAME,...", help="Keep these lens types; one named twice counts twice.")
 ]
+Sweeps = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sweep",
+        metavar="KEY=VALUE,...",
+        help="A scene for each of these values, as in noise.variance=1e-6,1e-4; several options: every combination.",
+    ),
+]
 Complete = Annotated[
     bool, typer.Option("--complete", help="Leave nothing out, however small its effect: render.complete=true.")
 ]
@@ -63,7 +71,7 @@ Scheduler = Annotated[
 ]
 Workers = Annotated[
     int | None,
-    typer.Option("--workers", metavar="N", min=1, help="Share the scenes among N processes on this machine."),
+    typer.Option("--workers", metavar="N", min=1, help="Share the scenes among N processes; absent: as many as help."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
 Dark = Annotated[
@@ -126,6 +134,7 @@ def run(
     output: Folder = Path("out"),
     sets: Sets = None,
     lens: Lenses = "",
+    sweep: Sweeps = None,
     scheduler: Scheduler = "",
     workers: Workers = None,
     complete: Complete = False,
@@ -137,22 +146,24 @@ def run(
     """Render, calibrate, reconstruct and report."""
     from chain import spend, stages
 
-    sets = _complete(sets, complete)
-    does = _within(within, len(scenes), scheduler, workers) if within else stages.run
-
-    def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+    def tell(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         from reconstruct import depth, report, study
 
         if not as_json:
             lines = report.rows(description) + spend.rows(description["spent"])
-            _table(f"{scene.title or scene.source.stem}: {folder}", lines)
+            _table(f"{description['title'] or member.scene.stem}: {member.folder}", lines)
             if "depth" in description:
                 _table("Error against distance", depth.rows(description["depth"]))
             if "study" in description:
                 _table("The same stack with other ideas of H", study.rows(description["study"]))
         return description
 
-    _each(scenes, output, _batch(sets, lens, does, tell), scheduler, workers, as_json, index=True)
+    sets = _complete(sets, complete)
+    members = _members(scenes, output, sweep, sets, lens)
+    does = stages.run
+    if within:
+        does, workers = _within(within, len(members), scheduler, workers), 1
+    _each(members, output, _batch(sets, lens, does, tell), scheduler, workers, as_json, index=True)
 
 
 @app.command()
@@ -161,6 +172,7 @@ def render(
     output: Folder = Path("out"),
     sets: Sets = None,
     lens: Lenses = "",
+    sweep: Sweeps = None,
     scheduler: Scheduler = "",
     workers: Workers = None,
     complete: Complete = False,
@@ -169,13 +181,12 @@ def render(
     """Render the sub-images alone."""
     from chain import stages
 
+    def tell(member: Member, description: dict[str, Any]) -> dict[str, Any]:
+        return {"file": str(member.folder / "stack.exr"), **description}
+
     sets = _complete(sets, complete)
-
-    def tell(scene: Scene, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
-        del scene
-        return {"file": str(folder / "stack.exr"), **description}
-
-    _each(scenes, output, _batch(sets, lens, stages.render, tell), scheduler, workers, as_json)
+    members = _members(scenes, output, sweep, sets, lens)
+    _each(members, output, _batch(sets, lens, stages.render, tell), scheduler, workers, as_json)
 
 
 @app.command()
@@ -336,16 +347,33 @@ def import_(
 
 
 @app.command()
-def predict(scene: SceneFile, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
+def predict(
+    scene: SceneFile,
+    sets: Sets = None,
+    lens: Lenses = "",
+    sweep: Sweeps = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Of --sweep: folder of its table and plot.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Expected error, rank and null space of H.
 
     From Eq. 5 and the ideal model: nothing is rendered.
     """
+    from chain import stages
     from chain.prediction import electrons, predicted
     from reconstruct import accuracy
     from scenes.camera import derive
     from scenes.scene import read
 
+    if sweep:
+        members = _members([scene], Path(), sweep, sets, lens)
+        batch = _batch(sets, lens, stages.foresee, lambda _, description: description)
+        _each(members, output, batch, "", None, as_json, folders=False)
+        return
+    if output is not None:
+        raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
     described = read(scene, sets or (), _names(lens))
     with naming(scene):
         prediction, light = predicted(described), electrons(described, derive(described))
@@ -613,17 +641,18 @@ class _Worst(Exception):
 
 
 def _batch(
-    sets: list[str] | None, lens: str, stages: Stages, tell: Callable[[Scene, Path, dict[str, Any]], dict[str, Any]]
+    sets: list[str] | None, lens: str, stages: Stages, tell: Callable[[Member, dict[str, Any]], dict[str, Any]]
 ) -> Batch:
     """What is asked of every scene: changes, the stages, and what to tell the user when they are done."""
-    from chain.stages import facts, opened
+    from chain.stages import facts, fitting, member_opened
     from scenes.batch import Batch
     from scenes.parcel import Watch
 
     def watch(folder: Path) -> Watch:
         return Watch(_progress, partial(_say_done, folder))
 
-    return Batch(lambda path: opened(path, sets or (), _names(lens)), stages, watch, tell, facts)
+    asked = tuple(sets or ()), _names(lens)
+    return Batch(partial(member_opened, *asked), stages, watch, tell, facts, partial(fitting, *asked))
 
 
 def _within(text: str, scenes: int, scheduler: str, workers: int | None) -> Stages:
@@ -639,47 +668,71 @@ def _within(text: str, scenes: int, scheduler: str, workers: int | None) -> Stag
         raise InputError(f"--within: {error}") from error
 
 
+def _members(
+    scenes: list[Path], output: Path, sweep: list[str] | None, sets: list[str] | None, lens: str
+) -> list[Member]:
+    """The scenes of a batch, each as often as a sweep has combinations. Raises InputError before any work."""
+    from scenes.sweep import axes, members, refuse_unknown
+
+    swept = axes(sweep or ())
+    for scene in scenes:
+        refuse_unknown(scene, swept, sets or (), _names(lens))
+    return members(scenes, swept, output)
+
+
 def _each(
-    paths: list[Path],
-    output: Path,
+    members: list[Member],
+    output: Path | None,
     batch: Batch,
     scheduler: str,
     workers: int | None,
     as_json: bool,
     *,
+    folders: bool = True,
     index: bool = False,
 ) -> None:
     """Do every scene of a batch, whatever happens to the others; then end with the worst exit code.
 
-    index : whether a page of all of them is written
+    folders : whether there is one for each;  index : whether a page of all of them is written
     """
-    stems = [path.stem for path in paths]
-    for stem in stems:
-        if stems.count(stem) > 1:
-            raise InputError(f"{output / stem}: two scenes of the batch are called '{stem}'; rename one of them")
-    folders = {path: output / path.stem for path in paths}
-    results: dict[Path, dict[str, Any]] = {}
-    failures: dict[Path, str] = {}
+    results: dict[Member, dict[str, Any]] = {}
+    failures: dict[Member, str] = {}
     worst = 0
-    for path, work in batch.works(folders, scheduler, workers):
+    for member, work in batch.works(members, scheduler, workers):
+        told: dict[str, Any] = {"scene": str(member.scene)}
+        if member.changes:
+            told |= {**({"folder": str(member.folder)} if folders else {}), "values": member.values}
         try:
-            results[path] = {"scene": str(path), **work()}
+            results[member] = {**told, **work()}
         except Exception as error:
             code = _complain(error)
-            failures[path] = str(error) or type(error).__name__
-            results[path] = {"scene": str(path), "error": str(error), "exit_code": code}
+            failures[member] = str(error) or type(error).__name__
+            results[member] = {**told, "error": str(error), "exit_code": code}
             worst = max(worst, code)
+    documents = [results[member] for member in members]
+    if members[0].changes:
+        _tell_sweep(documents, output, as_json)
     if as_json:
-        _print_json([results[path] for path in paths])
-    if index:
+        _print_json(documents)
+    if index and output is not None:
         from reconstruct.page.index import kept_index
 
         try:
-            kept_index(output, {folders[path]: failures.get(path, "") for path in paths})
+            kept_index(output, {member.folder: failures.get(member, "") for member in members})
         except Exception as error:
             worst = max(worst, _complain(error))
     if worst:
         raise _Worst(worst)
+
+
+def _tell_sweep(documents: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
+    from reconstruct.sweep import lines, summary, write_sweep
+
+    rows = [summary(document) for document in documents]
+    if output is not None:
+        write_sweep(output, rows)
+    if not as_json:
+        _table("Sweep" + (f": {output / 'sweep.csv'}" if output is not None else ""), lines(rows))
 
 
 @contextmanager

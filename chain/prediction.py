@@ -14,10 +14,12 @@ from reconstruct.foresight import predict_large
 from reconstruct.prior import prior_of
 from scenes.camera import Camera, derive
 from scenes.errors import InputError
+from scenes.processors import one_thread
 from scenes.scene import Scene
 from simulate.ideal import ideal_matrix, ideal_model
 
 
+@one_thread()
 def predicted(scene: Scene) -> Prediction:
     """What Eq. 5 and the ideal model promise of a scene."""
     camera = derive(scene)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from scenes.batch import prepare
+from scenes.batch import Member, prepare
 from scenes.camera import Camera, derive
-from scenes.errors import naming
+from scenes.errors import InputError, naming
 from scenes.parcel import Watch
 from scenes.picture import Image, load
+from scenes.processors import one_thread
 from scenes.progress import no_progress
 from scenes.scene import Scene, read
 from scenes.stack import Stack
@@ -33,6 +35,28 @@ def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) 
     return scene, camera, load(scene)
 
 
+def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member) -> tuple[Scene, Camera, Image]:
+    """A scene of a batch, with its own changes after those of all."""
+    return opened(member.scene, (*changes, *member.changes), lenses)
+
+
+def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
+    """How many scenes of a batch memory holds side by side, whichever these are; at least one."""
+    from reconstruct.choice import BASE, allowed_memory, choose
+
+    def needed(member: Member) -> int:
+        try:
+            scene = read(member.scene, (*changes, *member.changes), lenses)
+            camera = derive(scene)
+            return BASE + choose(scene, camera, scene.calibration.method == "ideal" and camera.boxed).memory
+        except InputError:  # it will be told in its turn
+            return 0
+
+    largest_first = sorted(map(needed, members), reverse=True)
+    allowed = allowed_memory(None)
+    return max(1, sum(together <= allowed for together in accumulate(largest_first)))
+
+
 def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
     description = results(scene, camera, image, folder, watch)
@@ -40,6 +64,7 @@ def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) 
     return description
 
 
+@one_thread()
 def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
     """All of a run but its page, and what run.json says of it."""
     from reconstruct import study
@@ -90,6 +115,15 @@ def render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watc
     """What `render` does of a scene, here or on a worker, and says of it."""
     stack = _rendered(scene, camera, image, folder, watch)
     return {"sub_images": len(camera.sub_imagers), **stack.record}
+
+
+def foresee(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
+    """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
+    from .prediction import predicted
+
+    del camera, image, folder, watch
+    with naming(scene.source):
+        return predicted(scene).describe()
 
 
 def facts(chosen: bool) -> dict[str, str]:

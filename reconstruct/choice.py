@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from math import ceil
 
 from scenes.camera import Camera
 from scenes.errors import InputError
 from scenes.memory import free_memory
+from scenes.processors import processors
 from scenes.scene import Scene
 
 from .aligned import Aligned, Robust
@@ -143,7 +143,7 @@ def _needed(way: str, scene: Scene, camera: Camera, exact: bool) -> int:
     images = 8 * (5 * camera.measurements + 16 * camera.unknowns)
     if way == "tiles":
         side = scene.tiles.size**2
-        return BASE + images + entries + 2 * (os.cpu_count() or 1) * needed_memory("information", 3 * side, side)
+        return BASE + images + entries + 2 * processors() * needed_memory("information", 3 * side, side)
     widest = max(ceil(kind.ratio) for kind in camera.types)
     longest = max(camera.rows, camera.columns)
     strips = 8 * 4 * longest * (5 * widest) * (5 * widest * (widest - 1) + widest)

@@ -15,7 +15,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
+
+from scenes.processors import one_thread
 
 from .forms.cholesky import factorise_positive
 from .selected import inverse_diagonal
@@ -34,7 +35,7 @@ def posterior_map(frame: Sliding) -> Image:
     """The diagonal of K^-1 for independent pixels: (rows, columns)."""
     # A strip takes what lies beyond it for known, so that of two in a corner the larger variance is nearer.
     border = np.zeros(frame.shape)
-    with threadpool_limits(1, "blas"):  # the blocks are small
+    with one_thread():  # the blocks are small
         for axis in (1, 0):
             view = border if axis == 0 else border.T
             size = frame.shape[axis]

@@ -16,10 +16,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
-from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
 from scenes.camera import Camera
 from scenes.errors import InputError
+from scenes.processors import one_thread
 from scenes.progress import Progress, no_progress
 
 from .sliding import WORKERS, Sliding, sliding
@@ -109,7 +109,7 @@ class Frame:
 
         Raises NotReachedError if steps do not get there.
         """
-        with threadpool_limits(1, "blas"):  # products of vectors gain nothing from threads, and wait for them
+        with one_thread():  # products of vectors gain nothing from threads, and wait for them
             found, left, lanczos = np.zeros_like(right), right.copy(), _Lanczos()
             for _ in range(RESTARTS):
                 found, lanczos = self._improved(found, left, accuracy, lanczos, progress)

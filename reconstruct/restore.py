@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scenes import estimation
 from scenes.errors import InputError
 from scenes.model import Model
+from scenes.processors import one_thread
 from scenes.progress import Progress, no_progress
 from scenes.stack import Stack
 from scenes.workers import Workers
@@ -138,6 +139,7 @@ def refuse_strangers(stack: Stack, model: Model, names: tuple[Path | str, Path |
             )
 
 
+@one_thread()
 def restore(
     stack: Stack,
     model: Model,

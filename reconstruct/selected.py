@@ -6,14 +6,14 @@ backwards of those behind it.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
-from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
+
+from scenes.processors import one_thread, processors
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -57,7 +57,7 @@ def frame_variances(precision: sparse.csr_array, shape: tuple[int, int], reach: 
     def work(strip: tuple[Numbers, slice]) -> Matrix:
         return _strip(precision, *strip, reach, halo)
 
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
+    with one_thread(), ThreadPoolExecutor(processors()) as threads:
         parts = list(threads.map(work, upright + level))
     found = np.concatenate(parts[: len(upright)], axis=1)
     for (_, rows), part in zip(level, parts[len(upright) :], strict=True):

@@ -5,15 +5,14 @@ Its error is that of what it is: of every pixel estimated from the measurements 
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
 from scenes.files import digest
+from scenes.processors import one_thread, processors
 from scenes.workers import workers
 
 from .estimator import Solver
@@ -82,7 +81,7 @@ class Tiled(Way):
         pieces = (self._piece(tiles, noise, truth) for tiles in groups)  # each is made when somebody is free for it
         if self.hands.workers is not None:
             return self.hands.workers.map(work_alone, pieces, self.hands.progress, len(groups))
-        with threadpool_limits(1, "blas"), workers(threads=os.cpu_count() or 1) as here:
+        with one_thread(), workers(threads=processors()) as here:
             return here.map(work, pieces, self.hands.progress, len(groups))
 
     def _key(self, tile: Tile, noise: dict[str, Vector]) -> object:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
 from scenes.estimation import Estimator
+from scenes.processors import one_thread
 
 from .estimator import FORMS, Solver, estimate
 from .expected import expected_error
@@ -128,7 +128,7 @@ def work(piece: Piece) -> Done:
 
 def work_alone(piece: Piece) -> Done:
     """The same in a process of its own: by one thread, for more of them change the last digits."""
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         return work(piece)
 
 

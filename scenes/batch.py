@@ -1,8 +1,11 @@
-"""Many scenes, one after the other here or side by side on workers, each independent of what becomes of the others."""
+"""Many scenes, side by side in processes or on a cluster, each independent of what becomes of the others.
+
+Numbers do not depend on where a scene is done, nor beside which others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,14 +13,32 @@ from typing import Any
 
 from .camera import Camera
 from .errors import DeniedError, InputError
-from .files import make_folder, refuse_output
-from .parcel import Outcome, Parcel, Stages, Watch, carry_out, packed, unpack
+from .files import clear_abandoned, make_folder, refuse_output
+from .parcel import Outcome, Parcel, Stages, Watch, carry_out, done_of, packed, unpack
 from .picture import Image, write_truth
+from .processors import processors
 from .scene import TRUTH, Scene, resolved, write
 from .workers import Ended, refuse_options, workers
 
 Description = dict[str, Any]
-Works = Generator[tuple[Path, Callable[[], Description]]]
+Opened = tuple[Scene, Camera, Image]
+
+
+@dataclass(frozen=True)
+class Member:
+    """A scene file of a batch, what is changed in it, and the folder of its results."""
+
+    scene: Path
+    folder: Path
+    changes: tuple[str, ...] = ()
+
+    @property
+    def values(self) -> dict[str, str]:
+        """What is changed, key by key, as it was written."""
+        return {key: value for key, _, value in (change.partition("=") for change in self.changes)}
+
+
+Works = Generator[tuple[Member, Callable[[], Description]]]
 
 
 @dataclass(frozen=True)
@@ -26,89 +47,114 @@ class Batch:
 
     opened : reads and checks it;  stages : what is done, and the description of it;  watch : who hears of a folder
     tell : passes on what became of it;  facts : what has to be the same on all machines, given whether the variant is
-        left to them
+        left to them;  fitting : how many memory holds side by side
     """
 
-    opened: Callable[[Path], tuple[Scene, Camera, Image]]
+    opened: Callable[[Member], Opened]
     stages: Stages
     watch: Callable[[Path], Watch]
-    tell: Callable[[Scene, Path, Description], Description]
+    tell: Callable[[Member, Description], Description]
     facts: Callable[[bool], dict[str, str]]
+    fitting: Callable[[Sequence[Member]], int]
 
-    def works(self, folders: dict[Path, Path], scheduler: str = "", count: int | None = None) -> Works:
-        """Every scene with what does it or tells why it failed, here or on workers; `folders` are its results'."""
-        return self._sent(folders, scheduler, count) if scheduler or count else self._here(folders)
+    def works(self, members: Sequence[Member], scheduler: str = "", count: int | None = None) -> Works:
+        """Every scene with what does it or tells why it failed: in `count` processes, or on a cluster.
 
-    def _here(self, folders: dict[Path, Path]) -> Works:
-        for path, folder in folders.items():
-            yield path, partial(self._work, path, folder)
-
-    def _work(self, path: Path, folder: Path) -> Description:
-        scene, camera, image = self.opened(path)
-        return self.tell(scene, folder, self.stages(scene, camera, image, folder, self.watch(folder)))
-
-    def _sent(self, folders: dict[Path, Path], scheduler: str, count: int | None) -> Works:
-        """Each as it ends, what is wrong with it already here first of all."""
+        Without either, in as many processes as there are scenes, processors and memory for them.
+        Where that is one, it is this one, which tells more while it works.
+        """
         refuse_options(scheduler, count)
-        scenes: dict[Path, Scene] = {}
-        for path, folder in folders.items():
+        if scheduler:
+            return self._sent(members, scheduler)
+        count = min(self._side_by_side(members) if count is None else count, len(members))
+        return self._beside(members, count) if count > 1 else self._here(members)
+
+    def _side_by_side(self, members: Sequence[Member]) -> int:
+        most = min(len(members), processors())
+        return min(most, self.fitting(members)) if most > 1 else 1
+
+    def _here(self, members: Sequence[Member]) -> Works:
+        for member in members:
+            yield member, partial(self._work, member)
+
+    def _work(self, member: Member) -> Description:
+        description = self.stages(*self.opened(member), member.folder, self.watch(member.folder))
+        return self.tell(member, description)
+
+    def _beside(self, members: Sequence[Member], count: int) -> Works:
+        """Each as it ends; the processes work in the scenes' own folders."""
+        with workers(count=count) as pool:
+            for ended in pool.each(partial(_in_process, self.opened, self.stages), members):
+                member = members[ended.place]
+                yield member, partial(self._finished, member, ended)
+
+    def _sent(self, members: Sequence[Member], scheduler: str) -> Works:
+        """Each as it ends, what is wrong with it already here first of all."""
+        scenes: dict[Member, Scene] = {}
+        for member in members:
             try:
-                scene, _, image = self.opened(path)
-                if scheduler and scene.world is not None:
+                scene, _, image = self.opened(member)
+                if scene.world is not None:
                     raise InputError(
-                        f"{path}: the files of a [world] do not travel to other machines; leave out --scheduler"
+                        f"{member.scene}: the files of a [world] do not travel to other machines; leave out --scheduler"
                     )
-                prepare(scene, image, folder)
-                scenes[path] = scene
+                prepare(scene, image, member.folder)
+                scenes[member] = scene
             except Exception as error:
-                yield path, partial(_raise, error)
+                yield member, partial(_raise, error)
         if not scenes:
             return
-        with workers(scheduler, count and min(count, len(scenes))) as pool:
+        with workers(scheduler) as pool:
             left_to_them = any(scene.render.variant == "auto" for scene in scenes.values())
             pool.refuse_differences(partial(self.facts, left_to_them))
-            parcels = _Parcels(self, [(path, folders[path]) for path in scenes])
+            parcels = _Parcels(self, list(scenes))
             try:
                 for ended in pool.each(partial(carry_out, self.stages), parcels):
-                    path = parcels.sent[ended.place]
-                    yield path, partial(self._finished, path, scenes.pop(path), folders[path], ended)
+                    member = parcels.sent[ended.place]
+                    scenes.pop(member)
+                    yield member, partial(self._finished, member, ended)
             except DeniedError as error:
-                parcels.failed |= {path: DeniedError(f"{path}: {error}") for path in scenes}
-        for path in scenes:
-            yield path, partial(_raise, parcels.failed[path])
+                parcels.failed |= {member: DeniedError(f"{member.scene}: {error}") for member in scenes}
+        for member in scenes:
+            yield member, partial(_raise, parcels.failed[member])
 
-    def _finished(self, path: Path, scene: Scene, folder: Path, ended: Ended[Outcome]) -> Description:
+    def _finished(self, member: Member, ended: Ended[Outcome]) -> Description:
         """Take in what a worker made of a scene. Raises what stopped it there."""
         try:
             outcome = ended.result()
         except DeniedError as error:
-            raise DeniedError(f"{path}: {error}") from error
-        unpack(outcome, folder)
-        watch = self.watch(folder)
+            raise DeniedError(f"{member.scene}: {error}") from error
+        unpack(outcome, member.folder)
+        watch = self.watch(member.folder)
         for stage, made in outcome.done.items():
             watch.done(stage, made)
         if outcome.error is not None:
             raise outcome.error
-        return self.tell(scene, folder, outcome.description)
+        return self.tell(member, outcome.description)
+
+
+def _in_process(opened: Callable[[Member], Opened], stages: Stages, member: Member) -> Outcome:
+    """What becomes of a scene in a process on this machine, which finds the scene's files and writes its folder."""
+    return done_of(lambda watch: stages(*opened(member), member.folder, watch))
 
 
 class _Parcels:
     """The scenes of a batch, opened again one by one as workers are free: the pictures of all might be too many."""
 
-    def __init__(self, batch: Batch, places: list[tuple[Path, Path]]) -> None:
-        self.sent: list[Path] = []
-        self.failed: dict[Path, Exception] = {}
+    def __init__(self, batch: Batch, members: list[Member]) -> None:
+        self.sent: list[Member] = []
+        self.failed: dict[Member, Exception] = {}
         self._batch = batch
-        self._places = places
+        self._members = members
 
     def __iter__(self) -> Iterator[Parcel]:
-        for path, folder in self._places:
+        for member in self._members:
             try:
-                parcel = packed(*self._batch.opened(path), folder)
+                parcel = packed(*self._batch.opened(member), member.folder)
             except Exception as error:  # removed meanwhile
-                self.failed[path] = error
+                self.failed[member] = error
                 continue
-            self.sent.append(path)
+            self.sent.append(member)
             yield parcel
 
 
@@ -118,6 +164,7 @@ def prepare(scene: Scene, image: Image, folder: Path) -> None:
     What a world truly looks like is rendered later.
     """
     make_folder(folder)
+    clear_abandoned(folder)
     for name in ("scene.toml", TRUTH):
         refuse_output(folder / name, scene.source, *([Path(scene.target.image)] if scene.target.image else []))
     rows, columns = image.shape

@@ -6,7 +6,6 @@ intervals with pixels are computed in whole numbers and are exact for any ratio.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from scipy import sparse
 
 from .camera import Camera
 from .lens_type import LensType
+from .processors import processors
 
 Image = NDArray[np.float64]
 
@@ -198,6 +198,6 @@ def _by_rows(rows: int, work: Callable[[int, int], None]) -> None:
     if len(pieces) == 1:
         work(*pieces[0])
         return
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(processors()) as threads:
         for _ in threads.map(work, *zip(*pieces, strict=True)):
             pass

@@ -1,26 +1,22 @@
-"""Workers of a Dask cluster: one somewhere else, or processes on this machine for the length of a command."""
+"""Workers of a Dask cluster that somebody else started, on this machine or elsewhere."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor
 from contextlib import closing, contextmanager
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from . import workers
 from .errors import DeniedError, InputError
 from .workers import LOST, Workers
 
-DEATHS = 2  # of workers on this machine: so many may die of one piece of work before it is given up
 NEVER = logging.CRITICAL + 1
-SHARERS = "ommatid.sharers"  # in Dask's configuration, which its workers are given
 _LOGS = ("distributed", "distributed.client", "distributed.gc", "tornado", "tornado.application", "asyncio")
 
 
@@ -29,13 +25,6 @@ def at(address: str) -> Generator[Workers]:
     """The workers of the cluster whose scheduler is at `address`. Raises InputError if there are none."""
     with _settings(), _connected(address) as client:
         yield _Remote(client, address)
-
-
-@contextmanager
-def here(count: int) -> Generator[Workers]:
-    """`count` processes on this machine."""
-    with _settings(), _local(count) as client:
-        yield Workers(*_employed(client))
 
 
 class _Remote(Workers):
@@ -75,22 +64,6 @@ def scratch() -> str | None:
         return get_worker().local_directory
     except ValueError:
         return None
-
-
-def dask_setup(worker: Any) -> None:
-    """What a worker on this machine does first (Dask looks for this name).
-
-    Ctrl-C is for the command, not for it. And it keeps to its share of the processors, or the threads with which each
-    renders would wait for each other's.
-    """
-    from dask import config
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _silence()
-    if hasattr(os, "sched_setaffinity"):
-        settings: Any = config
-        processors = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, processors[worker.name % len(processors) :: settings.get(SHARERS)])
 
 
 def _employed(client: Any) -> tuple[Executor, Callable[[], int]]:
@@ -135,32 +108,6 @@ async def _answered(address: str) -> None:
     reached: Any = connect(address, timeout=workers.PATIENCE, **options)  # pyright: ignore[reportUnknownVariableType]
     comm: Any = await asyncio.wait_for(reached, workers.PATIENCE + 1)
     await comm.close()
-
-
-@contextmanager
-def _local(count: int) -> Generator[Any]:
-    """A client of `count` processes with one thread each, which nobody outside this machine can reach."""
-    from dask import config
-    from distributed import Client, LocalCluster
-
-    start: Any = LocalCluster
-    with (
-        TemporaryDirectory(prefix="ommatid-") as folder,
-        config.set({"temporary-directory": folder, SHARERS: count}),
-        start(
-            n_workers=count,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",  # None would ask for the port 8787, and complain if it is taken
-            scheduler_kwargs={"dashboard": False, "allowed_failures": DEATHS},
-            memory_limit=0,
-            preload=[__name__],
-            silence_logs=NEVER,
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
 
 
 @contextmanager

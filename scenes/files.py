@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,8 @@ from numpy.typing import NDArray
 
 from .errors import DeniedError, InputError
 
+PART = ".part."  # in the name of a file that is not whole
+
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     """Let `write` fill a file beside `path`, then rename it: readers never see half of it.
@@ -22,19 +27,43 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     Raises DeniedError when the disk is full or refuses, InputError when the folder does not exist.
     """
     refuse_output(path)
-    beside = path.with_name(f".{secrets.token_hex(4)}.part.{path.name}")
+    clear_abandoned(path.parent, path.name)
     try:
-        write(beside)
-        with beside.open("rb+") as stream:
-            os.fsync(stream.fileno())
-        beside.replace(path)
+        with _beside(path) as beside:
+            write(beside)
+            with beside.open("rb+") as stream:
+                os.fsync(stream.fileno())
+            beside.replace(path)
     except OSError as error:
         reason = error.strerror or str(error)
         raise DeniedError(
             f"{path}: could not be written ({reason}); free some space or choose another folder"
         ) from error
-    finally:
-        beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def _beside(path: Path) -> Generator[Path]:
+    """An empty file beside `path` that is locked as long as somebody fills it, and is then gone, or renamed."""
+    while True:
+        beside = path.with_name(f".{secrets.token_hex(4)}{PART}{path.name}")
+        with beside.open("xb") as held:
+            with suppress(OSError):  # where files cannot be locked nobody clears up either
+                fcntl.flock(held, fcntl.LOCK_EX)
+            if not beside.exists():  # who clears up came between the two lines before
+                continue
+            try:
+                yield beside
+            finally:
+                beside.unlink(missing_ok=True)
+            return
+
+
+def clear_abandoned(folder: Path, name: str | None = None) -> None:
+    """Remove what dead processes were writing, to the file called `name` or to any: nobody holds its lock."""
+    for left in folder.glob(f".{'[0-9a-f]' * 8}{PART}{'*' if name is None else escape(name)}"):
+        with suppress(OSError), left.open("rb") as stream:  # another's, or just gone
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
 
 
 def refuse_output(path: Path, *inputs: Path) -> None:

@@ -9,7 +9,6 @@ rounding. Lenses of an aperture count as their centre: this is what they show of
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import cast
@@ -22,6 +21,7 @@ from .camera import Camera
 from .distortion import coefficients, field, undistort
 from .lens_type import SubImager
 from .pose import Pose, corner_offset
+from .processors import processors
 
 Range = tuple[NDArray[np.int64], NDArray[np.int64]]
 
@@ -53,7 +53,7 @@ def sub_matrix(camera: Camera, sub: SubImager, pose: Pose) -> sparse.csr_array:
 
 def matrix(camera: Camera, poses: tuple[Pose, ...]) -> sparse.csr_array:
     """H of all sub-imagers, whose poses are in the order of measurements: (M, N). Raises as `sub_matrix` does."""
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(processors()) as threads:
         parts = list(threads.map(partial(sub_matrix, camera), camera.sub_imagers, poses))
     return sparse.csr_array(sparse.vstack(parts, format="csr"))
 

@@ -32,7 +32,7 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str,
         if not isinstance(table, dict):
             raise InputError(f"--set {override}: '{'.'.join(tables)}' is no table, so it has no key '{last}'")
         if text.strip():
-            table[last] = _value(text)
+            table[last] = value_of(text)
         else:
             table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
     return changed
@@ -49,7 +49,8 @@ def _inside(table: Any, name: str, override: str) -> Any:
     return table.setdefault(name, {})  # type: ignore[return-value]
 
 
-def _value(text: str) -> Any:
+def value_of(text: str) -> Any:
+    """What a value on the command line is: TOML, else text."""
     try:
         return toml.loads(f"value = {text}")["value"]
     except ValueError:

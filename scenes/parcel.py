@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -64,23 +64,29 @@ def packed(scene: Scene, camera: Camera, image: Image, folder: Path) -> Parcel:
 
 def carry_out(stages: Stages, parcel: Parcel) -> Outcome:
     """Do the stages in a folder that is removed afterwards; what fails does not lose the files made before."""
-    done: dict[str, bool] = {}
-    watch = Watch(lambda _: nullcontext(no_progress), done.__setitem__)
     with TemporaryDirectory(prefix="ommatid-", dir=scratch()) as temporary:
         folder = Path(temporary)
         for name, content in parcel.files.items():
             (folder / name).write_bytes(content)
-        description: dict[str, Any] = {}
-        failure = None
-        try:
+
+        def work(watch: Watch) -> dict[str, Any]:
             scene = parse(parcel.tables, Path(parcel.source))
-            description = stages(scene, derive(scene), parcel.image, folder, watch)
-        except (InputError, DeniedError) as error:
-            failure = type(error)(str(error).replace(temporary, parcel.folder))
-        except (OSError, MemoryError) as error:
-            failure = error
+            return stages(scene, derive(scene), parcel.image, folder, watch)
+
+        outcome, failure = done_of(work), None
+        if isinstance(outcome.error, InputError | DeniedError):
+            failure = type(outcome.error)(str(outcome.error).replace(temporary, parcel.folder))
         files = {name: content for name, content in _contents(folder).items() if parcel.files.get(name) != content}
-        return Outcome(files, done, description, failure)
+        return replace(outcome, files=files, error=failure or outcome.error)
+
+
+def done_of(work: Callable[[Watch], dict[str, Any]]) -> Outcome:
+    """What some stages did before they ended or failed, without files."""
+    done: dict[str, bool] = {}
+    try:
+        return Outcome({}, done, work(Watch(lambda _: nullcontext(no_progress), done.__setitem__)))
+    except (InputError, DeniedError, OSError, MemoryError) as error:
+        return Outcome({}, done, {}, error)
 
 
 def unpack(outcome: Outcome, folder: Path) -> None:

@@ -25,7 +25,7 @@ class Partial:
 
     def __init__(self, path: Path, fingerprint: str) -> None:
         """Of the result that will stand at `path`."""
-        self._path = path.with_name(f".{path.name}.partial.npz")
+        self._path = _beside(path)
         self._fingerprint = fingerprint
         self._saved = monotonic()
         self._latest: Callable[[], State] | None = None
@@ -60,6 +60,15 @@ class Partial:
     def remove(self) -> None:
         """The work is done."""
         self._path.unlink(missing_ok=True)
+
+
+def clear(path: Path) -> None:
+    """Remove what was left of the result at `path` by a run that was killed just after it was written."""
+    _beside(path).unlink(missing_ok=True)
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.partial.npz")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Where work is done: in this process, one piece after another or in threads, or on the workers of a Dask cluster.
+"""Where work is done: here, one piece after another, in threads or in processes, or on the workers of a Dask cluster.
 
 A piece of work is a function that a module defines, and one item; both are sent as pickles. Which worker does which
 piece, and how often one dies meanwhile, makes no difference to the results.
@@ -12,16 +12,19 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import islice
+from time import monotonic
 from typing import Any, Generic, TypeVar
 from urllib.parse import urlsplit
 
 from .errors import DeniedError, InputError
+from .interrupts import remembered
 from .progress import Progress
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 PATIENCE = 10.0  # seconds, for a scheduler that does not answer, and for a cluster that has no workers
+GLANCE = 0.5  # seconds between two looks for a Ctrl-C that was lost
 LOST = "the connection to the scheduler was lost; see whether it still runs, and repeat the command"
 
 
@@ -64,21 +67,18 @@ class Workers:
         waiting = enumerate(items)
         pending: dict[Future[Result], int] = {}
         alone = 0
-        try:
+        with remembered() as interrupted, _cancelled_at_last(pending):
             while True:
                 for place, item in islice(waiting, max(0, max(1, self._hands()) - len(pending))):
                     pending[self._executor.submit(function, item)] = place
                 if not pending:
                     return
-                ended, _ = wait(pending, PATIENCE, FIRST_COMPLETED)
+                ended = _first_of(pending, interrupted)
                 alone = 0 if ended or self._hands() else alone + 1  # a worker that died may be back in a moment
                 if alone > 1:
                     raise DeniedError("no workers are left; start some and repeat the command")
                 for future in sorted(ended, key=pending.__getitem__):
                     yield Ended(pending.pop(future), future)
-        finally:
-            for future in pending:
-                future.cancel()
 
     def refuse_differences(self, facts: Callable[[], dict[str, str]]) -> None:
         """Raise InputError if a worker answers `facts`, such as versions, otherwise than this process does."""
@@ -99,6 +99,25 @@ class Workers:
         return [results[place] for place in range(count)]
 
 
+@contextmanager
+def _cancelled_at_last(pending: Iterable[Future[Any]]) -> Generator[None]:
+    try:
+        yield
+    finally:
+        for future in pending:
+            future.cancel()
+
+
+def _first_of(pending: Iterable[Future[Result]], interrupted: Callable[[], None]) -> set[Future[Result]]:
+    """Those that ended first; none after some patience. Raises KeyboardInterrupt even where that was swallowed."""
+    until = monotonic() + PATIENCE
+    while True:
+        ended, _ = wait(pending, max(0.0, min(GLANCE, until - monotonic())), FIRST_COMPLETED)
+        interrupted()
+        if ended or monotonic() >= until:
+            return ended
+
+
 class _Serial(Executor):
     """Does what is submitted there and then."""
 
@@ -115,16 +134,19 @@ class _Serial(Executor):
 def workers(scheduler: str = "", count: int | None = None, threads: int = 1) -> Generator[Workers]:
     """Workers of the cluster at `scheduler`, or `count` processes on this machine, or `threads` in this process.
 
-    A process has one thread for linear algebra, as Dask gives its workers, unless OPENBLAS_NUM_THREADS says otherwise;
-    its last digits are those of this process where that has as many threads.
+    One process is this one.
     Raises InputError that names the option if there is no such cluster.
     """
     refuse_options(scheduler, count)
     with ExitStack() as stack:
-        if scheduler or count is not None:
-            from .cluster import at, here
+        if scheduler:
+            from .cluster import at
 
-            yield stack.enter_context(at(scheduler) if scheduler else here(count or 1))
+            yield stack.enter_context(at(scheduler))
+        elif count is not None and count > 1:
+            from .processes import processes
+
+            yield Workers(stack.enter_context(processes(count)), lambda: count)
         else:
             yield Workers(
                 stack.enter_context(_Serial() if threads == 1 else ThreadPoolExecutor(threads)), lambda: threads
@@ -133,17 +155,16 @@ def workers(scheduler: str = "", count: int | None = None, threads: int = 1) -> 
 
 def refuse_options(scheduler: str, count: int | None) -> None:
     """Raise InputError if the options contradict each other, are no address, or need what is not installed."""
-    if not scheduler and count is None:
+    if not scheduler:
         return
-    if scheduler and count is not None:
+    if count is not None:
         raise InputError(
-            "--scheduler and --workers: expected one of them; the first names a cluster, the second starts one here"
+            "--scheduler and --workers: expected one of them; the first names a cluster, the second processes here"
         )
-    if scheduler and not _is_address(scheduler):
+    if not _is_address(scheduler):
         raise InputError(f"--scheduler: expected an address such as tcp://192.168.1.5:8786, got '{scheduler}'")
     if find_spec("distributed") is None:
-        option = "--scheduler" if scheduler else "--workers"
-        raise InputError(f"{option}: needs Dask, which is not installed; run: pip install 'ommatid[cluster]'")
+        raise InputError("--scheduler: needs Dask, which is not installed; run: pip install 'ommatid[cluster]'")
 
 
 def _is_address(text: str) -> bool:

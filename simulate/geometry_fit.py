@@ -10,7 +10,6 @@ batches, by an F test with the degrees of freedom that these show; any other kee
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,6 +21,7 @@ from scipy import sparse, stats
 
 from scenes.camera import Camera
 from scenes.lens_type import SubImager
+from scenes.processors import processors
 
 from .geometry_deviance import Deviance, cells, with_beside
 from .geometry_model import UNITS
@@ -125,7 +125,7 @@ def fit_all(responses: Responses, camera: Camera) -> list[Fit]:
         for sub, place in zip(camera.sub_imagers, camera.slices(), strict=True)
         if camera.wavelength is None or sub.type.glass.aperture is None
     }
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(processors()) as threads:
         found = list(threads.map(partial(fit_one, responses, camera), places, places.values()))
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / max(len(found), 1))
     return pooled([replace(fit, accepted=fit.chance >= single) for fit in found])

@@ -13,7 +13,8 @@ from scenes.camera import Camera
 from scenes.errors import InputError
 from scenes.files import digest
 from scenes.model import Judge, Model
-from scenes.partial import partial_of
+from scenes.partial import clear, partial_of
+from scenes.processors import one_thread
 from scenes.progress import Progress
 from scenes.scene import TRUTH, Scene, resolved
 from scenes.stack import Stack
@@ -43,12 +44,14 @@ def kept_stack(
         if old.scene.plain() != now.plain() or old.record != record:
             # What the estimator is told, or what it is compared with, may have changed; the values have not.
             stack.write(path, replace(old, scene=now, record=record))
+        clear(path)
         return stack.read(path), False
     with partial_of(path, render.made_from(scene, camera, image)) as partial:
         stack.write(path, render.render(scene, camera, image, progress, partial, truth))
     return stack.read(path), True
 
 
+@one_thread()
 def kept_model(
     path: Path, scene: Scene, camera: Camera, progress: Progress, judge: Judge | None = None
 ) -> tuple[Model, bool]:
@@ -62,6 +65,7 @@ def kept_model(
     except InputError:
         old = None
     if old is not None and old.record.get("fingerprint") == wanted:
+        clear(path)
         return old, False
     with partial_of(path, wanted) as partial:
         model.write(path, calibrate.calibrate(scene, camera, progress, partial, judge))

@@ -7,14 +7,14 @@ import platform
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from reconstruct.bench_figure import write_figures
 from reconstruct.slopes import recommend, slope
 from scenes import bench_file
-from scenes.bench_file import JSON, BenchTable, Cell, Curve, LeftOut
+from scenes.bench_file import JSON, BenchTable, Cell, Curve, LeftOut, Stage
 from scenes.camera import Camera
 from scenes.cheapest import Finished, Job, measure, name_of
 from scenes.errors import InputError, naming
@@ -26,12 +26,12 @@ from scenes.versions import versions
 from simulate.curves import REFERENCE, right
 from simulate.passes import FEWEST_PASSES
 from simulate.refuse import refuse
-from simulate.samplers import law
+from simulate.samplers import corners, law
 
 from .bench_jobs import Subject, jobs
 
 PARTIAL = ".bench.partial.jsonl"
-FLAT = {"render": 1e-5 * 255, "calibrate": 1e-5}  # errors below which float32 shows, and no slope
+FLAT: dict[Stage, float] = {"render": 1e-5 * 255, "calibrate": 1e-5}  # errors below which float32 shows, and no slope
 SETTING_UP = 0.02  # of the progress: the reference, and what the noise alone leaves
 
 
@@ -57,6 +57,7 @@ def bench(
         for cell in old.cells:
             finished.cells.setdefault(name_of(cell), cell)
         finished.seconds = max(finished.seconds, old.seconds)
+    before = finished.seconds
     with naming(scene.source):
         found = right(scene, camera, image, folder, lambda done: progress(SETTING_UP * done))
         subject = Subject(scene, camera, image, found)
@@ -64,7 +65,7 @@ def bench(
     spent = perf_counter() - start
     late = measure(told, seconds, finished, lambda done: progress(SETTING_UP + (1 - SETTING_UP) * done), spent)
     left_out += [LeftOut(name, why) for name, why in finished.refused.items()]
-    total = finished.seconds + spent
+    total = before + perf_counter() - start
     table = _table(subject, told, finished, [*left_out, *late], (what, made, seconds, total))
     write_figures(folder, table)
     bench_file.write(folder, table)
@@ -149,22 +150,30 @@ def curves(cells: Sequence[Cell], camera: Camera) -> list[Curve]:
     """The slope of each way of rendering and calibrating, beside what theory says."""
     found: list[Curve] = []
     for stage, limit in FLAT.items():
-        ways = dict.fromkeys((cell.way, cell.variant) for cell in cells if cell.stage == stage)
-        for way, variant in ways:
-            sampler = cast(Sampler, way.split(", ")[-1])
-            theory = law(sampler, camera)
-            least = theory.least if theory.least == 1 else theory.least * FEWEST_PASSES
-            alike = [one for one in cells if (one.stage, one.way, one.variant) == (stage, way, variant)]
-            fitted = slope([one for one in alike if (one.samples or 0) >= least and one.error.median > limit])
-            told: dict[str, Any] = {"stage": stage, "way": way, "variant": variant, "theory": theory.slope}
-            if fitted is None:
-                why = f"{theory.why}; fewer than three cells to fit, or errors that are rounding alone"
-                found.append(Curve(**told, slope=None, slope_deviation=None, why=why, agrees=None))
-                continue
-            agrees = None if theory.slope is None else fitted.agrees(theory.slope)
-            why = theory.why if least == 1 else f"{theory.why}, fitted from {least} samples on"
-            found.append(Curve(**told, slope=fitted.value, slope_deviation=fitted.deviation, why=why, agrees=agrees))
+        some = [cell for cell in cells if cell.stage == stage]
+        for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in some):
+            alike = [cell for cell in some if (cell.way, cell.variant) == (way, variant) and cell.error.median > limit]
+            found.append(_curve(alike, camera, (stage, way, variant)))
     return found
+
+
+def _curve(cells: Sequence[Cell], camera: Camera, key: tuple[Stage, str, str | None]) -> Curve:
+    stage, way, variant = key
+    theory = law(cast(Sampler, way.split(", ")[-1]), camera)
+    limited = theory.least > 1
+    used = [cell for cell in cells if not limited or (cell.samples or 0) >= theory.least * FEWEST_PASSES]
+    fitted, why = slope(used), theory.why
+    if fitted is None:
+        why += "; fewer than three cells to fit, or errors that are rounding alone"
+        return Curve(stage, way, variant, None, None, theory.slope, why, None)
+    counts = [(cell.samples or 1) // FEWEST_PASSES for cell in used]
+    if limited:
+        why += f"; fitted from {theory.least * FEWEST_PASSES} samples on"
+    allowed = corners(camera, min(counts), max(counts)) if limited and theory.slope is not None else 0.0
+    if 0 < allowed < float("inf"):
+        why += f", where strata that hold corners may change it by {allowed:.2g}"
+    agrees = None if theory.slope is None or allowed == float("inf") else fitted.agrees(theory.slope, allowed)
+    return Curve(stage, way, variant, fitted.value, fitted.deviation, theory.slope, why, agrees)
 
 
 def rows(table: BenchTable) -> list[tuple[str, str]]:

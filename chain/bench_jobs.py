@@ -11,6 +11,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruct.choice import DENSE
 from reconstruct.precision import Exact, Setting, exact, settings
 from reconstruct.restore import way_of
 from reconstruct.way import Task
@@ -24,6 +25,7 @@ from scenes.stack import Stack
 from simulate import curves
 from simulate.curves import Right
 from simulate.passes import plan
+from simulate.render import Rendering
 from simulate.streams import repeat_seed
 from simulate.variant import PREFERENCE, blocked, release
 
@@ -58,21 +60,43 @@ class Subject:
 
     def stack(self, repeat: int) -> Stack:
         """Exact light, recorded."""
-        return curves.stack_of_right(self.noise(repeat), self.camera, self.right)
+        return curves.stack_of_light(self.noise(repeat), self.camera, self.right.light, self.right)
 
     def squares(self, image: Image) -> float:
         """Mean squared error of an estimate, (N,)."""
         return float(np.mean(np.square(image - self.image.ravel())))
 
-    def brought(self, stack: Stack, model: Model, repeat: int) -> float:
-        """Mean squared error of the estimate from a stack with a model, freed of this noise's luck.
+    @property
+    def large(self) -> bool:
+        """Whether the estimate is one of a frame or of tiles, which noise of its own in every pixel would slow down."""
+        return self.camera.unknowns > DENSE
+
+    def of_rendering(self, rendering: Rendering, repeat: int) -> float:
+        """Mean squared error of the estimate from a rendering and exact H, freed of this noise's luck."""
+        scene = self.noise(repeat)
+        if self.large or rendering.passes == 1:
+            return self._brought(curves.stack_of_light(scene, self.camera, rendering.mean, self.right), repeat)
+        return self._brought(curves.stack_of(scene, self.camera, rendering), repeat)
+
+    def of_model(self, model: Model, repeat: int) -> float:
+        """Mean squared error of the estimate from exact light with a calibrated H, freed of this noise's luck.
+
+        Where that is large the two change places: light through the calibrated H and an estimate with the exact one,
+        which to first order in the error of H are wrong by the same, A dH f.
+        """
+        if not self.large:
+            return self.freed(self.squares(way_of(self.stack(repeat), model).image), repeat)
+        light = model.forward(self.image.ravel())
+        return self._brought(curves.stack_of_light(self.noise(repeat), self.camera, light, self.right), repeat)
+
+    def _brought(self, stack: Stack, repeat: int) -> float:
+        return self.freed(self.squares(way_of(stack, self.right.model).image), repeat)
+
+    def freed(self, squares: float, repeat: int) -> float:
+        """A mean squared error with the noise of a repeat as it would be with noise of middling luck.
 
         It is that of the floor, times what it is more than exact light and exact H make of the same noise.
         """
-        return self.freed(self.squares(way_of(stack, model).image), repeat)
-
-    def freed(self, squares: float, repeat: int) -> float:
-        """The same of a mean squared error with the noise of a repeat."""
         own = self.floors[repeat]
         return squares / own * self.floor if own > 0 else squares
 
@@ -133,8 +157,7 @@ def _rendering(subject: Subject, variant: str, sampler: Sampler, asked: int) -> 
         scene = curves.with_rendering(subject.scene, sampler, variant, asked, subject.seed(name, repeat))
         rendering, cost = _costed(lambda: curves.rendered(scene, subject.camera, subject.image))
         error = curves.error_of_light(rendering, subject.right)
-        stack = curves.stack_of(subject.noise(repeat), subject.camera, rendering, error)
-        return Repeat(error, cost, subject.brought(stack, subject.right.model, repeat) if repeat < FEWER else None)
+        return Repeat(error, cost, subject.of_rendering(rendering, repeat) if repeat < FEWER else None)
 
     guess = READY[variant] + work.total * subject.camera.measurements / RAYS[variant] + subject.solving
     setting = f"{work.passes} pass{'es' if work.passes > 1 else ''} of {work.samples}"
@@ -162,7 +185,7 @@ def _calibration(subject: Subject, variant: str, method: Method, sampler: Sample
         scene = curves.with_calibration(subject.scene, method, sampler, variant, asked, seed)
         model, cost = _costed(lambda: curves.calibrated(scene, subject.camera))
         error = curves.error_of_model(model, subject.right)
-        return Repeat(error, cost, subject.brought(subject.stack(repeat), model, repeat) if repeat < FEWER else None)
+        return Repeat(error, cost, subject.of_model(model, repeat) if repeat < FEWER else None)
 
     each = work.total * subject.camera.measurements / RAYS[variant]
     guess = 2 * READY[variant] + each * (POINTS if method == "points" else 1.0) + TWICE * subject.solving

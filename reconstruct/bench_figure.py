@@ -20,6 +20,7 @@ from .slopes import WORSE, pareto
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 RESOLUTION = 110
+FRONT: dict[str, Any] = {"color": "0.75", "linewidth": 7, "alpha": 0.6, "solid_capstyle": "round"}
 LINE = 0.035  # of a panel's height: how far apart labels stand
 
 
@@ -112,6 +113,7 @@ def _by_way(figure: Any, table: BenchTable, stage: Stage) -> None:
         panel.set_xlabel("seconds")
     _draw(panels[0], groups, styles, lambda one: one.seconds.median, lambda one: one.error)
     _front(panels[0], pareto(cells))
+    panels[0].legend(loc="lower left", fontsize=9)
     _level(panels[0], 0.1, "a tenth of a posterior standard deviation: 1 % of the mean squared error")
     panels[0].set_ylabel("error of the computation: RMS over pixels (posterior standard deviations)")
     panels[0].set_title("How far from the exact answer; hollow: a dense form by itself, not refined", fontsize=10)
@@ -174,10 +176,7 @@ def _draw(
 
 def _front(panel: Any, front: Sequence[Cell]) -> None:
     x, y = [cell.seconds.median for cell in front], [cell.error.median for cell in front]
-    panel.plot(x, y, color="0.75", linewidth=7, alpha=0.6, solid_capstyle="round", zorder=1)
-    if front:
-        text = {"xytext": (10, 10), "textcoords": "offset points", "fontsize": 9, "color": "0.4"}
-        panel.annotate("Pareto front", (x[0], y[0]), ha="left", **text)
+    panel.plot(x, y, zorder=1, label="Pareto front", **FRONT)
 
 
 def _level(panel: Any, value: float, words: str) -> None:
@@ -208,7 +207,9 @@ def _star(panel: Any, table: BenchTable, stage: Stage) -> None:
             point = cell.seconds.median, cell.mse.median
             panel.plot(*point, marker="o", markersize=15, markerfacecolor="none", color="black", zorder=5)
             name = "recommended" if table.recommended["reached"] else "nearest"
-            panel.annotate(name, point, xytext=(0, 12), textcoords="offset points", ha="center", fontsize=9)
+            behind = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+            text = {"textcoords": "offset points", "ha": "center", "fontsize": 9, "bbox": behind, "zorder": 6}
+            panel.annotate(name, point, xytext=(0, 12), **text)
 
 
 def _name_slopes(
@@ -270,4 +271,5 @@ def _legend(figure: Any, groups: dict[Key, list[Cell]], styles: dict[Key, Style]
 
     lines: list[Any] = [Line2D([], [], **styles[key].line()) for key in groups]
     names = [way if variant is None else f"{way}, {variant}" for way, variant in groups]
-    figure.legend(lines, names, loc="outside lower center", ncols=5, fontsize=9)
+    names.append("Pareto front: nothing is both faster and better")
+    figure.legend([*lines, Line2D([], [], **FRONT)], names, loc="outside lower center", ncols=4, fontsize=9)

@@ -26,9 +26,9 @@ class Slope:
     value: float
     deviation: float
 
-    def agrees(self, theory: float) -> bool:
-        """Whether it lies within 3 standard errors of what theory says."""
-        return abs(self.value - theory) <= AGREES * self.deviation
+    def agrees(self, theory: float, allowed: float = 0.0) -> bool:
+        """Whether it lies within 3 standard errors of what theory says, which is known to what is `allowed`."""
+        return abs(self.value - theory) <= AGREES * self.deviation + allowed
 
 
 def slope(cells: Sequence[Cell]) -> Slope | None:

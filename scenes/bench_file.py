@@ -78,7 +78,8 @@ class Curve:
 
     slope_deviation : its standard error, from the scatter over seeds
     theory : what it should be, None where theory says no number;  why : where that comes from, or why there is none
-    agrees : whether the slope lies within 3 standard errors of theory
+    agrees : whether the slope lies within 3 standard errors of theory, and of what theory of a limit leaves open at the
+        counts that were fitted, which `why` tells
     """
 
     stage: Stage

@@ -114,19 +114,18 @@ def error_of_light(rendering: Rendering, right: Right) -> float:
     return float(np.sqrt(max(np.nanmean(squares), 0.0)))
 
 
-def stack_of(scene: Scene, camera: Camera, rendering: Rendering, error: float) -> Stack:
-    """The rendering as the scene's sensor records it, with noise by the scene's seed.
+def stack_of(scene: Scene, camera: Camera, rendering: Rendering) -> Stack:
+    """A rendering of several passes as the scene's sensor records it, with noise by the scene's seed."""
+    return exposed(scene, camera, rendering.mean, rendering.stated(camera), {})
 
-    error : stands for the variance that a single pass does not know of itself
+
+def stack_of_light(scene: Scene, camera: Camera, light: Vector, right: Right) -> Stack:
+    """Light, (M,), as the scene's sensor records it; every pixel is said to be as far from right as all are on average.
+
+    Of exact light that is not at all.
     """
-    several = rendering.passes > 1
-    variance = rendering.stated(camera) if several else np.full(camera.measurements, error**2)
-    return exposed(scene, camera, rendering.mean, variance, {})
-
-
-def stack_of_right(scene: Scene, camera: Camera, right: Right) -> Stack:
-    """Exact light as the scene's sensor records it."""
-    return exposed(scene, camera, right.light, np.zeros(camera.measurements), {})
+    away = float(np.nanmean(np.square(light - right.light)))
+    return exposed(scene, camera, light, np.broadcast_to(away, light.shape), {})
 
 
 def calibrated(scene: Scene, camera: Camera) -> Model:

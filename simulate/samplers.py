@@ -7,7 +7,7 @@ recorded is what was used.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isqrt
+from math import inf, isqrt, log
 
 from scenes.camera import Camera
 from scenes.scene import Sampler
@@ -71,3 +71,16 @@ def law(sampler: Sampler, camera: Camera) -> Law:
         return Law(None, why, IN_THE_LIMIT)
     why = "of n strata only those along edges, some n^1/2, err: n^1/2 / n^2 of variance (Mitchell 1996), for large n"
     return Law(-0.75, why, IN_THE_LIMIT)
+
+
+def corners(camera: Camera, fewest: int, most: int) -> float:
+    """By how much a slope between so many samples in a pass may differ from -3/4, which holds in the limit.
+
+    Of s x s strata, 2 (m - 1) s lie along edges of pixels of f, of which (m - 1)^2 hold two at once, a corner. Their
+    variance lies between none and twice that of two, so the error's square is C s^-3 (1 + c / s), |c| <= (m - 1) / 2.
+    """
+    c = float(max(kind.ratio for kind in camera.types) - 1) / 2
+    sides = fewest**0.5, most**0.5
+    if c >= sides[0] or fewest == most:
+        return inf
+    return 0.5 * log((1 - c / sides[1]) / (1 - c / sides[0])) / log(most / fewest)

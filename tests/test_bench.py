@@ -16,7 +16,7 @@ from chain.bench import curves, rows
 from chain.bench_jobs import SAMPLERS, Subject, jobs
 from chain.stages import opened
 from reconstruct.estimator import FORMS
-from reconstruct.slopes import excess, pareto, recommend, slope
+from reconstruct.slopes import Slope, excess, pareto, recommend, slope
 from scenes.bench_file import CSV, JSON, BenchTable, Cell, Quantiles, Stage, cell_of, read, rows_of
 from scenes.cheapest import Finished, Job, Repeat, cell, measure
 from scenes.errors import InputError
@@ -68,6 +68,8 @@ def test_too_few_points_have_no_slope() -> None:
     cells = [made(samples=count, error=exactly(1 / count)) for count in (4, 16)]
     assert slope(cells) is None
     assert slope([*cells, made(samples=64, scatter=None)]) is None
+    assert Slope(-0.738, 0.002).agrees(-0.75, 0.01)
+    assert not Slope(-0.738, 0.002).agrees(-0.75)
 
 
 Points = st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-9, 1e3)), min_size=1, max_size=12)

@@ -19,7 +19,7 @@ from simulate.ideal import ideal_matrix
 from simulate.passes import plan
 from simulate.render import light
 from simulate.rig import Rig
-from simulate.samplers import filling, fitting, law
+from simulate.samplers import corners, filling, fitting, law
 from simulate.streams import sampler_seeds
 from simulate.variant import activate
 
@@ -124,5 +124,9 @@ def test_stratified_samples_err_as_strata_do(variant: str) -> None:
     sizes = [float(np.sqrt(np.mean(jittered(described, seen, side)))) for side in (8, 32)]
     told = law("stratified", seen)
     assert told.slope == pytest.approx(np.log(sizes[1] / sizes[0]) / np.log(16), abs=0.01)
+    for first, last in ((8, 16), (8, 32), (16, 64)):
+        ends = [float(np.sqrt(np.mean(jittered(described, seen, side)))) for side in (first, last)]
+        away = abs(np.log(ends[1] / ends[0]) / np.log((last / first) ** 2) + 0.75)
+        assert away <= corners(seen, first**2, last**2) < 0.06
     assert law("independent", seen).slope == -0.5
     assert law("ldsampler", seen).slope is None

@@ -60,6 +60,10 @@ INDEPENDENT = ["--set", "prior.kind=independent", "--set", "prior.correlation_le
 SPARED = {
     "run scenes/misaligned.toml": [*QUICK, *INDEPENDENT, "--set", 'study.models=["ideal","true"]'],
     "run scenes/corridor.toml": [*QUICK, *SLOW_BACKEND, "--set", "target.shape=[19, 19]"],
+    "bench": ["--seconds", "5"],
+    "run scenes/tile19.toml -o sweep": [*QUICK, *SLOW_BACKEND, "--set", "calibration.method=ideal", "--workers", "1"],
+    "run scenes/tile19.toml -o auto": SLOW_BACKEND,
+    "run scenes/tile19.toml -o within": [*SLOW_BACKEND, "--within", "5 s"],
     "predict scenes/sensor.toml": ["--set", "camera.wavelength="],
     "run": [*QUICK, *SLOW_BACKEND],
     "render": [*QUICK, *SLOW_BACKEND],
@@ -234,7 +238,10 @@ def leaves(document: Any, prefix: str = "") -> Iterator[str]:
         yield prefix
 
 
-WHOLE = ("versions", "model.fit.parameters", "model.fit.units", "depth.rms_disparity_by_type")  # explained as one
+WHOLE = (  # explained as one
+    *("versions", "model.fit.parameters", "model.fit.units", "depth.rms_disparity_by_type"),
+    *("stages.render.not_reached", "stages.calibrate.auto", "spent.stages", "spent.chosen"),
+)
 
 
 def explained(key: str, keys: set[str]) -> bool:

@@ -28,7 +28,6 @@ from scenes.scene import Scene
 from simulate.variant import blocked
 
 from .conftest import Command, shell
-from .examples import GALLERY
 from .documentation import (
     PAGES,
     ROOT,
@@ -45,6 +44,7 @@ from .documentation import (
     sections,
     text_of,
 )
+from .examples import GALLERY
 
 DOCS = ROOT / "docs"
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")

@@ -48,5 +48,5 @@ def factorise_positive(matrix: Matrix) -> tuple[Factor, float]:
     except linalg.LinAlgError as error:
         raise NotSolvableError("its matrix is not positive definite in double precision") from error
     reciprocal, _ = linalg.lapack.dpocon(root, size, uplo="L") if scale.size else (1.0, 0)
-    # An estimate whose last digits depend on where in memory LAPACK sums: no two runs may differ by them.
+    # An estimate, whose last digits depend on where in memory LAPACK sums: no two runs may differ by that.
     return Factor(root, scale), float(f"{1 / reciprocal:.6g}") if reciprocal > 0 else float("inf")

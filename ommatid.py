@@ -144,14 +144,13 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
-    from chain import spend, stages
+    from chain import stages
 
     def tell(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         from reconstruct import depth, report, study
 
         if not as_json:
-            lines = report.rows(description) + spend.rows(description["spent"])
-            _table(f"{description['title'] or member.scene.stem}: {member.folder}", lines)
+            _table(f"{description['title'] or member.scene.stem}: {member.folder}", report.rows(description))
             if "depth" in description:
                 _table("Error against distance", depth.rows(description["depth"]))
             if "study" in description:

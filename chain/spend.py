@@ -1,4 +1,4 @@
-"""Dividing a time over the stages of a run, and what more of it would buy.
+"""Dividing a time over the stages of a run.
 
 The expected error of a run with n samples a pixel for rendering and k for calibration is taken as
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import log
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,9 @@ from numpy.typing import NDArray
 Numbers = NDArray[np.float64]
 Number = TypeVar("Number", float, NDArray[np.float64])
 
-FALL = {"independent": 1.0}  # exponents of a part of the error against samples, by sampler, before they are measured
-STRATIFIED = 1.5  # of all other samplers; pinholes
 FALLS = (0.5, 2.0)  # what is believed of a measured one
 NEGLIGIBLE = 0.005  # of the expected error: what is not worth any time
 STEPS = 16  # sample numbers tried, for every factor of 2
-MORE = (2, 4, 16)  # times the samples, of which run.json says what they would buy
-STAGES = {"render": "rendering", "calibrate": "calibration"}  # and their parts of the error budget
 
 
 @dataclass(frozen=True)
@@ -98,43 +94,3 @@ def curve(
         measured = log(wide / narrow) / log(m / n) if wide > 0 and narrow > 0 else FALLS[1]
         exponent = min(max(measured, FALLS[0]), FALLS[1])
     return Curve(part, m, exponent, max(after - each * m, 0.0), each)
-
-
-def spent(description: dict[str, Any], calibrated: bool) -> dict[str, Any]:
-    """What the stages of a run took, and what more samples would buy: from its error budget, nothing is computed anew.
-
-    seconds : of all stages, when they were done;  noise_alone : the expected error without the parts of both stages
-    more : the expected seconds and error of so many times the samples of both, with the exponents of theory
-    """
-    stages, error = description["stages"], description["error"]
-    taken = {name: float(stage.get("seconds", 0.0)) for name, stage in stages.items()}
-    parts = {stage: error["budget"][part] for stage, part in STAGES.items()}
-    sampler = stages["render"].get("sampler")
-    rest = error["predicted_mse"] - sum(parts.values())
-    found: dict[str, Any] = {"seconds": sum(taken.values()), "stages": taken, "noise_alone": rest}
-    if sampler is None:  # recorded frames
-        return found
-    fall = FALL.get(sampler, STRATIFIED)
-    grows = taken["render"] + (taken["calibrate"] if calibrated else 0.0)
-    found["more"] = [
-        {
-            "times": times,
-            "seconds": found["seconds"] + (times - 1) * grows,
-            "predicted_mse": rest + sum(part * times**-fall for part in parts.values()),
-        }
-        for times in MORE
-    ]
-    return found
-
-
-def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of the printed table."""
-    stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found["stages"].items())
-    lines: list[tuple[str, str]] = []
-    if "within" in found:
-        chosen = ", ".join(f"{key} {value}" for key, value in found["chosen"].items())
-        lines.append(("time", f"{found['seconds']:.1f} s of {found['within']:g} s: {stages}; chosen: {chosen}"))
-    if found.get("more"):
-        more = [f"{one['seconds']:.3g} s: {one['predicted_mse']:.4g}" for one in found["more"][:2]]
-        lines.append(("more time would bring", f"{', '.join(more)}; noise alone: {found['noise_alone']:.4g}"))
-    return lines

@@ -73,7 +73,6 @@ def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Wat
     from reconstruct.results import RUN, kept_results
 
     from .judges import by_stack
-    from .spend import spent
 
     exact = scene.calibration.method == "ideal" and camera.boxed
     refuse(scene, camera)
@@ -89,7 +88,7 @@ def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Wat
     with watch.progress("reconstruct") as progress:
         description, made = kept_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     watch.done("reconstruct", made)
-    more: dict[str, Any] = {"spent": spent(description, calibrated=scene.calibration.method != "ideal")}
+    more: dict[str, Any] = {}
     if scene.world is not None:
         from reconstruct.depth import of_run
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from reconstruct.report import write_run
 from reconstruct.results import RUN
+from reconstruct.spent import STAGES
 from scenes import model, stack
 from scenes.camera import Camera
 from scenes.parcel import Stages, Watch
@@ -75,7 +76,7 @@ def run_within(
     few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
     chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
     description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun))
-    sampled = sum(few.seconds(stage) for stage in spend.STAGES)
+    sampled = sum(few.seconds(stage) for stage in STAGES)
     rest = max(few.wall - sampled, few.seconds("reconstruct"))
     if _needs_little(scene, camera):
         if left > ROUND * sampled + few.seconds("reconstruct") + rest:
@@ -87,7 +88,7 @@ def run_within(
             chosen, description, curves = (FEW[1], FEW[1]), more.description, _curves(scene, few, more)
             left = (1 - SPARE) * (seconds - (clock() - begun))
         error = description["error"]
-        floor = error["predicted_mse"] - sum(error["budget"][part] for part in spend.STAGES.values())
+        floor = error["predicted_mse"] - sum(error["budget"][part] for part in STAGES.values())
         division = spend.divide(*curves, floor, left - rest - COMPILED, (MOST, MOST))
         if division is not None and division.predicted_mse < error["predicted_mse"]:
             chosen = division.render, division.calibrate
@@ -139,7 +140,7 @@ def _measured(scene: Scene, camera: Camera, image: Image, folder: Path, watch: W
 
 def _curves(scene: Scene, few: Measured, more: Measured) -> tuple[spend.Curve, spend.Curve]:
     found: list[spend.Curve] = []
-    for stage, part in spend.STAGES.items():
+    for stage, part in STAGES.items():
         if stage == "calibrate" and scene.calibration.method == "ideal":
             found.append(spend.Curve(0.0, FEW[0], 1.0, 0.0, 0.0))
             continue

@@ -23,6 +23,7 @@ from scenes.show import why_left_out
 from scenes.stack import STRAIGHT, Stack
 from scenes.versions import versions
 
+from . import spent
 from .estimator import Solver
 from .fit import Fit
 from .restore import MOST_FEIGNED, Restoration
@@ -62,7 +63,7 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
         "calibrate": {"method": model.record["method"], **_stage(model.record)},
         "reconstruct": {"seconds": restoration.seconds},
     }
-    return {
+    described: dict[str, Any] = {
         "title": stack.scene.title,
         "measurements": model.measurements,
         "unknowns": model.unknowns,
@@ -87,6 +88,7 @@ def describe(stack: Stack, model: Model, restoration: Restoration) -> dict[str, 
             "calibration": model.record.get("first_seed"),
         },
     }
+    return {**described, "spent": spent.spent(described, calibrated=model.record["method"] != "ideal")}
 
 
 def _solver(solver: Solver) -> dict[str, Any]:
@@ -215,7 +217,7 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     if agreement["feigned_information"] > MOST_FEIGNED:
         lines.append(("do not trust the predicted error", WARNING))
     lines += [(f"left out: {skip['what']}", why_left_out(skip)) for skip in description["skipped"]]
-    return lines
+    return lines + spent.rows(description["spent"])
 
 
 def samples_of(stage: dict[str, Any]) -> str:

@@ -162,7 +162,12 @@ def everything(out: Path) -> dict[str, Any]:
 
 
 def all_files() -> set[str]:
-    return {f"{scene}/{name}" for scene in SCENES for name in FILES} | {"sweep.csv", "sweep.json", "sweep.png"}
+    return {f"{scene}/{name}" for scene in SCENES for name in FILES} | {
+        "index.html",
+        "sweep.csv",
+        "sweep.json",
+        "sweep.png",
+    }
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +226,7 @@ def test_a_run_clears_what_one_that_was_killed_has_left(kept: Path, ommatid: Com
     for name in (f".0123abcd{files.PART}estimate.png", ".stack.exr.partial.npz", ".model.npz.partial.npz"):
         (kept / name).write_bytes(b"half")
     ended = ommatid("run", "tiny.toml", "-o", "out")
-    assert ended.err.count("up to date, nothing to do") == 3
+    assert ended.err.count("up to date, nothing to do") == 4
     assert {path.name for path in kept.iterdir()} == FILES
 
 

@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chain import measured
-from chain.spend import NEGLIGIBLE, Curve, curve, divide, spent
+from chain.spend import NEGLIGIBLE, Curve, curve, divide
 from chain.within import KEYS, run_within
+from reconstruct.spent import spent
 from scenes import bench_file
 from scenes.bench_file import BenchTable, Cell, Quantiles
 from scenes.camera import derive

@@ -150,7 +150,7 @@ def curves(cells: Sequence[Cell], camera: Camera) -> list[Curve]:
     """The slope of each way of rendering and calibrating, beside what theory says."""
     found: list[Curve] = []
     for stage, limit in FLAT.items():
-        some = [cell for cell in cells if cell.stage == stage]
+        some = [cell for cell in cells if cell.stage == stage and cell.counted]
         for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in some):
             alike = [cell for cell in some if (cell.way, cell.variant) == (way, variant) and cell.error.median > limit]
             found.append(_curve(alike, camera, (stage, way, variant)))
@@ -189,9 +189,11 @@ def rows(table: BenchTable) -> list[tuple[str, str]]:
     for stage in bench_file.STAGES:
         best = table.recommended.get(stage)
         if best is not None:
-            words = ", ".join(str(value) for key, value in best.items() if key != "seconds" and value)
-            samples = " samples" if stage != "reconstruct" else ""
-            lines.append((f"recommended, {stage}", f"{words}{samples}, {best['seconds']:.2g} s"))
+            words = [str(value) for key, value in best.items() if key not in ("samples", "seconds") and value]
+            if "samples" in best:
+                counted = best["samples"] != bench_file.AUTO
+                words.append(f"{best['samples']} samples" if counted else f'samples = "{bench_file.AUTO}"')
+            lines.append((f"recommended, {stage}", f"{', '.join(words)}, {best['seconds']:.2g} s"))
     lines.append(("why", str(table.recommended["why"])))
     lines.append(("cells", f"{len(table.cells)} in {table.seconds:.0f} s, held against {table.against}"))
     late = sum(one.late for one in table.left_out)

@@ -15,19 +15,22 @@ from reconstruct.choice import DENSE
 from reconstruct.precision import Exact, Setting, exact, settings
 from reconstruct.restore import way_of
 from reconstruct.way import Task
-from scenes.bench_file import LeftOut
+from scenes.bench_file import AUTO, LeftOut
 from scenes.camera import Camera
 from scenes.cheapest import FEWER, REPEATS, Job, Repeat
+from scenes.errors import InputError
 from scenes.model import Model
 from scenes.peak import Cost, costed
 from scenes.scene import Sampler, Scene
 from scenes.stack import Stack
 from simulate import curves
-from simulate.curves import Right
-from simulate.passes import plan
+from simulate.auto import Lit
+from simulate.curves import Right, Samples
 from simulate.render import Rendering
 from simulate.streams import repeat_seed
 from simulate.variant import PREFERENCE, blocked, release
+
+from .judges import by_stack
 
 Image = NDArray[np.float64]
 Method = Literal["points", "transport"]
@@ -38,6 +41,8 @@ SAMPLERS: tuple[Sampler, ...] = ("independent", "stratified", "multijitter", "or
 RAYS = {"scalar_rgb": 5e6, "llvm_ad_mono": 3e7, "cuda_ad_mono": 3e8}  # a second, about: only an order to begin with
 READY = {"scalar_rgb": 0.02, "llvm_ad_mono": 0.03, "cuda_ad_mono": 0.05}  # seconds before the first ray, about
 TWICE = 2  # estimates that a calibrated H takes: its uncertainty adds noise that the first one shows
+JUDGING = 2  # more of them, where an H is judged by what its uncertainty adds
+BY_ITSELF = 0.005  # seconds that a sub-imager takes which is rendered by itself, about
 POINTS = 12.0  # renderings that point sources take, in units of one, about
 
 
@@ -71,10 +76,11 @@ class Subject:
         """Whether the estimate is one of a frame or of tiles, which noise of its own in every pixel would slow down."""
         return self.camera.unknowns > DENSE
 
-    def of_rendering(self, rendering: Rendering, repeat: int) -> float:
+    def of_rendering(self, rendering: Rendering | Lit, repeat: int) -> float:
         """Mean squared error of the estimate from a rendering and exact H, freed of this noise's luck."""
         scene = self.noise(repeat)
-        if self.large or rendering.passes == 1:
+        once = isinstance(rendering, Rendering) and rendering.passes == 1  # whose variance nobody knows
+        if self.large or once:
             return self._brought(curves.stack_of_light(scene, self.camera, rendering.mean, self.right), repeat)
         return self._brought(curves.stack_of(scene, self.camera, rendering), repeat)
 
@@ -135,8 +141,41 @@ def jobs(subject: Subject) -> tuple[list[Job], list[LeftOut]]:
         working.remove("scalar_rgb")
         left_out.append(LeftOut("scalar_rgb", "lenses that are more than pinholes need a fast backend"))
     found = [*_renderings(subject, working), *_calibrations(subject, working)]
+    try:
+        found += _as_needed(subject, working)
+    except InputError as error:
+        left_out.append(LeftOut("samples 'auto'", str(error)))
     estimates, refused = _estimates(subject)
     return [*found, *estimates], [*left_out, *refused]
+
+
+@dataclass(frozen=True)
+class Work:
+    """How many samples a pixel a cell takes: `taken`, unless only the cell can tell, and about how many to begin with.
+
+    setting : the same for people
+    """
+
+    taken: int | None
+    about: int
+    setting: str
+
+
+def _counted(asked: int, sampler: Sampler) -> Work:
+    work = curves.work_of(asked, sampler)
+    return Work(work.total, work.total, f"{work.passes} pass{'es' if work.passes > 1 else ''} of {work.samples}")
+
+
+def _as_needed(subject: Subject, variants: list[str]) -> list[Job]:
+    """With samples "auto" and the scene's own sampler. Raises InputError where there is no noise to compare with."""
+    scene = subject.scene
+    work = Work(None, curves.foreseen_samples(scene, subject.camera, subject.image, subject.right), AUTO)
+    found: list[Job] = []
+    for variant in variants:
+        found.append(_rendering(subject, variant, scene.render.sampler, AUTO, work))
+        methods: tuple[Method, ...] = () if variant.startswith("scalar") else ("points", "transport")
+        found += [_calibration(subject, variant, method, scene.render.sampler, AUTO, work) for method in methods]
+    return found
 
 
 def _renderings(subject: Subject, variants: list[str]) -> list[Job]:
@@ -144,24 +183,24 @@ def _renderings(subject: Subject, variants: list[str]) -> list[Job]:
     for variant in variants:
         for sampler in SAMPLERS:
             for asked in SAMPLES:
-                job = _rendering(subject, variant, sampler, asked)
+                job = _rendering(subject, variant, sampler, asked, _counted(asked, sampler))
                 found.setdefault(job.name, job)  # where several counts are rounded up to one
     return list(found.values())
 
 
-def _rendering(subject: Subject, variant: str, sampler: Sampler, asked: int) -> Job:
-    work = curves.work_of(asked, sampler)
-    name = f"render {sampler} {variant} {work.total}"
+def _rendering(subject: Subject, variant: str, sampler: Sampler, asked: Samples, work: Work) -> Job:
+    name = f"render {sampler} {variant} {work.taken or AUTO}"
 
     def one(repeat: int) -> Repeat:
         scene = curves.with_rendering(subject.scene, sampler, variant, asked, subject.seed(name, repeat))
         rendering, cost = _costed(lambda: curves.rendered(scene, subject.camera, subject.image))
         error = curves.error_of_light(rendering, subject.right)
-        return Repeat(error, cost, subject.of_rendering(rendering, repeat) if repeat < FEWER else None)
+        mse = subject.of_rendering(rendering, repeat) if repeat < FEWER else None
+        return Repeat(error, cost, mse, int(rendering.record()["samples"]))
 
-    guess = READY[variant] + work.total * subject.camera.measurements / RAYS[variant] + subject.solving
-    setting = f"{work.passes} pass{'es' if work.passes > 1 else ''} of {work.samples}"
-    return Job("render", sampler, variant, work.total, setting, guess, one)
+    ready = READY[variant] + (BY_ITSELF * len(subject.camera.sub_imagers) if asked == AUTO else 0.0)
+    guess = ready + work.about * subject.camera.measurements / RAYS[variant] + subject.solving
+    return Job("render", sampler, variant, work.taken, work.setting, guess, one)
 
 
 def _calibrations(subject: Subject, variants: list[str]) -> list[Job]:
@@ -171,25 +210,28 @@ def _calibrations(subject: Subject, variants: list[str]) -> list[Job]:
         methods: list[tuple[Method, Sampler]] = [("points", own), *(("transport", sampler) for sampler in rays)]
         for method, sampler in methods:
             for asked in SAMPLES[1:]:  # fewer than there are passes cannot be asked for
-                job = _calibration(subject, variant, method, sampler, asked)
+                job = _calibration(subject, variant, method, sampler, asked, _counted(asked, sampler))
                 found.setdefault(job.name, job)
     return list(found.values())
 
 
-def _calibration(subject: Subject, variant: str, method: Method, sampler: Sampler, asked: int) -> Job:
-    work, way = plan(asked, sampler), f"{method}, {sampler}"
-    name = f"calibrate {way} {variant} {work.total}"
+def _calibration(subject: Subject, variant: str, method: Method, sampler: Sampler, asked: Samples, work: Work) -> Job:
+    way = f"{method}, {sampler}"
+    name = f"calibrate {way} {variant} {work.taken or AUTO}"
 
     def one(repeat: int) -> Repeat:
         seed = subject.seed(name, repeat)
         scene = curves.with_calibration(subject.scene, method, sampler, variant, asked, seed)
-        model, cost = _costed(lambda: curves.calibrated(scene, subject.camera))
+        judge = by_stack(subject.stack(repeat)) if asked == AUTO else None
+        model, cost = _costed(lambda: curves.calibrated(scene, subject.camera, judge))
         error = curves.error_of_model(model, subject.right)
-        return Repeat(error, cost, subject.of_model(model, repeat) if repeat < FEWER else None)
+        mse = subject.of_model(model, repeat) if repeat < FEWER else None
+        return Repeat(error, cost, mse, int(model.record["samples"]))
 
-    each = work.total * subject.camera.measurements / RAYS[variant]
-    guess = 2 * READY[variant] + each * (POINTS if method == "points" else 1.0) + TWICE * subject.solving
-    return Job("calibrate", way, variant, work.total, f"{work.passes} passes of {work.samples}", guess, one)
+    each = work.about * subject.camera.measurements / RAYS[variant]
+    solving = subject.solving * (TWICE + JUDGING if asked == AUTO else TWICE)
+    guess = 2 * READY[variant] + each * (POINTS if method == "points" else 1.0) + solving
+    return Job("calibrate", way, variant, work.taken, work.setting, guess, one)
 
 
 def _estimates(subject: Subject) -> tuple[list[Job], list[LeftOut]]:

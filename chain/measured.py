@@ -34,17 +34,20 @@ def curves(folder: Path, scene: Scene, camera: Camera) -> tuple[Curve, Curve] | 
 
 def _curve(table: BenchTable, stage: Stage, way: str, variant: str) -> Curve | None:
     """None where the stage was not measured in that way."""
+    counted = [one for one in table.cells if one.counted]
     cells = sorted(
         (one.samples, one.seconds.median, one.mse.median)
-        for one in table.of(stage)
-        if (one.way, one.variant) == (way, variant) and one.mse is not None and one.samples is not None
+        for one in counted
+        if (one.stage, one.way, one.variant) == (stage, way, variant)
+        and one.mse is not None
+        and one.samples is not None
     )
     alike = [one.slope for one in table.curves if (one.stage, one.way, one.variant) == (stage, way, variant)]
     slopes = [slope for slope in alike if slope is not None]
     if len(cells) < 2 or not slopes:
         return None
     (few, before, mse), (many, after, _) = cells[0], cells[-1]
-    floor = min(one.mse.median for one in table.cells if one.mse is not None)
+    floor = min(one.mse.median for one in counted if one.mse is not None)
     each = max((after - before) / (many - few), 0.0)
     # Twice the slope: of a variance, not of a deviation.
     return Curve(max(mse - floor, 0.0), few, -2 * slopes[0], max(before - each * few, 0.0), each)

@@ -10,18 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from scenes.bench_file import ALONE, STAGES, BenchTable, Cell, Curve, Quantiles, Stage
+from scenes.bench_file import ALONE, AUTO, STAGES, BenchTable, Cell, Curve, Quantiles, Stage
 from scenes.files import write_whole
 
+from .labels import Label, spread
 from .slopes import WORSE, pareto
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 RESOLUTION = 110
 FRONT: dict[str, Any] = {"color": "0.75", "linewidth": 7, "alpha": 0.6, "solid_capstyle": "round"}
-LINE = 0.035  # of a panel's height: how far apart labels stand
+OPEN: dict[str, Any] = {"markersize": 10, "markeredgecolor": "black", "linestyle": "none"}
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,8 @@ class Style:
 
 
 Key = tuple[str, str | None]  # way, and variant or setting
-Label = tuple[float, float, str, str]  # of a point at x, y: words, colour
+Across = Callable[[Cell], float | None]
+Up = Callable[[Cell], Quantiles | None]
 
 
 def write_figures(folder: Path, table: BenchTable) -> None:
@@ -72,30 +72,32 @@ def _by_samples(figure: Any, table: BenchTable, stage: Stage) -> None:
     what = "Rendering" if stage == "render" else "Calibration"
     figure.suptitle(f"{what}: {table.title}", parse_math=False)
     panels = figure.subplots(1, 3, width_ratios=(1.35, 1, 1))
-    groups = _groups(table.of(stage))
-    styles = _styles(list(groups))
+    cells = table.of(stage)
+    groups, styles = _groups([cell for cell in cells if cell.counted]), _styles(cells)
     for panel in panels:
         _furnish(panel)
-    _draw(panels[0], groups, styles, lambda one: one.samples, lambda one: one.error)
-    panels[0].set(
-        xlabel="samples a pixel (4 in one pass, others in 16 passes or more)",
-        ylabel=f"error of the {what.lower()}: {unit}",
-    )
-    panels[0].set_title(f"How it falls: slope ± standard error\nagainst {table.against}", fontsize=10)
-    _name_slopes(panels[0], groups, styles, table.curves, stage)
-    _draw(panels[1], groups, styles, lambda one: one.seconds.median, lambda one: one.error)
-    _front(panels[1], pareto(table.of(stage)))
-    panels[1].set(xlabel="seconds", ylabel=f"error of the {what.lower()}: {unit}")
-    panels[1].set_title("What it costs\n", fontsize=10)
+    shown: tuple[tuple[Across, Up], ...] = ((_samples, _error), (_seconds, _error), (_seconds, _mse))
+    for panel, (across, up) in zip(panels, shown, strict=True):
+        _draw(panel, groups, styles, across, up)
     if stage == "render" and table.noise_deviation > 0:
         for panel in panels[:2]:
             _level(panel, table.noise_deviation, f"noise of the sensor, {table.noise_deviation:.2g}")
-    _draw(panels[2], groups, styles, lambda one: one.seconds.median, lambda one: one.mse)
+    _floor(panels[2], table)
+    for panel, (across, up) in zip(panels, shown, strict=True):
+        _as_needed(panel, cells, styles, across, up)
+    _name_slopes(panels[0], groups, styles, table.curves, stage)
+    _front(panels[1], pareto(cells))
+    panels[0].set(
+        xlabel="samples a pixel (4 in one pass, others in 16 passes or more; auto: the most on any pixel)",
+        ylabel=f"error of the {what.lower()}: {unit}",
+    )
+    panels[0].set_title(f"How it falls: slope ± standard error\nagainst {table.against}", fontsize=10)
+    panels[1].set(xlabel="seconds", ylabel=f"error of the {what.lower()}: {unit}")
+    panels[1].set_title("What it costs\n", fontsize=10)
     panels[2].set(xlabel="seconds", ylabel="mean squared error of the image (squared values of f)")
     panels[2].set_title(
         f"What it brings: the image's error\nwith {'H' if stage == 'render' else 'light'} exact", fontsize=10
     )
-    _floor(panels[2], table)
     _star(panels[2], table, stage)
     _legend(figure, groups, styles)
 
@@ -111,7 +113,7 @@ def _by_way(figure: Any, table: BenchTable, stage: Stage) -> None:
     for panel in panels:
         _furnish(panel)
         panel.set_xlabel("seconds")
-    _draw(panels[0], groups, styles, lambda one: one.seconds.median, lambda one: one.error)
+    _draw(panels[0], groups, styles, _seconds, _error)
     _front(panels[0], pareto(cells))
     panels[0].legend(loc="lower left", fontsize=9)
     _level(panels[0], 0.1, "a tenth of a posterior standard deviation: 1 % of the mean squared error")
@@ -121,8 +123,8 @@ def _by_way(figure: Any, table: BenchTable, stage: Stage) -> None:
         (cell.seconds.median, cell.error.median, f"{cell.way}, {cell.setting.split(',')[0]}", styles[key].colour)
         for key, (cell,) in groups.items()
     ]
-    _spread(panels[0], labels, 1.7)
-    _draw(panels[1], groups, styles, lambda one: one.seconds.median, lambda one: one.mse)
+    spread(panels[0], labels, 1.7)
+    _draw(panels[1], groups, styles, _seconds, _mse)
     panels[1].set_ylabel("mean squared error of the image (squared values of f)")
     panels[1].set_title("What it brings: the image's error with light and H exact", fontsize=10)
     _floor(panels[1], table)
@@ -134,6 +136,22 @@ def _by_way(figure: Any, table: BenchTable, stage: Stage) -> None:
     _star(panels[1], table, stage)
 
 
+def _samples(cell: Cell) -> float | None:
+    return cell.samples
+
+
+def _seconds(cell: Cell) -> float:
+    return cell.seconds.median
+
+
+def _error(cell: Cell) -> Quantiles:
+    return cell.error
+
+
+def _mse(cell: Cell) -> Quantiles | None:
+    return cell.mse
+
+
 def _groups(cells: Sequence[Cell]) -> dict[Key, list[Cell]]:
     found: dict[Key, list[Cell]] = {}
     for cell in cells:
@@ -141,8 +159,9 @@ def _groups(cells: Sequence[Cell]) -> dict[Key, list[Cell]]:
     return {key: sorted(some, key=lambda one: one.samples or 0) for key, some in found.items()}
 
 
-def _styles(keys: Sequence[Key]) -> dict[Key, Style]:
-    ways = list(dict.fromkeys(way for way, _ in keys))
+def _styles(cells: Sequence[Cell]) -> dict[Key, Style]:
+    ways = list(dict.fromkeys(cell.way for cell in cells))
+    keys = dict.fromkeys((cell.way, cell.variant) for cell in cells)
     return {(way, variant): _style(ways.index(way), (variant or "").startswith("scalar")) for way, variant in keys}
 
 
@@ -161,8 +180,8 @@ def _draw(
     panel: Any,
     groups: dict[Key, list[Cell]],
     styles: dict[Key, Style],
-    across: Callable[[Cell], float | None],
-    up: Callable[[Cell], Quantiles | None],
+    across: Across,
+    up: Up,
 ) -> None:
     for key, cells in groups.items():
         points = [(across(cell), up(cell)) for cell in cells]
@@ -172,6 +191,28 @@ def _draw(
         x, y = [one for one, _ in known], [one.median for _, one in known]
         bars = [[max(one.median - one.low, 0.0) for _, one in known], [one.high - one.median for _, one in known]]
         panel.errorbar(x, y, yerr=bars, elinewidth=0.8, capsize=1.5, zorder=3, **styles[key].line())
+
+
+def _as_needed(panel: Any, cells: Sequence[Cell], styles: dict[Key, Style], across: Across, up: Up) -> None:
+    """Mark cells of samples "auto", which lie on no curve: their way's mark, large and edged black, with a name.
+
+    Where the panel ends above them, since only rounding is left, they stand on its lower edge, and the name says it.
+    """
+    low, high = panel.get_ylim()
+    known = [(across(cell), up(cell), styles[cell.way, cell.variant]) for cell in cells if not cell.counted]
+    points = [(x, y.median, style) for x, y, style in known if x is not None and y is not None]
+    for x, y, style in points:
+        panel.plot(x, max(y, low), zorder=5, clip_on=False, **{**style.line(), **OPEN})
+    left, right = panel.get_xlim()
+    middle = (left * right) ** 0.5
+    for number, (x, y, style) in enumerate(points):
+        words = f"{AUTO}, below: {y:.1g}" if y < low else AUTO
+        place = {"xytext": (-14 if x > middle else 14, 28 + 14 * number), "ha": "right" if x > middle else "left"}
+        leader = {"arrowstyle": "-", "color": style.colour, "linewidth": 0.8}
+        behind = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+        text = {"textcoords": "offset points", "fontsize": 9, "fontweight": "bold", "bbox": behind, "zorder": 6}
+        panel.annotate(words, (x, max(y, low)), color=style.colour, arrowprops=leader, **place, **text)
+    panel.set_ylim(low, high)
 
 
 def _front(panel: Any, front: Sequence[Cell]) -> None:
@@ -222,11 +263,11 @@ def _name_slopes(
         if key == next(one for one in groups if one[0] == key[0]):
             words = _slope_words(key[0], known.get(key))
             labels.append((float(cells[-1].samples or 1), cells[-1].error.median, words, styles[key].colour))
-    counts = sorted({cell.samples for cells in groups.values() for cell in cells if cell.samples})
-    panel.set_xticks([4**power for power in range(1, 12) if 4**power <= counts[-1]])
+    most = max((cell.samples or 0 for cells in groups.values() for cell in cells), default=0)
+    panel.set_xticks([4**power for power in range(1, 12) if 4**power <= most])
     panel.minorticks_off()
     panel.xaxis.set_major_formatter("{x:.0f}")
-    _spread(panel, labels, 1.75)
+    spread(panel, labels, 1.75)
 
 
 def _slope_words(way: str, curve: Curve | None) -> str:
@@ -236,40 +277,11 @@ def _slope_words(way: str, curve: Curve | None) -> str:
     return f"{way}\n{curve.slope:.3f} ± {curve.slope_deviation:.3f}{beside}"
 
 
-def _spread(panel: Any, labels: Sequence[Label], wider: float) -> None:
-    """Labels right of all points, not on top of one another, each with a thin line to its own.
-
-    wider : how much the panel's axis is prolonged to make room, as a power of the span it has
-    """
-    left, right = panel.get_xlim()
-    panel.set_xlim(left, left * (right / left) ** wider)
-    low, high = np.log(panel.get_ylim())
-    rising = sorted(labels, key=lambda one: one[1])
-    places = [float((np.log(value) - low) / (high - low)) for _, value, _, _ in rising]
-    apart = [LINE * (1 + words.count("\n")) for _, _, words, _ in rising]
-    for place, (x, y, words, colour) in zip(_moved_apart(places, apart), rising, strict=True):
-        leader = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "alpha": 0.6, "relpos": (0, 0.5)}
-        text = {"textcoords": "axes fraction", "va": "center", "fontsize": 8.5, "color": colour}
-        panel.annotate(words, (x, y), xytext=(1.03 / wider, place), arrowprops=leader, **text)
-
-
-def _moved_apart(places: Sequence[float], apart: Sequence[float]) -> list[float]:
-    """Rising places between 0 and 1, moved until neighbours stand half their heights' sum from one another."""
-    found: list[float] = []
-    for number, place in enumerate(places):
-        least = found[-1] + (apart[number] + apart[number - 1]) / 2 if found else apart[0] / 2
-        found.append(max(place, least))
-    most = 1.0
-    for number in reversed(range(len(found))):
-        found[number] = min(found[number], most - apart[number] / 2)
-        most = found[number] - apart[number] / 2
-    return found
-
-
 def _legend(figure: Any, groups: dict[Key, list[Cell]], styles: dict[Key, Style]) -> None:
     from matplotlib.lines import Line2D
 
     lines: list[Any] = [Line2D([], [], **styles[key].line()) for key in groups]
     names = [way if variant is None else f"{way}, {variant}" for way, variant in groups]
-    names.append("Pareto front: nothing is both faster and better")
-    figure.legend([*lines, Line2D([], [], **FRONT)], names, loc="outside lower center", ncols=4, fontsize=9)
+    lines += [Line2D([], [], **FRONT), Line2D([], [], marker="o", markerfacecolor="0.7", color="0.7", **OPEN)]
+    names += ["Pareto front: nothing is both faster and better", "auto: as many samples as are needed"]
+    figure.legend(lines, names, loc="outside lower center", ncols=4, fontsize=9)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.bench_file import ALONE, Cell
+from scenes.bench_file import ALONE, AUTO, Cell
 from scenes.moderate import moderate
 
 AGREES = 3.0  # standard errors within which a slope is that of theory
@@ -100,11 +100,12 @@ def recommend(cells: Sequence[Cell], floor: float) -> dict[str, Any]:
     more = _excess_of(best, floor)
     found |= {cell.stage: _told(cell) for cell in best} | {"mse": floor * (1 + more), "reached": bool(reaching)}
     if reaching:
-        why = f"the cheapest within {100 * WORSE:g} % of what exact light and exact H give: {100 * more:.2g} % above it"
-        return {**found, "why": why}
+        above = f"{round(100 * more, 4):.2g} % above it"
+        why = f"the cheapest within {100 * WORSE:g} % of what exact light and exact H give: {above}"
+        return {**found, "why": "; ".join([why, *_as_needed(best)])}
     words = [word for word in (_needed(cells, cell, floor) for cell in best) if word]
     why = f"no setting measured comes within {100 * WORSE:g} % of what exact light and exact H give; these come nearest"
-    return {**found, "why": "; ".join([f"{why}, {100 * more:.0f} % above it", *words])}
+    return {**found, "why": "; ".join([f"{why}, {100 * more:.0f} % above it", *words, *_as_needed(best)])}
 
 
 def _choices(cells: Sequence[Cell], floor: float) -> Iterator[tuple[Cell, ...]]:
@@ -144,15 +145,25 @@ def _told(cell: Cell) -> dict[str, Any]:
         return {"method": cell.way, "setting": cell.setting, **seconds}
     *method, sampler = cell.way.split(", ")
     told = {"method": method[0]} if method else {}
-    return {**told, "sampler": sampler, "variant": cell.variant, "samples": cell.samples, **seconds}
+    samples = cell.samples if cell.counted else AUTO
+    return {**told, "sampler": sampler, "variant": cell.variant, "samples": samples, **seconds}
+
+
+def _as_needed(some: Sequence[Cell]) -> list[str]:
+    """What "auto" took, where it is recommended."""
+    names = {"render": "render.samples", "calibrate": "calibration.samples"}
+    open_ones = [cell for cell in some if not cell.counted]
+    return [f'{names[cell.stage]} = "{AUTO}" took up to {cell.samples} samples a pixel' for cell in open_ones]
 
 
 def _needed(cells: Sequence[Cell], cell: Cell, floor: float) -> str:
     """About how many samples a stage would take, as its last two cells go on: excess falls with the squared error."""
+    if cell.samples is None or not cell.counted:
+        return ""
     share, now = WORSE / 2, excess(cell, floor)  # the other half is for the other of both
     alike = [one for one in cells if (one.stage, one.way, one.variant) == (cell.stage, cell.way, cell.variant)]
-    last = sorted((one for one in alike if one.samples), key=lambda one: one.samples or 0)[-2:]
-    if cell.samples is None or now <= share or len(last) < 2 or last[0].error.median <= last[1].error.median:
+    last = sorted((one for one in alike if one.samples and one.counted), key=lambda one: one.samples or 0)[-2:]
+    if now <= share or len(last) < 2 or last[0].error.median <= last[1].error.median:
         return ""
     fall = log(last[0].error.median / last[1].error.median) / log((last[1].samples or 1) / (last[0].samples or 1))
     samples = cell.samples * exp(log(now / share) / (2 * fall))

@@ -22,6 +22,7 @@ from .files import write_text
 
 JSON, CSV = "bench.json", "bench.csv"
 ALONE = "alone"  # the setting of a dense form without refinement, which no scene can ask for
+AUTO = "auto"  # the setting of a cell that takes as many samples as are needed: one point, and no part of a curve
 LOW, HIGH = 0.1, 0.9  # the quantiles that go with a median
 
 Stage = Literal["render", "calibrate", "reconstruct"]
@@ -53,7 +54,7 @@ class Cell:
     """One setting of a stage, measured.
 
     way : the sampler, the method of calibration (and its sampler), a dense form, "tiles" or "frame"
-    samples : a pixel, as many as were used;  setting : what else was set
+    samples : a pixel, as many as were used; of AUTO the most on any pixel, in any repeat;  setting : what else was set
     scatter : standard deviation of the error's natural logarithm over repeats, None where it says nothing
     memory : bytes that the process held at its peak, None where the system does not tell
     mse : mean squared error of the image that this setting brings, with the scene's noise and all else exact
@@ -70,6 +71,11 @@ class Cell:
     memory: int | None
     mse: Quantiles | None
     scatter: float | None = None
+
+    @property
+    def counted(self) -> bool:
+        """Whether its number of samples was given beforehand, so that it may lie on a curve."""
+        return self.setting != AUTO
 
 
 @dataclass(frozen=True)
@@ -108,7 +114,7 @@ class BenchTable:
     scene : fingerprint of what is measured;  fingerprint : of that and of the versions it was measured with
     against : what renderings and calibrations were held against;  noise_deviation : of the sensor, in values of f
     budget : seconds that were allowed;  seconds : that all cells took
-    recommended : the cheapest setting that reaches the noise floor, a table a stage
+    recommended : the cheapest setting that reaches the noise floor, a table a stage; samples are a number or AUTO
     """
 
     title: str

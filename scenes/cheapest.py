@@ -1,7 +1,8 @@
 """Measurements one after the other, the cheapest first, as far as the time goes; each is kept as soon as it is done.
 
 A measurement is a job of several repeats. How long a job takes is guessed from the one before it in its series, which
-differs from it in a known ratio; jobs that do not fit into what is left of the time are left out.
+differs from it in a known ratio; jobs that do not fit into what is left of the time are left out. Short ones of
+AUTO come before all others, since each tells as much as the end of a curve.
 """
 
 from __future__ import annotations
@@ -15,22 +16,28 @@ from time import perf_counter
 
 import numpy as np
 
-from .bench_file import Cell, LeftOut, Quantiles, Stage, cell_of
+from .bench_file import AUTO, Cell, LeftOut, Quantiles, Stage, cell_of
 from .errors import DeniedError, InputError
 from .peak import Cost
 from .progress import Progress
 
 REPEATS, FEWER = 5, 3  # with seeds of their own; odd, so that the median is one of them
+SOON = 0.1  # of the time: what a cell of AUTO may take to be measured before all others
 LONG = 1.0  # seconds of a repeat, from which on there are fewer
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """What one repeat found; `mse`, of the image that it brings, None where that was not computed."""
+    """What one repeat found.
+
+    mse : of the image that it brings, None where that was not computed
+    samples : a pixel, where they were not known beforehand
+    """
 
     error: float
     cost: Cost
     mse: float | None
+    samples: int | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,8 @@ class Job:
 
 def name_of(one: Job | Cell) -> str:
     """For people, and what it is kept under."""
-    samples = None if one.samples is None else f"{one.samples} samples"
+    known = one.samples is not None and one.setting != AUTO  # of AUTO only once it is done
+    samples = f"{one.samples} samples" if known else None
     return ", ".join(part for part in (f"{one.stage} {one.way}", one.variant, samples, one.setting) if part)
 
 
@@ -118,7 +126,7 @@ class Finished:
 def measure(
     jobs: Sequence[Job], allowed: float, finished: Finished, progress: Progress, spent: float = 0.0
 ) -> list[LeftOut]:
-    """Do those jobs that are not finished, the cheapest first, and say what did not fit.
+    """Do those jobs that are not finished, short ones of AUTO and then the cheapest first, and say what did not fit.
 
     allowed : seconds, of which `spent` and those of what is finished are gone
     """
@@ -135,9 +143,13 @@ def measure(
     def expected(job: Job) -> float:
         return job.guess * ratios.get(job.series, 1.0)
 
+    def turn(job: Job) -> tuple[bool, float]:
+        each = expected(job)
+        return job.setting != AUTO or each * _repeats(each) > SOON * allowed, each
+
     left_out: list[LeftOut] = []
     while waiting:
-        job = min(waiting, key=expected)
+        job = min(waiting, key=turn)
         waiting.remove(job)
         each = expected(job)
         if each * _repeats(each) > left():
@@ -182,12 +194,13 @@ def cell(job: Job, done: Sequence[Repeat]) -> Cell:
     """What repeats come to."""
     errors, mse = [one.error for one in done], [one.mse for one in done if one.mse is not None]
     several = len(errors) > 1 and min(errors) > 0
+    taken = [one.samples for one in done if one.samples is not None]
     peaks = [one.cost.memory for one in done if one.cost.memory is not None]
     return Cell(
         stage=job.stage,
         way=job.way,
         variant=job.variant,
-        samples=job.samples,
+        samples=max(taken, default=None) if job.samples is None else job.samples,
         setting=job.setting,
         repeats=len(done),
         error=Quantiles.of(errors),

@@ -14,21 +14,24 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from scenes.camera import Camera
-from scenes.model import Model
+from scenes.model import Judge, Model
 from scenes.needs import needed
 from scenes.progress import Progress, no_progress
 from scenes.scene import Sampler, Scene, resolved
 from scenes.stack import Stack
 
+from .auto import AIM, EXPONENTS, LEAST, MOST, STRATIFIED, Lit, light_until
 from .calibrate import calibrate
+from .goal import allowed_variance
 from .ideal import exact_model, ideal_model, true_matrix
 from .kept import kept_model
-from .passes import FEWEST_PASSES, Plan, plan
+from .passes import FEWEST_PASSES, JITTERED, Plan, cells_of, on_grid, plan
 from .render import Rendering, exposed, light
 from .samplers import fitting
 from .streams import repeat_seed
 
 Vector = NDArray[np.float64]
+Samples = int | Literal["auto"]
 
 TRUER = 64  # times the samples of what is judged: then the reference brings less than a hundredth of the error
 REFERENCE = ".bench.reference.npz"
@@ -81,13 +84,13 @@ def right(
     return Right(model, model.forward(flat), model.spread(flat), f"a reference of {model.record['samples']} samples")
 
 
-def with_rendering(scene: Scene, sampler: Sampler, variant: str, samples: int, seed: int) -> Scene:
+def with_rendering(scene: Scene, sampler: Sampler, variant: str, samples: Samples, seed: int) -> Scene:
     """The scene rendered so."""
     return _changed(scene, "render", sampler=sampler, variant=variant, samples=samples, seed=seed)
 
 
 def with_calibration(
-    scene: Scene, method: Literal["points", "transport"], sampler: Sampler, variant: str, samples: int, seed: int
+    scene: Scene, method: Literal["points", "transport"], sampler: Sampler, variant: str, samples: Samples, seed: int
 ) -> Scene:
     """The scene calibrated so."""
     told = _changed(scene, "render", sampler=sampler, variant=variant, seed=seed)
@@ -103,18 +106,34 @@ def work_of(samples: int, sampler: Sampler) -> Plan:
     return plan(samples, sampler) if samples >= FEWEST_PASSES else Plan(1, fitting(sampler, samples))
 
 
-def rendered(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Rendering:
+def foreseen_samples(scene: Scene, camera: Camera, image: NDArray[np.float64], right: Right) -> int:
+    """About how many samples a pixel 'auto' will take: those of a first round where grids fit the edges of pixels of f.
+
+    Elsewhere as many as leave a quarter of the variance that is allowed, if a pixel's rays scatter like the image.
+    Raises InputError where there is no noise, so that 'auto' cannot tell when it is enough.
+    """
+    allowed = float(np.nanmean(allowed_variance(scene, camera)(right.light)))
+    sampler = scene.render.sampler
+    if camera.boxed and sampler in JITTERED:
+        return max(on_grid(LEAST, sampler, cells_of(kind.ratio)).total for kind in camera.types)
+    ratio = float(image.var()) / (FEWEST_PASSES * AIM * allowed)
+    return int(min(max(FEWEST_PASSES * ratio ** (1 / EXPONENTS.get(sampler, STRATIFIED)), LEAST), MOST))
+
+
+def rendered(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Rendering | Lit:
     """The light alone, as `run` renders it."""
+    if scene.render.samples == "auto":
+        return light_until(scene, camera, image)
     return light(scene, camera, image, work=work_of(scene.render.counted, scene.render.sampler))
 
 
-def error_of_light(rendering: Rendering, right: Right) -> float:
+def error_of_light(rendering: Rendering | Lit, right: Right) -> float:
     """Root mean square over sensor pixels, in values of f; what the reference itself errs by is taken out."""
     squares = np.square(rendering.mean - right.light) - right.spread
     return float(np.sqrt(max(np.nanmean(squares), 0.0)))
 
 
-def stack_of(scene: Scene, camera: Camera, rendering: Rendering) -> Stack:
+def stack_of(scene: Scene, camera: Camera, rendering: Rendering | Lit) -> Stack:
     """A rendering of several passes as the scene's sensor records it, with noise by the scene's seed."""
     return exposed(scene, camera, rendering.mean, rendering.stated(camera), {})
 
@@ -128,9 +147,9 @@ def stack_of_light(scene: Scene, camera: Camera, light: Vector, right: Right) ->
     return exposed(scene, camera, light, np.broadcast_to(away, light.shape), {})
 
 
-def calibrated(scene: Scene, camera: Camera) -> Model:
-    """H as `run` finds it."""
-    return calibrate(scene, camera)
+def calibrated(scene: Scene, camera: Camera, judge: Judge | None = None) -> Model:
+    """H as `run` finds it; `judge` says when 'auto' is enough."""
+    return calibrate(scene, camera, judge=judge)
 
 
 def error_of_model(model: Model, right: Right) -> float:

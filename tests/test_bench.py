@@ -17,8 +17,8 @@ from chain.bench_jobs import SAMPLERS, Subject, jobs
 from chain.stages import opened
 from reconstruct.estimator import FORMS
 from reconstruct.slopes import Slope, excess, pareto, recommend, slope
-from scenes.bench_file import CSV, JSON, BenchTable, Cell, Quantiles, Stage, cell_of, read, rows_of
-from scenes.cheapest import Finished, Job, Repeat, cell, measure
+from scenes.bench_file import AUTO, CSV, JSON, BenchTable, Cell, Quantiles, Stage, cell_of, read, rows_of
+from scenes.cheapest import Finished, Job, Repeat, cell, measure, name_of
 from scenes.errors import InputError
 from scenes.peak import FORGET, Cost, costed
 from scenes.progress import no_progress
@@ -113,6 +113,33 @@ def test_the_cheapest_that_reaches_the_floor_is_recommended() -> None:
     assert excess(estimate, 2.0) == pytest.approx(0.01)
 
 
+def test_what_takes_as_many_as_needed_is_recommended_as_a_scene_asks_for_it() -> None:
+    """It shares its sampler with cells of given numbers, and neither slopes nor forecasts of samples count it."""
+    ways: list[tuple[Stage, str]] = [("render", "multijitter"), ("calibrate", "transport, multijitter")]
+    counted = [
+        made(stage, way=way, seconds=exactly(0.1 * count), mse=exactly(2 + 100 / count), samples=count,
+             error=exactly(count**-0.5))
+        for stage, way in ways
+        for count in (16, 64, 256)
+    ]  # fmt: skip
+    needed = [
+        made(stage, way=way, seconds=exactly(1.0), mse=exactly(2.0), samples=576, setting=AUTO, error=exactly(1e-15))
+        for stage, way in ways
+    ]
+    estimate = made("reconstruct", way="frame", error=exactly(0.0), seconds=exactly(0.1), samples=None)
+    found = recommend([*counted, *needed, estimate], 2.0)
+    assert found["reached"]
+    assert (found["render"]["samples"], found["calibrate"]["samples"]) == (AUTO, AUTO)
+    assert found["render"]["sampler"] == found["calibrate"]["sampler"] == "multijitter"
+    assert 'render.samples = "auto" took up to 576' in found["why"]
+    assert not recommend([*counted, estimate], 2.0)["reached"]
+    half = recommend([*counted, needed[0], estimate], 2.0)
+    assert (half["render"]["samples"], half["calibrate"]["samples"]) == (AUTO, 256)
+    assert "calibrate, transport, multijitter, would take about 1000 samples" in half["why"]
+    of_tile = opened(GALLERY / "tile19.toml")[1]
+    assert curves([*counted, *needed], of_tile) == curves(counted, of_tile)
+
+
 class Counter:
     """Jobs that count how often they ran; each says that it takes its guess, and takes no time."""
 
@@ -155,6 +182,29 @@ def test_the_cheapest_come_first_and_what_does_not_fit_is_named(tmp_path: Path) 
     assert "64 samples" in left_out[0].what
     assert left_out[0].late
     assert done[-1] == 1.0
+
+
+def test_short_jobs_of_unknown_samples_come_first_and_are_found_again(tmp_path: Path) -> None:
+    """A long one waits for its turn. The most samples of any repeat are told; the name is the same before and after."""
+    ran: list[str] = []
+
+    def job(way: str, guess: float) -> Job:
+        def work(repeat: int) -> Repeat:
+            ran.append(way)
+            return Repeat(1e-15, Cost(guess, None), 2.0, 576 * (1 + repeat % 2))
+
+        return Job("render", way, None, None, AUTO, guess, work)
+
+    several, path = [Counter().job(4), job("short", 1.0), job("long", 3.0)], tmp_path / "partial"
+    measure(several, 60, Finished(path, "a"), no_progress)
+    assert list(dict.fromkeys(ran)) == ["short", "long"]
+    again = Finished(path, "a")
+    assert list(again.cells) == ["render short, auto", several[0].name, "render long, auto"]
+    assert all(name_of(one) == name for name, one in again.cells.items())
+    assert again.cells["render short, auto"].samples == 1152
+    assert not again.cells["render short, auto"].counted
+    assert measure(several, 60, again, no_progress) == []
+    assert len(ran) == 5 + 5, "five repeats of each, since neither takes the time that it says, and no more"
 
 
 def test_a_cell_is_median_and_quantiles_of_its_repeats() -> None:
@@ -220,8 +270,34 @@ def test_every_sampler_method_and_way_is_measured(subject: Subject) -> None:
     assert {"information", "dual", "tiles"} <= {job.way for job in told if job.stage == "reconstruct"}
     assert all(one.why for one in left_out)
     counts = {job.samples for job in told if (job.stage, job.way) == ("render", "multijitter")}
-    assert counts == {4, 16, 64, 256, 1024, 4096, 16384}
+    assert counts == {4, 16, 64, 256, 1024, 4096, 16384, None}
+    needed = {(job.stage, job.way) for job in told if job.setting == AUTO}
+    assert needed <= {
+        ("render", "multijitter"),
+        *(("calibrate", f"{how}, multijitter") for how in ("points", "transport")),
+    }
+    assert ("render", "multijitter") in needed
     assert work_of(4, "orthogonal").passes == 1
+
+
+def test_as_many_samples_as_are_needed_leave_the_noise_alone(subject: Subject) -> None:
+    """Rendering may add a tenth of the noise, H a tenth of all the rest, whatever the backend."""
+    told, _ = jobs(subject)
+    some = [job for job in told if job.setting == AUTO]
+    assert some
+    for job in some:
+        found = job.work(0)
+        assert found.mse is not None
+        assert found.samples is not None
+        assert found.samples >= 256
+        assert found.mse < 1.1 * subject.floor, job.name
+
+
+def test_without_noise_no_cell_takes_as_many_as_needed(here: Path) -> None:
+    scene, camera, image = opened(here / "tiny.toml", ["noise="])
+    told, left_out = jobs(Subject(scene, camera, image, right(scene, camera, image, here)))
+    assert all(job.setting != AUTO for job in told)
+    assert ["noise.variance above 0" in one.why for one in left_out if "auto" in one.what] == [True]
 
 
 def test_light_and_h_of_a_cell_are_those_of_no_run(subject: Subject) -> None:

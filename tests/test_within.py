@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +159,11 @@ def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
         )
         for stage, law in laws.items()
         for n in (256, 2**24)
+    )
+    # Where as many samples were taken as are needed, nothing lies on a curve.
+    cells += tuple(
+        replace(one, samples=2**26, setting=bench_file.AUTO, seconds=always(1e3), mse=always(1e-3))
+        for one in cells[::2]
     )
     slopes = tuple(
         bench_file.Curve(stage, ways[stage], "scalar_rgb", -law.exponent / 2, 0.01, None, "", None)

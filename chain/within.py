@@ -74,25 +74,26 @@ def run_within(
         return _told(camera, folder, watch, description, again)
     few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
     chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
-    description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun))
+    page = _page(camera, folder, watch, clock) if seconds - (clock() - begun) > few.wall else 0.0
+    description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun)) - page
     sampled = sum(few.seconds(stage) for stage in spend.STAGES)
     rest = max(few.wall - sampled, few.seconds("reconstruct"))
     if _needs_little(scene, camera):
         if left > ROUND * sampled + few.seconds("reconstruct") + rest:
             chosen = "auto", "auto"
             description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
-    elif (curves := measured.curves(folder, scene, camera)) is not None or left > 2 * few.wall:
+    elif (curves := _of_bench(folder, scene, camera)) is not None or left > 2 * few.wall:
         if curves is None:
             more = _measured(with_samples(scene, FEW[1], FEW[1]), camera, image, folder, watch, clock)
             chosen, description, curves = (FEW[1], FEW[1]), more.description, _curves(scene, few, more)
-            left = (1 - SPARE) * (seconds - (clock() - begun))
+            left = (1 - SPARE) * (seconds - (clock() - begun)) - page
         error = description["error"]
         floor = error["predicted_mse"] - sum(error["budget"][part] for part in spend.STAGES.values())
         division = spend.divide(*curves, floor, left - rest - COMPILED, (MOST, MOST))
         if division is not None and division.predicted_mse < error["predicted_mse"]:
             chosen = division.render, division.calibrate
             description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
-    total = clock() - begun
+    total = clock() - begun + page  # the last one is still to come
     if total > seconds:
         what = "even the least" if chosen[0] == FEW[0] else "this"
         say(f"{folder}: {what}, {chosen[0]} and {chosen[1]} samples a pixel, took {total:.1f} s of {seconds:g} s")
@@ -111,7 +112,7 @@ def _needs_little(scene: Scene, camera: Camera) -> bool:
     """Whether grids of samples fit the edges of pixels of f, so that 'auto' comes to the noise floor at once."""
     noise = scene.noise
     silent = noise is None or noise.variance + noise.quantisation_variance == 0
-    return camera.boxed and scene.render.sampler == "multijitter" and not silent
+    return camera.boxed and scene.world is None and scene.render.sampler == "multijitter" and not silent
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,11 @@ class Measured:
         """What a stage took, when it was done."""
         return float(self.description["stages"][stage]["seconds"])
 
+    @property
+    def beside(self) -> float:
+        """What it took beside its stages, seconds."""
+        return max(self.wall - sum(self.seconds(stage) for stage in (*spend.STAGES, "reconstruct")), 0.0)
+
 
 def _measured(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch, clock: Clock) -> Measured:
     start = clock()
@@ -137,13 +143,29 @@ def _measured(scene: Scene, camera: Camera, image: Image, folder: Path, watch: W
     return Measured(description, wall, {"render": float(np.nanmean(light)), "calibrate": float(np.nanmean(spread))})
 
 
+def _page(camera: Camera, folder: Path, watch: Watch, clock: Clock) -> float:
+    """Show what stands there, and the seconds that it took, as it will in the end."""
+    start = clock()
+    stages.tell(camera, folder, watch)
+    return clock() - start
+
+
+def _of_bench(folder: Path, scene: Scene, camera: Camera) -> tuple[spend.Curve, spend.Curve] | None:
+    """Curves from the samples on that have been taken: `bench` begins with fewer than a scene can ask for."""
+    found = measured.curves(folder, scene, camera)
+    return None if found is None else (found[0].from_on(FEW[0]), found[1].from_on(FEW[0]))
+
+
 def _curves(scene: Scene, few: Measured, more: Measured) -> tuple[spend.Curve, spend.Curve]:
     found: list[spend.Curve] = []
     for stage, part in spend.STAGES.items():
         if stage == "calibrate" and scene.calibration.method == "ideal":
             found.append(spend.Curve(0.0, FEW[0], 1.0, 0.0, 0.0))
             continue
-        ends = [(n, one.seconds(stage), one.variance[stage]) for n, one in zip(FEW, (few, more), strict=True)]
+        # What a world truly looks like is rendered with more samples when its sub-images are.
+        truth = stage == "render" and scene.world is not None
+        taken = [one.seconds(stage) + (one.beside if truth else 0.0) for one in (few, more)]
+        ends = [(n, s, one.variance[stage]) for n, s, one in zip(FEW, taken, (few, more), strict=True)]
         found.append(spend.curve(ends[0], ends[1], more.description["error"]["budget"][part]))
     return found[0], found[1]
 

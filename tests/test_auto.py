@@ -14,7 +14,7 @@ from chain.judges import by_prior, by_stack
 from reconstruct.restore import restore
 from scenes.camera import derive
 from scenes.errors import DeniedError
-from scenes.model import Judge, Model
+from scenes.model import Judge
 from scenes.picture import load
 from scenes.progress import no_progress
 from scenes.scene import Scene, read
@@ -238,9 +238,7 @@ def test_calibration_goes_on_until_h_adds_little(tmp_path: Path, variant: str, m
     assert kept_model(tmp_path / "model.npz", fixed, camera, no_progress, judge)[1], "another model"
 
 
-def test_a_calibration_whose_writing_failed_comes_out_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_calibration_whose_writing_failed_comes_out_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The round that was good enough is done again: no further one follows it."""
     described = scene(
         (9, 9),
@@ -252,12 +250,13 @@ def test_a_calibration_whose_writing_failed_comes_out_the_same(
     camera = derive(described)
     judge = Judge(lambda model: 0.0 if model.record["samples"] > 1000 else 1.0, "step", "a step")
 
-    def full(path: Path, model: Model) -> None:
-        raise DeniedError(f"{path}: could not be written")
+    def full(*told: object) -> None:
+        raise DeniedError(f"{told[0]}: could not be written")
 
-    with monkeypatch.context() as patched, pytest.raises(DeniedError):
+    with monkeypatch.context() as patched:
         patched.setattr("scenes.model.write", full)
-        kept_model(tmp_path / "model.npz", described, camera, no_progress, judge)
+        with pytest.raises(DeniedError):
+            kept_model(tmp_path / "model.npz", described, camera, no_progress, judge)
     found, _ = kept_model(tmp_path / "model.npz", described, camera, no_progress, judge)
     whole, _ = kept_model(tmp_path / "whole.npz", described, camera, no_progress, judge)
     assert len(whole.record["auto"]["tried"]) > 1

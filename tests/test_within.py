@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from chain import measured
 from chain.spend import NEGLIGIBLE, Curve, curve, divide, spent
-from chain.within import KEYS, run_within
+from chain.within import KEYS, run_within, turns
 from scenes import bench_file
 from scenes.bench_file import BenchTable, Cell, Quantiles
 from scenes.camera import derive
@@ -130,6 +130,26 @@ def test_time_that_is_there_brings_more_samples_and_the_folder_repeats_it(tmp_pa
     again, _ = within(folder, described(), 6.0, ticking(1e-3))
     assert again["spent"]["chosen"] == spent_on["chosen"]
     assert [path.stat().st_mtime_ns for path in made] == before, "nothing is done again"
+
+
+def test_scenes_that_share_a_time_are_repeated_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares differ from run to run, what was asked does not; a scene that fails leaves its share to the others."""
+    monkeypatch.setattr("chain.stages.tell", lambda *_: None)
+    one, folders = described(), [tmp_path / name for name in ("fails", "a", "b")]
+    watch = Watch(lambda _: nullcontext(no_progress), dict[str, bool]().__setitem__)
+
+    def done(seconds: float, which: list[Path], later: float) -> list[dict[str, Any]]:
+        does = turns(seconds, which, 0.0, lambda _: None, ticking(later))
+        return [does(one, derive(one), load(one), folder, watch)["spent"] for folder in which if folder.name != "fails"]
+
+    for folder in folders[1:]:
+        folder.mkdir()
+    first = done(0.9, folders, 1e-3)
+    assert first[0]["within"] == pytest.approx(0.9 / 2, rel=0.01)
+    before = [(folder / "stack.exr").stat().st_mtime_ns for folder in folders[1:]]
+    assert done(0.9, folders, 2e-3) == first
+    assert [(folder / "stack.exr").stat().st_mtime_ns for folder in folders[1:]] == before
+    assert done(0.9, folders[1:2], 1e-3)[0]["within"] == pytest.approx(0.9, rel=0.01), "alone it has more"
 
 
 def test_where_grids_fit_as_many_are_taken_as_are_needed(tmp_path: Path) -> None:

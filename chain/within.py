@@ -88,7 +88,7 @@ def run_within(
         return _told(camera, folder, watch, description, again)
     few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
     chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
-    page = _page(camera, folder, watch, clock) if seconds - (clock() - begun) > few.wall else 0.0
+    page = _page(camera, folder, watch, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
     description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun)) - page
     sampled = sum(few.seconds(stage) for stage in spend.STAGES)
     rest = max(few.wall - sampled, few.seconds("reconstruct"))

@@ -161,7 +161,7 @@ def run(
     members = _members(scenes, output, sweep, sets, lens)
     does = stages.run
     if within:
-        does, workers = _within(within, len(members), scheduler, workers), 1
+        does, workers = _within(within, members, scheduler, workers), 1
     _each(members, output, _batch(sets, lens, does, tell), scheduler, workers, as_json, index=True)
 
 
@@ -654,7 +654,7 @@ def _batch(
     return Batch(partial(member_opened, *asked), stages, watch, tell, facts, partial(fitting, *asked))
 
 
-def _within(text: str, scenes: int, scheduler: str, workers: int | None) -> Stages:
+def _within(text: str, members: list[Member], scheduler: str, workers: int | None) -> Stages:
     """What is done of each scene where all of them together have a time, counted from the start of the program."""
     if scheduler or workers is not None:
         raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
@@ -662,7 +662,7 @@ def _within(text: str, scenes: int, scheduler: str, workers: int | None) -> Stag
     from scenes.quantities import duration
 
     try:
-        return turns(duration(text), scenes, STARTED, _say)
+        return turns(duration(text), [member.folder for member in members], STARTED, _say)
     except ValueError as error:
         raise InputError(f"--within: {error}") from error
 

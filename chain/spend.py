@@ -10,7 +10,7 @@ come from runs with few samples, the exponents from how the parts fall between t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log
 from typing import TypeVar, cast
 
@@ -42,6 +42,11 @@ class Curve:
     def seconds(self, samples: Number) -> Number:
         """What it takes."""
         return cast(Number, self.fixed + self.each * samples)
+
+    def from_on(self, samples: int) -> Curve:
+        """The same, which begins at so many samples at least."""
+        first = max(self.samples, samples)
+        return replace(self, part=float(self.error(first)), samples=first)
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -37,16 +37,27 @@ Clock = Callable[[], float]
 Samples = int | Literal["auto"]
 
 
+@dataclass(frozen=True)
+class Asked:
+    """Seconds that several scenes have together, and how many these are."""
+
+    seconds: float
+    scenes: int = 1
+
+
 def turns(
-    seconds: float, scenes: int, started: float, say: Callable[[str], None], clock: Clock = perf_counter
+    seconds: float, folders: Sequence[Path], started: float, say: Callable[[str], None], clock: Clock = perf_counter
 ) -> Stages:
-    """What is done of each of several scenes that have `seconds` together from `started` on: alike of what is left."""
-    left = iter(range(scenes, 0, -1))
+    """What is done of each of several scenes that have `seconds` together from `started` on: alike of what is left.
+
+    folders : of the scenes, in the order in which they are done; one that fails leaves its share to the others
+    """
+    asked = Asked(seconds, len(folders))
 
     def does(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:
-        rest = (seconds - (clock() - started)) / next(left)
-        begun = started if scenes == 1 else clock()
-        return run_within(scene, camera, image, folder, watch, seconds if scenes == 1 else rest, say, clock, begun)
+        begun = started if asked.scenes == 1 else clock()
+        rest = (seconds - (begun - started)) / (asked.scenes - folders.index(folder))
+        return run_within(scene, camera, image, folder, watch, rest, say, clock, begun, asked)
 
     return does
 
@@ -61,13 +72,16 @@ def run_within(
     say: Callable[[str], None],
     clock: Clock = perf_counter,
     begun: float | None = None,
+    asked: Asked | None = None,
 ) -> dict[str, Any]:
     """What `run` does of a scene with the samples that bring most within `seconds`, and says of it.
 
     say : hears where even the least did not fit;  begun : when the time began to count, absent: now
+    asked : what these seconds are a share of, which differs from run to run; absent: of nothing else
     """
     begun = clock() if begun is None else begun
-    again = _again(folder, scene, camera, seconds)
+    told = asdict(Asked(seconds) if asked is None else asked)
+    again = _again(folder, scene, camera, told)
     if again is not None:
         description = stages.results(
             with_samples(scene, *(again["chosen"][key] for key in KEYS)), camera, image, folder, watch
@@ -75,30 +89,29 @@ def run_within(
         return _told(camera, folder, watch, description, again)
     few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
     chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
-    description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun))
+    page = _page(camera, folder, watch, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
+    description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun)) - page
     sampled = sum(few.seconds(stage) for stage in STAGES)
     rest = max(few.wall - sampled, few.seconds("reconstruct"))
     if _needs_little(scene, camera):
         if left > ROUND * sampled + few.seconds("reconstruct") + rest:
             chosen = "auto", "auto"
             description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
-    elif (curves := measured.curves(folder, scene, camera)) is not None or left > 2 * few.wall:
+    elif (curves := _of_bench(folder, scene, camera)) is not None or left > 2 * few.wall:
         if curves is None:
             more = _measured(with_samples(scene, FEW[1], FEW[1]), camera, image, folder, watch, clock)
             chosen, description, curves = (FEW[1], FEW[1]), more.description, _curves(scene, few, more)
-            left = (1 - SPARE) * (seconds - (clock() - begun))
-        error = description["error"]
-        floor = error["predicted_mse"] - sum(error["budget"][part] for part in STAGES.values())
-        division = spend.divide(*curves, floor, left - rest - COMPILED, (MOST, MOST))
-        if division is not None and division.predicted_mse < error["predicted_mse"]:
+            left = (1 - SPARE) * (seconds - (clock() - begun)) - page
+        division = _better(description["error"], curves, left - rest - COMPILED)
+        if division is not None:
             chosen = division.render, division.calibrate
             description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
-    total = clock() - begun
+    total = clock() - begun + page  # the last one is still to come
     if total > seconds:
         what = "even the least" if chosen[0] == FEW[0] else "this"
         say(f"{folder}: {what}, {chosen[0]} and {chosen[1]} samples a pixel, took {total:.1f} s of {seconds:g} s")
-    keys = dict(zip(KEYS, chosen, strict=True))
-    return _told(camera, folder, watch, description, {"within": seconds, "seconds": total, "chosen": keys})
+    spent = {"within": seconds, "asked": told, "seconds": total, "chosen": dict(zip(KEYS, chosen, strict=True))}
+    return _told(camera, folder, watch, description, spent)
 
 
 def with_samples(scene: Scene, rendering: Samples, calibration: Samples) -> Scene:
@@ -112,7 +125,7 @@ def _needs_little(scene: Scene, camera: Camera) -> bool:
     """Whether grids of samples fit the edges of pixels of f, so that 'auto' comes to the noise floor at once."""
     noise = scene.noise
     silent = noise is None or noise.variance + noise.quantisation_variance == 0
-    return camera.boxed and scene.render.sampler == "multijitter" and not silent
+    return camera.boxed and scene.world is None and scene.render.sampler == "multijitter" and not silent
 
 
 @dataclass(frozen=True)
@@ -127,6 +140,11 @@ class Measured:
         """What a stage took, when it was done."""
         return float(self.description["stages"][stage]["seconds"])
 
+    @property
+    def beside(self) -> float:
+        """What it took beside its stages, seconds."""
+        return max(self.wall - sum(self.seconds(stage) for stage in (*STAGES, "reconstruct")), 0.0)
+
 
 def _measured(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch, clock: Clock) -> Measured:
     start = clock()
@@ -138,27 +156,50 @@ def _measured(scene: Scene, camera: Camera, image: Image, folder: Path, watch: W
     return Measured(description, wall, {"render": float(np.nanmean(light)), "calibrate": float(np.nanmean(spread))})
 
 
+def _better(error: dict[str, Any], curves: tuple[spend.Curve, spend.Curve], seconds: float) -> spend.Division | None:
+    """The best division of these seconds, if it promises less than this error."""
+    floor = error["predicted_mse"] - sum(error["budget"][part] for part in STAGES.values())
+    found = spend.divide(*curves, floor, seconds, (MOST, MOST))
+    return found if found is not None and found.predicted_mse < error["predicted_mse"] else None
+
+
+def _page(camera: Camera, folder: Path, watch: Watch, clock: Clock) -> float:
+    """Show what stands there, and the seconds that it took, as it will in the end."""
+    start = clock()
+    stages.tell(camera, folder, watch)
+    return clock() - start
+
+
+def _of_bench(folder: Path, scene: Scene, camera: Camera) -> tuple[spend.Curve, spend.Curve] | None:
+    """Curves from the samples on that have been taken: `bench` begins with fewer than a scene can ask for."""
+    found = measured.curves(folder, scene, camera)
+    return None if found is None else (found[0].from_on(FEW[0]), found[1].from_on(FEW[0]))
+
+
 def _curves(scene: Scene, few: Measured, more: Measured) -> tuple[spend.Curve, spend.Curve]:
     found: list[spend.Curve] = []
     for stage, part in STAGES.items():
         if stage == "calibrate" and scene.calibration.method == "ideal":
             found.append(spend.Curve(0.0, FEW[0], 1.0, 0.0, 0.0))
             continue
-        ends = [(n, one.seconds(stage), one.variance[stage]) for n, one in zip(FEW, (few, more), strict=True)]
+        # What a world truly looks like is rendered with more samples when its sub-images are.
+        truth = stage == "render" and scene.world is not None
+        taken = [one.seconds(stage) + (one.beside if truth else 0.0) for one in (few, more)]
+        ends = [(n, s, one.variance[stage]) for n, s, one in zip(FEW, taken, (few, more), strict=True)]
         found.append(spend.curve(ends[0], ends[1], more.description["error"]["budget"][part]))
     return found[0], found[1]
 
 
-def _again(folder: Path, scene: Scene, camera: Camera, seconds: float) -> dict[str, Any] | None:
-    """What an earlier run within the same time spent, if it was of the same scene."""
+def _again(folder: Path, scene: Scene, camera: Camera, asked: dict[str, Any]) -> dict[str, Any] | None:
+    """What an earlier run within the same time spent, if it was of the same scene among as many."""
     try:
         old = json.loads((folder / RUN).read_text(encoding="utf-8"))["spent"]
         rendering, calibration = (old["chosen"][key] for key in KEYS)
         now = resolved(with_samples(scene, rendering, calibration), (camera.rows, camera.columns)).plain()
-        same = old["within"] == seconds and tomllib.loads((folder / "scene.toml").read_text("utf-8")) == now
+        same = old["asked"] == asked and tomllib.loads((folder / "scene.toml").read_text("utf-8")) == now
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return {key: old[key] for key in ("within", "seconds", "chosen")} if same else None
+    return {key: old[key] for key in ("within", "asked", "seconds", "chosen")} if same else None
 
 
 def _told(

@@ -66,7 +66,7 @@ def write_sweep(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     if any("predicted_mse" in row for row in rows):
         write_figure(folder / PICTURE, rows)
     write_text(folder / TABLE, _csv(rows))
-    told = [{**row, "values": {key: value_of(text) for key, text in row["values"].items()}} for row in rows]
+    told = [{**row, "values": {key: _for_json(text) for key, text in row["values"].items()}} for row in rows]
     write_text(folder / NUMBERS, json.dumps(told, indent=2, allow_nan=False) + "\n")
 
 
@@ -81,6 +81,16 @@ def lines(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
         told += [f"null space {row['null_space']}"] if "null_space" in row else []
         found.append((", ".join(named), row.get("failed") or ", ".join(told) or "done"))
     return found
+
+
+def _for_json(text: str) -> Any:
+    """A value as `--set` reads it; what JSON does not know, such as nan or a date, as it was written."""
+    value = value_of(text)
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return text
+    return value
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> str:

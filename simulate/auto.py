@@ -201,9 +201,11 @@ class Rounds:
             if work.total < LEAPS[0] * course.last.total:
                 self._end(place, TIME)
                 return
-        seeds = sampler_seeds(self._scene.render.seed, "data", course.seeds, MOST_PASSES)
+        seed, first = self._scene.render.seed, course.seeds
         tally = Tally(which.size)
-        for values in self._rig.expose_alone(place, which, work, lambda number: seeds(place) + 2 * number):
+        for values in self._rig.expose_alone(
+            place, which, work, lambda number: sampler_seeds(seed, "data", first + number, MOST_PASSES)(place)
+        ):
             tally.add(values)
         floor = rounding_variance(tally.mean, self._rig.summed(work.samples))
         self.mean[start + which] = tally.mean

@@ -57,10 +57,11 @@ def calibrated_until(
         model = once(scene.model_copy(update={"calibration": number}), camera, progress, None, plans, exact)
         spent = {name: plan.total for name, plan in plans.items()}
         tried.append({"asked": max(spent.values()), "samples": spent, "adds": judge.adds(model)})
-        if partial is not None:
-            partial.offer(lambda: {"tried": np.array(json.dumps(tried))})
         if tried[-1]["adds"] <= DONE or samples >= most:
-            break
+            break  # and whoever is stopped before the model is written does this round again, not one more
+        if partial is not None:
+            kept = json.dumps(tried)
+            partial.offer(lambda kept=kept: {"tried": np.array(kept)})
     how = {"goal": GOAL, "adds": tried[-1]["adds"], "reached": tried[-1]["adds"] <= GOAL, "judged_by": judge.words}
     totals = [sum(one["samples"][name] for one in tried) for name in plans]
     counted = {"samples": max(totals), "fewest_samples": min(totals), "auto": {**how, "tried": tried}}

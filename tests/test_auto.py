@@ -13,6 +13,7 @@ from scipy import stats
 from chain.judges import by_prior, by_stack
 from reconstruct.restore import restore
 from scenes.camera import derive
+from scenes.errors import DeniedError
 from scenes.model import Judge
 from scenes.picture import load
 from scenes.progress import no_progress
@@ -235,6 +236,32 @@ def test_calibration_goes_on_until_h_adds_little(tmp_path: Path, variant: str, m
     assert not kept_model(tmp_path / "model.npz", described, camera, no_progress, judge)[1], "up to date"
     fixed = described.model_copy(update={"calibration": described.calibration.model_copy(update={"samples": 256})})
     assert kept_model(tmp_path / "model.npz", fixed, camera, no_progress, judge)[1], "another model"
+
+
+def test_a_calibration_whose_writing_failed_comes_out_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The round that was good enough is done again: no further one follows it."""
+    described = scene(
+        (9, 9),
+        (("1/3", [1, 1], [3, 3]),),
+        render={"variant": "scalar_rgb"},
+        calibration={"samples": "auto"},
+        noise={"variance": 1.0},
+    )
+    camera = derive(described)
+    judge = Judge(lambda model: 0.0 if model.record["samples"] > 1000 else 1.0, "step", "a step")
+
+    def full(*told: object) -> None:
+        raise DeniedError(f"{told[0]}: could not be written")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("scenes.model.write", full)
+        with pytest.raises(DeniedError):
+            kept_model(tmp_path / "model.npz", described, camera, no_progress, judge)
+    found, _ = kept_model(tmp_path / "model.npz", described, camera, no_progress, judge)
+    whole, _ = kept_model(tmp_path / "whole.npz", described, camera, no_progress, judge)
+    assert len(whole.record["auto"]["tried"]) > 1
+    assert found.record["auto"] == whole.record["auto"]
+    np.testing.assert_array_equal(found.matrix.data, whole.matrix.data)
 
 
 def test_jumps_are_few_and_what_cannot_be_reached_is_said() -> None:

@@ -104,6 +104,16 @@ def test_a_combination_that_is_no_scene_fails_for_itself(here: Path, ommatid: Co
     assert (here / "out" / "sweep.png").is_file()
 
 
+@pytest.mark.parametrize("value", ["nan", "-inf", "2024-01-01", "[{a=2024-01-01}]"])
+def test_a_value_that_json_does_not_know_fails_for_itself(here: Path, ommatid: Command, value: str) -> None:
+    ended = ommatid("predict", "tiny.toml", "--sweep", f"noise.variance={value},1", "-o", "out", "--json")
+    assert ended.code == 2
+    assert [one.get("exit_code", 0) for one in json.loads(ended.out)] == [2, 0]
+    told = json.loads((here / "out" / "sweep.json").read_text(encoding="utf-8"))
+    assert [row["values"]["noise.variance"] for row in told] == [value, 1]
+    assert len(ended.err.splitlines()) == 1
+
+
 def table(path: Path) -> list[dict[str, str]]:
     with path.open(encoding="utf-8", newline="") as stream:
         return list(csv.DictReader(stream))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from chain import measured
 from chain.spend import NEGLIGIBLE, Curve, curve, divide
-from chain.within import KEYS, run_within
+from chain.within import KEYS, run_within, turns
 from reconstruct.spent import spent
 from scenes import bench_file
 from scenes.bench_file import BenchTable, Cell, Quantiles
@@ -133,6 +133,26 @@ def test_time_that_is_there_brings_more_samples_and_the_folder_repeats_it(tmp_pa
     assert [path.stat().st_mtime_ns for path in made] == before, "nothing is done again"
 
 
+def test_scenes_that_share_a_time_are_repeated_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares differ from run to run, what was asked does not; a scene that fails leaves its share to the others."""
+    monkeypatch.setattr("chain.stages.tell", lambda *_: None)
+    one, folders = described(), [tmp_path / name for name in ("fails", "a", "b")]
+    watch = Watch(lambda _: nullcontext(no_progress), dict[str, bool]().__setitem__)
+
+    def done(seconds: float, which: list[Path], later: float) -> list[dict[str, Any]]:
+        does = turns(seconds, which, 0.0, lambda _: None, ticking(later))
+        return [does(one, derive(one), load(one), folder, watch)["spent"] for folder in which if folder.name != "fails"]
+
+    for folder in folders[1:]:
+        folder.mkdir()
+    first = done(0.9, folders, 1e-3)
+    assert first[0]["within"] == pytest.approx(0.9 / 2, rel=0.01)
+    before = [(folder / "stack.exr").stat().st_mtime_ns for folder in folders[1:]]
+    assert done(0.9, folders, 2e-3) == first
+    assert [(folder / "stack.exr").stat().st_mtime_ns for folder in folders[1:]] == before
+    assert done(0.9, folders[1:2], 1e-3)[0]["within"] == pytest.approx(0.9, rel=0.01), "alone it has more"
+
+
 def test_where_grids_fit_as_many_are_taken_as_are_needed(tmp_path: Path) -> None:
     one = described()
     one = one.model_copy(update={"render": one.render.model_copy(update={"sampler": "multijitter"})})
@@ -146,19 +166,15 @@ def always(value: float) -> Quantiles:
     return Quantiles(value, value, value)
 
 
-def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
-    one = described()
-    laws: dict[bench_file.Stage, Curve] = {
-        "render": Curve(0.5, 256, 1.0, 0.2, 1e-4),
-        "calibrate": Curve(2.0, 256, 1.5, 0.4, 1e-3),
-    }
+def benched(folder: Path, one: Scene, laws: dict[bench_file.Stage, Curve], counts: tuple[int, ...]) -> None:
+    """Write what `bench` would have measured if these laws were true."""
     ways = {"render": "independent", "calibrate": "points, independent"}
     cells = tuple(
         Cell(
             stage, ways[stage], "scalar_rgb", n, "", 3, always(1.0), always(law.seconds(n)), None, always(law.error(n))
         )
         for stage, law in laws.items()
-        for n in (256, 2**24)
+        for n in counts
     )
     # Where as many samples were taken as are needed, nothing lies on a curve.
     cells += tuple(
@@ -175,8 +191,16 @@ def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
     for field in fields(BenchTable):
         if field.name not in told:
             told[field.name] = blank[str(field.type).partition("[")[0]]
-    table = BenchTable(**told)
-    bench_file.write(tmp_path, table)
+    bench_file.write(folder, BenchTable(**told))
+
+
+def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
+    one = described()
+    laws: dict[bench_file.Stage, Curve] = {
+        "render": Curve(0.5, 256, 1.0, 0.2, 1e-4),
+        "calibrate": Curve(2.0, 256, 1.5, 0.4, 1e-3),
+    }
+    benched(tmp_path, one, laws, (256, 2**24))
     found = measured.curves(tmp_path / "x", one, derive(one))
     assert found is not None
     for law, read_again in zip(laws.values(), found, strict=True):
@@ -185,6 +209,27 @@ def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
         assert read_again.error(5000) == pytest.approx(law.error(5000), rel=1e-3)
     other = scene((14, 14), (("1/3", [3, 3], [3, 3]),))
     assert measured.curves(tmp_path / "x", other, derive(other)) is None
+
+
+def test_curves_that_begin_at_few_samples_ask_for_no_fewer_than_have_been_taken(tmp_path: Path) -> None:
+    """`bench` begins at 4 samples, which no scene can ask for; where noise hides the rest these are the cheapest."""
+    one = described()
+    flat = Curve(1e-9, 4, 1.0, 1e-3, 1e-6)
+    benched(tmp_path, one, {"render": flat, "calibrate": flat}, (4, 2**14))
+    description, _ = within(tmp_path / "x", one, 600.0, ticking(1e-3))
+    assert min(description["spent"]["chosen"].values()) >= 256
+
+
+def test_a_world_has_edges_where_no_grid_is(tmp_path: Path) -> None:
+    """So 'auto', which knows no time, is not left to end there; the flat target above is."""
+    shape = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><scale value="2.3"/>'
+    glow = '<emitter type="area"><float name="radiance" value="0.5"/></emitter>'
+    content = f'{shape}<translate x="0.3" y="0.4" z="990"/></transform>{glow}</shape>'
+    (tmp_path / "world.xml").write_text(f'<scene version="3.0.0">{content}</scene>', encoding="utf-8")
+    one = described(world={"file": str(tmp_path / "world.xml")}, calibration={"method": "ideal"})
+    one = one.model_copy(update={"render": one.render.model_copy(update={"sampler": "multijitter"})})
+    description, _ = within(tmp_path / "x", one, 3.0, ticking(1e-3))
+    assert "auto" not in description["spent"]["chosen"].values()
 
 
 def test_every_run_says_what_more_would_buy(here: Path, ommatid: Command) -> None:

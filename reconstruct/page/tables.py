@@ -35,7 +35,10 @@ def plan(run: Run) -> Table:
 
 
 def more_time(run: Run) -> Table | None:
-    """What more samples would take and bring; None where nothing was rendered."""
+    """What more samples would take and bring; None where nothing was rendered.
+
+    The estimator is taken as it is. Of less noise another follows, which leans less on the prior and errs less.
+    """
     spent = run.description.get("spent", {})
     if not spent.get("more"):
         return None
@@ -43,7 +46,7 @@ def more_time(run: Run) -> Table | None:
     known = [("as here", here), *((f"{one['times']} times as many", one) for one in spent["more"])]
     rows = [(name, f"{one['seconds']:.3g}{GAP}s", f"{one['predicted_mse']:.4g}") for name, one in known]
     rows.append(("without end", "", f"{spent['noise_alone']:.4g}"))
-    return Table("What more samples would bring", ("samples", "time", "predicted squared error"), rows)
+    return Table("What more samples would bring", ("samples", "time", "squared error of this estimator"), rows)
 
 
 def given_time(run: Run) -> str:

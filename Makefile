@@ -8,7 +8,7 @@ READY := .venv/ready
 
 demo: setup
 	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
-	@echo "Look at out/photo/overview.png; the numbers are in out/photo/run.json."
+	@echo "Look at out/photo/report.html; overview.png beside it is a picture of it, run.json has the numbers."
 
 # One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
 test: setup browser

@@ -168,6 +168,9 @@ def _scanned(path: Path) -> NDArray[Any]:
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as opened:
             needed = tiff.BYTES * prod(opened.size) * len(opened.getbands())
+            inks = opened.mode == "CMYK"
+        if inks:
+            raise InputError(f"{path}: expected grey or RGB, got inks (CMYK); save it as RGB")
         refuse_beyond(needed, f"{path}: to read it", "take a smaller picture, or free some memory")
         return np.asarray(imread(path))
     finally:

@@ -17,7 +17,7 @@ from .errors import shown
 
 LONGEST = 80  # characters of a quantity: whatever its library does with each, it is done at once
 NUMBER = r"[-+]?(\d[\d_]*\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
-UNIT = r"[^\W\d]+((\*\*|\^)-?\d|[²³])?"
+UNIT = r"(?:[^\W\d]+|°)((\*\*|\^)-?\d|[²³])?"
 QUANTITY = re.compile(rf"\s*{NUMBER}(\s*/\s*{NUMBER})?\s*\*?\s*{UNIT}(\s*[*/]\s*{UNIT})*\s*")
 RATIO = re.compile(rf"\s*{NUMBER}(/\d+)?\s*")
 EXTREME = 1e15  # of millimetres, seconds, radians or lux: beyond, squares and ratios leave what floats can tell

@@ -172,6 +172,17 @@ def test_a_tiff_that_bites_its_tail(tmp_path: Path) -> None:
     assert picture.decode(path, "here").shape == (2, 20, 20)
 
 
+def test_a_file_of_many_pages_needs_what_they_are_stored_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tifffile
+
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((40, 1000, 1000), np.uint16), photometric="minisblack")
+    monkeypatch.setattr("scenes.memory.free_memory", lambda: 110 * 10**6)  # two bytes a number; one page as floats
+    assert len(recorded_frames.pictures_of(tmp_path / "a.tif", "images")) == 40
+    monkeypatch.setattr("scenes.memory.free_memory", lambda: 100 * 10**6)
+    with pytest.raises(InputError, match=r"a.tif: to read it needs 0.104 GB of memory, 0.1 GB are free"):
+        recorded_frames.pictures_of(tmp_path / "a.tif", "images")
+
+
 def npy_of(shape: str, kind: str = "<f8") -> bytes:
     """The header of an NPY file that promises a shape, and eight numbers."""
     text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()

@@ -329,6 +329,34 @@ def test_a_study_and_the_error_against_distance_have_tables(drawn: data.Run) -> 
     assert (reader.open, reader.wrong) == ([], [])
 
 
+def test_a_page_tells_what_was_spent_and_what_more_would_bring(drawn: data.Run) -> None:
+    assert "What more samples would bring" not in page(drawn, None, None, "0")
+    spent: dict[str, Any] = {
+        "seconds": 9.0,
+        "stages": {"render": 1.25, "calibrate": 2.5, "reconstruct": 0.25},
+        "noise_alone": 0.125,
+        "more": [{"times": 2, "seconds": 7.75, "predicted_mse": 0.1875}],
+    }
+    rows = [("as here", "4", None), ("2 times as many", "7.75", "0.1875"), ("without end", "", "0.125")]
+    text = page(replace(drawn, description={**drawn.description, "spent": spent}), None, None, "0")
+    told = f"{drawn.description['error']['predicted_mse']:.4g}"
+    for name, seconds, error in rows:
+        time = f"{seconds}\N{NO-BREAK SPACE}s" if seconds else ""
+        assert f'<th scope="row">{name}</th><td>{time}</td><td>{error or told}</td>' in text
+    assert "The run was given" not in text
+    within = {"within": 30.0, "chosen": {"render.samples": 700, "calibration.samples": "auto"}}
+    text = page(replace(drawn, description={**drawn.description, "spent": spent | within}), None, None, "0")
+    assert "given 30\N{NO-BREAK SPACE}s and took 9\N{NO-BREAK SPACE}s" in text
+    assert "it chose render.samples = 700, calibration.samples = auto." in text
+
+
+def test_commands_in_the_verdict_are_marked_and_the_rest_is_text(
+    drawn: data.Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reconstruct.page.words.verdict", lambda _: "a < b; `ommatid design` & more")
+    assert "a &lt; b; <code>ommatid design</code> &amp; more</p>" in page(drawn, None, None, "0")
+
+
 # --- errors, responses, effort
 
 
@@ -393,6 +421,7 @@ def test_the_ideal_h_has_responses_without_a_comparison(drawn: data.Run) -> None
     run = drawn
     text = page(run, lambda sub: matrix_as_designed(run.stack.camera, sub), None, "0")
     assert "H is the ideal one here" in text
+    assert "Measured response" not in text
     assert 'id="plot-response-A-measured"' in text
     assert 'id="plot-response-A-ideal"' not in text
     stored = response.responses(run.model, None)
@@ -567,6 +596,12 @@ def test_an_index_shows_a_sweep_where_there_is_one(finished: Path, tmp_path: Pat
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "noise.variance" in parsed(text).text["th"]
     assert 'id="plot-sweep"' in text
+    listed.append({"folder": "c", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"})
+    (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")
+    assert index.kept_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": "", tmp_path / "c": "below 0"})
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert 'id="plot-sweep"' in text
+    assert "c/report.html" not in text
     for damaged in ("{}", "[{}]", "nothing"):
         (tmp_path / "sweep.json").write_text(damaged, encoding="utf-8")
         assert index.sweep_of(tmp_path / "sweep.json") is None

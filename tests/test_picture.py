@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -94,3 +95,38 @@ def test_nan_is_refused_where_it_is_seen_and_only_there(tmp_path: Path, bad: flo
     with pytest.raises(InputError, match="NaN"):
         load(looking_at(path))
     load(looking_at(path, origin=[1, 1]))
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "said"),
+    [
+        ("a.tif", "P", "a palette's colours"),
+        ("a.tif", "CMYK", r"inks \(CMYK\)"),
+        ("a.jpg", "CMYK", r"inks \(CMYK\)"),
+        ("white.tif", "L", "0 is white"),
+    ],
+)
+def test_numbers_that_are_no_light_are_refused(name: str, mode: str, said: str, tmp_path: Path) -> None:
+    from PIL import Image
+
+    colour = Image.fromarray(np.dstack([GREY, GREY[::-1], GREY[:, ::-1]]))
+    more: dict[str, Any] = {"tiffinfo": {262: 0}} if name == "white.tif" else {}  # its photometric interpretation
+    colour.convert(mode).save(tmp_path / name, **more)
+    with pytest.raises(InputError, match=f"{name}: expected grey or RGB, got .*{said}"):
+        load(looking_at(tmp_path / name))
+
+
+def test_the_palette_of_a_png_is_looked_up(tmp_path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(GREY).convert("P").save(tmp_path / "a.png")
+    np.testing.assert_allclose(load(looking_at(tmp_path / "a.png")), GREY, rtol=1e-6)
+
+
+@pytest.mark.skipif(find_spec("imagecodecs") is not None, reason="with this package it is read")
+def test_a_compression_that_is_not_known_is_named(tmp_path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(GREY).save(tmp_path / "a.tif", compression="tiff_lzw")
+    with pytest.raises(InputError, match=r"a.tif: its compression LZW is not read; save it without"):
+        load(looking_at(tmp_path / "a.tif"))

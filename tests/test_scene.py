@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from math import radians
 from pathlib import Path
 
 import pytest
@@ -26,11 +27,30 @@ def test_gallery_reads_and_survives_writing(path: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "millimetres"),
-    [("6 um", 0.006), ("1 m", 1000.0), ("2.5 cm", 25.0), ("1 inch", 25.4), ("500 nm", 0.0005), ("3 mm", 3.0)],
+    [
+        ("6 um", 0.006),
+        ("1 m", 1000.0),
+        ("2.5 cm", 25.0),
+        ("1 inch", 25.4),
+        ("500 nm", 0.0005),
+        ("3 mm", 3.0),
+        ("1e-3 m", 1.0),
+        ("0.5mm", 0.5),
+        ("1 µm", 0.001),
+        (" 6 um ", 0.006),
+        ("1/4 mm", 0.25),
+    ],
 )
 def test_lengths_become_millimetres(text: str, millimetres: float) -> None:
     changed = with_changes(scene().plain(), Path("a.toml"), [f'target.pixel_pitch="{text}"'], ())
     assert changed.target.pixel_pitch == pytest.approx(millimetres, rel=1e-12)
+
+
+@pytest.mark.parametrize(("text", "degrees"), [("1 deg", 1.0), ("1°", 1.0), ("60 arcmin", 1.0)])
+def test_angles_become_radians(text: str, degrees: float) -> None:
+    changed = with_changes(scene().plain(), Path("a.toml"), [f'camera.tolerance={{tilt="{text}"}}'], ())
+    assert changed.camera.tolerance is not None
+    assert changed.camera.tolerance.tilt == pytest.approx(radians(degrees), rel=1e-12)
 
 
 @pytest.mark.parametrize(

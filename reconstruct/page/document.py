@@ -56,6 +56,8 @@ def _page(run: Run, ideal: Ideal | None, bench: dict[str, Any] | None, stamp: st
         "curves": curves,
         "curve_words": effort.words(curves) if curves else "",
         "plan": tables.plan(run),
+        "more_time": tables.more_time(run),
+        "given_time": tables.given_time(run),
         "left_out": tables.left_out(run),
         "lenses": lenses,
         "facts": facts,
@@ -76,9 +78,10 @@ def _views(mosaic: sensor.Mosaic) -> dict[str, float]:
 
 
 def _titled(kind: response.Response) -> list[tuple[str, str, str]]:
-    """Name, title and words of each map of a response."""
+    """Name, title and words of each map of a response; the ideal one was not measured."""
+    titles = response.TITLES | ({"measured": "Response"} if kind.exact else {})
     return [
-        (f"response-{kind.lens}-{name}", response.TITLES[name], images.values_in_words(image))
+        (f"response-{kind.lens}-{name}", titles[name], images.values_in_words(image))
         for name, image in response.shown(kind)
     ]
 
@@ -88,9 +91,16 @@ def fill(template: str, content: Mapping[str, Any]) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
+    def code(text: str) -> Markup:
+        """A sentence whose commands stand between backticks."""
+        parts = text.split("`")
+        marked = [Markup("<code>{}</code>").format(part) if place % 2 else part for place, part in enumerate(parts)]
+        return Markup("").join(marked)
+
     house = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    house.filters["code"] = code
     files = {"css": "page.css", "paper": "print.css", "js": "page.js"}
     ours = {name: Markup((HERE / file).read_text(encoding="utf-8")) for name, file in files.items()}
     drawn = {"bokeh": Markup(plots.script()), "document": Markup(content["document"])} if content["document"] else {}

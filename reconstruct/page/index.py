@@ -53,7 +53,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Keys that were varied, and a row a scene: its folder's link, the keys' values, measured and predicted error."""
+    """Keys that were varied, and a row a scene: its page's link, the keys' values, measured and predicted error.
+
+    The link is empty where the scene failed.
+    """
 
     keys: tuple[str, ...]
     rows: list[tuple[str, tuple[str, ...], float | None, float | None]]
@@ -109,7 +112,7 @@ def sweep_of(path: Path) -> Sweep | None:
         keys = tuple(dict.fromkeys(key for one in listed for key in one["values"]))
         rows = [
             (
-                quote(f"{Path(one['folder']).name}/{REPORT}"),
+                "" if "failed" in one else quote(f"{Path(one['folder']).name}/{REPORT}"),
                 tuple(str(one["values"].get(key, "")) for key in keys),
                 one.get("mse"),
                 one.get("predicted_mse"),
@@ -178,14 +181,16 @@ def _measured_against_predicted(entries: list[Entry]) -> Any:
 
 
 def _series(swept: Sweep) -> dict[str, list[tuple[float, float, float]]]:
-    """Value of the first key, measured and predicted error, a series for each choice of the others.
+    """Value of the first key, measured and predicted error of what did not fail, a series a choice of the others.
 
     None where the first key's values are no numbers above 0, or only one.
     """
     found: dict[str, list[tuple[float, float, float]]] = {}
     for _, values, mse, predicted in swept.rows:
+        if not predicted:
+            continue
         number = _number(values[0])
-        if number is None or not predicted:
+        if number is None:
             return {}
         others = ", ".join(f"{key} {value}" for key, value in zip(swept.keys[1:], values[1:], strict=True))
         found.setdefault(others or "measured", []).append((number, mse or predicted, predicted))

@@ -34,6 +34,31 @@ def plan(run: Run) -> Table:
     return Table("What ran", ("stage", "how", "time", "share"), rows)
 
 
+def more_time(run: Run) -> Table | None:
+    """What more samples would take and bring; None where nothing was rendered.
+
+    The estimator is taken as it is. Of less noise another follows, which leans less on the prior and errs less.
+    """
+    spent = run.description.get("spent", {})
+    if not spent.get("more"):
+        return None
+    here = {"seconds": sum(spent["stages"].values()), "predicted_mse": run.description["error"]["predicted_mse"]}
+    known = [("as here", here), *((f"{one['times']} times as many", one) for one in spent["more"])]
+    rows = [(name, f"{one['seconds']:.3g}{GAP}s", f"{one['predicted_mse']:.4g}") for name, one in known]
+    rows.append(("without end", "", f"{spent['noise_alone']:.4g}"))
+    return Table("What more samples would bring", ("samples", "time", "squared error of this estimator"), rows)
+
+
+def given_time(run: Run) -> str:
+    """What became of the time that a run was given; nothing where it was given none."""
+    spent = run.description.get("spent", {})
+    if "within" not in spent:
+        return ""
+    chosen = ", ".join(f"{key} = {value}" for key, value in spent["chosen"].items())
+    taken = f"took {spent['seconds']:.3g}{GAP}s with what it measured beforehand"
+    return f"The run was given {spent['within']:g}{GAP}s and {taken}; it chose {chosen}."
+
+
 def _how(name: str, stage: dict[str, Any], run: Run) -> str:
     told = [str(stage["method"])] if "method" in stage else []
     if "samples" in stage:

@@ -32,6 +32,7 @@ from .bench_jobs import Subject, jobs
 
 PARTIAL = ".bench.partial.jsonl"
 FLAT: dict[Stage, float] = {"render": 1e-5 * 255, "calibrate": 1e-5}  # errors below which float32 shows, and no slope
+PATIENCE = 0.1  # of the time: how long the noise alone may take
 SETTING_UP = 0.02  # of the progress: the reference, and what the noise alone leaves
 
 
@@ -60,7 +61,7 @@ def bench(
     before = finished.seconds
     with naming(scene.source):
         found = right(scene, camera, image, folder, lambda done: progress(SETTING_UP * done))
-        subject = Subject(scene, camera, image, found)
+        subject = Subject(scene, camera, image, found, PATIENCE * seconds)
         told, left_out = jobs(subject)
     spent = perf_counter() - start
     late = measure(told, seconds, finished, lambda done: progress(SETTING_UP + (1 - SETTING_UP) * done), spent)

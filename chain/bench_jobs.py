@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from math import inf
 from time import perf_counter
 from typing import Literal, TypeVar
 
@@ -48,12 +49,16 @@ POINTS = 12.0  # renderings that point sources take, in units of one, about
 
 @dataclass(frozen=True)
 class Subject:
-    """The scene that is measured: its camera, its target, and what is right of both."""
+    """The scene that is measured: its camera, its target, and what is right of both.
+
+    patience : seconds after which no more estimates are made of what the noise alone leaves
+    """
 
     scene: Scene
     camera: Camera
     image: Image
     right: Right
+    patience: float = inf
 
     def noise(self, repeat: int) -> Scene:
         """The scene with the sensor's noise of a repeat, which all cells share."""
@@ -103,20 +108,25 @@ class Subject:
 
         It is that of the floor, times what it is more than exact light and exact H make of the same noise.
         """
-        own = self.floors[repeat]
+        own = self._own(repeat)
         return squares / own * self.floor if own > 0 else squares
+
+    def _own(self, repeat: int) -> float:
+        """Mean squared error with exact light and exact H and the noise of a repeat."""
+        if repeat not in self._known:
+            self._known[repeat] = self.squares(way_of(self.stack(repeat), self.right.model).image)
+        return self._known[repeat]
+
+    @cached_property
+    def _known(self) -> dict[int, float]:
+        return {}
 
     @cached_property
     def _alone(self) -> tuple[list[float], float]:
-        start = perf_counter()
-        stacks = map(self.stack, range(REPEATS))
-        found = [self.squares(way_of(stack, self.right.model).image) for stack in stacks]
-        return found, (perf_counter() - start) / REPEATS
-
-    @property
-    def floors(self) -> list[float]:
-        """Mean squared errors with exact light and exact H, by repeat."""
-        return self._alone[0]
+        start, found = perf_counter(), list[float]()
+        while not found or (len(found) < REPEATS and perf_counter() - start < self.patience):
+            found.append(self._own(len(found)))
+        return found, (perf_counter() - start) / len(found)
 
     @property
     def solving(self) -> float:
@@ -126,7 +136,7 @@ class Subject:
     @property
     def floor(self) -> float:
         """Their median: what the noise alone leaves."""
-        return float(np.median(self.floors))
+        return float(np.median(self._alone[0]))
 
     def _seeded(self, what: str, repeat: int) -> Scene:
         render = self.scene.render.model_copy(update={"seed": self.seed(what, repeat)})

@@ -160,7 +160,8 @@ def light_until(
             left = (limit - (clock() - start)) / (len(going) - number)
             rounds.one_more(place, left, rounds.rays / max(clock() - start, 1e-9))
             if partial is not None:
-                partial.offer(lambda: {**rounds.state(), "seconds": np.array(clock() - start)})
+                state = {**rounds.state(), "seconds": np.array(clock() - start)}  # whole, wherever the next one stops
+                partial.offer(lambda state=state: state)
             progress(1 - len(rounds.going) / len(rounds.courses))
     progress(1.0)
     return Lit(rounds.mean, rounds.variance, {"variant": variant, **rounds.record()}, rig.straight)
@@ -255,7 +256,8 @@ class Rounds:
     def state(self) -> State:
         """All of it, to be kept."""
         courses = json.dumps([asdict(course) for course in self.courses])
-        return {"mean": self.mean, "variance": self.variance, "open": self._open, "courses": np.array(courses)}
+        mean, variance, still = self.mean.copy(), self.variance.copy(), self._open.copy()
+        return {"mean": mean, "variance": variance, "open": still, "courses": np.array(courses)}
 
     def resume(self, state: State) -> None:
         """Go on where a kept one stopped, if there is one."""

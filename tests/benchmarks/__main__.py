@@ -104,31 +104,32 @@ def _frames() -> Iterator[Table]:
 
 
 def _lenses() -> Iterator[Table]:
-    table = Table(title="Real lenses, and calibration by transport", show_lines=True)
-    for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
-        table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
-    reason = blocked(LENSES)
-    if reason:
-        table.caption = f"All was left out: {reason}."
-    else:
+    def rows() -> Iterator[tuple[str, Row]]:
         for row in lens_rows():
-            _add(table, f"{SIDE} x {SIDE} pixels\n{BUNDLE} samples a pixel", row)
+            yield f"{SIDE} x {SIDE} pixels\n{BUNDLE} samples a pixel", row
         for row in transport_rows(SCENES / "tile19.toml"):
-            _add(table, "calibration: tile19\n1024 samples", row)
-    yield table
+            yield "calibration: tile19\n1024 samples", row
+
+    yield _compared("Real lenses, and calibration by transport", rows())
 
 
 def _leaving_out() -> Iterator[Table]:
-    table = Table(title="What leaving out saves", show_lines=True)
+    what = f"{WIDE} x {WIDE}, three types\n{EACH} samples a pixel"
+    yield _compared("What leaving out saves", ((what, row) for row in leaving_out_rows()))
+
+
+def _compared(title: str, rows: Iterator[tuple[str, Row]]) -> Table:
+    """A table of ratios on the fast backend; of what was measured, and the row."""
+    table = Table(title=title, show_lines=True)
     for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
         table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
     reason = blocked(LENSES)
     if reason:
         table.caption = f"All was left out: {reason}."
-    else:
-        for row in leaving_out_rows():
-            _add(table, f"{WIDE} x {WIDE}, three types\n{EACH} samples a pixel", row)
-    yield table
+        return table
+    for what, row in rows:
+        _add(table, what, row)
+    return table
 
 
 PARTS: dict[str, Callable[[], Iterator[Table]]] = {

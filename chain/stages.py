@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from scenes.batch import Member, prepare
 from scenes.camera import Camera, derive
-from scenes.errors import InputError, naming
+from scenes.errors import naming
 from scenes.parcel import Watch
 from scenes.picture import Image, load
-from scenes.processors import one_thread
+from scenes.processors import one_thread, processors
 from scenes.progress import no_progress
 from scenes.scene import Scene, read
 from scenes.stack import Stack
@@ -41,20 +40,12 @@ def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member)
 
 
 def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
-    """How many scenes of a batch memory holds side by side, whichever these are; at least one."""
-    from reconstruct.choice import BASE, allowed_memory, choose
+    """In how many processes a batch is done soonest, of as many as memory holds."""
+    from .effort import effort, held, soonest
 
-    def needed(member: Member) -> int:
-        try:
-            scene = read(member.scene, (*changes, *member.changes), lenses)
-            camera = derive(scene)
-            return BASE + choose(scene, camera, scene.calibration.method == "ideal" and camera.boxed).memory
-        except InputError:  # it will be told in its turn
-            return 0
-
-    largest_first = sorted(map(needed, members), reverse=True)
-    allowed = allowed_memory(None)
-    return max(1, sum(together <= allowed for together in accumulate(largest_first)))
+    efforts = [effort(member, changes, lenses) for member in members]
+    most = min(held([one.memory for one in efforts]), len(members), processors())
+    return soonest([one.seconds for one in efforts], most, processors())
 
 
 def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Watch) -> dict[str, Any]:

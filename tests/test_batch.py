@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
-from chain import stages
+from chain.effort import effort, held, soonest
 from reconstruct import choice
 from reconstruct.choice import BASE
 from scenes import batch, files
@@ -268,7 +268,16 @@ def test_memory_is_asked_of_the_scenes_that_need_most(here: Path, monkeypatch: p
     needs = [BASE + 7 * 8 * pixels**2 for pixels in (3600, 3600, 3600)]
     for free, expected in ((needs[0] * 1.5, 1), (needs[0] * 2.5, 2), (needs[0] * 50, 5)):
         monkeypatch.setattr(choice, "free_memory", lambda free=free: 2 * int(free))
-        assert stages.fitting((), (), [*small, *large]) == expected
+        assert held([effort(member, (), ()).memory for member in (*small, *large)]) == expected
+
+
+def test_a_batch_is_shared_where_that_is_sooner() -> None:
+    """In closed form for two processors: n alike are done after n/2 of their time, or n (1 - 0.6/2) one by one."""
+    assert soonest([3.0] * 8, 2, 2) == 2, "2 + 12 s against 16.8"
+    assert soonest([2.0] * 2, 2, 2) == 1, "2 + 2 s against 2.8: they end before a process has begun"
+    assert soonest([60.0, 3.0], 2, 2) == 1, "the large one would have one processor all the time"
+    assert soonest([3.0, 60.0, 60.0], 2, 2) == 2
+    assert soonest([60.0] * 8, 1, 8) == 1, "no more than memory holds"
 
 
 def test_linear_algebra_is_done_by_one_thread_whatever_was_set_before() -> None:

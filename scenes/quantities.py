@@ -170,7 +170,7 @@ def _samples(value: object) -> object:
     if value == AUTO:
         return value
     raise ValueError(
-        f'expected a whole number of samples from {FEWEST_SAMPLES} to {MOST_SAMPLES}, or "{AUTO}", got {value!r}'
+        f'expected a whole number of samples from {FEWEST_SAMPLES} to {MOST_SAMPLES}, or "{AUTO}", got {shown(value)}'
     )
 
 

@@ -118,7 +118,9 @@ def test_sentences_stay_short(tmp_path: Path) -> None:
     assert len(shown({"a" * 1000: ["b" * 1000] * 1000})) < 700
     assert short("a") == "a"
     assert len(short("a" * 1000)) < 100
-    for change in ("x" * 9000 + "=1", "title=[" + "1," * 9000 + "]", "prior.kind=" + "x" * 9000, "x" * 9000):
+    long = "x" * 9000
+    told = (f"{long}=1", "title=[" + "1," * 9000 + "]", f"prior.kind={long}", f"render.samples={long}", long)
+    for change in told:
         with pytest.raises(InputError) as refused:
             read(tmp_path, change)
         assert len(str(refused.value)) < 600

@@ -17,7 +17,7 @@ from scenes.blur import blur_of
 from scenes.errors import InputError, short, shown
 from scenes.memory import free_memory, refuse_beyond
 
-from .conftest import TINY, shell
+from .conftest import TINY, Command, shell
 from .examples import scene as example
 
 GIBI = 2**30
@@ -362,3 +362,11 @@ def test_what_memory_does_not_hold_is_refused_before_it_is_asked_for(here: Path)
         assert line.startswith("ommatid: ")
         assert "GB" in line, line
     assert sorted(here.rglob("*")) == before
+
+
+def test_the_least_noise_that_there_is(here: Path, ommatid: Command) -> None:
+    """Its precision squared is beyond float64."""
+    assert (here / "tiny.toml").is_file()
+    ended = ommatid("predict", "tiny.toml", "--set", "noise.variance=5e-324")
+    assert ended.code == 2
+    assert "no form of the estimator reaches" in ended.err

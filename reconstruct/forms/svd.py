@@ -109,5 +109,5 @@ def svd(problem: Problem) -> Svd:
     rank = int(np.sum(found > least))
     values = np.zeros(freedoms)
     values[:rank] = found[:rank]
-    condition = float(np.sqrt(1 + largest**2))
+    condition = float(np.hypot(1.0, largest))
     return Svd(problem, condition, np.ascontiguousarray(left[:, :rank]), values, transposed.T)

@@ -33,7 +33,7 @@ $(READY): pyproject.toml
 
 # The fast backend wants LLVM 17 or newer; Debian's libllvm19 is installed where that can be done without asking.
 # Where it cannot, everything works on the slow backend, and `ommatid doctor` names the one command that mends it.
-FAST := $(BIN)/python -c 'import sys; from simulate.variant import blocked; sys.exit(bool(blocked("llvm_ad_mono")))'
+FAST := $(BIN)/python -c 'import sys; from ommatid.simulate.renderer.variant import unusable_reason; sys.exit(bool(unusable_reason("llvm_ad_mono")))'
 ROOT := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo -n; fi)
 
 llvm: $(READY)

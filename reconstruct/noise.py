@@ -11,20 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes import estimation
-from scenes.errors import InputError
-from scenes.model import Model
-from scenes.needs import without_shot_noise
-from scenes.stack import Stack
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.model import Model
+from ommatid.scenes.optics.negligible import without_shot_noise
+from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables import estimation
 
-from .way import is_one_number
+from .methods.method import is_one_number
 
 Vector = NDArray[np.float64]
 Noise = dict[str, Vector]
 
 
 @dataclass(frozen=True)
-class Usable:
+class UsablePixels:
     """Which of the M sensor pixels are used, and how many are not, and why."""
 
     used: NDArray[np.bool_]
@@ -32,7 +32,7 @@ class Usable:
     saturated: int
 
 
-def usable_pixels(stack: Stack, model: Model | None = None) -> Usable:
+def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
     """Which pixels tell something: not those that are no number (dead), nor those at the level of saturation.
 
     Nor, where the model is given, those of which it does not know what they see.
@@ -46,7 +46,7 @@ def usable_pixels(stack: Stack, model: Model | None = None) -> Usable:
         full = alive & stack.recording.saturated
     elif noise is not None and noise.saturation is not None:
         full = alive & (stack.values >= np.float32(noise.saturation))  # the stack holds float32
-    return Usable(alive & ~full, int(np.sum(~alive)), int(np.sum(full)))
+    return UsablePixels(alive & ~full, int(np.sum(~alive)), int(np.sum(full)))
 
 
 def known_noise(stack: Stack) -> Noise:
@@ -62,11 +62,11 @@ def known_noise(stack: Stack) -> Noise:
     return noise
 
 
-def noise_at_first(stack: Stack, model: Model, usable: Usable, prior: estimation.Prior) -> Noise:
+def noise_at_first(stack: Stack, model: Model, usable: UsablePixels, prior: estimation.PriorTable) -> Noise:
     """Variances, (pixels used,), of everything that is known of the noise before there is an estimate."""
     noise = {name: of_used(variances, usable.used) for name, variances in known_noise(stack).items()}
     if model.variance.any():
-        noise["calibration"] = model.prior_spread(np.full(model.unknowns, prior.variance))[usable.used]
+        noise["calibration"] = model.prior_variance_from_model(np.full(model.unknowns, prior.variance))[usable.used]
     return noise
 
 
@@ -76,14 +76,14 @@ def depends_on_light(stack: Stack, model: Model) -> bool:
     return counted or bool(model.variance.any())
 
 
-def noise_given(image: Vector, stack: Stack, model: Model, usable: Usable, noise: Noise) -> Noise:
+def noise_given(image: Vector, stack: Stack, model: Model, usable: UsablePixels, noise: Noise) -> Noise:
     """The same noise with what depends on the light as this estimate of the image, (N,), has it."""
     noise = dict(noise)
     if stack.recording is not None:
         found = stack.recording.noise(model.forward(image))
         noise |= {name: of_used(variances, usable.used) for name, variances in found.items()}
     if model.variance.any():
-        noise["calibration"] = model.spread(image)[usable.used]
+        noise["calibration"] = model.variance_from_model(image)[usable.used]
     return noise
 
 
@@ -99,7 +99,7 @@ def of_used(values: Vector, used: NDArray[np.bool_]) -> Vector:
     return everywhere(float(values[0]), int(used.sum())) if is_one_number(values) else values[used]
 
 
-def refuse_fit_of_sensor(stack: Stack) -> None:
+def check_noise_fit(stack: Stack) -> None:
     """Raise InputError where one number is to be found for the noise of a sensor whose every pixel has its own."""
     if stack.recording is not None and stack.scene.estimator.noise_variance == "fit":
         raise InputError(

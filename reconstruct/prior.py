@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from scenes import estimation
-from scenes.errors import InputError
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.tables import estimation
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -62,7 +62,7 @@ def independent(mean: float, variance: float, unknowns: int) -> Prior:
     return Prior(np.full(unknowns, mean), np.full(unknowns, variance**0.5))
 
 
-def prior_of(described: estimation.Prior, shape: tuple[int, int], pitch: float) -> Prior:
+def prior_of(described: estimation.PriorTable, shape: tuple[int, int], pitch: float) -> Prior:
     """The prior that a scene describes, for an image of `shape` whose pixels are `pitch` millimetres apart.
 
     Raises InputError for kind "fit", which takes a stack to find.
@@ -78,7 +78,7 @@ def prior_of(described: estimation.Prior, shape: tuple[int, int], pitch: float) 
     raise InputError(NOT_YET_FOUND)
 
 
-def spectrum_of(described: estimation.Prior, shape: tuple[int, int], pitch: float) -> float | Matrix:
+def spectrum_of(described: estimation.PriorTable, shape: tuple[int, int], pitch: float) -> float | Matrix:
     """P0 as it is diagonal: the variance of independent pixels, else its spectrum under the cosine transform (DCT-II).
 
     Such a prior is the stationary one reflected at the edges of the image: inside the two are the same, and within a

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from scenes.errors import InputError
+from ommatid.runtime.errors import InputError
 
 from .prior import Prior
 

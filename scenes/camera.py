@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
-from .lens_type import Glass, LensType, SubImager
-from .lenses import Lens, Tolerance
-from .memory import refuse_beyond
-from .picture import shape
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.memory import check_memory
+
+from .formats.picture import shape
+from .lens_type import LensOptics, LensType, SubImager
 from .scene import Scene
+from .tables.camera import LensTable, ToleranceTable
 
 MOST_MEASUREMENTS = 2**30
 MOST_SUB_IMAGERS = 2**14
@@ -41,13 +42,18 @@ class Camera:
     lens_pitch: float
     types: tuple[LensType, ...]
     wavelength: float | None = None
-    tolerance: Tolerance | None = None
-    across: int | None = None  # columns of sub-imagers, those of types that were left out later among them
+    tolerance: ToleranceTable | None = None
+    lens_columns: int | None = None  # columns of sub-imagers, those of types that were left out later among them
 
     @property
     def unknowns(self) -> int:
         """N, pixels of f."""
         return self.rows * self.columns
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of f."""
+        return self.rows, self.columns
 
     @property
     def measurements(self) -> int:
@@ -64,7 +70,7 @@ class Camera:
 
     def focus(self, kind: LensType) -> float:
         """Distance that a type's lenses show sharp."""
-        return self.distance if kind.glass.focus is None else kind.glass.focus
+        return self.distance if kind.optics.focus is None else kind.optics.focus
 
     @property
     def corner(self) -> float:
@@ -72,27 +78,27 @@ class Camera:
         return self.target_pitch * hypot(self.rows, self.columns) / 2
 
     @property
-    def perfect(self) -> bool:
+    def is_ideal_pinhole(self) -> bool:
         """Whether it is a set of pinholes that stand where they should: then H is a product of overlaps."""
-        return self.tolerance is None and all(kind.glass.pinhole for kind in self.types)
+        return self.tolerance is None and all(kind.optics.pinhole for kind in self.types)
 
     @property
-    def boxed(self) -> bool:
+    def has_box_footprints(self) -> bool:
         """Whether H of the camera as designed averages f over boxes: no distortion, and no blur that is known."""
-        return all(kind.glass.distortion is None and not self.blurs(kind) for kind in self.types)
+        return all(kind.optics.distortion is None and not self.is_blurred(kind) for kind in self.types)
 
-    def blurs(self, kind: LensType) -> bool:
+    def is_blurred(self, kind: LensType) -> bool:
         """Whether a thin lens shows a point of the target as a disk: out of focus, or by diffraction."""
-        if kind.glass.aperture is None:
+        if kind.optics.aperture is None:
             return False
         return self.wavelength is not None or self.focus(kind) != self.distance
 
     @property
-    def stays_sharp(self) -> bool:
+    def has_sharp_footprints(self) -> bool:
         """Whether footprints of misaligned sub-imagers are known in closed form: no surfaces, and no blur."""
         moved = self.tolerance is not None and (self.tolerance.focal_length or self.tolerance.tilt)
         return not any(
-            kind.glass.surfaces is not None or self.blurs(kind) or (kind.glass.aperture is not None and moved)
+            kind.optics.surfaces is not None or self.is_blurred(kind) or (kind.optics.aperture is not None and moved)
             for kind in self.types
         )
 
@@ -110,7 +116,7 @@ class Camera:
     def sub_imager(self, place: int, k: int, l: int) -> SubImager:  # noqa: E741
         """Sub-imager (k, l) of the lens type that stands at `place` in the list; types stand side by side."""
         kind = self.types[place]
-        across = sum(other.array[1] for other in self.types) if self.across is None else self.across
+        across = sum(other.array[1] for other in self.types) if self.lens_columns is None else self.lens_columns
         left = sum(other.array[1] for other in self.types[:place]) if kind.left is None else kind.left
         x = ((across - 1) / 2 - (left + l)) * self.lens_pitch
         y = ((kind.array[0] - 1) / 2 - k) * self.lens_pitch
@@ -145,9 +151,9 @@ class Camera:
 
     def types_seeing(self) -> NDArray[np.int64]:
         """(rows, columns): by how many lens types each pixel of f is seen whole."""
-        seen = np.zeros((self.rows, self.columns), dtype=np.int64)
+        seen = np.zeros(self.shape, dtype=np.int64)
         for kind in self.types:
-            axes = [np.zeros(size, dtype=np.int64) for size in (self.rows, self.columns)]
+            axes = [np.zeros(size, dtype=np.int64) for size in self.shape]
             for axis, marked in enumerate(axes):
                 for number in range(kind.array[axis]):
                     start = kind.origin[axis] + number * kind.step
@@ -180,12 +186,16 @@ class Camera:
                     "array": list(kind.array),
                     "pixels": list(kind.pixels),
                     "step": str(kind.step),
-                    **kind.glass.describe(),
+                    **kind.optics.describe(),
                 }
                 for place, kind in enumerate(self.types)
             },
             # Through pinholes it is all the same where the lenses stand.
-            **({} if self.perfect else {"camera.places": [self.across, *(kind.left for kind in self.types)]}),
+            **(
+                {}
+                if self.is_ideal_pinhole
+                else {"camera.places": [self.lens_columns, *(kind.left for kind in self.types)]}
+            ),
             **({} if self.wavelength is None else {"camera.wavelength": self.wavelength}),
             **({} if self.tolerance is None else {"camera.tolerance": self.tolerance.model_dump(mode="json")}),
         }
@@ -210,7 +220,7 @@ def derive(scene: Scene) -> Camera:
         types=types,
         wavelength=scene.camera.wavelength,
         tolerance=scene.camera.tolerance,
-        across=lefts[-1],
+        lens_columns=lefts[-1],
     )
     for kind in types:
         if kind.count > MOST_SUB_IMAGERS:
@@ -219,14 +229,14 @@ def derive(scene: Scene) -> Camera:
                 f" {MOST_SUB_IMAGERS} a lens type are served; use fewer"
             )
     needed = PLANES * 8 * (camera.unknowns + camera.measurements)
-    refuse_beyond(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
+    check_memory(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
     if camera.measurements > MOST_MEASUREMENTS:
         raise InputError(f"{scene.source}: the lens arrays have {camera.measurements} pixels, at most 2^30 are served")
     _refuse_overlap(camera, scene)
     return camera
 
 
-def _lens_type(lens: Lens, rows: int, columns: int, scene: Scene) -> LensType:
+def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensType:
     ratio = 1 / lens.magnification
     most = tuple(
         floor((size - (count - 1) * lens.step) / ratio) for size, count in zip((rows, columns), lens.array, strict=True)
@@ -243,7 +253,7 @@ def _lens_type(lens: Lens, rows: int, columns: int, scene: Scene) -> LensType:
             f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}"
         )
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # a file's name was replaced by what it holds
-    glass = Glass(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale)
+    glass = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale)
     kind = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), glass)
     origin = floor((rows - kind.span[0]) / 2), floor((columns - kind.span[1]) / 2)
     return replace(kind, origin=origin)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from .lenses import Surface
+from .tables.camera import Surface
 
 
 @dataclass(frozen=True)
-class Glass:
+class LensOptics:
     """What a lens type's lenses are beside a pinhole in focus; absent effects are None.
 
     aperture : diameter of a thin lens;  focus : distance that it shows sharp, absent: the target's
@@ -30,7 +30,7 @@ class Glass:
     @property
     def pinhole(self) -> bool:
         """Whether there is nothing but a pinhole."""
-        return self == Glass()
+        return self == LensOptics()
 
     def describe(self) -> dict[str, Any]:
         """What is there, in JSON's types."""
@@ -54,7 +54,7 @@ class LensType:
     pixels: tuple[int, int]
     step: Fraction
     origin: tuple[int, int]
-    glass: Glass = Glass()
+    optics: LensOptics = LensOptics()
     left: int | None = None
 
     @property

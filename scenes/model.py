@@ -1,36 +1,28 @@
 """The observation model g = H f + v: a sparse H with the variance of its every entry (Wood et al., Eq. 1).
 
-H is (M, N): a row a sensor pixel in the order of measurements, a column a pixel of f, row by row. The file is what
-`scipy.sparse.load_npz` reads, with `variance` (in the order of `data`) and a JSON text `ommatid` beside it. The ideal
-H of a large frame is not stored, it follows from the scene: such a file has the format "boxes" and no entries.
+H is (M, N): a row a sensor pixel in the order of measurements, a column a pixel of f, row by row. The ideal
+H of a large frame is not stored, it follows from the scene.
 """
 
 from __future__ import annotations
 
-import errno
-import hashlib
-import json
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import ceil
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from . import npz
-from .boxes import Boxes
-from .camera import Camera, derive
-from .errors import InputError, short
-from .files import digest, write_whole
-from .moderate import moderate
-from .record import checked
-from .scene import Scene, parse
-from .table import LARGEST
+from ommatid.runtime.errors import InputError
+
+from .camera import Camera
+from .optics.boxes import BoxFootprints
+from .scene import Scene
+from .shrinkage import shrink_variances
 
 Vector = NDArray[np.float64]
 
@@ -39,19 +31,6 @@ ALIKE = 200  # pixels of like contrast, at least, whose scatter is moderated tog
 MOST_KINDS = 24  # such groups of a lens type, at most
 RECORDED = "recorded points"  # the method of a model whose every entry was read by itself
 NOWHERE = -1  # what a measurement sees that sees nothing: no window has it
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Who says of a model whether its H is known well enough.
-
-    adds : what the uncertainty of H adds to the expected error of a reconstruction, relative to all the rest of it
-    by : fingerprint of what is reconstructed;  words : the same for people
-    """
-
-    adds: Callable[[Model], float]
-    by: str
-    words: str
 
 
 @dataclass(frozen=True)
@@ -85,14 +64,14 @@ class Model:
         return self.boxes.entries if self.stored is None else int(self.stored.nnz)
 
     @property
-    def exact(self) -> bool:
+    def is_exact(self) -> bool:
         """Whether H is that of a perfect camera of pinholes, and so follows from its geometry."""
-        return self.record["method"] == "ideal" and self.camera.boxed
+        return self.record["method"] == "ideal" and self.camera.has_box_footprints
 
     @cached_property
-    def boxes(self) -> Boxes:
+    def boxes(self) -> BoxFootprints:
         """H of a perfect camera, whatever this one is."""
-        return Boxes(self.camera)
+        return BoxFootprints(self.camera)
 
     @property
     def measurements(self) -> int:
@@ -116,19 +95,19 @@ class Model:
             return self.boxes.adjoint(measurements)
         return self.stored.T @ np.asarray(measurements, dtype=np.float64)
 
-    def numbers(self, rows: slice, columns: slice) -> NDArray[np.int64]:
+    def measurements_inside(self, rows: slice, columns: slice) -> NDArray[np.int64]:
         """Which measurements see nothing but a window of f: (m,)."""
-        if self.exact:
-            return self.boxes.numbers(rows, columns)
+        if self.is_exact:
+            return self.boxes.measurements_inside(rows, columns)
         top, bottom, left, right = self._reach
         inside = (top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop)
         return np.flatnonzero(inside)
 
-    def part(self, rows: slice, columns: slice) -> sparse.csr_array:
+    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """H of the window from these measurements: (m, pixels of the window)."""
-        if self.exact:
-            return self.boxes.part(rows, columns)
-        some = self.matrix[self.numbers(rows, columns)]
+        if self.is_exact:
+            return self.boxes.submatrix(rows, columns)
+        some = self.matrix[self.measurements_inside(rows, columns)]
         row, column = np.divmod(some.indices, self.camera.columns)
         shape = rows.stop - rows.start, columns.stop - columns.start
         indices = (row - rows.start) * shape[1] + column - columns.start
@@ -136,7 +115,7 @@ class Model:
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """What two windows have in common whose `part` is the same."""
-        return self.boxes.signature(rows, columns) if self.exact else (rows.start, columns.start)
+        return self.boxes.signature(rows, columns) if self.is_exact else (rows.start, columns.start)
 
     @property
     def reach(self) -> int:
@@ -172,7 +151,7 @@ class Model:
             record={key: value for key, value in self.record.items() if key != "agreement"},  # of all types
         )
 
-    def spread(self, image: Vector) -> Vector:
+    def variance_from_model(self, image: Vector) -> Vector:
         """Variance that the uncertainty of H adds to each measurement of `image`: (M,).
 
         The errors of a row cancel in its sum, since all its entries share their rays, so what is left is about
@@ -199,10 +178,10 @@ class Model:
             # Strong contrast lets errors cancel otherwise than weak one does, so that like is compared with like.
             for alike in np.array_split(place[np.argsort(trend[place])], max(1, min(place.size // ALIKE, MOST_KINDS))):
                 if alike.size:
-                    trend[alike] *= moderate(seen[alike] / trend[alike], count)
+                    trend[alike] *= shrink_variances(seen[alike] / trend[alike], count)
         return trend
 
-    def feigned(self, noise_variance: Vector) -> Vector:
+    def spurious_information(self, noise_variance: Vector) -> Vector:
         """Information on each pixel that the noise of H alone would seem to bring: (N,), sum over i of var_ij / Rv_i.
 
         Where the measurements leave a pixel open, an estimator that takes H for exact believes this much too much.
@@ -213,101 +192,10 @@ class Model:
         weights = self.variance / noise_variance[rows]
         return np.bincount(self.matrix.indices, weights=weights, minlength=self.unknowns).astype(np.float64)
 
-    def prior_spread(self, prior_variance: Vector) -> Vector:
+    def prior_variance_from_model(self, prior_variance: Vector) -> Vector:
         """The same before anything is known of the image but the (N,) variance of its pixels: sum of var_ij P0_j."""
         rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
         return self._row_sums(rows, self.variance * prior_variance[self.matrix.indices])
 
     def _row_sums(self, rows: NDArray[np.int64], entries: Vector) -> Vector:
         return np.bincount(rows, weights=entries, minlength=self.measurements).astype(np.float64)
-
-
-def write(path: Path, model: Model) -> None:
-    """Write a model, whole or not at all. Raises InputError or DeniedError."""
-    arrays: dict[str, NDArray[Any]] = {
-        "shape": np.array([model.measurements, model.unknowns], dtype=np.int64),
-        "variance": model.variance,
-        "batches": model.batches,
-    }
-    if model.stored is not None:
-        arrays |= {name: getattr(model.stored, name) for name in ENTRIES}
-    layout = b"boxes" if model.stored is None else b"csr"
-    description = json.dumps({"scene": model.scene.plain(), "record": model.record})
-    record = json.dumps({"description": description, "sha256": _seal(arrays, description)})
-
-    def fill(beside: Path) -> None:
-        with beside.open("wb") as stream:
-            savez: Any = np.savez_compressed
-            savez(stream, format=np.array(layout), _is_array=np.array(True), ommatid=record, **arrays)
-        try:
-            _arrays(beside)
-        except InputError as error:
-            raise OSError(errno.ENOSPC, f"not all of it could be stored: {error}") from error
-
-    write_whole(path, fill)
-
-
-def read(path: Path) -> Model:
-    """Read a model. Raises InputError if it is missing, damaged, pickled or no model."""
-    arrays, description = _arrays(path)
-    try:
-        content = json.loads(description)
-        scene = parse(content["scene"], path)
-        record = checked(content["record"])
-        method = record["method"]
-        camera = derive(scene)
-        matrix, shape = None, tuple(arrays["shape"].tolist())
-        if "data" in arrays:
-            matrix = _checked(arrays, shape)
-        elif not (method == "ideal" and camera.boxed):
-            raise ValueError("it has no entries")
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            f"{path}: holds no usable observation matrix ({short(str(error))}); calibrate again"
-        ) from error
-    expected = (camera.measurements, camera.unknowns)
-    entries = np.shape(arrays.get("data", ()))
-    if shape != expected or not arrays["variance"].shape == entries == arrays["batches"].shape[1:]:
-        raise InputError(f"{path}: its matrix is {shape}, its scene wants {expected}; calibrate again")
-    return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
-
-
-def _checked(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
-    """H from its parts. Raises ValueError where they are no matrix in rows, or hold what is no number."""
-    for name, kinds in (("data", "f"), ("variance", "f"), ("batches", "f"), ("indices", "i"), ("indptr", "i")):
-        if arrays[name].dtype.kind not in kinds or not (np.abs(arrays[name]) <= LARGEST**2).all():
-            raise ValueError(f"{name} of {arrays[name].dtype} holds what is no number of its kind")
-    if (arrays["variance"] < 0).any():
-        raise ValueError("a variance is below 0")
-    if len(shape) != 2:
-        raise ValueError(f"its shape is {shape}")
-    matrix = sparse.csr_array((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
-    matrix.check_format(full_check=True)
-    return matrix
-
-
-def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    try:
-        found = npz.read(path)
-        names = ["shape", "variance", "batches", *(ENTRIES if found["format"][()] != b"boxes" else ())]
-        arrays = {name: found[name] for name in names}
-        record = json.loads(str(found["ommatid"][()]))
-        description, seal = record["description"], record["sha256"]
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
-        raise InputError(
-            f"{path}: expected a model that ommatid wrote, got one that cannot be read: {short(str(error))}"
-        ) from error
-    if _seal(arrays, description) != seal:
-        raise InputError(f"{path}: does not match its checksum; the file is damaged, calibrate again")
-    return arrays, description
-
-
-def _seal(arrays: dict[str, NDArray[Any]], description: str) -> str:
-    pixels = digest(*(arrays[name] for name in sorted(arrays)))
-    return hashlib.sha256(f"{pixels}{description}".encode()).hexdigest()

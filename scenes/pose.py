@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 from .lens_type import SubImager
-from .lenses import Tolerance
+from .tables.camera import ToleranceTable
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Pose:
     axes: NDArray[np.float64]
 
 
-def pose(sub: SubImager, wrong: Misalignment = NONE) -> Pose:
+def pose_of(sub: SubImager, wrong: Misalignment = NONE) -> Pose:
     """The pose of a sub-imager that is misaligned so; as designed unless said."""
     lens = sub.lens[0] + wrong.position[0], sub.lens[1] + wrong.position[1]
     depth = sub.depth * (1 + wrong.focal_length)
@@ -69,7 +69,7 @@ def misalignments(camera: Camera) -> tuple[Misalignment, ...]:
     return tuple(_drawn(camera.tolerance, sub) for sub in camera.sub_imagers)
 
 
-def _drawn(tolerance: Tolerance, sub: SubImager) -> Misalignment:
+def _drawn(tolerance: ToleranceTable, sub: SubImager) -> Misalignment:
     key = zlib.crc32(f"tolerance {sub.type.name}".encode()), sub.k, sub.l
     rng = np.random.default_rng(np.random.SeedSequence(tolerance.seed, spawn_key=key))
     x, y, about_x, about_y, turn, longer = (float(number) for number in rng.standard_normal(6))
@@ -85,4 +85,4 @@ def _drawn(tolerance: Tolerance, sub: SubImager) -> Misalignment:
 def poses(camera: Camera) -> tuple[Pose, ...]:
     """Of every sub-imager as the camera was put together, in the order of measurements."""
     pairs = zip(camera.sub_imagers, misalignments(camera), strict=True)
-    return tuple(pose(sub, wrong) for sub, wrong in pairs)
+    return tuple(pose_of(sub, wrong) for sub, wrong in pairs)

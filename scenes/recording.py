@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Camera
-from .sensor import Sensor
+from .tables.sensor import SensorTable
 
 Vector = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class Recording:
     flat_value : (M,) units of f, the uniform target of the flat frames, of each lens type its own
     """
 
-    sensor: Sensor
+    sensor: SensorTable
     digital: Vector
     dark: Vector
     flat: Vector
@@ -121,24 +121,24 @@ class Recording:
         return (reading + ROUNDING) / self.sensor.frames + stays
 
 
-def dark_level(sensor: Sensor) -> float:
+def dark_level(sensor: SensorTable) -> float:
     """Electrons of the dark current in an exposure."""
     return sensor.dark_current * sensor.exposure
 
 
-def charge_of_full(sensor: Sensor) -> float:
+def charge_of_full(sensor: SensorTable) -> float:
     """Electrons of light at which a pixel is full."""
     return max((sensor.full - sensor.black_level) / sensor.gain - dark_level(sensor), 0.0)
 
 
-def reaching_below_zero(sensor: Sensor) -> bool:
+def reaching_below_zero(sensor: SensorTable) -> bool:
     """Whether the noise of the dark is cut off at 0 DN, which pulls dim readings up and dim values down."""
     spread = (dark_level(sensor) + sensor.read_noise**2 + sensor.dsnu**2) ** 0.5
     random = sensor.read_noise > 0 or sensor.dsnu > 0  # what can be negative
     return random and sensor.black_level + sensor.gain * (dark_level(sensor) - CUT * spread) < -0.5
 
 
-def flat_values(sensor: Sensor, camera: Camera, response: Vector) -> Vector:
+def flat_values(sensor: SensorTable, camera: Camera, response: Vector) -> Vector:
     """The uniform target, in units of f, that half fills the brightest pixel of each lens type: (M,).
 
     response : (M,) electrons for each unit of f
@@ -150,7 +150,7 @@ def flat_values(sensor: Sensor, camera: Camera, response: Vector) -> Vector:
     return found
 
 
-def foreseen(sensor: Sensor, camera: Camera, response: Vector, values: Vector) -> Recording:
+def expected_recording(sensor: SensorTable, camera: Camera, response: Vector, values: Vector) -> Recording:
     """What is recorded of light of `values`, (M,), on average, by pixels all alike."""
     level = flat_values(sensor, camera, response)
     dark = np.full(camera.measurements, sensor.gain * dark_level(sensor) + sensor.black_level)

@@ -13,23 +13,24 @@ from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
-from . import toml
-from .errors import InputError
-from .estimation import Estimator, Prior, Study, Tiles
-from .explain import explain
-from .files import write_text
-from .lenses import Camera
-from .override import apply_overrides, keep_lenses
-from .quantities import Corner, FileName, Length, Pair, Samples, Time
-from .sensor import Noise, Sensor
-from .table import Table
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import write_text
+
+from .tables import toml
+from .tables.camera import CameraTable
+from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
+from .tables.messages import explain
+from .tables.overrides import apply_overrides, keep_lenses
+from .tables.sensor import NoiseTable, SensorTable
+from .tables.table import Table
+from .tables.units import Corner, FileName, Length, Pair, Samples, Time
 
 TRUTH = "truth.exr"
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
 IN_PLACE_OF_AUTO = 1024  # samples, for what is no rendering of sub-images
 
 
-class Target(Table):
+class TargetTable(Table):
     """The flat picture that the camera looks at, and the grid on which the image is to be recovered."""
 
     image: FileName | None = Field(
@@ -44,7 +45,7 @@ class Target(Table):
     distance: Length = Field(description="from the plane of the lenses to the target")
 
 
-class World(Table):
+class WorldTable(Table):
     """A Mitsuba scene behind the target or, where that has no picture, instead of it."""
 
     file: FileName = Field(
@@ -53,7 +54,7 @@ class World(Table):
     white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that counts as a value of 255")
 
 
-class Render(Table):
+class RenderTable(Table):
     """How the sub-images are rendered."""
 
     samples: Samples = Field(
@@ -76,13 +77,13 @@ class Render(Table):
         return IN_PLACE_OF_AUTO if self.samples == "auto" else self.samples
 
     @model_validator(mode="after")
-    def _time_to_spend(self) -> Render:
+    def _time_to_spend(self) -> RenderTable:
         if self.time is not None and self.samples != "auto":
             raise ValueError(f'time ends samples = "auto", got samples = {self.samples}; remove one of the two keys')
         return self
 
 
-class Calibration(Table):
+class CalibrationTable(Table):
     """How the observation matrix H is found."""
 
     method: Literal["points", "transport", "ideal"] = "points"
@@ -102,7 +103,7 @@ class Calibration(Table):
         return self.samples
 
     @model_validator(mode="after")
-    def _something_to_fit(self) -> Calibration:
+    def _something_to_fit(self) -> CalibrationTable:
         if self.fit is not None and self.method == "ideal":
             raise ValueError("fit belongs to a calibrated H, got method 'ideal'; take 'points' or 'transport'")
         return self
@@ -112,17 +113,17 @@ class Scene(Table):
     """A camera, its target and what is to be computed."""
 
     title: str = ""
-    target: Target
-    camera: Camera
-    world: World | None = None
-    noise: Noise | None = None
-    sensor: Sensor | None = None
-    prior: Prior = Prior()
-    estimator: Estimator = Estimator()
-    tiles: Tiles = Tiles()
-    render: Render = Render()
-    calibration: Calibration = Calibration()
-    study: Study | None = None
+    target: TargetTable
+    camera: CameraTable
+    world: WorldTable | None = None
+    noise: NoiseTable | None = None
+    sensor: SensorTable | None = None
+    prior: PriorTable = PriorTable()
+    estimator: EstimatorTable = EstimatorTable()
+    tiles: TilesTable = TilesTable()
+    render: RenderTable = RenderTable()
+    calibration: CalibrationTable = CalibrationTable()
+    study: StudyTable | None = None
 
     _source: Path = PrivateAttr(default=Path("scene"))
 
@@ -165,7 +166,7 @@ def resolved(scene: Scene, shape: tuple[int, int]) -> Scene:
     return _moved(scene.model_copy(update={"target": target}), scene.source)
 
 
-def replaced(scene: Scene, **tables: Any) -> Scene:
+def with_tables(scene: Scene, **tables: Any) -> Scene:
     """The scene with some of its tables exchanged; its errors name the same file."""
     return _moved(scene.model_copy(update=tables), scene.source)
 
@@ -212,7 +213,7 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     scene = parse(data, source)
     update: dict[str, Any] = {}
     if any(lens.surfaces is not None for lens in scene.camera.lens):
-        from .lens_file import with_surfaces
+        from .tables.lens_file import with_surfaces
 
         update["camera"] = with_surfaces(scene.camera, source)
     image, world = scene.target.image, scene.world

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exr
+from ommatid.runtime.errors import InputError
+
 from .camera import Camera, derive
-from .errors import InputError
-from .record import checked
+from .formats import exr
+from .formats.provenance import checked
 from .recording import Recording
 from .scene import Scene, parse
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from scenes.boxes import Boxes, overlap
-from scenes.camera import Camera
-from scenes.errors import InputError
-from scenes.lens_type import LensType, SubImager
-from scenes.model import Model
-from scenes.pose import pose, poses
-from scenes.scene import Scene
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType, SubImager
+from ommatid.scenes.model import Model
+from ommatid.scenes.optics.boxes import BoxFootprints, overlap
+from ommatid.scenes.pose import pose_of, poses
+from ommatid.scenes.scene import Scene
 
 MOST_STORED = 2**24  # entries of H; more follow from the scene each time
 
@@ -40,18 +40,18 @@ def ideal_matrix(camera: Camera) -> sparse.csr_array:
 
 def _type_matrix(camera: Camera, kind: LensType) -> sparse.csr_array:
     subs = [sub for sub in camera.sub_imagers if sub.type == kind]
-    blurred = camera.blurs(kind)
-    if kind.glass.distortion is not None:
-        from scenes import footprints
+    blurred = camera.is_blurred(kind)
+    if kind.optics.distortion is not None:
+        from ommatid.scenes.optics import footprints
 
         if blurred:
             raise InputError(
                 f"camera.lens.{kind.name}: distortion with defocus or diffraction has no closed form; run with"
                 " calibration.method 'transport', or remove one of them"
             )
-        parts = [footprints.sub_matrix(camera, sub, pose(sub)) for sub in subs]
+        parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
     elif blurred:
-        from scenes import blur
+        from ommatid.scenes.optics import blur
 
         return blur.matrix(camera, kind, blur.blur_of(camera, kind))
     else:
@@ -62,7 +62,7 @@ def _type_matrix(camera: Camera, kind: LensType) -> sparse.csr_array:
 def matrix_as_designed(camera: Camera, sub: SubImager) -> sparse.csr_array:
     """H of one sub-imager, whatever its lens is: (its pixels, N). Raises as `ideal_matrix` does."""
     kind = sub.type
-    if kind.glass.distortion is None and not camera.blurs(kind):
+    if kind.optics.distortion is None and not camera.is_blurred(kind):
         return sub_matrix(camera, sub)
     size = kind.pixels[0] * kind.pixels[1]
     first = (sub.k * kind.array[1] + sub.l) * size
@@ -76,16 +76,16 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
     """
     if camera.tolerance is None:
         return ideal_matrix(camera)
-    if not camera.stays_sharp:
+    if not camera.has_sharp_footprints:
         raise InputError("misaligned lenses with surfaces, defocus or diffraction have no closed form; calibrate them")
-    from scenes import footprints
+    from ommatid.scenes.optics import footprints
 
     return footprints.matrix(camera, poses(camera))
 
 
 def ideal_model(scene: Scene, camera: Camera) -> Model:
     """The ideal H as a model without uncertainty; of a perfect camera stored only while it is small."""
-    small = not camera.boxed or Boxes(camera).entries <= MOST_STORED
+    small = not camera.has_box_footprints or BoxFootprints(camera).entries <= MOST_STORED
     return exact_model(scene, camera, ideal_matrix(camera) if small else None, "ideal")
 
 

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Camera
-from scenes.files import digest, fingerprint
-from scenes.moderate import moderate
-from scenes.needs import needed, without_shot_noise
-from scenes.partial import Partial
-from scenes.progress import Progress, no_progress
-from scenes.recording import Recording
-from scenes.scene import Scene, resolved
-from scenes.sensor import Sensor
-from scenes.stack import STRAIGHT, Stack, recorded
-from scenes.versions import versions
+from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.versions import versions
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.optics.negligible import without_negligible_effects, without_shot_noise
+from ommatid.scenes.recording import Recording
+from ommatid.scenes.scene import Scene, resolved
+from ommatid.scenes.shrinkage import shrink_variances
+from ommatid.scenes.stack import STRAIGHT, Stack, recorded
+from ommatid.scenes.tables.sensor import SensorTable
 
-from .passes import OverPasses, Plan, Tally, plan, rounding_variance
-from .streams import sampler_seeds
-from .variant import choose
+from .renderer.variant import choose
+from .sampling.checkpoint import Checkpoint
+from .sampling.passes import OverPasses, Plan, Tally, plan, rounding_variance
+from .sampling.seeds import sampler_seeds
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Rendering(OverPasses):
 
     def stated(self, camera: Camera) -> NDArray[np.float64]:
         """The variance, (M,), drawn towards its sub-image's and never below float32's rounding."""
-        settled = np.concatenate([moderate(self.variance[place], self.passes) for place in camera.slices()])
+        settled = np.concatenate([shrink_variances(self.variance[place], self.passes) for place in camera.slices()])
         return np.maximum(settled, rounding_variance(self.mean, self.samples))
 
 
@@ -47,14 +47,14 @@ def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
     """Fingerprint of everything that the values of a stack depend on."""
     world: dict[str, Any] = {}
     if scene.world is not None:
-        from .world import describe
+        from .renderer.world import describe
 
         world = {"world": describe(scene)}
     return fingerprint(
         {
             **world,
             "camera": camera.describe(),
-            "simulated": needed(scene, camera)[0].describe(),
+            "simulated": without_negligible_effects(scene, camera)[0].describe(),
             "target": digest(image.astype(np.float32)),
             "noise": scene.noise.model_dump() if scene.noise else None,
             "sensor": scene.sensor.model_dump() if scene.sensor else None,
@@ -69,7 +69,7 @@ def light(
     camera: Camera,
     image: NDArray[np.float64],
     progress: Progress = no_progress,
-    partial: Partial | None = None,
+    partial: Checkpoint | None = None,
     work: Plan | None = None,
 ) -> Rendering:
     """Render the light alone, before the sensor. Raises InputError if the variant asked for does not work here.
@@ -77,15 +77,15 @@ def light(
     partial : where passes that are done are kept and found again
     work : passes and their samples; absent: as the scene's samples ask
     """
-    from .rig import Rig
+    from .renderer.renderer import Renderer
 
     if scene.render.samples == "auto":
         raise ValueError("expected a number of samples, got 'auto', which `light_until` renders")
     variant = choose(scene.render.variant)
     work = plan(scene.render.samples, scene.render.sampler) if work is None else work
     around = None if scene.world is None else scene
-    rig = Rig(needed(scene, camera)[0], variant, scene.render.sampler, around=around)
-    rig.show(image)
+    rig = Renderer(without_negligible_effects(scene, camera)[0], variant, scene.render.sampler, around=around)
+    rig.set_target(image)
     tally = Tally(camera.measurements)
     if partial is not None:
         tally.resume("light", partial.state())
@@ -114,7 +114,7 @@ def render(
     camera: Camera,
     image: NDArray[np.float64],
     progress: Progress = no_progress,
-    partial: Partial | None = None,
+    partial: Checkpoint | None = None,
     truth: NDArray[np.float64] | None = None,
 ) -> Stack:
     """Render and record the sub-images of `image`, (rows, columns), on the target.
@@ -125,9 +125,9 @@ def render(
     """
     start = perf_counter()
     if scene.render.samples == "auto":
-        from .auto import light_until
+        from .adaptive_render import render_until
 
-        rendering = light_until(scene, camera, image, progress, partial)
+        rendering = render_until(scene, camera, image, progress, partial)
     else:
         rendering = light(scene, camera, image, progress, partial)
     record: dict[str, Any] = {
@@ -147,19 +147,19 @@ def exposed(
     scene: Scene, camera: Camera, light: NDArray[np.float64], variance: NDArray[np.float64], record: dict[str, Any]
 ) -> Stack:
     """What the scene's sensor records of light, (M,), whose variances are known; noise by the scene's seed."""
-    kept, values = resolved(scene, (camera.rows, camera.columns)), light
+    kept, values = resolved(scene, camera.shape), light
     if scene.sensor is not None:
         return recorded(kept, camera, _exposed(scene, scene.sensor, camera, light), variance, record)
     if scene.noise is not None:
-        from .expose import expose, generators
+        from .sensor.gaussian import expose, generators
 
         values = expose(values, scene.noise, generators(camera, scene.render.seed), camera.slices())
     return Stack(kept, camera, values, variance, record)
 
 
-def _exposed(scene: Scene, sensor: Sensor, camera: Camera, light: NDArray[np.float64]) -> Recording:
-    from .emva import record
-    from .response import response
+def _exposed(scene: Scene, sensor: SensorTable, camera: Camera, light: NDArray[np.float64]) -> Recording:
+    from .sensor.emva1288 import record
+    from .sensor.response import response
 
     dark = np.isnan(light)  # no light can reach these pixels; so they are dead, and known by their flat
     freed = np.where(dark, 0.0, response(scene, camera))

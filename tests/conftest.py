@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-import ommatid as program
+from ommatid.cli import app as program
 
 settings.register_profile("any machine", deadline=None)  # no test depends on how fast a machine is
 settings.load_profile("any machine")
@@ -64,7 +64,7 @@ Command = Callable[..., Ended]
 
 def shell(*arguments: str | Path, cwd: Path, before: str = "") -> Ended:
     """Run a command in a process of its own; `before` is Python that runs there first."""
-    start = ["-c", f"{before}\nimport ommatid\nommatid.main()"] if before else ["-m", "ommatid"]
+    start = ["-c", f"{before}\nfrom ommatid.cli.app import main\nmain()"] if before else ["-m", "ommatid"]
     command = [sys.executable, *start, *map(str, arguments)]
     # Unbuffered, output cannot come late, and so not where it does not belong: users have it buffered.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}

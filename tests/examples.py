@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from scenes.camera import Camera, derive
-from scenes.scene import Scene, parse
-from simulate.variant import blocked
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.scene import Scene, parse
+from ommatid.simulate.renderer.variant import unusable_reason
 
 GALLERY = Path(__file__).parent.parent / "scenes"
 Lenses = tuple[tuple[Any, Any, Any], ...]
@@ -58,7 +58,7 @@ def camera(shape: tuple[int, int] = (19, 19), lenses: Lenses = THREE) -> Camera:
 
 def needs(variant: str) -> None:
     """Skip where a variant does not work on this machine."""
-    reason = blocked(variant)
+    reason = unusable_reason(variant)
     if reason:
         pytest.skip(reason)
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from scenes.camera import Camera, derive
-from scenes.model import Model
-from scenes.scene import Scene
-from scenes.stack import Stack
-from simulate.ideal import ideal_matrix, ideal_model
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 from .examples import Lenses, scene
 

@@ -20,12 +20,13 @@ import pytest
 import typer.main
 from pydantic import BaseModel
 
-from ommatid import app
-from scenes import exr, scene
-from scenes.camera import derive
-from scenes.explain import known_keys
-from scenes.scene import Scene
-from simulate.variant import blocked
+from ommatid.cli.app import app
+from ommatid.scenes import scene
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats import exr
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.tables.messages import known_keys
+from ommatid.simulate.renderer.variant import unusable_reason
 
 from .conftest import Command, shell
 from .documentation import (
@@ -45,12 +46,16 @@ from .documentation import (
     text_of,
 )
 from .examples import GALLERY
+from .modules import modules
 
 DOCS = ROOT / "docs"
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 COMMANDS: dict[str, Any] = dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
 # Commands that other tests run: seconds that need not be spent twice.
-ELSEWHERE = {"stability": ("test_stability.py", "write_stability"), "doctor": ("test_ommatid.py", '"doctor"')}
+ELSEWHERE = {
+    "stability": ("stability/test_stability.py", "write_stability"),
+    "doctor": ("cli/test_commands.py", '"doctor"'),
+}
 
 # What is spared where pages are run: samples, pixels, a prior's correlations, diffraction.
 QUICK = ["--set", "render.samples=16", "--set", "calibration.samples=16"]
@@ -136,7 +141,7 @@ def follow(line: str, comment: str, folder: Path, ommatid: Command) -> None:
         test, there = ELSEWHERE[words[0]]
         assert there in (ROOT / "tests" / test).read_text(encoding="utf-8")
         return
-    if needs_the_fast_backend(words) and blocked("llvm_ad_mono"):
+    if needs_the_fast_backend(words) and unusable_reason("llvm_ad_mono"):
         return
     claimed = re.match(r"([0-9][0-9.e-]*)[,:]", comment) if words[0] == "predict" else None
     asked = [*spared(words), *(["--json"] if claimed else [])]
@@ -362,12 +367,7 @@ def test_the_page_of_commands_has_no_option_too_many() -> None:
 def test_messages_are_those_of_the_program() -> None:
     """Every table of messages quotes them, with dots for what changes."""
     said: list[str] = []
-    for path in [
-        ROOT / "ommatid.py",
-        *(ROOT / "scenes").glob("*.py"),
-        *ROOT.glob("[cr]*/*.py"),
-        *ROOT.glob("sim*/*.py"),
-    ]:
+    for path in modules().values():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.JoinedStr):
                 parts = [part.value if isinstance(part, ast.Constant) else "..." for part in node.values]

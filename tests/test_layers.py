@@ -1,5 +1,4 @@
-"""Who may import whom: scenes neither half, reconstruct neither simulate nor Mitsuba, nobody Mitsuba but simulate,
-and both halves only the chain that joins them."""
+"""Who may import what: the four floors of the house, no circles, and nothing heavy in front."""
 
 from __future__ import annotations
 
@@ -7,64 +6,108 @@ import ast
 import importlib
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from .modules import LINKED, ROOT, circles, existing, imports, modules
+
 RENDERER = {"mitsuba", "drjit"}
-FORBIDDEN = {
-    "scenes": {"simulate", "reconstruct", "chain", "ommatid", "tests"} | RENDERER,
-    "simulate": {"reconstruct", "chain", "ommatid", "tests"},
-    "reconstruct": {"simulate", "chain", "ommatid", "tests"} | RENDERER,
-    "chain": {"ommatid", "tests"} | RENDERER,
+LONGEST = 300  # lines of a module
+LARGEST = 12  # modules of a folder, `__init__` not counted
+# The floors, the lowest first. A module imports its own package and those below; above these three, all rooms are one.
+BELOW = {
+    "runtime": set[str](),
+    "scenes": {"runtime"},
+    "simulate": {"runtime", "scenes"},
+    "reconstruct": {"runtime", "scenes"},
 }
-MODULES = [(package, path) for package in FORBIDDEN for path in sorted((ROOT / package).glob("**/*.py"))]
+TOO_LONG = {"ommatid.cli.app": 860}
 
 
-def imports(path: Path) -> set[str]:
-    """Top-level packages that a module imports anywhere in it, relative imports left out."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found.add(node.module.split(".")[0])
-    return found
+def room(module: str) -> str:
+    """The package of ours that a module stands in; empty for the front door and for what is not ours."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == "ommatid" and len(parts) > 1 else ""
 
 
-@pytest.mark.parametrize(("package", "path"), MODULES, ids=lambda value: getattr(value, "stem", value))
-def test_imports_point_one_way(package: str, path: Path) -> None:
-    assert not imports(path) & FORBIDDEN[package]
+def package(module: str) -> str:
+    """The distribution that a module belongs to, as it is imported."""
+    return module.partition(".")[0]
+
+
+@pytest.mark.parametrize("module", modules())
+def test_imports_point_one_way(module: str) -> None:
+    ours = {room(name) for name in imports(module) if package(name) == "ommatid"}
+    if room(module) in BELOW:
+        assert ours <= BELOW[room(module)] | {room(module)}
+    if room(module) not in ("cli", "__main__"):
+        assert "cli" not in ours
+    assert "tests" not in {package(name) for name in imports(module)}
+
+
+@pytest.mark.parametrize("module", modules())
+def test_only_the_renderer_imports_mitsuba(module: str) -> None:
+    if not module.startswith("ommatid.simulate.renderer."):
+        assert not {package(name) for name in imports(module)} & RENDERER
 
 
 def test_only_one_module_imports_openexr() -> None:
-    assert [path.name for _, path in MODULES if "OpenEXR" in imports(path)] == ["exr.py"]
+    assert [name for name in modules() if "OpenEXR" in imports(name)] == ["ommatid.scenes.formats.exr"]
 
 
-@pytest.mark.parametrize("package", sorted(FORBIDDEN))
-def test_the_packages_are_ours_and_export_nothing(package: str) -> None:
-    module = importlib.import_module(package)
-    assert module.__file__ == str(ROOT / package / "__init__.py"), "another package of this name is in the way"
-    body = ast.parse((ROOT / package / "__init__.py").read_text(encoding="utf-8")).body
+def test_no_modules_import_one_another_in_a_circle() -> None:
+    assert circles() == []
+
+
+@pytest.mark.parametrize("path", sorted({*modules().values(), *ROOT.glob("tests/**/*.py")}), ids=str)
+def test_nothing_is_imported_by_the_bare_name_of_a_folder(path: Path) -> None:
+    """`import scenes` works in a checkout, and would load every class twice."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            assert not {package(alias.name) for alias in node.names} & {*LINKED}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            assert package(node.module or "") not in LINKED
+
+
+@pytest.mark.parametrize("module", modules())
+def test_no_module_is_long(module: str) -> None:
+    assert len(modules()[module].read_text(encoding="utf-8").splitlines()) <= TOO_LONG.get(module, LONGEST)
+
+
+def test_no_folder_is_crowded() -> None:
+    inside = Counter(path.parent for path in modules().values() if path.stem != "__init__")
+    assert {folder: count for folder, count in inside.items() if count > LARGEST} == {}
+
+
+def test_a_module_that_does_not_exist_is_noticed() -> None:
+    with pytest.raises(ModuleNotFoundError):
+        existing("ommatid.scenes.camera", "ommatid.scenes.no_such_module")
+
+
+@pytest.mark.parametrize("name", [name for name, path in modules().items() if path.stem == "__init__"])
+def test_packages_export_nothing(name: str) -> None:
+    module = importlib.import_module(name)
+    assert Path(str(module.__file__)).resolve() == modules()[name], "another package of this name is in the way"
+    body = ast.parse(modules()[name].read_text(encoding="utf-8")).body
     assert len(body) == 1, "a docstring and nothing else"
 
 
 def test_reconstruct_works_where_mitsuba_does_not_exist() -> None:
-    paths = [path.relative_to(ROOT).with_suffix("") for package, path in MODULES if package == "reconstruct"]
-    names = [".".join(path.parts) for path in paths]
+    names = [name for name in modules() if room(name) == "reconstruct"]
     script = (
         "import sys, importlib\n"
-        "sys.modules['mitsuba'] = sys.modules['drjit'] = sys.modules['simulate'] = None\n"
+        "sys.modules['mitsuba'] = sys.modules['drjit'] = sys.modules['ommatid.simulate'] = None\n"
         f"for name in {names!r}: importlib.import_module(name)\n"
     )
     ended = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_the_front_door_imports_nothing_heavy() -> None:
+def test_the_command_line_imports_nothing_heavy() -> None:
     """`ommatid --help` in under 0.3 s: what it loads decides, and that can be tested on any machine."""
-    script = "import sys, ommatid; print(*sys.modules)"
+    script = "import sys, ommatid.__main__; print(*sys.modules)"
     ended = subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, capture_output=True, text=True)
     heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR"}
     assert not heavy & set(ended.stdout.split())

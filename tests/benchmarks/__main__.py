@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from scenes.versions import versions
-from simulate.variant import blocked
+from ommatid.runtime.versions import versions
+from ommatid.simulate.renderer.variant import unusable_reason
 
 from .alternation import VARIANTS, Row
 from .calibration import PASS, calibration_rows
@@ -58,7 +58,7 @@ def _rendering() -> Iterator[Table]:
     table = Table(title=f"Speed against stock Mitsuba, on {os.cpu_count()} cores with {found}", show_lines=True)
     for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
         table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
-    reasons = {variant: blocked(variant) for variant in VARIANTS}
+    reasons = {variant: unusable_reason(variant) for variant in VARIANTS}
     working = [variant for variant in VARIANTS if not reasons[variant]]
     for variant in working:
         for samples in SAMPLES:
@@ -123,7 +123,7 @@ def _compared(title: str, rows: Iterator[tuple[str, Row]]) -> Table:
     table = Table(title=title, show_lines=True)
     for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
         table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
-    reason = blocked(LENSES)
+    reason = unusable_reason(LENSES)
     if reason:
         table.caption = f"All was left out: {reason}."
         return table

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.boxes import Boxes
+from ommatid.scenes.optics.boxes import BoxFootprints
 
 from .alternation import alternate
 from .whole import whole_camera
@@ -51,7 +51,7 @@ class BandwidthRow:
 def bandwidth_rows() -> list[BandwidthRow]:
     """Copy, triad, H and its adjoint, in alternation; the limit is the faster of the first two."""
     camera = whole_camera(SIZE)
-    boxes, rng = Boxes(camera), np.random.default_rng(0)
+    boxes, rng = BoxFootprints(camera), np.random.default_rng(0)
     image, readings = rng.normal(size=camera.unknowns), rng.normal(size=camera.measurements)
     first, second, third = np.zeros(readings.size), np.ones(readings.size), np.ones(readings.size)
     ways = {

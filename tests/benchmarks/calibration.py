@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from scenes.camera import derive
-from scenes.progress import no_progress
-from scenes.scene import read
-from simulate.passes import Plan
-from simulate.points import Sweep, entries_of
-from simulate.rig import Rig
-from simulate.streams import sampler_seeds
+from ommatid.runtime.progress import no_progress
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import read
+from ommatid.simulate.calibration.point_sources import SourceSweep, entries_of
+from ommatid.simulate.renderer.renderer import Renderer
+from ommatid.simulate.sampling.passes import Plan
+from ommatid.simulate.sampling.seeds import sampler_seeds
 
 from .alternation import Row, alternate
 
@@ -33,7 +33,7 @@ OVERRIDES = ("target.shape=[119,119]", "target.origin=[98,196]")
 def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
     """One row for sources that the same rig renders, and one for the whole camera in one sensor where that can be."""
     camera = derive(read(scene_file, OVERRIDES))
-    rig = Rig(camera, variant, together=False)
+    rig = Renderer(camera, variant, together=False)
     sources = np.random.default_rng(1).choice(camera.unknowns, SOURCES, replace=False)
     matrix = by_grids(rig, 0)
     singly = by_sources(rig, sources, 0)
@@ -42,7 +42,7 @@ def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
     names = ["one source a rendering, a sensor a lens type"]
     checks = [f"H of {SOURCES} sources differs by {apart:.2g} at most, {np.count_nonzero(singly)} entries not 0"]
     if not variant.startswith("scalar"):
-        whole = Rig(camera, variant)
+        whole = Renderer(camera, variant)
         by_sources(whole, sources[:2], 0)
         ways.append(lambda seed: by_sources(whole, sources, seed))
         names.append("one source a rendering, one sensor in all")
@@ -62,25 +62,25 @@ def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
     ]
 
 
-def by_grids(rig: Rig, seed: int) -> sparse.csr_array:
+def by_grids(rig: Renderer, seed: int) -> sparse.csr_array:
     """H, (M, N), by one pass of grids, the uniform target for its check included."""
     rows: list[sparse.csr_array] = []
     for group in rig.groups:
-        swept = Sweep(rig, group)
+        swept = SourceSweep(rig, group)
         swept.one_more(PASS, seed, no_progress)
         tally = swept.tally
         rows.append(entries_of(rig.camera, swept.reach, tally.mean)[0])
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 
 
-def by_sources(rig: Rig, sources: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
+def by_sources(rig: Renderer, sources: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
     """Columns of H, (M, sources), by a rendering of the whole camera for each source."""
     camera = rig.camera
     columns = np.empty((camera.measurements, sources.size))
     for place, source in enumerate(sources):
-        image = np.zeros((camera.rows, camera.columns))
+        image = np.zeros(camera.shape)
         image.flat[source] = 1.0
-        rig.show(image)
+        rig.set_target(image)
         for group in rig.groups:
             own = sampler_seeds(seed, "calibration", 0, PASS.passes)
             columns[rig.places(group), place] = rig.expose(group, PASS.samples, own)[0]

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Camera, derive
-from scenes.picture import load
-from scenes.scene import read
-from simulate.rig import Rig
-from simulate.stock import film, scene_of, stock_sensor, target_of, texture_of
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.scene import read
+from ommatid.simulate.renderer.plugins import film, scene_of, stock_sensor, target_of, texture_of
+from ommatid.simulate.renderer.renderer import Renderer
 
 from .alternation import Row, alternate
 
@@ -61,8 +61,8 @@ def _difference(one: NDArray[np.float64], other: NDArray[np.float64]) -> str:
 
 
 def _ours(camera: Camera, picture: NDArray[np.float64], variant: str, samples: int) -> Reader:
-    rig = Rig(camera, variant, SAMPLER)
-    rig.show(*[picture] * rig.channels)
+    rig = Renderer(camera, variant, SAMPLER)
+    rig.set_target(*[picture] * rig.channels)
 
     def expose(seed: int) -> NDArray[np.float64]:
         # Each sensor a seed of its own, else their noise would be alike.

@@ -9,14 +9,14 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruct.certificate import Exact, refine
-from reconstruct.estimator import FORMS
-from reconstruct.forms.form import Form, NotSolvableError
-from reconstruct.prior import independent
-from reconstruct.problem import Problem
-from scenes.camera import derive
-from scenes.scene import read
-from simulate.ideal import ideal_matrix
+from ommatid.reconstruct.estimator.certificate import ExactResiduals, refine
+from ommatid.reconstruct.estimator.estimate import FORMS
+from ommatid.reconstruct.forms.form import Form, NotSolvableError
+from ommatid.reconstruct.prior import independent
+from ommatid.reconstruct.problem import Problem
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import read
+from ommatid.simulate.ideal import ideal_matrix
 
 Vector = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def _case(path: Path, lenses: tuple[str, ...], words: str) -> list[FormRow]:
     rng = np.random.default_rng(0)
     image = rng.uniform(0, 255, camera.unknowns)
     recorded = problem.matrix @ image + rng.normal(0, NOISE**0.5, camera.measurements)
-    exactly = Exact(problem)
+    exactly = ExactResiduals(problem)
     built: dict[str, Form] = {}
     failed: dict[str, str] = {}
     times: dict[str, list[float]] = {name: [] for name in FORMS}

@@ -7,7 +7,7 @@ from time import perf_counter
 import numpy as np
 from rich.table import Table
 
-from reconstruct.frame import ACCURACY
+from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY
 
 from .bandwidth import SIZE as WIDE
 from .bandwidth import bandwidth_rows

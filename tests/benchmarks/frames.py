@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from reconstruct.frame import ACCURACY
+from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY
 
 from .alternation import alternate
 from .fresh import call, memory_of

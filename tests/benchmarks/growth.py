@@ -8,7 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
-from reconstruct.frame import Solution
+from ommatid.reconstruct.frame.conjugate_gradients import Solution
 
 from .fresh import call, memory_of
 from .whole import MEAN, Whole, compile_all, predicted

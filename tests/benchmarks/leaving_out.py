@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Camera, derive
-from scenes.needs import LeftOut, needed, without_shot_noise
-from scenes.photons import electrons
-from scenes.scene import Scene, parse
-from simulate.emva import record
-from simulate.passes import plan
-from simulate.rig import Rig
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics.negligible import SkippedEffect, without_negligible_effects, without_shot_noise
+from ommatid.scenes.optics.radiometry import electrons
+from ommatid.scenes.scene import Scene, parse
+from ommatid.simulate.renderer.renderer import Renderer
+from ommatid.simulate.sampling.passes import plan
+from ommatid.simulate.sensor.emva1288 import record
 
 from .alternation import Row, alternate
 
@@ -52,10 +52,10 @@ def _scene(lens: dict[str, str], more: dict[str, str], **tables: Any) -> tuple[S
 
 
 def _light(kind: str) -> Row:
-    from scenes.picture import load
+    from ommatid.scenes.formats.picture import load
 
     scene, camera = _scene(*RULES[kind])
-    short, left = needed(scene, camera)
+    short, left = without_negligible_effects(scene, camera)
     picture, each = load(scene), plan(SAMPLES * 16).samples
     ways: list[Callable[[int], Any]] = [_exposure(one, picture, each) for one in (short, camera)]
     images = [way(0) for way in ways]
@@ -66,8 +66,8 @@ def _light(kind: str) -> Row:
 
 
 def _exposure(camera: Camera, picture: NDArray[np.float64], samples: int) -> Callable[[int], NDArray[np.float64]]:
-    rig = Rig(camera, VARIANT, SAMPLER)
-    rig.show(picture)
+    rig = Renderer(camera, VARIANT, SAMPLER)
+    rig.set_target(picture)
 
     def expose(seed: int) -> NDArray[np.float64]:
         found = [rig.expose(group, samples, lambda place: 100 * seed + place)[0] for group in rig.groups]
@@ -90,5 +90,5 @@ def _shot() -> Row:
     return Row("-", "without shot noise below the read noise", "complete", seconds[0], seconds[1], None, stated)
 
 
-def _bound(left: tuple[LeftOut, ...]) -> float:
+def _bound(left: tuple[SkippedEffect, ...]) -> float:
     return sum(one.bound or 0.0 for one in left)

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Camera, derive
-from scenes.scene import Scene, parse, read
-from simulate.points import from_points
-from simulate.rig import Rig
-from simulate.stock import film, scene_of, target_of, texture_of
-from simulate.transport import from_transport
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.scene import Scene, parse, read
+from ommatid.simulate.calibration.point_sources import responses_from_points
+from ommatid.simulate.calibration.ray_transport import responses_from_rays
+from ommatid.simulate.renderer.plugins import film, scene_of, target_of, texture_of
+from ommatid.simulate.renderer.renderer import Renderer
 
 from .alternation import Row, alternate
 
@@ -54,7 +54,7 @@ def scene_with(lens: dict[str, Any]) -> Scene:
 
 def lens_rows() -> list[Row]:
     """Ours through surfaces, and as a thin lens, against Mitsuba's."""
-    from scenes.picture import load
+    from ommatid.scenes.formats.picture import load
 
     described = scene_with({"surfaces": FIVE})
     picture, camera = load(described), derive(described)
@@ -88,7 +88,7 @@ def transport_rows(scene_file: Path) -> list[Row]:
         changes = [f"camera.lens.{name}.{key}" for name in ("I", "II", "III") for key in keys]
         scene = read(scene_file, ["calibration.samples=1024", "render.complete=true", *changes])
         camera = derive(scene)
-        ways = [partial(_by, way, scene, camera) for way in (from_transport, from_points)]
+        ways = [partial(_by, way, scene, camera) for way in (responses_from_rays, responses_from_points)]
         matrices = [way(0).matrix for way in ways]
         apart = abs(matrices[0] - matrices[1]).max() / matrices[1].max()
         seconds = alternate(ways, 3)
@@ -104,8 +104,8 @@ def _by(way: Callable[[Scene, Camera], Any], scene: Scene, camera: Camera, seed:
 
 
 def _ours(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
-    rig = Rig(camera, VARIANT, SAMPLER)
-    rig.show(picture)
+    rig = Renderer(camera, VARIANT, SAMPLER)
+    rig.set_target(picture)
     return lambda seed: rig.expose("I", SAMPLES, lambda _: seed)[0].reshape(SIDE, SIDE)
 
 

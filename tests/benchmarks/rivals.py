@@ -101,17 +101,17 @@ def factorised(matrix: sparse.csr_array) -> Callable[[Vector], Vector]:
 
 def by_tiles(whole: Whole, matrix: sparse.csr_array, steps: int = 0, watch: Watch = None) -> Vector:
     """Our own dense tiles of 35 less a border of 8, which share their factorisations; not as right as the others."""
-    from reconstruct.tiled import Tiled
-    from reconstruct.way import Hands, Task
-    from simulate.ideal import ideal_model
+    from ommatid.reconstruct.methods.method import EstimationTask, Execution
+    from ommatid.reconstruct.methods.tile_method import TileMethod
+    from ommatid.simulate.ideal import ideal_model
 
     del matrix, steps, watch
     scene = whole_scene(whole.camera.rows)
     every = (whole.camera.measurements,)
     believed, used = np.broadcast_to(NOISE, every), np.ones(every, dtype=np.bool_)
     model = ideal_model(scene, whole.camera)
-    task = Task(model, whole.readings, used, believed, scene.prior, scene.estimator, scene.tiles)
-    return Tiled(task, Hands()).image - MEAN
+    task = EstimationTask(model, whole.readings, used, believed, scene.prior, scene.estimator, scene.tiles)
+    return TileMethod(task, Execution()).image - MEAN
 
 
 RIVALS = (

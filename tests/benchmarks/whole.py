@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from reconstruct.frame import ACCURACY, Frame, Solution
-from scenes.boxes import Boxes
-from scenes.camera import Camera, derive
-from scenes.scene import Scene, parse
-from simulate.ideal import ideal_matrix
+from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY, FrameSystem, Solution
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics.boxes import BoxFootprints
+from ommatid.scenes.scene import Scene, parse
+from ommatid.simulate.ideal import ideal_matrix
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Whole:
         """A frame of size x size pixels."""
         camera, rng = whole_camera(size), np.random.default_rng(seed)
         image = rng.normal(MEAN, VARIANCE**0.5, camera.unknowns)
-        readings = Boxes(camera).forward(image)
+        readings = BoxFootprints(camera).forward(image)
         readings += rng.normal(0, NOISE**0.5, readings.size)
         return Whole(camera, image, readings)
 
@@ -51,10 +51,10 @@ class Whole:
         """g - H f0: (M,). What every type sees is inside the frame, so H f0 is f0 everywhere."""
         return self.readings - MEAN
 
-    def frame(self) -> Frame:
+    def frame(self) -> FrameSystem:
         """Its solver, with nothing prepared yet."""
         weights = np.broadcast_to(1 / NOISE, self.camera.measurements)
-        return Frame(self.camera, Boxes(self.camera), weights, 1 / VARIANCE)
+        return FrameSystem(self.camera, BoxFootprints(self.camera), weights, 1 / VARIANCE)
 
     def estimate(self, accuracy: float = ACCURACY) -> Solution:
         """f^ - f0, from nothing prepared."""

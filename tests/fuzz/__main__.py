@@ -8,8 +8,7 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tests.conftest import TINY, shell
-
+from ..conftest import TINY, shell
 from .campaign import ANOTHER, REFUSED, UNCHANGED, Result, again, campaign, damaged, prepare
 from .kinds import KINDS, SCENE
 

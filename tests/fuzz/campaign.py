@@ -25,9 +25,9 @@ from pathlib import Path
 from random import Random
 from time import perf_counter
 
-from scenes.errors import InputError
-from tests.examples import GALLERY
+from ommatid.runtime.errors import InputError
 
+from ..examples import GALLERY
 from .kinds import BASE, EVERYTHING, KINDS, SCENE, Kind
 
 REFUSED, UNCHANGED, ANOTHER = "refused", "read unchanged", "another valid one"
@@ -65,7 +65,7 @@ def damaged(kind: Kind, seed: int, number: int, originals: list[bytes]) -> tuple
 def prepare(folder: Path, finished: Path) -> None:
     """Lay out the files that inputs are read beside; `finished` is the folder of a run of the tiny scene."""
     (folder / SCENE).write_bytes((finished.parent.parent / SCENE).read_bytes())
-    for beside in ("lenses_of_glass", "worlds"):
+    for beside in ("lenses", "worlds"):
         shutil.copytree(GALLERY / beside, folder / beside)
     (folder / BASE).write_text(EVERYTHING, encoding="utf-8")
     for name in ("stack.exr", "model.npz"):
@@ -201,7 +201,7 @@ def _told(kind: Kind, path: Path, verdict: str) -> str:
 
 
 def _commanded(kind: Kind, path: Path) -> tuple[int, str, str]:
-    import ommatid
+    from ommatid.cli import app
 
     words = [path.name if word == "{file}" else word.replace("{file}", path.name) for word in kind.command]
     if words[-1] == "{sets}":
@@ -215,7 +215,7 @@ def _commanded(kind: Kind, path: Path) -> tuple[int, str, str]:
     try:
         with _captured() as told:
             try:
-                ommatid.main()
+                app.main()
                 code = 0
             except SystemExit as ended:
                 code = int(ended.code or 0)

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from scenes import exr, model
+from ommatid.scenes import model_file
+from ommatid.scenes.formats import exr
 
 from . import damage, nasty
 
@@ -148,7 +149,7 @@ def _archive(members: dict[str, bytes]) -> bytes:
 def model_sealed(rng: Random, original: bytes) -> bytes:
     """A model that somebody altered, and gave the checksum of what it became."""
     with np.load(io.BytesIO(original)) as file:
-        arrays: dict[str, Any] = {name: file[name] for name in ("shape", "variance", "batches", *model.ENTRIES)}
+        arrays: dict[str, Any] = {name: file[name] for name in ("shape", "variance", "batches", *model_file.ENTRIES)}
         told = json.loads(json.loads(str(file["ommatid"][()]))["description"])
     if rng.random() < 0.5:
         told = nasty.record(rng, told)
@@ -156,7 +157,7 @@ def model_sealed(rng: Random, original: bytes) -> bytes:
         name = rng.choice(sorted(arrays))
         arrays[name] = _array_altered(rng, arrays[name])
     description = json.dumps(told)
-    seal = model._seal(arrays, description)  # pyright: ignore[reportPrivateUsage]
+    seal = model_file._seal(arrays, description)  # pyright: ignore[reportPrivateUsage]
     stream = io.BytesIO()
     record = json.dumps({"description": description, "sha256": seal})
     np.savez_compressed(stream, format=np.array(b"csr"), ommatid=record, **arrays)

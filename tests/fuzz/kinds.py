@@ -13,11 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from scenes import camera, lens_file, model, picture, places, recorded_frames, scene, stack
-from scenes.files import digest
-from tests.conftest import TINY
-from tests.examples import GALLERY
+from ommatid.runtime.files import digest
+from ommatid.scenes import camera, model_file, scene, stack
+from ommatid.scenes.formats import picture
+from ommatid.scenes.hardware import frames, source_positions
+from ommatid.scenes.tables import lens_file
 
+from ..conftest import TINY
+from ..examples import GALLERY
 from . import damage, nasty
 from .formats import encoded, exr_damaged, model_sealed, npy_damaged, npz_damaged, stack_sealed
 
@@ -141,14 +144,14 @@ def with_options(path: Path) -> str:
 def lens_toml(folder: Path) -> list[bytes]:
     """The gallery's lens files."""
     del folder
-    return [path.read_bytes() for path in sorted((GALLERY / "lenses_of_glass").glob("*.toml"))]
+    return [path.read_bytes() for path in sorted((GALLERY / "lenses").glob("*.toml"))]
 
 
 def lens_rows(folder: Path) -> list[bytes]:
     """Lenses in PBRT's form."""
     del folder
     doublet = b"# a doublet\n50.0\n29.475 3.76 1.67 25.2\n84.83 0.12 1 25.2\n0 4.2 0 17.1  # stop\n-25.87 2 1.603 14\n"
-    return [doublet, *(path.read_bytes() for path in sorted((GALLERY / "lenses_of_glass").glob("*.dat")))]
+    return [doublet, *(path.read_bytes() for path in sorted((GALLERY / "lenses").glob("*.dat")))]
 
 
 def lens_in(path: Path) -> str:
@@ -172,7 +175,7 @@ def stack_in(path: Path) -> str:
 
 def model_in(path: Path) -> str:
     """What a model holds."""
-    found, stored = model.read(path), None
+    found, stored = model_file.read(path), None
     if found.stored is not None:
         stored = [found.stored.data, found.stored.indices.astype(np.int64), found.stored.indptr.astype(np.int64)]
     return sum_of(*(stored or ()), found.variance, found.batches, found.scene.plain(), found.record)
@@ -203,8 +206,8 @@ def picture_in(path: Path) -> str:
 def frames_in(path: Path) -> str:
     """The numbers of frames of the tiny camera, each a mosaic."""
     derived = camera.derive(scene.read(path.with_name(SCENE)))
-    bench = recorded_frames.Bench(origin=(0, 0))
-    return sum_of(recorded_frames.read_frames(derived, [path], bench, mosaics=True).numbers)
+    bench = frames.AcquisitionSettings(origin=(0, 0))
+    return sum_of(frames.read_frames(derived, [path], bench, mosaics=True).numbers)
 
 
 def mosaics(suffix: str) -> Callable[[Path], list[bytes]]:
@@ -212,7 +215,7 @@ def mosaics(suffix: str) -> Callable[[Path], list[bytes]]:
 
     def originals(folder: Path) -> list[bytes]:
         derived = camera.derive(scene.read(folder / SCENE))
-        corners = recorded_frames.patches(derived)
+        corners = frames.patches(derived)
         rows, columns = (corners.max(axis=0) - corners.min(axis=0) + 8).astype(int)
         rng = np.random.default_rng(3)
         several = rng.integers(0, 4096, (3, rows, columns), dtype=np.uint16)
@@ -235,7 +238,7 @@ def places_csv(folder: Path) -> list[bytes]:
 def places_in(path: Path) -> str:
     """Rows and columns of the points in three images."""
     derived = camera.derive(scene.read(path.with_name(SCENE)))
-    return sum_of(*places.read_places(path, derived, [Path(f"{number}.png") for number in range(3)]))
+    return sum_of(*source_positions.read_positions(path, derived, [Path(f"{number}.png") for number in range(3)]))
 
 
 # Worlds
@@ -249,7 +252,7 @@ def worlds(folder: Path) -> list[bytes]:
 
 def world_in(path: Path) -> str:
     """The files that a world names, and that Mitsuba builds it."""
-    from simulate import world
+    from ommatid.simulate.renderer import world
 
     described = scene.read(path.with_name(SCENE), [f"world.file={path.name}"])
     found = world.files(described)

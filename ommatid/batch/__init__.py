@@ -1,0 +1,1 @@
+"""Many scenes at once: batches, sweeps, and how they are shared among processes."""

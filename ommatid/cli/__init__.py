@@ -1,0 +1,1 @@
+"""The command line: options are parsed, functions are called, results are printed."""

@@ -1,0 +1,216 @@
+"""The paper's Figures 2, 3, 4, 5 and 7 as plots (Wood, Rajan and Christensen); their numbers are drawn as they come.
+
+Errors and noise are in squared units of f, 0 to 255. Maps are upright, with pixels of the target along both axes.
+Lines that coincide are told apart by their marks, which stand at different places.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ommatid.reconstruct.forms.form import Vector
+from ommatid.reconstruct.prediction import TRIM
+from ommatid.runtime.files import write_whole
+
+from .photographs import Photograph, TileCrops, Trials
+from .tile_errors import ACTUAL, EXPECTED, THREE, PaperTile, TileError, inner
+
+RESOLUTION = 130
+KINDS = ("tab:blue", "tab:orange", "tab:green")  # of lens types
+MARKS = ("o", "s", "^", "D")  # of expected noise variances
+SHADES = ("#1b9e77", "#d95f02", "#7570b3", "#a6761d")  # the same
+COLOURS = ("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#a6761d")  # of tiles of a photograph
+APART = 8  # actual noise variances from mark to mark
+ERROR = "expected squared error a pixel (squared units of f)"
+NOISE = "actual noise variance (squared units of f)"
+EXPECTS = "noise variance that\nthe estimator expects"
+PEAK = 255.0
+
+
+def draw_sweeps(path: Path, shown: list[PaperTile]) -> None:
+    """Fig. 2 and Fig. 4: mean error against actual noise, whole and trimmed, a line an estimator and combination."""
+    figure = _figure(12.0, 6.0)
+    side = shown[0].side
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, trim in zip(panels, (0, TRIM), strict=True):
+        for tile, colour in zip(shown, KINDS, strict=True):
+            for number, expected in enumerate(EXPECTED):
+                axes.loglog(ACTUAL, _means(tile.line(expected), side, trim), color=colour, **_marked(number))
+        within = f"trimmed by {trim} pixels" if trim else "full tile"
+        _axes(axes, f"{side} x {side}, {within}", NOISE, f"average {ERROR}")
+    _legend(panels[0], "lens types", [({"color": one}, tile.name) for one, tile in zip(KINDS, shown, strict=True)])
+    marks = [({"color": "black", "marker": one}, _power(value)) for one, value in zip(MARKS, EXPECTED, strict=True)]
+    _legend(panels[1], EXPECTS, marks)
+    figure.suptitle(f"Error of the {side} x {side} tile against noise, by lens types and by what the estimator expects")
+    _save(figure, path)
+
+
+def draw_maps(path: Path, shown: list[PaperTile], noise: float) -> None:
+    """Fig. 3: the error within the tile for each combination of lens types, with the maximum over each."""
+    figure = _figure(14.5, 4.6)
+    figure.get_layout_engine().set(wspace=0.08)
+    side = shown[0].side
+    for axes, tile in zip(figure.subplots(1, len(shown)), shown, strict=True):
+        error = tile.matched(noise)
+        drawn = axes.imshow(error.reshape(side, side), cmap="viridis", vmin=0.0, vmax=error.max())
+        where = "" if tile.camera.types_seeing().all() else " where no lens looks"
+        title = f"{tile.name}\nmaximum {error.max():.4g}{where}, average {error.mean():.4g}"
+        _axes(axes, title, "column (target pixels)", "row (target pixels)")
+        axes.grid(visible=False)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.get_major_locator().set_params(integer=True)
+        bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
+        bar.set_label("expected squared error (squared units of f)")
+    figure.suptitle(f"Error within the {side} x {side} tile; noise variance {_power(noise)}, as the estimator expects")
+    _save(figure, path)
+
+
+def draw_sides(path: Path, shown: list[PaperTile]) -> None:
+    """Fig. 5: three lens types on tiles of several sizes side by side, on the same axes."""
+    figure = _figure(15.0, 5.8)
+    panels = figure.subplots(1, len(shown), sharey=True)
+    for axes, tile in zip(panels, shown, strict=True):
+        for number, (expected, colour) in enumerate(zip(EXPECTED, SHADES, strict=True)):
+            errors = _means(tile.line(expected), tile.side, 0)
+            axes.loglog(ACTUAL, errors, color=colour, label=_power(expected), **_marked(number))
+        best = np.array([tile.mse(noise) for noise in map(float, ACTUAL)])
+        axes.loglog(ACTUAL, best, "--", color="black", lw=1.4, label="the actual one")
+        _error_of_one(axes, best)
+        lenses = ", ".join(f"1/{kind.ratio}" for kind in tile.camera.types)
+        _axes(axes, f"{tile.side} x {tile.side}, lenses {lenses}", NOISE, f"average {ERROR}")
+    panels[0].legend(title=EXPECTS, fontsize=9, title_fontsize=9, loc="upper left")
+    figure.suptitle(f"Error of tiles of three sizes with three lens types ({'+'.join(THREE)})")
+    _save(figure, path)
+
+
+def _error_of_one(axes: Any, best: Vector) -> None:
+    """Say at which noise the best estimator's error is 1, so that tiles can be compared."""
+    noise = float(np.exp(np.interp(0.0, np.log(best), np.log(ACTUAL))))
+    axes.axhline(1.0, color="0.5", lw=1.0, ls=":")
+    axes.plot([noise], [1.0], "*", color="black", ms=12)
+    axes.annotate(
+        f"error 1 at noise {noise:.2g}", (noise, 1.0), xytext=(14, -16), textcoords="offset points", fontsize=10
+    )
+
+
+def draw_distortion(path: Path, shown: list[PaperTile], noise: float) -> None:
+    """Error against noise of one lens type with and without distortion, beside three types; the error's maps."""
+    figure = _figure(14.5, 5.2)
+    axes, *panels = figure.subplots(1, 1 + len(shown), width_ratios=(1.9, *(1.0 for _ in shown)))
+    for tile, colour in zip(shown, KINDS, strict=True):
+        label = f"{tile.name}: {tile.camera.measurements} measurements"
+        axes.loglog(ACTUAL, [tile.mse(float(actual)) for actual in ACTUAL], color=colour, label=label)
+    axes.axvline(noise, color="0.5", lw=1.0, ls=":")
+    _axes(axes, "the estimator expects the noise that there is", NOISE, f"average {ERROR}")
+    axes.legend(fontsize=9, loc="lower right")
+    maps = [tile.matched(noise) for tile in shown]
+    scale = max(error.max() for error in maps if error.max() < 100 * maps[0].max())  # one, where they compare
+    for panel, tile, error in zip(panels, shown, maps, strict=True):
+        most = max(scale, error.max())
+        drawn = panel.imshow(error.reshape(tile.side, tile.side), cmap="viridis", vmin=0.0, vmax=most)
+        _axes(panel, f"{tile.name}\naverage {error.mean():.3g}", "column (target pixels)", "row (target pixels)")
+        panel.grid(visible=False)
+        bar = figure.colorbar(drawn, ax=panel, fraction=0.046, pad=0.03)
+        bar.set_label("expected squared error")
+    figure.suptitle(f"Distortion as lens diversity; maps: expected squared error at noise variance {_power(noise)}")
+    _save(figure, path)
+
+
+def draw_photograph(path: Path, found: Photograph, side: int) -> None:
+    """Fig. 7: measured errors of six tiles against noise and against bits, beside the prediction; the tiles above."""
+    figure = _figure(13.0, 10.2)
+    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 3.2))
+    name = f"Six tiles of {Path(found.name).name}, {side} x {side} pixels each, reconstructed from three lens types"
+    above.suptitle(name, parse_math=False)
+    _thumbnails(above, found.cut, side)
+    panels = below.subplots(2, 2, sharex="col", sharey="row", height_ratios=(2.4, 1.0))
+    experiments = (
+        (found.noisy, [noise.variance for noise in found.noisy.noises], "Gaussian noise, as the estimator expects"),
+        (
+            found.quantised,
+            [float(noise.bits or 0) for noise in found.quantised.noises],
+            r"Quantisation in steps of 256/$2^\mathrm{bits}$; the estimator expects noise of step$^2$/12",
+        ),
+    )
+    across = ("noise variance (squared units of f)", "bits a measurement")
+    for (errors, ratios), (trials, levels, title), label in zip(panels.T, experiments, across, strict=True):
+        _trials(errors, trials, levels, found.cut)
+        _axes(errors, title, label, "mean squared error a pixel (squared units of f)")
+        _ratios(ratios, trials, levels)
+        _axes(ratios, "", label, "measured over predicted")
+    panels[0, 0].set_xscale("log")
+    panels[0, 1].xaxis.get_major_locator().set_params(integer=True)
+    panels[0, 0].legend(fontsize=9, loc="upper left")
+    _save(figure, path)
+
+
+def _trials(axes: Any, trials: Trials, levels: list[float], cut: TileCrops) -> None:
+    for number, (colour, (row, column)) in enumerate(zip(COLOURS, cut.places, strict=True)):
+        label = f"tile at row {row}, column {column}"
+        axes.semilogy(levels, trials.measured[:, number], color=colour, lw=0.9, label=label)
+    axes.semilogy(levels, trials.mean, color="black", lw=1.6, marker="o", ms=4, label="mean of the six")
+    axes.semilogy(levels, trials.predicted, "--", color="red", lw=2.0, label="predicted (Eq. 5)")
+
+
+def _ratios(axes: Any, trials: Trials, levels: list[float]) -> None:
+    for number, colour in enumerate(COLOURS):
+        axes.plot(levels, trials.measured[:, number] / trials.predicted, color=colour, lw=0.9)
+    axes.plot(levels, trials.mean / trials.predicted, color="black", lw=1.6, marker="o", ms=4)
+    axes.axhline(1.0, color="red", ls="--", lw=2.0)
+    axes.set_ylim(bottom=0.0)
+
+
+def _thumbnails(figure: Any, cut: TileCrops, side: int) -> None:
+    panels = figure.subplots(1, len(cut.places))
+    for axes, image, colour, place in zip(panels, cut.images, COLOURS, cut.places, strict=True):
+        axes.imshow(image.reshape(side, side), cmap="gray", vmin=0.0, vmax=PEAK)
+        axes.set_title(f"row {place[0]}, column {place[1]}", fontsize=9)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        for spine in axes.spines.values():
+            spine.set(color=colour, linewidth=3)
+
+
+def _means(line: TileError, side: int, trim: int) -> Vector:
+    return np.array([inner(line.at(actual), side, trim) for actual in map(float, ACTUAL)])
+
+
+def _marked(number: int) -> dict[str, Any]:
+    start = number * APART // len(MARKS)
+    return {"lw": 1.3, "marker": MARKS[number], "ms": 6, "markevery": (start, APART)}
+
+
+def _power(value: float) -> str:
+    exponent = round(np.log10(value))
+    return f"$10^{{{exponent}}}$" if exponent else "1"
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure: Any = Figure(figsize=(width, height), dpi=RESOLUTION, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _axes(axes: Any, title: str, across: str, up: str) -> None:
+    """Name both axes."""
+    axes.set_title(title, fontsize=11)
+    axes.set_xlabel(across)
+    axes.set_ylabel(up)
+    axes.grid(True, which="major", color="0.85", lw=0.7)
+
+
+def _legend(axes: Any, title: str, entries: list[tuple[dict[str, Any], str]]) -> None:
+    from matplotlib.lines import Line2D
+
+    handles: list[Any] = [Line2D([], [], lw=1.8, **style) for style, _ in entries]
+    axes.legend(handles, [name for _, name in entries], title=title, loc="lower right", fontsize=9, title_fontsize=9)
+
+
+def _save(figure: Any, path: Path) -> None:
+    write_whole(path, lambda beside: figure.savefig(beside, format="png"))

@@ -1,0 +1,161 @@
+"""The stages of a scene, one after the other: they meet in the files of its folder, and what is up to date stays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ommatid.batch.batch import Member, prepare
+from ommatid.batch.remote import RunObserver
+from ommatid.runtime.errors import naming_source
+from ommatid.runtime.processors import one_thread, processors
+from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.versions import versions
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.formats.picture import Image, load
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.cache import cached_model, cached_stack
+from ommatid.simulate.calibrate import is_adaptive
+from ommatid.simulate.renderer.variant import check_transport_variant
+from ommatid.simulate.renderer.variant import choose as choose_variant
+from ommatid.simulate.validation import check_scene, check_scene_memory
+
+
+def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> tuple[Scene, Camera, Image]:
+    """A scene, its camera and its target, all checked before anything is written."""
+    scene = read(path, changes, lenses)
+    camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
+    if scene.world is not None:
+        from ommatid.simulate.renderer.world import files
+
+        files(scene)
+    return scene, camera, load(scene)
+
+
+def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member) -> tuple[Scene, Camera, Image]:
+    """A scene of a batch, with its own changes after those of all."""
+    return opened(member.scene, (*changes, *member.changes), lenses)
+
+
+def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
+    """In how many processes a batch is done soonest, of as many as memory holds."""
+    from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
+
+    efforts = [estimate_cost(member, changes, lenses) for member in members]
+    most = min(concurrent_by_memory([one.memory for one in efforts]), len(members), processors())
+    return fastest_process_count([one.seconds for one in efforts], most, processors())
+
+
+def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+    """What `run` does of a scene, here or on a worker, and says of it."""
+    description = results(scene, camera, image, folder, watch)
+    write_page(camera, folder, watch)
+    return description
+
+
+@one_thread()
+def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+    """All of a run but its page, and what run.json says of it."""
+    from ommatid.analysis import study
+    from ommatid.analysis.calibration_goal import for_stack
+    from ommatid.reconstruct.method_choice import choose_method
+    from ommatid.reconstruct.output.result_files import RUN, cached_results
+    from ommatid.reconstruct.output.run_json import write_run
+
+    exact = scene.calibration.method == "ideal" and camera.has_box_footprints
+    check_scene(scene, camera)
+    if scene.study is not None and "transport" in scene.study.models:
+        with naming_source(scene.source):
+            check_transport_variant(choose_variant(scene.render.variant), "study.models")
+    choose_method(scene, camera, exact)  # what memory does not hold is refused before any work
+    study.check_study(scene, camera)
+    stack = _rendered(scene, camera, image, folder, watch)
+    with watch.progress("calibrate") as progress:
+        model, made = cached_model(folder / "model.npz", scene, camera, progress, for_stack(stack))
+    watch.done("calibrate", made)
+    with watch.progress("reconstruct") as progress:
+        description, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
+    watch.done("reconstruct", made)
+    more: dict[str, Any] = {}
+    if scene.world is not None:
+        from ommatid.analysis.depth_error import of_run
+
+        more["depth"] = of_run(folder, camera)
+    if scene.study is not None:
+        more["study"] = _studied(scene, camera, stack, folder, watch)
+    if any(description.get(key) != value for key, value in more.items()):
+        write_run(folder / RUN, {**description, **more})
+    return {**description, **more}
+
+
+def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
+    """Show the run whose results stand in a folder on a page."""
+    from ommatid.page.cached import cached_page
+    from ommatid.simulate.ideal import matrix_as_designed
+
+    with watch.progress("report"):
+        made = cached_page(folder, partial(matrix_as_designed, camera))
+    watch.done("report", made)
+
+
+def render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+    """What `render` does of a scene, here or on a worker, and says of it."""
+    stack = _rendered(scene, camera, image, folder, watch)
+    return {"sub_images": len(camera.sub_imagers), **stack.record}
+
+
+def predict_scene(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+    """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
+    from ommatid.analysis.predict import predict_scene
+
+    del camera, image, folder, watch
+    with naming_source(scene.source):
+        return predict_scene(scene).describe()
+
+
+def calibrated(scene: Scene, camera: Camera, path: Path, progress: Progress) -> tuple[Model, bool]:
+    """H alone, kept at `path`, and whether it had to be made; its samples are judged by images of the prior."""
+    if scene.calibration.method != "ideal":
+        check_scene(scene, camera)
+    check_scene_memory(scene, camera)
+    judge = None
+    if is_adaptive(scene):
+        from ommatid.analysis.calibration_goal import for_prior
+
+        judge = for_prior(scene, camera)
+    return cached_model(path, scene, camera, progress, judge)
+
+
+def facts(chosen: bool) -> dict[str, str]:
+    """What has to be the same on all machines for results to be the same; `chosen`: the variant is left to them."""
+    found = versions("mitsuba", "drjit", "scipy")
+    if chosen:
+        found["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
+    return found
+
+
+def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> Stack:
+    check_scene(scene, camera, calibrates=False)
+    prepare(scene, image, folder)
+    with watch.progress("render") as progress:
+        stack, made = cached_stack(folder / "stack.exr", scene, camera, image, progress)
+    watch.done("render", made)
+    return stack
+
+
+def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: RunObserver) -> list[dict[str, Any]]:
+    """The same stack with every idea of H that the scene's study names."""
+    from ommatid.analysis.calibration_goal import for_stack
+    from ommatid.analysis.models import study_models
+    from ommatid.analysis.study import cached_study
+    from ommatid.reconstruct.output.result_files import truth_beside
+
+    with watch.progress("study") as progress:
+        known = study_models(scene, camera, folder, no_progress, for_stack(stack))
+        cases, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
+    watch.done("study", made)
+    return cases

@@ -1,0 +1,1 @@
+"""Numerical stability of the estimator on stiff and extreme cases."""

@@ -1,0 +1,1 @@
+"""Prior and noise of largest marginal likelihood."""

@@ -1,0 +1,1 @@
+"""Whole frames by preconditioned conjugate gradients."""

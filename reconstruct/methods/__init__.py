@@ -1,0 +1,1 @@
+"""Methods of reconstruction: dense, by tiles, and what all methods share."""

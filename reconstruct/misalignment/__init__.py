@@ -1,0 +1,1 @@
+"""Cameras whose sub-imagers stand beside their places."""

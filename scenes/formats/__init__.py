@@ -1,0 +1,1 @@
+"""File formats: OpenEXR, NumPy archives, TIFF and pictures."""

@@ -1,0 +1,164 @@
+"""OpenEXR files with float32 channels and one JSON attribute; the only module that imports OpenEXR.
+
+The library writes non-contiguous arrays wrongly, loses lists in headers, reports a full disk not at all
+when little is written, and reads a truncated file as a shorter one: all of that is dealt with here.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import sys
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import digest, fingerprint, write_whole
+from ommatid.runtime.memory import check_memory
+
+ATTRIBUTE = "ommatid"
+
+
+@dataclass(frozen=True)
+class Part:
+    """One image of a file: (rows, columns) arrays by channel name, and what is said about them."""
+
+    name: str
+    channels: dict[str, NDArray[np.float32]]
+    record: dict[str, Any]
+
+
+def write(path: Path, parts: Sequence[Part]) -> None:
+    """Write the parts, each with a SHA-256 of its pixels and one of its record, and check that they arrived.
+
+    Raises InputError for a folder that does not exist, DeniedError for a disk that is full.
+    """
+    import OpenEXR
+
+    height = max(next(iter(part.channels.values())).shape[0] for part in parts)
+    width = max(next(iter(part.channels.values())).shape[1] for part in parts)
+    window = (np.zeros(2, np.int32), np.array([width - 1, height - 1], np.int32))
+    files: list[Any] = []
+    for part in parts:
+        channels = {name: np.ascontiguousarray(pixels, dtype=np.float32) for name, pixels in part.channels.items()}
+        record = {**part.record, "parts": len(parts), "sha256": _seal(channels)}
+        record["seal"] = fingerprint(record)
+        header = {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "displayWindow": window,  # the format wants one for all parts
+            ATTRIBUTE: json.dumps(record),
+        }
+        files.append(OpenEXR.Part(header, channels, name=part.name))
+
+    def fill(beside: Path) -> None:
+        try:
+            with _quiet():
+                OpenEXR.File(files).write(str(beside))
+            arrived = len(read(beside)) == len(parts)
+        except (RuntimeError, InputError) as error:
+            raise OSError(errno.ENOSPC, f"not all of it could be stored: {error}") from error
+        if not arrived:
+            raise OSError(errno.ENOSPC, "not all of it could be stored")
+
+    write_whole(path, fill)
+
+
+def read(path: Path) -> list[Part]:
+    """Read a file that `write` made. Raises InputError if it is missing, cut short, altered or another kind of EXR."""
+    parts = [_checked(path, name, channels, attribute) for name, channels, attribute in _open(path)]
+    expected = parts[0].record.get("parts") if parts else "1 or more"
+    if len(parts) != expected:
+        raise InputError(f"{path}: expected {expected} parts, got {len(parts)}; the file is cut short, make it again")
+    return parts
+
+
+def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
+    """The channels of the first part of any OpenEXR picture. Raises InputError if it cannot be read."""
+    parts = _open(path)
+    if not parts or not parts[0][1]:
+        raise InputError(f"{path}: expected an OpenEXR picture, got a file without complete channels")
+    return parts[0][1]
+
+
+def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | None]]:
+    import OpenEXR
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with _quiet():
+            check_memory(_promised(path), f"{path}: to read it", "take a smaller one, or free some memory")
+            file = OpenEXR.File(str(path), separate_channels=True)
+        return [
+            (
+                str(part.header.get("name", "")),
+                {name: np.asarray(channel.pixels, dtype=np.float32) for name, channel in part.channels.items()},
+                part.header.get(ATTRIBUTE),
+            )
+            for part in file.parts
+        ]
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected an OpenEXR file, got one that cannot be read ({error})") from error
+
+
+def _promised(path: Path) -> int:
+    """Bytes of all channels as the headers tell, twice: the library's copy and ours."""
+    import OpenEXR
+
+    total = 0
+    for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts:
+        first, last = part.header["dataWindow"]
+        columns, rows = (int(high) - int(low) + 1 for low, high in zip(first, last, strict=True))
+        total += 2 * 4 * rows * columns * len(part.header["channels"])
+    return total
+
+
+def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], attribute: str | None) -> Part:
+    where = f"{path}: part '{name}'"
+    if not isinstance(attribute, str):
+        raise InputError(f"{where} has no attribute '{ATTRIBUTE}'; expected a file that ommatid wrote")
+    try:
+        record = json.loads(attribute)
+        seal = record.pop("seal")
+        intact = fingerprint(record) == seal
+        pixels = record.pop("sha256")
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+        raise InputError(f"{where} has a damaged attribute '{ATTRIBUTE}'; make the file again") from error
+    if not intact or not channels or _seal(channels) != pixels:
+        raise InputError(f"{where} does not match its checksum; the file is cut short or altered, make it again")
+    return Part(name, channels, record)
+
+
+def _seal(channels: dict[str, NDArray[np.float32]]) -> str:
+    return digest(*(channels[name] for name in sorted(channels)))
+
+
+@contextmanager
+def _quiet() -> Generator[None]:
+    """Keep the library's own warnings off stdout and stderr: what is wrong is said by an exception."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = os.dup(1), os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        with redirect_stdout(io.StringIO()):  # some warnings take the way through Python, whose buffer outlives this
+            yield
+    finally:
+        os.dup2(saved[0], 1)
+        os.dup2(saved[1], 2)
+        for descriptor in (*saved, nowhere):
+            os.close(descriptor)

@@ -1,0 +1,185 @@
+"""The target's picture as numbers in the paper's range, 0 to 255; row 0 is its top.
+
+Colour becomes luminance, 8 bits stay as they are, 16 bits are divided by 257, floats stay as they are.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.memory import check_memory
+
+from ..scene import Scene
+from . import npz, tiff
+from .exr import Part, read_channels, write
+
+Image = NDArray[np.float64]
+
+LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
+
+
+def load(scene: Scene) -> Image:
+    """The target, (rows, columns), cropped as the scene says, in the precision of float32.
+
+    Zeros where a world takes the target's place: what it looks like is not known before it is rendered.
+    Raises InputError if the picture is missing, unreadable, too small for the crop or holds NaN.
+    """
+    target = scene.target
+    where = f"{scene.source}: target.image"
+    if target.image is None:
+        if target.shape is None:
+            raise InputError(f"{where} is absent, and so is target.shape, which would do for a [world]; name a picture")
+        check_memory(prod(target.shape) * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one")
+        return np.zeros(target.shape)
+    picture = luminance(_pixels(target.image, where), where)
+    if target.origin is None:
+        if target.shape not in (None, picture.shape):
+            rows, columns = target.shape
+            raise InputError(
+                f"{scene.source}: target.shape asks for {rows} x {columns} pixels, but the picture has"
+                f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it"
+            )
+        crop = picture
+    else:
+        crop = _crop(picture, scene)
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = crop.astype(np.float32).astype(np.float64)  # the precision of the renderer and of truth.exr
+    if not np.isfinite(rounded).all():
+        raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
+    return rounded
+
+
+def shape(scene: Scene) -> tuple[int, int]:
+    """Rows and columns of the target, from the scene file alone where it says."""
+    if scene.target.shape is not None:
+        return scene.target.shape
+    rows, columns = load(scene).shape
+    return rows, columns
+
+
+def write_truth(path: Path, image: Image, depth: Image | None = None, record: dict[str, Any] | None = None) -> None:
+    """Write a target as OpenEXR, float32, channel Y; of a world also `depth` in mm, NaN where there is nothing."""
+    channels = {"Y": image.astype(np.float32)}
+    if depth is not None:
+        channels["depth"] = depth.astype(np.float32)
+    write(path, [Part("truth", channels, record or {})])
+
+
+def luminance(pixels: NDArray[Any], where: str) -> Image:
+    """Any (rows, columns[, channels]) picture as one channel of values from 0 to 255. Raises InputError."""
+    numbers = grey(pixels, where)
+    if pixels.dtype == np.bool_:
+        return numbers * 255.0
+    if pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
+        return numbers
+    if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
+        return numbers / 257.0
+    raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
+
+
+def grey(pixels: NDArray[Any], where: str) -> Image:
+    """Any (rows, columns[, channels]) picture as one channel of the numbers that it holds. Raises InputError."""
+    if pixels.ndim not in (2, 3) or pixels.size == 0 or (pixels.ndim == 3 and pixels.shape[2] not in (1, 2, 3, 4)):
+        raise InputError(f"{where}: expected a picture of rows x columns, grey or colour, got shape {pixels.shape}")
+    if pixels.dtype.kind not in "buif":
+        raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
+    values = pixels.astype(np.float64)
+    if values.ndim == 2:
+        return values
+    channels = values.shape[2]
+    if channels in (2, 4):
+        opaque = values[..., -1].max() == values[..., -1].min()
+        if not opaque:
+            raise InputError(f"{where}: the picture is partly transparent; save it without an alpha channel")
+    return values[..., :3] @ np.array(LUMINANCE) if channels >= 3 else values[..., 0]
+
+
+def _crop(picture: Image, scene: Scene) -> Image:
+    target = scene.target
+    row, column = target.origin or (0, 0)
+    rows, columns = target.shape or (picture.shape[0] - row, picture.shape[1] - column)
+    if rows <= 0 or columns <= 0 or row + rows > picture.shape[0] or column + columns > picture.shape[1]:
+        raise InputError(
+            f"{scene.source}: target.origin: the crop of {max(rows, 0)} x {max(columns, 0)} pixels at"
+            f" [{row}, {column}] is empty or leaves the picture of {picture.shape[0]} x {picture.shape[1]} pixels"
+        )
+    return picture[row : row + rows, column : column + columns]
+
+
+def _pixels(image: str, where: str) -> NDArray[Any]:
+    if image.startswith("photo:"):
+        return decode(_shipped(image.removeprefix("photo:"), where), where)
+    path = Path(image)
+    if not path.is_file():
+        raise InputError(f"{where}: there is no picture {path}; name a PNG, TIFF, EXR or NPY file, or photo:camera")
+    return decode(path, where)
+
+
+def _shipped(name: str, where: str) -> Path:
+    package = importlib.util.find_spec("skimage")
+    if package is None or package.origin is None:
+        raise InputError(f"{where}: 'photo:{name}' comes with scikit-image, which is not installed")
+    folder = Path(package.origin).parent / "data"
+    known = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in (".png", ".jpg")}
+    if name not in known:
+        raise InputError(f"{where}: scikit-image ships no picture 'photo:{name}'; it has {', '.join(known)}")
+    return known[name]
+
+
+def decode(path: Path, where: str) -> NDArray[Any]:
+    """The numbers that a picture file holds, as they are. Raises InputError that begins with `where`."""
+    kind = path.suffix.lower()
+    if kind == ".exr":
+        try:
+            channels = read_channels(path)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
+        if "Y" in channels:
+            return channels["Y"]
+        if not {"R", "G", "B"} <= channels.keys():
+            raise InputError(f"{where}: {path} has channels {', '.join(channels)}; expected Y, or R, G and B")
+        return np.stack([channels[name] for name in "RGB"], axis=-1)
+    if kind not in _READERS:
+        raise InputError(f"{where}: expected a PNG, TIFF, EXR or NPY file, got {path}")
+    try:
+        return _READERS[kind](path)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    except Exception as error:  # every decoder raises kinds of its own
+        raise InputError(
+            f"{where}: {path} could not be read as a picture; it is damaged or another kind of file"
+        ) from error
+
+
+def _scanned(path: Path) -> NDArray[Any]:
+    """A PNG or JPEG picture. Pillow has a limit to its size, and warns below it; here there is that of memory."""
+    from PIL import Image
+    from skimage import io
+
+    imread: Any = io.imread  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        with Image.open(path, formats=("PNG", "JPEG")) as opened:
+            needed = tiff.BYTES * prod(opened.size) * len(opened.getbands())
+            inks = opened.mode == "CMYK"
+        if inks:
+            raise InputError(f"{path}: expected grey or RGB, got inks (CMYK); save it as RGB")
+        check_memory(needed, f"{path}: to read it", "take a smaller picture, or free some memory")
+        return np.asarray(imread(path))
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
+    ".npy": npz.array,
+    **dict.fromkeys((".tif", ".tiff"), tiff.picture),
+    **dict.fromkeys((".png", ".jpg", ".jpeg"), _scanned),
+}

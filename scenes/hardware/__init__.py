@@ -1,0 +1,1 @@
+"""Recordings of real cameras: frames, point sources and where they belong."""

@@ -1,0 +1,93 @@
+"""Where recorded point sources stood: which pixels of f shone in which exposure."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ommatid.runtime.errors import InputError
+
+from ..camera import Camera
+
+Whole = NDArray[np.int64]
+
+COLUMNS = ("image", "row", "column")
+
+
+def positions_by_rows(camera: Camera, files: Sequence[Path]) -> list[Whole]:
+    """One source an exposure, pixel after pixel of f by rows, the whole of it once or several times: (1, 2) each."""
+    count = len(files)
+    if count == 0 or count % camera.unknowns:
+        raise InputError(
+            f"expected an image for each of the {camera.unknowns} pixels of f, once or several times, got {count}; say"
+            " with --places where the points of each stood"
+        )
+    rows, columns = np.divmod(np.arange(count) % camera.unknowns, camera.columns)
+    return list(np.stack([rows, columns], axis=1)[:, None, :])
+
+
+def read_positions(path: Path, camera: Camera, files: Sequence[Path]) -> list[Whole]:
+    """Row and column of f of every source of each exposure, (sources, 2) each, from a CSV file.
+
+    Its columns are image, row and column; an image is called by its file, or by its number from 0.
+    Raises InputError, naming the line, for what is no place, lies outside f, or stands there twice.
+    """
+    found: list[list[tuple[int, int]]] = [[] for _ in files]
+    for number, line in _lines(path):
+        where = f"{path}: line {number}"
+        image = _image(line["image"], files, where)
+        row, column = (_whole(line[name], name, where) for name in ("row", "column"))
+        if not (0 <= row < camera.rows and 0 <= column < camera.columns):
+            raise InputError(
+                f"{where}: row {row}, column {column} lies outside f of {camera.rows} x {camera.columns} pixels, which"
+                " are counted from 0"
+            )
+        if (row, column) in found[image]:
+            raise InputError(f"{where}: row {row}, column {column} is said twice of one image; remove one of them")
+        found[image].append((row, column))
+    for file, places in zip(files, found, strict=True):
+        if not places:
+            raise InputError(f"{path}: says of no point in {file}; add its place, or leave the image out")
+    return [np.array(places, dtype=np.int64) for places in found]
+
+
+def _lines(path: Path) -> list[tuple[int, dict[str, str]]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            header = [name.strip() for name in reader.fieldnames or ()]
+            reader.fieldnames = header
+            lines = [(reader.line_num, line) for line in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: could not be read as a CSV file of places ({error})") from error
+    if not set(COLUMNS) <= set(header):
+        raise InputError(f"{path}: expected the columns image,row,column in its first line, got '{','.join(header)}'")
+    for number, line in lines:
+        if any(line[name] is None for name in COLUMNS):
+            raise InputError(f"{path}: line {number}: expected an image, a row and a column, got fewer")
+    return lines
+
+
+def _image(text: str, files: Sequence[Path], where: str) -> int:
+    name = text.strip()
+    if name.isdecimal() and int(name) < len(files):
+        return int(name)
+    places = [place for place, file in enumerate(files) if name in (str(file), file.name)]
+    if len(places) == 1:
+        return places[0]
+    known = "none of that name is" if not places else f"{len(places)} are of that name"
+    raise InputError(
+        f"{where}: expected an image by its file's name or by its number from 0 to {len(files) - 1}, got '{name}', and"
+        f" {known} among the images"
+    )
+
+
+def _whole(text: str, name: str, where: str) -> int:
+    try:
+        return int(text)
+    except ValueError as error:
+        raise InputError(f"{where}: expected a whole number as its {name}, got '{text}'") from error

@@ -1,0 +1,120 @@
+"""The file of a model: what `scipy.sparse.load_npz` reads, with variances and a description beside it.
+
+`variance` is in the order of `data`; a JSON text `ommatid` holds the scene, how H was found, and a SHA-256. The ideal H
+of a large frame is not stored, it follows from the scene: such a file has the format "boxes" and no entries.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.files import digest, write_whole
+
+from .camera import derive
+from .formats import npz
+from .formats.provenance import checked
+from .model import Model
+from .scene import parse
+from .tables.table import LARGEST
+
+ENTRIES = ("indices", "indptr", "data")
+
+
+def write(path: Path, model: Model) -> None:
+    """Write a model, whole or not at all. Raises InputError or DeniedError."""
+    arrays: dict[str, NDArray[Any]] = {
+        "shape": np.array([model.measurements, model.unknowns], dtype=np.int64),
+        "variance": model.variance,
+        "batches": model.batches,
+    }
+    if model.stored is not None:
+        arrays |= {name: getattr(model.stored, name) for name in ENTRIES}
+    layout = b"boxes" if model.stored is None else b"csr"
+    description = json.dumps({"scene": model.scene.plain(), "record": model.record})
+    record = json.dumps({"description": description, "sha256": _seal(arrays, description)})
+
+    def fill(beside: Path) -> None:
+        with beside.open("wb") as stream:
+            savez: Any = np.savez_compressed
+            savez(stream, format=np.array(layout), _is_array=np.array(True), ommatid=record, **arrays)
+        try:
+            _arrays(beside)
+        except InputError as error:
+            raise OSError(errno.ENOSPC, f"not all of it could be stored: {error}") from error
+
+    write_whole(path, fill)
+
+
+def read(path: Path) -> Model:
+    """Read a model. Raises InputError if it is missing, damaged, pickled or no model."""
+    arrays, description = _arrays(path)
+    try:
+        content = json.loads(description)
+        scene = parse(content["scene"], path)
+        record = checked(content["record"])
+        method = record["method"]
+        camera = derive(scene)
+        matrix, shape = None, tuple(arrays["shape"].tolist())
+        if "data" in arrays:
+            matrix = _checked(arrays, shape)
+        elif not (method == "ideal" and camera.has_box_footprints):
+            raise ValueError("it has no entries")
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(
+            f"{path}: holds no usable observation matrix ({shortened(str(error))}); calibrate again"
+        ) from error
+    expected = (camera.measurements, camera.unknowns)
+    entries = np.shape(arrays.get("data", ()))
+    if shape != expected or not arrays["variance"].shape == entries == arrays["batches"].shape[1:]:
+        raise InputError(f"{path}: its matrix is {shape}, its scene wants {expected}; calibrate again")
+    return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
+
+
+def _checked(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
+    """H from its parts. Raises ValueError where they are no matrix in rows, or hold what is no number."""
+    for name, kinds in (("data", "f"), ("variance", "f"), ("batches", "f"), ("indices", "i"), ("indptr", "i")):
+        if arrays[name].dtype.kind not in kinds or not (np.abs(arrays[name]) <= LARGEST**2).all():
+            raise ValueError(f"{name} of {arrays[name].dtype} holds what is no number of its kind")
+    if (arrays["variance"] < 0).any():
+        raise ValueError("a variance is below 0")
+    if len(shape) != 2:
+        raise ValueError(f"its shape is {shape}")
+    matrix = sparse.csr_array((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
+    matrix.check_format(full_check=True)
+    return matrix
+
+
+def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        found = npz.read(path)
+        names = ["shape", "variance", "batches", *(ENTRIES if found["format"][()] != b"boxes" else ())]
+        arrays = {name: found[name] for name in names}
+        record = json.loads(str(found["ommatid"][()]))
+        description, seal = record["description"], record["sha256"]
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        raise InputError(
+            f"{path}: expected a model that ommatid wrote, got one that cannot be read: {shortened(str(error))}"
+        ) from error
+    if _seal(arrays, description) != seal:
+        raise InputError(f"{path}: does not match its checksum; the file is damaged, calibrate again")
+    return arrays, description
+
+
+def _seal(arrays: dict[str, NDArray[Any]], description: str) -> str:
+    pixels = digest(*(arrays[name] for name in sorted(arrays)))
+    return hashlib.sha256(f"{pixels}{description}".encode()).hexdigest()

@@ -1,0 +1,1 @@
+"""What happens to light between target and pixel, in closed form: footprints, blur, distortion, radiometry."""

@@ -1,0 +1,121 @@
+"""What the scene file says of the camera: its pitches, its lens types, and how exactly it was put together."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Annotated, Literal, cast
+
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from ommatid.runtime.errors import shortened_repr
+
+from .table import Table
+from .units import Angle, Length, Magnification, Pair, Radius, Step, file_name, pair
+
+Distortion = Annotated[float, Field(ge=-1000, le=1000)]
+LENS_NAME = r"^[A-Za-z0-9_-]+$"
+
+
+class Surface(Table):
+    """One surface of a lens, in the order in which light from the target meets them."""
+
+    radius: Radius | None = Field(
+        default=None, description="of curvature, positive where its centre lies towards the sensor; absent: flat"
+    )
+    thickness: Length | None = Field(default=None, description="to the next surface; of the last one absent")
+    glass: str | None = Field(default=None, description="behind the surface, by name, such as N-BK7; absent: air")
+    index: float | None = Field(default=None, ge=1, le=5, description="of refraction behind it, instead of a glass")
+    semi_diameter: Length = Field(description="half the diameter of its clear opening")
+    conic: float = Field(default=0.0, ge=-100, le=100, description="0: a sphere, -1: a paraboloid")
+    stop: bool = Field(default=False, description="whether this is the aperture stop, the same of one surface only")
+
+    @model_validator(mode="after")
+    def _one_medium(self) -> Surface:
+        if self.glass is not None and self.index is not None:
+            raise ValueError("expected a glass or an index of refraction, got both")
+        return self
+
+
+class ToleranceTable(Table):
+    """Standard deviations of how each sub-imager stands and is, drawn once for a camera."""
+
+    position: Length | None = Field(default=None, description="of a lens beside its place, in x and in y")
+    tilt: Angle | None = Field(default=None, description="of a sub-imager's sensor patch, about x and about y")
+    rotation: Angle | None = Field(default=None, description="of a sub-imager's sensor patch, about the axis")
+    focal_length: float | None = Field(
+        default=None, gt=0, lt=0.2, description="relative, of the distance between lens and sensor, so of magnification"
+    )
+    seed: int = Field(default=0, ge=0, lt=2**63, description="of the camera: another one is put together otherwise")
+
+
+class LensTable(Table):
+    """One lens type: an array of equal sub-imagers."""
+
+    name: str = Field(pattern=LENS_NAME)
+    magnification: Magnification = Field(description="image size over object size, at most 1")
+    array: Pair = Field(description="rows and columns of sub-imagers")
+    pixels: Literal["fit"] | Pair = Field(description='rows and columns of a sub-image, or "fit"')
+    step: Step = Field(default=Fraction(1), description="pixels of the target from one sub-imager's window to the next")
+    aperture: Length | None = Field(default=None, description="diameter of a thin lens; absent: a pinhole")
+    focus: Length | None = Field(default=None, description="distance that is shown sharp; absent: the target's")
+    distortion: Annotated[tuple[Distortion, Distortion], BeforeValidator(pair)] | None = Field(
+        default=None, description="k1, k2: magnification times 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner"
+    )
+    surfaces: Annotated[tuple[Surface, ...], BeforeValidator(pair), Field(min_length=1)] | str | None = Field(
+        default=None, description="of a real lens, from the target to the sensor, or the file that holds them"
+    )
+    scale: Literal["fit"] | Annotated[float, Field(gt=0, le=1e6)] | None = Field(
+        default=None, description='of the surfaces; "fit": to the focal length that the magnification asks for'
+    )
+
+    @field_validator("pixels", mode="before")
+    @classmethod
+    def _pixels(cls, value: object) -> object:
+        numbers: list[object] = list(value) if isinstance(value, list | tuple) else []  # type: ignore[arg-type]
+        if value == "fit" or (len(numbers) == 2 and all(type(n) is int and n >= 1 for n in numbers)):  # type: ignore[operator]
+            return pair(cast(object, value))
+        raise ValueError(
+            'expected two whole numbers of at least 1, such as [5, 5], or "fit",'
+            f" got {shortened_repr(cast(object, value))}"
+        )
+
+    @field_validator("surfaces")
+    @classmethod
+    def _a_file(cls, value: object) -> object:
+        return file_name(value) if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _one_kind_of_lens(self) -> LensTable:
+        if self.surfaces is not None:
+            for name in ("aperture", "distortion"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} belongs to a thin lens; the surfaces of a real one say it, got both")
+            if self.focus is not None and isinstance(self.scale, float | int):
+                raise ValueError('a scale of surfaces says already what is sharp; take scale "fit", got focus too')
+        elif self.scale is not None:
+            raise ValueError("scale belongs to surfaces, got none")
+        if self.focus is not None and self.aperture is None and self.surfaces is None:
+            raise ValueError("focus belongs to a lens with an aperture or surfaces, got a pinhole")
+        return self
+
+
+class CameraTable(Table):
+    """A flat sensor behind arrays of micro-lenses."""
+
+    pixel_pitch: Length = Field(description="side of one sensor pixel")
+    lens_pitch: Length = Field(description="from one lens's centre to the next")
+    wavelength: Length | None = Field(
+        default=None, description="of light; with it apertures diffract; absent: rays alone, glass and sensor at 550 nm"
+    )
+    tolerance: ToleranceTable | None = Field(
+        default=None, description="how exactly it was put together; absent: perfectly"
+    )
+    lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> CameraTable:
+        names = [lens.name for lens in self.lens]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"expected a name of its own for every lens type, got {name!r} twice")
+        return self

@@ -1,0 +1,86 @@
+"""One clear sentence out of a validation error: the key, what was expected, what came, the nearest known key."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from ommatid.runtime.errors import shortened, shortened_repr
+
+
+def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]) -> str:
+    """The first thing wrong with `data`, as a sentence without the file's name."""
+    problems = error.errors()
+    # A misspelt key also reads as a missing one: name the misspelling.
+    unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
+    first = (unknown or problems)[0]
+    sentence = _sentence(first, data, model)
+    others = len(problems) - 1
+    return sentence + (f" (and {others} more to mend)" if others else "")
+
+
+def known_keys(model: type[BaseModel], prefix: str = "") -> list[str]:
+    """Every key of the scene file in dotted form, lens types without their names."""
+    keys: list[str] = []
+    for name, field in model.model_fields.items():
+        keys.append(prefix + name)
+        for inner in _models_in(field.annotation):
+            keys.extend(known_keys(inner, f"{prefix}{name}."))
+    return keys
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
+
+
+def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel]) -> str:
+    kind = problem["type"]
+    location = problem["loc"] if kind == "extra_forbidden" else _trim(problem["loc"])
+    key = shortened(_dotted(location, data))
+    if kind == "extra_forbidden":
+        keys = known_keys(model)
+        bare = ".".join(part for part in location if isinstance(part, str))
+        near = difflib.get_close_matches(bare, keys, n=1, cutoff=0.5)
+        last = bare.rsplit(".", 1)[-1]
+        elsewhere = [known for known in keys if known.rsplit(".", 1)[-1] == last]
+        nearest = (elsewhere or near or difflib.get_close_matches(bare, keys, n=1, cutoff=0.0))[0]
+        return f"unknown key '{key}'; the nearest known key is '{nearest}'"
+    if kind == "missing":
+        return f"the key '{key}' is missing and has no default; add it"
+    message = problem["msg"].removeprefix("Value error, ")
+    message = message.replace("Input should be", "expected").replace(
+        "String should match", "expected text that matches"
+    )
+    if "got" not in message:
+        message = f"{message}, got {shortened_repr(problem['input'])}"
+    return f"{key}: {message}" if key else message
+
+
+def _trim(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
+    # pydantic appends the branch of a union or the kind of a tuple: these are no keys of the file.
+    return tuple(
+        part for part in location if isinstance(part, int) or part.isidentifier() or ("-" in part and "[" not in part)
+    )
+
+
+def _dotted(location: tuple[int | str, ...], data: Any) -> str:
+    parts: list[str] = []
+    for part in location:
+        try:
+            data = data[part]
+        except (KeyError, IndexError, TypeError):
+            data = None
+        parts.append(_name(data, part) if isinstance(part, int) else part)
+    return ".".join(parts)
+
+
+def _name(table: Any, place: int) -> str:
+    try:
+        return str(table["name"])
+    except (KeyError, TypeError):
+        return str(place)

@@ -1,0 +1,88 @@
+"""Changes to a scene's tables from the command line: `--set key=value` and `--lens I,II`."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from typing import Any
+
+from ommatid.runtime.errors import InputError, shortened
+
+from . import toml
+
+MOST_NAMED = 10  # lens types in a sentence
+
+
+def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """Set keys such as `noise.variance=1e-6` or `camera.lens.II.pixels=[2,2]`; an empty value removes the key.
+
+    The value is read as TOML, else as text. Raises InputError if the key's table does not exist.
+    """
+    changed = copy.deepcopy(data)
+    for written in overrides:
+        key, equals, text = written.partition("=")
+        override = shortened(written)
+        if not equals or not key.strip():
+            raise InputError(f"--set {override}: expected KEY=VALUE, such as noise.variance=1e-6")
+        *tables, last = [part.strip() for part in key.split(".")]
+        if len(tables) > toml.DEEPEST:
+            raise InputError(f"--set {override}: its key goes deeper than {toml.DEEPEST} tables")
+        table: Any = changed
+        for name in tables:
+            table = _inside(table, name, override)
+        if not isinstance(table, dict):
+            raise InputError(f"--set {override}: '{'.'.join(tables)}' is no table, so it has no key '{last}'")
+        if text.strip():
+            table[last] = value_of(text)
+        else:
+            table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
+    return changed
+
+
+def _inside(table: Any, name: str, override: str) -> Any:
+    if isinstance(table, list):
+        lenses = _by_name(table)  # pyright: ignore[reportUnknownArgumentType]
+        if name not in lenses:
+            raise InputError(f"--set {override}: no lens type is called '{name}'; there are {_names(lenses)}")
+        return lenses[name]
+    if not isinstance(table, dict):
+        raise InputError(f"--set {override}: '{name}' does not stand in a table")
+    return table.setdefault(name, {})  # type: ignore[return-value]
+
+
+def value_of(text: str) -> Any:
+    """What a value on the command line is: TOML, else text."""
+    try:
+        return toml.loads(f"value = {text}")["value"]
+    except ValueError:
+        return text.strip()
+
+
+def keep_lenses(data: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Keep the named lens types in the order named; one named again joins a second time, called NAME-2.
+
+    Raises InputError if a name is unknown. No names: everything stays.
+    """
+    wanted = list(names)
+    if not wanted:
+        return data
+    camera = data.get("camera")
+    listed: Any = camera.get("lens") if isinstance(camera, dict) else None  # type: ignore[union-attr]
+    lenses = _by_name(listed) if isinstance(listed, list) else {}  # pyright: ignore[reportUnknownArgumentType]
+    chosen: list[Any] = []
+    for place, name in enumerate(wanted):
+        if name not in lenses:
+            raise InputError(f"--lens {','.join(wanted)}: no lens type is called '{name}'; there are {_names(lenses)}")
+        earlier = wanted[:place].count(name)
+        chosen.append({**lenses[name], "name": name if earlier == 0 else f"{name}-{earlier + 1}"})
+    return {**data, "camera": {**camera, "lens": chosen}}  # type: ignore[dict-item]
+
+
+def _by_name(lenses: list[Any]) -> dict[str, Any]:
+    return {str(lens.get("name")): lens for lens in lenses if isinstance(lens, dict)}  # type: ignore[union-attr]
+
+
+def _names(lenses: Iterable[str]) -> str:
+    known = [f"'{shortened(name)}'" for name in lenses]
+    more = [f"{len(known) - MOST_NAMED} more"] if len(known) > MOST_NAMED else []
+    return ", ".join([*known[:MOST_NAMED], *more]) or "none"

@@ -1,0 +1,102 @@
+"""H entry by entry, from rays or rendered point sources: each entry with its variance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse, stats
+
+from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.versions import versions
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.model import Model
+from ommatid.scenes.optics.negligible import without_negligible_effects
+from ommatid.scenes.scene import Scene, resolved
+from ommatid.scenes.shrinkage import shrink_variances
+
+from ..ideal import ideal_matrix
+from ..sampling.checkpoint import Checkpoint
+from ..sampling.passes import rounding_variance
+from .point_sources import Plans, Responses, responses_from_points
+
+
+def rendered_model(
+    scene: Scene,
+    camera: Camera,
+    progress: Progress = no_progress,
+    partial: Checkpoint | None = None,
+    plans: Plans | None = None,
+    exact: bool = False,
+) -> Model:
+    """H by rays or point sources, with so many samples as the scene or the plans of the lens types say.
+
+    exact : that sums are taken for float64, where they are
+    """
+    start, record = perf_counter(), dict[str, Any](method=scene.calibration.method)
+    simulated = without_negligible_effects(scene, camera)[0]
+    if scene.calibration.method == "transport":
+        from .ray_transport import responses_from_rays
+
+        responses = responses_from_rays(scene, simulated, progress, plans)
+    else:
+        responses = responses_from_points(scene, simulated, progress, partial, plans)
+    if exact:
+        responses = replace(responses, summed=1)
+    variance = entry_variances(responses, camera)
+    if scene.calibration.fit == "geometry":
+        from .geometry_fit import fit_geometry
+
+        responses, variance, record["fit"] = fit_geometry(responses, variance, simulated)
+    record |= {
+        "seconds": perf_counter() - start,
+        "seed": scene.render.seed,
+        **responses.record(),
+        **_compared(responses, variance, camera),
+        "versions": versions("mitsuba", "drjit", "scipy"),
+    }
+    kept = resolved(scene, camera.shape)
+    return Model(kept, camera, responses.matrix, variance, responses.batches, record)
+
+
+def _compared(responses: Responses, variance: NDArray[np.float64], camera: Camera) -> dict[str, Any]:
+    """How far H lies from the ideal one, where that has a closed form."""
+    if any(kind.optics.distortion is not None and camera.is_blurred(kind) for kind in camera.types):
+        return {}
+    return {"agreement": agreement(responses.matrix, variance, camera, responses.passes)}
+
+
+def entry_variances(responses: Responses, camera: Camera) -> NDArray[np.float64]:
+    """Variances of H's entries, drawn towards their sub-imager's mean and never below float32's rounding."""
+    starts = responses.matrix.indptr
+    settled = np.empty_like(responses.variance)
+    for place in camera.slices():
+        stored = slice(int(starts[place.start]), int(starts[place.stop]))
+        settled[stored] = shrink_variances(responses.variance[stored], responses.passes)
+    summed = responses.samples if responses.summed is None else responses.summed
+    return np.maximum(settled, rounding_variance(responses.matrix.data, summed))
+
+
+def agreement(matrix: sparse.csr_array, variance: NDArray[np.float64], camera: Camera, passes: int) -> dict[str, float]:
+    """How far H lies from the ideal one: RMS difference, largest z, and the chance of so large a one (Sidak).
+
+    Over every entry that either of them has. The chance takes z as Student's t with one degree fewer than passes.
+    """
+    difference = sparse.csr_array(matrix - ideal_matrix(camera))
+    entries = int(difference.nnz)
+    if not entries:
+        return {"rms_difference_from_ideal": 0.0, "max_z": 0.0, "p_value": 1.0}
+    known = sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
+    # Where no ray has hit there is no scatter either: such an entry counts as uncertain as the others are on average.
+    unseen = float(variance.mean())
+    spread = np.asarray(known[difference.nonzero()], dtype=np.float64).ravel()
+    spread[spread == 0] = unseen
+    values = np.asarray(difference[difference.nonzero()], dtype=np.float64).ravel()
+    largest = float(np.max(np.abs(values) / np.sqrt(spread), initial=0.0))
+    single = 2 * float(stats.t.sf(largest, passes - 1))
+    chance = -np.expm1(entries * np.log1p(-single)) if single < 1 else 1.0
+    rms = float(np.sqrt((difference.data**2).sum() / max(entries, 1)))
+    return {"rms_difference_from_ideal": rms, "max_z": largest, "p_value": float(chance)}

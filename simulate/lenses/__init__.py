@@ -1,0 +1,1 @@
+"""Ray optics of lenses, without Mitsuba."""

@@ -1,0 +1,82 @@
+"""What a camera and its target are in Mitsuba's own terms: plugins by their dictionaries. Lengths are millimetres."""
+
+# pyright: basic
+from __future__ import annotations
+
+from math import atan, degrees
+from typing import Any
+
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import SubImager
+from ommatid.scenes.scene import Sampler
+
+from ..sampling.samplers import fitting
+
+BLOCK = 4  # scalar variants seed by block, and pick its size by the number of threads unless it is given
+
+
+def scene_of(target: dict[str, Any]) -> dict[str, Any]:
+    """A Mitsuba scene with the emissive target and no sensor: light goes straight, nothing bounces."""
+    return {"type": "scene", "integrator": {"type": "path", "max_depth": 1, "block_size": BLOCK}, "target": target}
+
+
+def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
+    """The rectangle that the picture is on, seen from the front, upright, one texel a pixel of f."""
+    import mitsuba as mi
+
+    half = [camera.columns * camera.target_pitch / 2, camera.rows * camera.target_pitch / 2, 1.0]
+    place = mi.ScalarTransform4f().translate([0, 0, camera.distance]).rotate([0, 1, 0], 180).scale(half)
+    return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": texture}}
+
+
+def stock_sensor(
+    camera: Camera, sub: SubImager, sampler: Sampler, samples: int, channels: int = 1, far: float = 2.0
+) -> dict[str, Any]:
+    """One sub-imager as Mitsuba's own `perspective` with a shifted principal point; it sees as far as `far` times the
+    target's distance."""
+    import mitsuba as mi
+
+    rows, columns = sub.type.pixels
+    width = float(sub.type.ratio) * columns * camera.target_pitch
+    height = float(sub.type.ratio) * rows * camera.target_pitch
+    x, y = camera.position(*sub.type.middle(sub.window))
+    lens_x, lens_y = sub.lens
+    return {
+        "type": "perspective",
+        "fov_axis": "x",
+        "fov": 2 * degrees(atan(width / 2 / camera.distance)),
+        "near_clip": camera.distance * 1e-3,
+        "far_clip": camera.distance * far,
+        "principal_point_offset_x": -(x - lens_x) / width,
+        "principal_point_offset_y": -(y - lens_y) / height,
+        "to_world": mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0]),
+        "film": film(columns, rows, channels),
+        "sampler": {"type": sampler, "sample_count": fitting(sampler, samples)},
+    }
+
+
+def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:
+    """A film that neither filters nor rounds to half precision."""
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb" if channels == 3 else "luminance",
+        "component_format": "float32",
+    }
+
+
+def texture_of(source: dict[str, Any]) -> dict[str, Any]:
+    """Texels as they are: upright, not filtered, not wrapped, not read as sRGB."""
+    import mitsuba as mi
+
+    upright = mi.ScalarTransform3f().translate([0, 1]).scale([1, -1])  # row 0 would lie at v = 0, the bottom
+    return {
+        "type": "bitmap",
+        "raw": True,
+        "filter_type": "nearest",
+        "wrap_mode": "clamp",
+        "to_uv": upright,
+        **source,
+    }

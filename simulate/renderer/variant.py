@@ -1,0 +1,180 @@
+"""Which of Mitsuba's variants work on this machine, and the choice of one.
+
+LLVM 15 and 16 load, and then kill the process at the first rendering, so a version is asked for before the backend
+is touched. A variant is global to the process.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+from ommatid.runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from ommatid.scenes.camera import Camera
+
+OLDEST_LLVM = (17, 0, 0)
+PATIENCE = 120  # seconds
+PREFERENCE = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
+
+_PROBE = """
+import json, sys, time
+from ommatid.simulate.renderer.variant import unusable_reason
+variant = sys.argv[1]
+reason = unusable_reason(variant)
+speed = 0.0
+if not reason:
+    import mitsuba as mi
+    mi.set_variant(variant)
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "path", "max_depth": 1},
+        "target": {"type": "rectangle", "emitter": {"type": "area"}},
+        "sensor": {"type": "perspective", "near_clip": 0.1,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 128, "height": 128, "pixel_format": "luminance"},
+            "sampler": {"type": "multijitter"}},
+    })
+    import numpy as np
+    np.array(mi.render(scene, spp=64, seed=0))
+    start = time.perf_counter()
+    np.array(mi.render(scene, spp=64, seed=1))
+    speed = 128 * 128 * 64 / (time.perf_counter() - start)
+print(json.dumps({"reason": reason, "speed": speed}))
+"""
+
+
+@dataclass(frozen=True)
+class BackendStatus:
+    """What was found out about a variant: why it cannot be used ("" if it can), and its samples per second."""
+
+    variant: str
+    reason: str
+    speed: float
+
+
+def unusable_reason(variant: str) -> str:
+    """Why a variant cannot be used here, or "" if it can; touches no backend that could kill the process."""
+    import drjit as dr
+
+    if variant.startswith("cuda"):
+        return "" if dr.has_backend(dr.JitBackend.CUDA) else "no CUDA device was found"
+    if variant.startswith("llvm"):
+        if not dr.has_backend(dr.JitBackend.LLVM):
+            return "no usable LLVM library (libLLVM.so) was found"
+        try:
+            version = tuple(dr.detail.llvm_version())
+        except AttributeError:  # not part of Dr.Jit's public interface
+            return "the version of LLVM could not be found out"
+        if version < OLDEST_LLVM:
+            return (
+                f"LLVM {version[0]} was found, which fails at the first rendering; {OLDEST_LLVM[0]} or newer is needed"
+            )
+    return ""
+
+
+def choose(requested: str) -> str:
+    """The variant to render with. Raises InputError if the one asked for does not work here."""
+    if requested == "auto":
+        return next(variant for variant in PREFERENCE if not unusable_reason(variant))
+    reason = unusable_reason(requested)
+    if reason:
+        raise InputError(f"render.variant: expected one that works here, got '{requested}': {reason}; {remedy()}")
+    return requested
+
+
+def check_fast_variant(camera: Camera, variant: str) -> None:
+    """Raise InputError where a camera is more than a set of pinholes and the backend is the slow one."""
+    if variant.startswith("scalar") and not camera.is_ideal_pinhole:
+        raise InputError(f"lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}")
+
+
+def check_transport_variant(variant: str, key: str = "calibration.method") -> None:
+    """Raise InputError where calibration by transport is asked, by a key, of the slow backend."""
+    if variant.startswith("scalar"):
+        raise InputError(f"{key} 'transport' needs Mitsuba's fast backend, got {variant}; {remedy()}")
+
+
+def activate(variant: str) -> None:
+    """Make a variant Mitsuba's current one, and send its log to stderr."""
+    import mitsuba as mi
+
+    if mi.variant() != variant:
+        mi.set_variant(variant)
+    logger = cast(Any, mi).logger()
+    if logger is not None and not isinstance(logger.appender(0), _stderr_appender()):
+        logger.clear_appenders()
+        appender: Any = _stderr_appender()
+        logger.add_appender(appender())
+        logger.set_log_level(mi.LogLevel.Warn)
+
+
+def release() -> None:
+    """Give back the memory that the renderer keeps for its next work, if it has been loaded."""
+    dr = sys.modules.get("drjit")
+    if dr is not None:
+        dr.flush_malloc_cache()
+
+
+INTERRUPTED = "Received interrupt signal"  # on which whoever asked for it hears the command line's own sentence
+_APPENDERS: dict[str, Any] = {}
+
+
+def _stderr_appender() -> Any:
+    import mitsuba as mi
+
+    if "stderr" not in _APPENDERS:
+
+        class Stderr(mi.Appender):
+            def append(self, level: object, text: str) -> None:
+                del level
+                if INTERRUPTED not in text:
+                    print(text, file=sys.stderr)
+
+            def log_progress(self, *arguments: object) -> None:
+                del arguments
+
+        _APPENDERS["stderr"] = Stderr
+    return _APPENDERS["stderr"]
+
+
+def probe(variant: str) -> BackendStatus:
+    """Render a little in a process of its own, so that a broken backend can take down nothing but that."""
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-c", _PROBE, variant], capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return BackendStatus(variant, f"a trial rendering did not end in {PATIENCE} s", 0.0)
+    answer = ended.stdout.rfind('{"reason"')  # a backend may have written before it
+    if ended.returncode != 0 or answer < 0:
+        last = ended.stderr.strip().splitlines()[-1:] or [f"it ended with status {ended.returncode}"]
+        return BackendStatus(variant, f"a trial rendering failed: {last[0]}", 0.0)
+    found = json.loads(ended.stdout[answer:])
+    return BackendStatus(variant, found["reason"], found["speed"])
+
+
+def diagnosis(found: list[BackendStatus]) -> str:
+    """One sentence on what is slow, and the one command that mends it."""
+    works = {one.variant for one in found if not one.reason}
+    if "cuda_ad_mono" in works or "llvm_ad_mono" in works:
+        return "The fast backend works; nothing to repair."
+    if "scalar_rgb" in works:
+        return f"Rendering works on scalar_rgb but is slow; for the fast backend {remedy()}"
+    return "Mitsuba does not work here; install it again: make clean setup"
+
+
+def remedy() -> str:
+    """The one command that brings the fast backend."""
+    if shutil.which("apt-get"):
+        prefix = "" if os.geteuid() == 0 else "sudo "
+        return f"run: {prefix}apt-get install -y libllvm19"
+    if shutil.which("brew"):
+        return "run: brew install llvm@19, and set DRJIT_LIBLLVM_PATH to its libLLVM.dylib"
+    return "install LLVM 17 or newer, and set DRJIT_LIBLLVM_PATH to its libLLVM.so"

@@ -1,0 +1,1 @@
+"""Samplers, passes, seeds and checkpoints of renderings."""

@@ -1,0 +1,171 @@
+"""Estimators that expect misalignment, as a scene asks for them; and studies of several ideas of H."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ommatid.analysis import run_table, study
+from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.restore import Reconstruction, restore
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
+
+from ..cli.test_commands import document
+from ..conftest import Command
+from ..examples import needs, scene
+
+ONE = (("1/2", [3, 3], [8, 8]),)
+SMOOTH = {"kind": "exponential", "correlation_length": "25 mm"}
+
+
+def misaligned(how: str = "trust", shape: tuple[int, int] = (18, 18), **tables: Any) -> Scene:
+    told = {"prior": SMOOTH, "noise": {"variance": 1e-2}, "estimator": {"misalignment": how}, **tables}
+    data = scene(shape, ONE, **told).plain()
+    data["camera"]["tolerance"] = {"position": "300 nm"}
+    return parse(data, Path("test.toml"))
+
+
+def recorded(described: Scene) -> tuple[Stack, Model, NDArray[np.float64]]:
+    """What the misaligned camera records, and the H of the one that was drawn."""
+    camera, truth = derive(described), load(described).ravel()
+    noise = np.random.default_rng(4).normal(0, 0.1, camera.measurements)
+    values = true_matrix(camera) @ truth + noise
+    record = {"seconds": 0.0, "versions": {}, "seed": 3, "first_seed": 3}
+    model = ideal_model(described, camera)
+    model = replace(model, record={**model.record, "seconds": 0.0, "versions": {}})
+    return Stack(described, camera, values, np.zeros_like(values), record), model, truth
+
+
+def restored(how: str) -> Reconstruction:
+    return restore(*recorded(misaligned(how)))
+
+
+def test_what_a_misaligned_camera_costs_and_what_helps() -> None:
+    """On trust the promise is broken; robust and fitted keep theirs, and fitting comes near the true H."""
+    found = {how: restored(how) for how in ("trust", "robust", "fit")}
+    stack, model, truth = recorded(misaligned())
+    camera = derive(misaligned())
+    best = restore(stack, exact_model(stack.scene, camera, true_matrix(camera), "true"), truth)
+    errors = {how: one.error.mse for how, one in found.items() if one.error is not None}
+    assert best.error is not None
+    assert found["trust"].interval is not None
+    assert errors["trust"] > found["trust"].interval.high
+    assert errors["robust"] < found["robust"].expected.mse * 1.5
+    assert found["fit"].interval is not None
+    assert errors["fit"] < found["fit"].interval.high
+    assert errors["fit"] < 0.5 * errors["trust"]
+    assert errors["fit"] < 1.5 * best.error.mse
+    for how in ("robust", "fit"):
+        assert sum(found[how].budget().values()) == pytest.approx(found[how].expected.mse, rel=1e-6)
+        assert found[how].budget()["misalignment"] > 0
+        assert found[how].choice.method == how
+        lines = dict(run_table.rows(run_json.describe(stack, model, found[how])))
+        assert "    from misalignment" in lines
+    residual = found["robust"].residual
+    assert residual is not None
+    assert residual.chi_squared < residual.expected + 4 * residual.deviation
+
+
+def test_a_region_knows_of_misalignment() -> None:
+    fitted = restored("fit")
+    mean, deviation = fitted.region((4, 4), (6, 6))
+    assert fitted.truth is not None
+    assert abs(mean - fitted.truth.reshape(18, 18)[4:10, 4:10].mean()) < 5 * deviation
+
+
+@pytest.mark.parametrize("how", ["robust", "fit"])
+def test_what_cannot_be_done_is_refused_in_a_sentence(how: str) -> None:
+    plain = scene((18, 18), ONE, estimator={"misalignment": how})
+    with pytest.raises(InputError, match=r"needs to know what may be misaligned, got no \[camera.tolerance\]"):
+        restore(Stack(plain, derive(plain), np.zeros(576), np.ones(576), {}), ideal_model(plain, derive(plain)))
+    large = misaligned(how, (80, 80))
+    with pytest.raises(InputError, match="serves up to 4000 pixels of f, got 6400"):
+        restore(*recorded(large))
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"method": "tiles"}, "takes a dense form, got estimator.method 'tiles'"),
+        ({"memory": "1 MB"}, "are allowed; raise estimator.memory"),
+    ],
+)
+def test_other_keys_of_the_estimator_still_count(told: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        restore(*recorded(misaligned(estimator={"misalignment": "robust", **told})))
+
+
+def test_a_calibrated_h_is_not_thrown_away_in_silence() -> None:
+    stack, model, truth = recorded(misaligned("fit"))
+    calibrated = replace(model, record={**model.record, "method": "points"})
+    with pytest.raises(InputError, match="begins with H as designed, got a calibrated one"):
+        restore(stack, calibrated, truth)
+
+
+def test_a_study_that_cannot_end_does_not_begin() -> None:
+    for models, lens, words in (
+        (["ideal", "fitted"], {"aperture": "0.4 mm", "focus": "600 mm"}, "serves pinholes and thin lenses in focus"),
+        (["ideal", "true"], {"aperture": "0.4 mm", "focus": "600 mm"}, "the 'true' H of misaligned lenses"),
+    ):
+        data = misaligned().plain()
+        data["camera"]["lens"][0] |= lens
+        data["study"] = {"models": models}
+        described = parse(data, Path("test.toml"))
+        with pytest.raises(InputError, match=words):
+            study.check_study(described, derive(described))
+
+
+def test_a_study_is_kept_and_told(tmp_path: Path) -> None:
+    stack, model, truth = recorded(misaligned())
+    made: list[str] = []
+
+    def give(name: str) -> Model:
+        made.append(name)
+        return model if name != "true" else exact_model(stack.scene, stack.camera, true_matrix(stack.camera), "true")
+
+    models = {name: (lambda name=name: give(name)) for name in ("ideal", "robust", "true")}
+    cases, fresh = study.cached_study(tmp_path, stack, models, truth)
+    assert (fresh, made) == (True, ["ideal", "robust", "true"])
+    assert study.cached_study(tmp_path, stack, models, truth) == (cases, False)
+    assert len(made) == 3, "nothing is made again"
+    rows = dict(study.rows(cases))
+    assert "OUTSIDE" in rows["the ideal H on trust"]
+    assert "inside" in rows["the true H"]
+    assert "for this picture" not in rows["the ideal H, misalignment as more noise"]
+    table = (tmp_path / "study.csv").read_text(encoding="utf-8").splitlines()
+    assert table[0].startswith("model,mse,predicted")
+    assert [line.split(",")[0] for line in table[1:]] == ["ideal", "robust", "true"]
+    other = replace(stack, scene=misaligned(noise={"variance": 2e-2}))
+    assert study.cached_study(tmp_path, other, models, truth)[1]
+
+
+def test_a_study_from_the_command_line(tmp_path: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Real lenses: the ideal H promises what it does not keep, and point sources and transport give the same."""
+    needs("llvm_ad_mono")
+    monkeypatch.chdir(tmp_path)
+    lens = {"aperture": "0.4 mm", "focus": "600 mm"}
+    data = scene((12, 12), (("1/3", [2, 2], [3, 3]),), noise={"variance": 1e-2}).plain()
+    data["camera"]["lens"][0] |= lens
+    data |= {"render": {"samples": 256}, "calibration": {"samples": 256, "method": "transport"}}
+    data["study"] = {"models": ["points", "transport", "ideal"]}
+    from ommatid.scenes.scene import write
+
+    write(tmp_path / "lens.toml", parse(data, tmp_path / "lens.toml"))
+    found = document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]
+    by_name = {case["model"]: case for case in found["study"]}
+    assert by_name["points"]["mse"] == pytest.approx(by_name["transport"]["mse"], rel=1e-9)
+    kept = json.loads((tmp_path / "out" / "lens" / "run.json").read_text(encoding="utf-8"))
+    assert kept["study"] == found["study"]
+    assert document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]["study"] == found["study"]

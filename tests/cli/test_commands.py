@@ -1,0 +1,471 @@
+"""The command line as a user meets it: what it prints, what it writes, what it does not do twice."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from ommatid.scenes import stack
+from ommatid.scenes.formats import exr
+
+from ..conftest import TINY, Command, Ended, shell
+
+GALLERY = Path(__file__).parents[2] / "scenes"
+COMMANDS = ("run", "render", "calibrate", "reconstruct", "predict", "show", "export", "init", "schema", "doctor")
+FILES = {
+    "scene.toml",
+    "truth.exr",
+    "stack.exr",
+    "model.npz",
+    "estimate.exr",
+    "estimate.png",
+    "overview.png",
+    "run.json",
+    "report.html",
+}
+MADE = ("stack.exr", "model.npz", "estimate.exr", "estimate.png", "overview.png", "run.json", "report.html")
+ASKED_FOR = 77
+
+
+def without(*packages: str) -> str:
+    """Python that ends the process as soon as anybody imports one of these packages, even inside a `try`."""
+    return f"""
+import os, sys
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {packages!r}:
+            os._exit({ASKED_FOR})
+sys.meta_path.insert(0, Refuse())
+"""
+
+
+def document(ended: Ended) -> Any:
+    """The one JSON document on stdout; anything before or after it is a failure."""
+    assert ended.code == 0, ended.err
+    return json.loads(ended.out)
+
+
+def numbers(description: dict[str, Any]) -> dict[str, Any]:
+    """What a reconstruction found, without what it was called and how long it took."""
+    told = {key: value for key, value in description.items() if key not in ("fingerprint", "scene", "file", "spent")}
+    stages = {name: {**stage, "seconds": None} for name, stage in description["stages"].items()}
+    return {**told, "stages": stages}
+
+
+def channels(path: Path) -> dict[str, Any]:
+    return exr.read(path)[0].channels
+
+
+def assert_same_light(one: Path, other: Path) -> None:
+    first, second = stack.read(one), stack.read(other)
+    np.testing.assert_array_equal(first.values, second.values)
+    np.testing.assert_array_equal(first.variance, second.variance)
+
+
+# --- what is printed
+
+
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_help_lists_every_command_and_loads_nothing_heavy(option: str, tmp_path: Path) -> None:
+    heavy = ("numpy", "scipy", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR", "mitsuba", "drjit")
+    ended = shell(option, cwd=tmp_path, before=without(*heavy))
+    assert ended.code == 0
+    listed = {line.split()[0] for line in ended.out.partition("Commands:")[2].splitlines() if line.strip()}
+    assert set(COMMANDS) <= listed
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_says_what_it_does(command: str, ommatid: Command) -> None:
+    ended = ommatid(command, "--help")
+    assert ended.code == 0
+    assert "--json" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "expected"),
+    [
+        ("tile19", (), {"mse": 2.79777e-4, "rank": 361, "null_space": 0, "measurements": 706, "unknowns": 361}),
+        ("tile19", ("--lens", "I,I"), {"mse": 2057.4237, "rank": 225, "null_space": 136, "measurements": 450}),
+        ("tile19", ("--lens", "I,II"), {"mse": 484.100, "rank": 329, "null_space": 32, "measurements": 450}),
+        ("tile35", (), {"mse": 1.54401e-4, "unknowns": 1225}),
+        ("tile41", (), {"mse": 1.24737e-3, "unknowns": 1681}),
+    ],
+)
+def test_predict_gives_the_values_of_the_reference(
+    scene: str, options: tuple[str, ...], expected: dict[str, float], ommatid: Command
+) -> None:
+    ended = ommatid("predict", GALLERY / f"{scene}.toml", "--set", "noise.variance=1e-6", *options, "--json")
+    predicted = document(ended)
+    keys = ["measurements", "unknowns", "rank", "null_space", "condition", "mse", "trimmed_mse", "trim"]
+    assert list(predicted)[:8] == keys
+    assert {"degrees_of_freedom", "resolution", "method"} == set(predicted) - set(keys)
+    assert {key: predicted[key] for key in expected} == pytest.approx(expected, rel=1e-5)
+    assert predicted["rank"] + predicted["null_space"] == predicted["unknowns"]
+
+
+def arguments(command: str, finished: Path) -> list[str | Path]:
+    files: dict[str, list[str | Path]] = {
+        "run": ["tiny.toml", "-o", "out"],
+        "render": ["tiny.toml", "-o", "out"],
+        "calibrate": ["tiny.toml", "-o", "model.npz"],
+        "reconstruct": [finished / "stack.exr", finished / "model.npz", "-o", "estimate.exr"],
+        "predict": ["tiny.toml"],
+        "show": ["tiny.toml"],
+        "export": ["tiny.toml", "-o", "camera.xml"],
+        "init": ["new.toml"],
+    }
+    return [command, *files.get(command, [])]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_json_is_all_there_is_on_stdout(command: str, here: Path, finished: Path) -> None:
+    # A new process: libraries like to greet when they are loaded, and to say goodbye when they are unloaded.
+    ended = shell(*arguments(command, finished), "--json", cwd=here)
+    assert isinstance(document(ended), list if command in ("run", "render") else dict)
+    assert "Traceback" not in ended.err
+
+
+@pytest.mark.parametrize("command", ["run", "predict", "show", "reconstruct"])
+def test_without_json_there_is_a_table_with_the_title(
+    command: str, here: Path, finished: Path, ommatid: Command
+) -> None:
+    assert here.is_dir()
+    ended = ommatid(*arguments(command, finished))
+    assert ended.code == 0
+    assert ("estimate.exr" if command == "reconstruct" else "Tiny") in ended.out
+    assert "measure" in ended.out
+
+
+@pytest.mark.parametrize("title", ["[/x]", "[red]hot", ":smile: and [[brackets]]"])
+def test_a_title_is_printed_as_it_is(title: str, here: Path, ommatid: Command) -> None:
+    assert here.is_dir()
+    ended = ommatid("predict", "tiny.toml", "--set", f"title='{title}'")
+    assert ended.code == 0
+    assert title in ended.out
+
+
+def test_show_names_what_is_left_out_and_what_is_not_seen(here: Path, ommatid: Command) -> None:
+    assert here.is_dir()
+    shown = document(ommatid("show", "tiny.toml", "--json", "--set", "noise="))
+    assert "sensor noise and quantisation" in [skip["what"] for skip in shown["skipped"]]
+    # Three windows of nine pixels, one pixel apart, span 11 of 12 rows and columns: 23 pixels are left.
+    assert shown["pixels_seen_by_fewer_types"] == {"0": 23}
+    assert (shown["measurements"], shown["unknowns"]) == (81, 144)
+
+
+def test_lens_keeps_types_and_takes_one_named_twice_twice(ommatid: Command) -> None:
+    shown = document(ommatid("show", GALLERY / "tile19.toml", "--lens", "III,I,III", "--json"))
+    assert [kind["name"] for kind in shown["lens_types"]] == ["III", "I", "III-2"]
+
+
+# --- what is imported
+
+
+@pytest.mark.parametrize("command", ["predict", "reconstruct"])
+def test_works_where_mitsuba_is_not_installed(command: str, here: Path, finished: Path) -> None:
+    ended = shell(*arguments(command, finished), cwd=here, before=without("mitsuba", "drjit"))
+    assert ended.code == 0, ended.err
+
+
+def test_the_trap_for_imports_works(here: Path) -> None:
+    ended = shell("render", "tiny.toml", "-o", "out", cwd=here, before=without("mitsuba", "drjit"))
+    assert ended.code == ASKED_FOR
+
+
+# --- the files of a run
+
+
+def test_a_run_writes_its_files_and_no_others(finished: Path) -> None:
+    assert {path.name for path in finished.iterdir()} == FILES
+
+
+def test_run_json_keeps_the_contract(finished: Path) -> None:
+    run = json.loads((finished / "run.json").read_text(encoding="utf-8"))
+    assert set(run["stages"]) == {"render", "calibrate", "reconstruct"}
+    assert all(stage["seconds"] >= 0 for stage in run["stages"].values())
+    error = run["error"]
+    assert {"mse", "trimmed_mse", "predicted_mse", "psnr", "ssim", "budget"} <= set(error)
+    assert set(error["budget"]) == {"null_space", "noise", "quantisation", "rendering", "calibration"}
+    assert sum(error["budget"].values()) == pytest.approx(error["predicted_mse"], rel=1e-9)
+    assert min(error["budget"].values()) >= 0
+    assert {"method", "condition", "digits", "bound", "variance_bound", "why", "tried"} <= set(run["solver"])
+    assert run["diagnostics"]["degrees_of_freedom"] <= run["unknowns"]
+    assert set(run["model"]) == {"rms_difference_from_ideal", "max_z", "p_value", "feigned_information"}
+    assert all(set(skip) == {"what", "why"} for skip in run["skipped"])
+    assert {"ommatid", "python", "mitsuba", "drjit", "numpy", "scipy"} <= set(run["versions"])
+    assert run["seeds"]
+
+
+def test_run_json_says_what_the_pictures_say(finished: Path) -> None:
+    error = json.loads((finished / "run.json").read_text(encoding="utf-8"))["error"]
+    found = {name: pixels.astype(np.float64) for name, pixels in channels(finished / "estimate.exr").items()}
+    measured = float(np.mean((found["estimate"] - found["truth"]) ** 2))
+    single = 1e-5  # float32 keeps seven digits, of values that are some times larger than their differences
+    assert error["mse"] == pytest.approx(measured, rel=single)
+    assert error["psnr"] == pytest.approx(10 * np.log10(255**2 / measured), rel=single)
+    assert error["predicted_mse"] == pytest.approx(found["variance"].mean(), rel=single)
+    np.testing.assert_array_equal(found["truth"], channels(finished / "truth.exr")["Y"])
+
+
+def test_the_scene_in_the_folder_makes_the_same_stack_again(here: Path, finished: Path, ommatid: Command) -> None:
+    for name in ("scene.toml", "truth.exr"):
+        shutil.copy(finished / name, here / name)
+    assert ommatid("render", "scene.toml", "-o", "again").code == 0
+    assert_same_light(here / "again" / "scene" / "stack.exr", finished / "stack.exr")
+
+
+def test_reconstruct_from_files_gives_the_numbers_of_the_run(here: Path, finished: Path, ommatid: Command) -> None:
+    run = json.loads((finished / "run.json").read_text(encoding="utf-8"))
+    ended = ommatid("reconstruct", finished / "stack.exr", finished / "model.npz", "-o", "again.exr", "--json")
+    assert numbers(document(ended)) == numbers(run)
+    before, after = channels(finished / "estimate.exr"), channels(here / "again.exr")
+    assert before.keys() == after.keys()
+    for name in before:
+        np.testing.assert_array_equal(before[name], after[name])
+    assert (here / "again.png").read_bytes() == (finished / "estimate.png").read_bytes()
+
+
+def test_reconstruct_without_the_truth_gives_the_same_estimate(here: Path, finished: Path, ommatid: Command) -> None:
+    shutil.copy(finished / "stack.exr", here)
+    ended = ommatid("reconstruct", "stack.exr", finished / "model.npz", "-o", "again.exr", "--json")
+    assert "mse" not in document(ended)["error"]
+    after = channels(here / "again.exr")
+    assert set(after) == {"estimate", "variance"}
+    np.testing.assert_array_equal(after["estimate"], channels(finished / "estimate.exr")["estimate"])
+
+
+# --- what is not done twice
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {name: (folder / name).stat().st_mtime_ns for name in MADE}
+
+
+def done(ended: Ended) -> dict[str, bool]:
+    """Which stages had to be done, by what stderr says."""
+    assert ended.code == 0, ended.err
+    lines = dict(line.split(": ", 1) for line in ended.err.splitlines())
+    assert set(lines) == {"render", "calibrate", "reconstruct", "report"}
+    assert all(said.startswith(("done", "up to date")) for said in lines.values())
+    return {stage: said.startswith("done") for stage, said in lines.items()}
+
+
+NOTHING = {"render": False, "calibrate": False, "reconstruct": False, "report": False}
+TOLD = {"reconstruct", "report"}  # what a page shows is new whenever the reconstruction is
+
+
+def test_a_repeated_run_does_nothing_again(kept: Path, ommatid: Command) -> None:
+    before = stamps(kept)
+    ended = ommatid("run", "tiny.toml", "-o", "out", "--json")
+    assert done(ended) == NOTHING
+    assert stamps(kept) == before
+    assert {path.name for path in kept.iterdir()} == FILES
+    [described] = document(ended)
+    assert numbers(described) == numbers(json.loads((kept / "run.json").read_text(encoding="utf-8")))
+
+
+def test_another_expected_noise_redoes_the_reconstruction_alone(
+    kept: Path, finished: Path, here: Path, ommatid: Command
+) -> None:
+    told = ("--set", "estimator.noise_variance=25")
+    model = stamps(kept)["model.npz"]
+    ended = ommatid("run", "tiny.toml", "-o", "out", *told)
+    assert done(ended) == {**NOTHING, **dict.fromkeys(TOLD, True)}
+    assert stamps(kept)["model.npz"] == model
+    assert_same_light(kept / "stack.exr", finished / "stack.exr")
+    estimate = channels(kept / "estimate.exr")["estimate"]
+    assert (estimate != channels(finished / "estimate.exr")["estimate"]).any()
+    # The run's folder now stands for itself: files alone give the same, and so does telling the old stack.
+    for source, options in ((kept, ()), (finished, told)):
+        assert ommatid("reconstruct", source / "stack.exr", source / "model.npz", "-o", "again.exr", *options).code == 0
+        np.testing.assert_array_equal(channels(here / "again.exr")["estimate"], estimate)
+
+
+@pytest.mark.parametrize(
+    ("setting", "redone"),
+    [
+        ("render.seed=1", {"render", "calibrate"} | TOLD),
+        ("render.samples=32", {"render"} | TOLD),
+        ("noise.variance=1", {"render"} | TOLD),
+        ("calibration.samples=32", {"calibrate"} | TOLD),
+        ("prior.mean=100", TOLD),
+        ("target.origin=[90,200]", {"render"} | TOLD),
+    ],
+)
+def test_what_is_out_of_date_is_done_again(setting: str, redone: set[str], kept: Path, ommatid: Command) -> None:
+    assert kept.is_dir()
+    ended = ommatid("run", "tiny.toml", "-o", "out", "--set", setting)
+    assert {stage for stage, again in done(ended).items() if again} == redone
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"),
+    [("stack.exr", "render"), ("model.npz", "calibrate"), ("run.json", "reconstruct"), ("estimate.exr", "reconstruct")],
+)
+def test_a_damaged_file_is_made_again(name: str, stage: str, kept: Path, finished: Path, ommatid: Command) -> None:
+    whole = (kept / name).read_bytes()
+    (kept / name).write_bytes(whole[: len(whole) // 2])
+    # What was made again took another time, which run.json has to say: the reconstruction follows.
+    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True, **dict.fromkeys(TOLD, True)}
+    assert_same_light(kept / "stack.exr", finished / "stack.exr")
+    described = [json.loads((folder / "run.json").read_text(encoding="utf-8")) for folder in (kept, finished)]
+    assert numbers(described[0]) == numbers(described[1])
+
+
+@pytest.mark.parametrize("left", [0, 2000, 100_000])
+def test_a_report_that_is_missing_or_cut_short_is_drawn_again_as_it_was(
+    left: int, kept: Path, ommatid: Command
+) -> None:
+    report = kept / "report.html"
+    whole = report.read_bytes()
+    if left:
+        report.write_bytes(whole[:left])
+    else:
+        report.unlink()
+    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, "report": True}
+    assert report.read_bytes() == whole
+
+
+# --- batches
+
+
+def test_one_bad_scene_does_not_stop_the_others(here: Path, ommatid: Command) -> None:
+    (here / "bad.toml").write_text(TINY.replace('"1/3"', "2"), encoding="utf-8")
+    (here / "last.toml").write_text(TINY, encoding="utf-8")
+    ended = ommatid("run", "tiny.toml", "bad.toml", "last.toml", "-o", "out", "--json")
+    assert ended.code == 2
+    first, bad, last = json.loads(ended.out)
+    assert bad["scene"] == "bad.toml"
+    assert bad["exit_code"] == 2
+    assert "magnification" in bad["error"]
+    assert [line for line in ended.err.splitlines() if line.startswith("ommatid: ")] == [f"ommatid: {bad['error']}"]
+    assert numbers(first) == numbers(last)
+    assert {path.name for path in (here / "out").iterdir()} == {"tiny", "last", "index.html"}
+    for stem in ("tiny", "last"):
+        assert {path.name for path in (here / "out" / stem).iterdir()} == FILES
+
+
+def test_two_scenes_of_one_name_would_share_a_folder(here: Path, ommatid: Command) -> None:
+    (here / "other").mkdir()
+    shutil.copy(here / "tiny.toml", here / "other")
+    ended = ommatid("render", "tiny.toml", "other/tiny.toml", "-o", "out")
+    assert ended.code == 2
+    assert ended.err.startswith("ommatid: ")
+    assert "'tiny'" in ended.err
+    assert not (here / "out").exists()
+
+
+# --- init and schema
+
+
+def test_init_writes_a_scene_to_start_from_and_never_overwrites(here: Path, ommatid: Command) -> None:
+    assert ommatid("init", "new.toml").code == 0
+    assert document(ommatid("show", "new.toml", "--json"))["lens_types"]
+    (here / "new.toml").write_text("mine", encoding="utf-8")
+    ended = ommatid("init", "new.toml")
+    assert ended.code == 2
+    assert "exists already" in ended.err
+    assert (here / "new.toml").read_text(encoding="utf-8") == "mine"
+
+
+def _alternatives(schema: Any, root: dict[str, Any]) -> list[dict[str, Any]]:
+    """A schema without references: one dictionary a branch of `anyOf`."""
+    if "$ref" in schema:
+        return _alternatives(root["$defs"][schema["$ref"].removeprefix("#/$defs/")], root)
+    if "anyOf" in schema:
+        return [found for branch in schema["anyOf"] for found in _alternatives(branch, root)]
+    return [schema]
+
+
+def _unknown(data: object, schemas: list[dict[str, Any]], root: dict[str, Any]) -> list[str]:
+    """Keys in `data` that no alternative knows."""
+    if isinstance(data, list):
+        inner = [found for schema in schemas if "items" in schema for found in _alternatives(schema["items"], root)]
+        return [key for entry in cast(list[object], data) for key in _unknown(entry, inner, root)]
+    if not isinstance(data, dict):
+        return []
+    unknown: list[str] = []
+    for key, value in cast(dict[str, object], data).items():
+        tables = [schema["properties"][key] for schema in schemas if key in schema.get("properties", {})]
+        if not tables:
+            unknown.append(key)
+        unknown += _unknown(value, [found for table in tables for found in _alternatives(table, root)], root)
+    return unknown
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in GALLERY.glob("*.toml")))
+def test_the_schema_knows_every_key_of_the_gallery(name: str, ommatid: Command) -> None:
+    schema = document(ommatid("schema"))
+    data = tomllib.loads((GALLERY / name).read_text(encoding="utf-8"))
+    assert _unknown(data, [schema], schema) == []
+    data["target"]["distnace"] = data["target"].pop("distance")
+    assert _unknown(data, [schema], schema) == ["distnace"], "the walk finds what is not there"
+    assert all(table["additionalProperties"] is False for table in [schema, *schema["$defs"].values()])
+
+
+# --- what must not be lost
+
+
+@pytest.mark.parametrize("command", ["run", "render"])
+def test_the_scene_that_is_read_is_never_replaced(command: str, here: Path, ommatid: Command) -> None:
+    (here / "scene").mkdir()
+    mine = here / "scene" / "scene.toml"
+    mine.write_text("# mine\n" + (here / "tiny.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    before = mine.read_bytes()
+    ended = ommatid(command, "scene/scene.toml", "-o", ".")
+    assert ended.code == 2
+    assert "would replace" in ended.err
+    assert mine.read_bytes() == before
+    assert [path.name for path in mine.parent.iterdir()] == ["scene.toml"]
+
+
+@pytest.mark.parametrize("name", ["stack.exr", "model.npz", "truth.exr"])
+def test_reconstruct_never_replaces_what_it_reads(name: str, kept: Path, ommatid: Command) -> None:
+    before = stamps(kept)
+    ended = ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", kept / name)
+    assert ended.code == 2
+    assert stamps(kept) == before
+
+
+def test_ctrl_c_ends_in_one_sentence_and_keeps_what_is_done(here: Path) -> None:
+    """Interrupted while it calibrates, a run leaves a whole stack and no part of a model."""
+    command = [sys.executable, "-m", "ommatid", "run", "tiny.toml", "-o", "out"]
+    more = ["--set", "calibration.samples=100000"]
+    with subprocess.Popen(
+        [*command, *more],
+        cwd=here,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell's background jobs inherit that SIGINT is ignored, and so would the run.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as started:
+        assert started.stderr is not None
+        assert "render: done" in started.stderr.readline()
+        started.send_signal(signal.SIGINT)
+        said = started.stderr.read()
+    assert started.returncode == 1
+    assert said.strip() == "ommatid: stopped; finished files stay, the next run carries on from them"
+    assert {path.name for path in (here / "out" / "tiny").iterdir()} == {"scene.toml", "truth.exr", "stack.exr"}
+
+
+def test_a_title_with_dollar_signs_is_drawn_as_it_is(here: Path, ommatid: Command) -> None:
+    extra = ("--set", "calibration.method=ideal", "--set", 'title="a $^$ b"')
+    assert ommatid("run", here / "tiny.toml", "-o", "out", *extra).code == 0
+
+
+def test_too_large_a_reconstruction_is_refused_before_anything_is_rendered(here: Path, ommatid: Command) -> None:
+    sets = ["target.origin=", "target.shape=[512, 512]", "camera.lens.I.pixels=fit", "camera.lens_pitch=9 mm"]
+    sets.append("estimator.memory=20 MB")
+    ended = ommatid("run", "tiny.toml", "-o", "out", *(word for one in sets for word in ("--set", one)))
+    assert ended.code == 2
+    assert "GB" in ended.err
+    assert not (here / "out").exists()

@@ -1,0 +1,85 @@
+"""The program's modules by name, and what each of them imports, read from their source."""
+
+from __future__ import annotations
+
+import ast
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+LINKED = ("scenes", "simulate", "reconstruct")  # folders at the top, which links in ommatid/ make part of it
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the program, by the name under which it is imported."""
+    own = {_name(path): path for path in sorted((ROOT / "ommatid").glob("**/*.py")) if not _linked(path)}
+    linked = [path for package in LINKED for path in sorted((ROOT / package).glob("**/*.py"))]
+    return own | {f"ommatid.{_name(path)}": path for path in linked}
+
+
+def existing(*names: str) -> set[str]:
+    """These names of modules. Raises ModuleNotFoundError for one that does not exist, for instance since a renaming."""
+    for name in names:
+        if find_spec(name) is None:
+            raise ModuleNotFoundError(name)
+    return set(names)
+
+
+@cache
+def imports(name: str) -> frozenset[str]:
+    """All that a module imports, anywhere in it: our modules by whole names, others as they are written."""
+    path = modules()[name]
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = _absolute(name, path, node)
+            whole = {f"{base}.{alias.name}" for alias in node.names}
+            found |= {one if one in modules() else base for one in whole}
+    return frozenset(found - {name})
+
+
+def circles() -> list[list[str]]:
+    """Groups of modules that import one another in a circle (Tarjan's strongly connected components)."""
+    index: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(name: str) -> None:
+        index[name] = lowest[name] = len(index)
+        stack.append(name)
+        for other in imports(name) & modules().keys():
+            if other not in index:
+                visit(other)
+            if other in stack:
+                lowest[name] = min(lowest[name], lowest[other])
+        if lowest[name] == index[name]:
+            start = stack.index(name)
+            group, stack[start:] = stack[start:], []
+            found.extend([group] if len(group) > 1 else [])
+
+    for name in modules():
+        if name not in index:
+            visit(name)
+    return found
+
+
+def _absolute(name: str, path: Path, node: ast.ImportFrom) -> str:
+    if not node.level:
+        return node.module or ""
+    package = name if path.stem == "__init__" else name.rpartition(".")[0]
+    parts = package.split(".")[: len(package.split(".")) - node.level + 1]
+    return ".".join([*parts, *([node.module] if node.module else [])])
+
+
+def _linked(path: Path) -> bool:
+    return path.relative_to(ROOT / "ommatid").parts[0] in LINKED
+
+
+def _name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)

@@ -1,0 +1,401 @@
+"""The paper's figures and claims: reference values by extended precision, statistics, and what is written."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from ommatid.paper import claims, paper
+from ommatid.paper import figures as paper_figures
+from ommatid.paper.claims import CATCH, NO, YES
+from ommatid.paper.photograph_claims import pictures
+from ommatid.paper.photographs import Photograph, TileCrops, cut, load, measure, seeds, simulate_trials
+from ommatid.paper.tile_errors import THREE, TWICE, TWO, PaperTile, TileError, Tiles, tile, tiles
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.tables.sensor import NoiseTable
+from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.sensor.gaussian import expose, generators
+
+from ..examples import familywise
+
+Values = NDArray[np.float64]
+
+
+def record(camera: Camera, light: Values, noise: NoiseTable, seed: int) -> Values:
+    return expose(light, noise, generators(camera, seed), camera.slices())
+
+
+@dataclass(frozen=True)
+class Written:
+    """What one run left behind, and the figures as they were drawn."""
+
+    folder: Path
+    description: dict[str, Any]
+    figures: dict[str, Any]
+
+    def rows(self, name: str) -> list[dict[str, str]]:
+        with (self.folder / name).open(newline="", encoding="utf-8") as stream:
+            return list(csv.DictReader(stream))
+
+    def claim(self, beginning: str) -> dict[str, Any]:
+        (found,) = [claim for claim in self.description["claims"] if claim["claim"].startswith(beginning)]
+        return found
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Written]:
+    folder = tmp_path_factory.mktemp("paper") / "new" / "folder"
+    drawn: dict[str, Any] = {}
+
+    def save(figure: Any, path: Path) -> None:
+        drawn[path.stem] = figure
+        original(figure, path)
+
+    original = vars(paper_figures)["_save"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_figures, "_save", save)
+        yield Written(folder, paper.write_paper(folder, ideal_matrix, record), drawn)
+
+
+@pytest.fixture(scope="module")
+def computed() -> Tiles:
+    return tiles(ideal_matrix)
+
+
+REFERENCE = [
+    ("fig2", "I+I", 1e-6, 1e-6, 2057.42393, None),
+    ("fig2", "I+II", 1e-6, 1e-6, 484.100274, None),
+    ("fig2", "I+II+III", 1e-6, 1e-6, 2.79776586e-4, None),
+    ("fig2", "I+II+III", 1e-2, 1e-4, 0.0330911224, None),
+    ("fig2", "I+II", 1e-2, 1e-4, 484.191545, None),
+    ("fig2", "I+II+III", 1.0, 1e-2, 35.5841883, None),
+    ("fig2", "I+II", 1.0, 1e-2, 589.811609, None),
+    ("fig2", "I+I", 1e-4, 1e-2, 2058.5, None),
+    ("fig2", "I+II", 1e-4, 1e-2, 489.606, None),
+    ("fig2", "I+II+III", 1e-4, 1e-2, 2.79766, 1.85623),
+    ("fig4", "I+I", 1e-6, 1e-6, 606.31081, None),
+    ("fig4", "I+II", 1e-6, 1e-6, 89.16378, None),
+    ("fig4", "I+II+III", 1e-6, 1e-6, 1.54401e-4, None),
+    ("fig4", "I+II+III", 1.0, 1.0, 139.233, None),
+    ("fig4", "I+II", 1.0, 1.0, 397.08, None),
+]
+
+
+@pytest.mark.parametrize(("figure", "lenses", "expected", "actual", "mse", "trimmed"), REFERENCE)
+def test_the_numbers_of_figures_2_and_4_are_those_of_extended_precision(
+    written: Written, figure: str, lenses: str, expected: float, actual: float, mse: float, trimmed: float | None
+) -> None:
+    (row,) = [
+        row
+        for row in written.rows(f"{figure}.csv")
+        if row["lenses"] == lenses
+        and float(row["expected_noise_variance"]) == expected
+        and np.isclose(float(row["actual_noise_variance"]), actual, rtol=1e-12)
+    ]
+    assert float(row["mse"]) == pytest.approx(mse, rel=digits(mse))
+    if trimmed is not None:
+        assert float(row["trimmed_mse"]) == pytest.approx(trimmed, rel=digits(trimmed))
+
+
+def digits(reference: float) -> float:
+    """Half a unit of the last digit that a reference is given with, relative."""
+    figures = len(f"{reference:.12g}".split("e")[0].replace(".", "").strip("0"))
+    return 0.6 * 10.0 ** (1 - figures)
+
+
+def test_figure_5_holds_the_tile_of_longer_lenses(written: Written) -> None:
+    rows = written.rows("fig5.csv")
+    matched = {
+        row["side"]: float(row["mse"])
+        for row in rows
+        if float(row["actual_noise_variance"]) == float(row["expected_noise_variance"]) == 1e-6
+    }
+    assert matched["41"] == pytest.approx(1.24737e-3, rel=digits(1.24737e-3))
+    assert set(matched) == {"19", "35", "41"}
+
+
+def test_two_types_of_longer_lenses() -> None:
+    assert tile(41, TWO, ideal_matrix).mse(1e-6) == pytest.approx(194.93058, rel=1e-7)
+
+
+@pytest.mark.parametrize("lenses", [TWICE, TWO, THREE])
+def test_a_line_is_equation_5_written_out(computed: Tiles, lenses: tuple[str, ...]) -> None:
+    shown, expected, actual = computed[19, lenses], 1e-2, 3.0
+    h, p0 = shown.form.problem.matrix.toarray(), 5461.25
+    gain = np.linalg.solve(p0 * h @ h.T + expected * np.eye(len(h)), p0 * h).T
+    left = np.eye(361) - gain @ h
+    covariance = p0 * left @ left.T + actual * gain @ gain.T
+    # The textbook form loses 7e-17/v of its digits, and its squares once more.
+    np.testing.assert_allclose(shown.line(expected).at(actual), np.diag(covariance), rtol=1e-7)
+
+
+def test_maps_are_of_the_tile_and_upright(written: Written, computed: Tiles) -> None:
+    rows = written.rows("fig3.csv")
+    for number, lenses in enumerate((TWICE, TWO, THREE)):
+        image = np.zeros((19, 19))
+        for row in rows:
+            if row["lenses"] == "+".join(lenses):
+                image[int(row["row"]), int(row["column"])] = float(row["expected_squared_error"])
+        axes = written.figures["fig3"].axes[number]
+        np.testing.assert_array_equal(axes.images[0].get_array(), image)
+        assert axes.images[0].origin == "upper"
+        assert f"maximum {image.max():.4g}" in axes.get_title()
+        assert image.mean() == pytest.approx(computed[19, lenses].mse(1e-4), rel=1e-12)
+
+
+@pytest.mark.parametrize(("name", "side", "panels"), [("fig2", 19, 2), ("fig4", 35, 2)])
+def test_sweeps_are_drawn_as_they_are_written(written: Written, name: str, side: int, panels: int) -> None:
+    rows = written.rows(f"{name}.csv")
+    assert len(rows) == 3 * 4 * 33
+    for axes, column in zip(written.figures[name].axes, ("mse", "trimmed_mse"), strict=True):
+        drawn = np.array([line.get_ydata() for line in axes.lines])
+        np.testing.assert_allclose(drawn.ravel(), [float(row[column]) for row in rows], rtol=1e-12)
+        assert axes.get_xscale() == axes.get_yscale() == "log"
+        assert str(side) in axes.get_title()
+    assert len(written.figures[name].axes) == panels
+
+
+def test_figure_7_is_drawn_as_it_is_written(written: Written) -> None:
+    rows = written.rows("fig7.csv")
+    tiles_at = [f"tile_{row}_{column}" for row, column in written.description["picture"]["places"]]
+    parts = [row for row in rows if not row["bits"]], [row for row in rows if row["bits"]]
+    panels = [axes for axes in written.figures["fig7"].axes if axes.get_yscale() == "log"]
+    for axes, part in zip(panels, parts, strict=True):
+        wanted = [*tiles_at, "mean", "predicted"]
+        for line, column in zip(axes.lines, wanted, strict=True):
+            np.testing.assert_array_equal(line.get_ydata(), [float(row[column]) for row in part])
+        for row in part:
+            assert float(row["mean"]) == pytest.approx(np.mean([float(row[one]) for one in tiles_at]), rel=1e-12)
+    for row in parts[1]:
+        assert float(row["noise_variance"]) == pytest.approx((256 / 2 ** int(row["bits"])) ** 2 / 12, rel=1e-12)
+
+
+def test_every_axis_has_a_name(written: Written) -> None:
+    for name, figure in written.figures.items():
+        for axes in figure.axes:
+            pictured = not len(axes.get_xticks()) and not len(axes.get_yticks())
+            bar = axes.get_label() == "<colorbar>"
+            assert axes.get_ylabel() or pictured, f"{name}: {axes.get_title()}"
+            assert axes.get_xlabel() or pictured or bar, f"{name}: {axes.get_title()}"
+        assert (written.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_everything_is_written_and_nothing_else(written: Written) -> None:
+    assert {path.name for path in written.folder.iterdir()} == set(written.description["files"])
+    assert set(written.figures) == {"fig2", "fig3", "fig4", "fig5", "fig7", "distortion"}
+    json.dumps(written.description, allow_nan=False)
+
+
+VERDICTS = {
+    "two sets of type I": CATCH,
+    "two types are better": CATCH,
+    "one type or two: the null space": YES,
+    "three types: the error falls": YES,
+    "two types: the error is largest": YES,
+    "type I alone": CATCH,
+    "three types: the 35 x 35": CATCH,
+    "41 x 41": CATCH,
+    "one type leaves": YES,
+    "two coprime types": YES,
+    "quantisation": CATCH,
+    "real photographs": YES,
+}
+
+
+@pytest.mark.parametrize("beginning", VERDICTS)
+def test_each_claim_holds_as_was_measured_beforehand(written: Written, beginning: str) -> None:
+    found = written.claim(beginning)
+    assert found["holds"] == VERDICTS[beginning]
+    assert bool(found["remark"]) or found["holds"] == YES, "a catch is named"
+    (row,) = [row for row in written.rows("claims.csv") if row["claim"] == found["claim"]]
+    assert (row["holds"], row["remark"]) == (found["holds"], found["remark"])
+    assert all(name in row["numbers"] for name in found["numbers"])
+
+
+def test_there_are_no_other_claims(written: Written) -> None:
+    assert len(written.rows("claims.csv")) == len(VERDICTS)
+
+
+@pytest.mark.parametrize(
+    ("beginning", "number", "value"),
+    [
+        ("two types are better", "19: least noise at which they cross", 3.6),
+        ("two types are better", "19: largest noise at which they cross", 7.9),
+        ("type I alone", "19: mean of the 17 x 17 pixels it sees", 1209.41),
+        ("type I alone", "19: trimmed by 1", 1213.35),
+        ("41 x 41", "times less than 19", 4.5),
+        ("41 x 41", "times less than 35", 8.1),
+        ("one type leaves", "19 I (a = 4): null space", 361 - 225),
+        ("one type leaves", "35 I (a = 2): null space", 1225 - 1089),
+        ("two coprime", "19 I+II (a = 4, b = 4): null space", 361 - 329),
+        ("two coprime", "19 I+III (a = 4, b = 3): null space", 361 - 337),
+        ("two coprime", "35 I+II (a = 2, b = 5): null space", 1225 - 1205),
+        ("two coprime", "41 I+II (a = 6, b = 5): null space", 1681 - 1621),
+        ("one type or two", "19 I+II: error at noise 1e-6", 484.100274),
+    ],
+)
+def test_the_numbers_of_the_claims(written: Written, beginning: str, number: str, value: float) -> None:
+    exact = isinstance(value, int)
+    found = written.claim(beginning)["numbers"][number]
+    assert found == value if exact else found == pytest.approx(value, rel=digits(value))
+
+
+def test_whole_numbers_are_rounded_with_a_third_less_error(written: Written) -> None:
+    numbers = written.claim("quantisation")["numbers"]
+    assert numbers["whole numbers, from 12 bits on"] == pytest.approx(2 / 3, abs=0.05)
+    fine = [numbers[f"error it causes over predicted at {bits} bits"] for bits in range(10, 17)]
+    np.testing.assert_allclose(fine, 1, atol=4 * numbers["standard error at most"])
+
+
+def test_the_printed_table_names_every_claim(written: Written) -> None:
+    lines = dict(paper.rows(written.description))
+    for claim in written.description["claims"]:
+        assert lines[claim["claim"]].startswith(claim["holds"])
+
+
+def test_a_claim_that_does_not_hold_is_said_not_to(computed: Tiles) -> None:
+    swapped = {**computed, (19, TWICE): computed[19, THREE], (19, THREE): computed[19, TWICE]}
+    verdicts = {claim.claim: claim.holds for claim in claims.errors(swapped)}
+    broken = (
+        "two sets of type I",
+        "two types are better",
+        "one type or two",
+        "three types: the error falls",
+        "41 x 41",
+    )
+    for beginning in broken:
+        assert [holds for claim, holds in verdicts.items() if claim.startswith(beginning)] == [NO]
+
+
+def test_lines_cross_and_bend_where_they_do() -> None:
+    one, two = (
+        TileError(np.array([9.0, 11.0]), np.array([1.0, 1.0])),
+        TileError(np.array([1.0, 3.0]), np.array([4.0, 6.0])),
+    )
+    assert one.crossing(two) == 2.0
+    assert one.at(2.0).mean() == two.at(2.0).mean()
+    assert one.crossing(replace(two, noise=np.array([0.5, 0.5]))) == float("inf")
+    assert (one.knee, two.knee) == (10.0, 0.4)
+
+
+def from_prior(shown: PaperTile, count: int, seed: int) -> Values:
+    prior, rng = shown.form.problem.prior, np.random.default_rng(seed)
+    return prior.mean + rng.normal(size=(count, prior.mean.size)) * prior.root
+
+
+def test_images_from_the_prior_err_as_predicted(computed: Tiles) -> None:
+    """The error's covariance has the eigenvalues P0 / (1 + s^2): mean and variance of its squared length follow."""
+    shown, count = computed[19, TWO], 200
+    noises = tuple(NoiseTable(variance=variance) for variance in (1e-6, 1e-3, 1.0, 100.0))
+    trials = measure(shown, from_prior(shown, count, 1), noises, record, seeds(3, 0))
+    for level, noise in enumerate(noises):
+        eigenvalues = 5461.25 / (1 + shown.form.values**2 / noise.variance)
+        spread = np.sqrt(2 * np.sum(eigenvalues**2)) / 361
+        z = (trials.mean[level] - trials.predicted[level]) / (spread / np.sqrt(count))
+        assert abs(z) < stats.norm.isf(familywise(len(noises)) / 2), f"at noise {noise.variance:g}"
+
+
+def test_the_noise_alone_errs_as_predicted(computed: Tiles) -> None:
+    shown, count = computed[19, THREE], 200
+    noises = (NoiseTable(variance=1e-4), NoiseTable(variance=1.0), *(NoiseTable(bits=bits) for bits in (4, 8, 12)))
+    trials = measure(shown, from_prior(shown, count, 2), noises, record, seeds(4, 0))
+    limit = stats.norm.isf(familywise(len(noises)) / 2)
+    z = (trials.from_noise.mean(axis=1) / trials.noise_part - 1) / (trials.spread / np.sqrt(count))
+    assert np.abs(z).max() < limit
+    for level, noise in enumerate(noises[:2]):  # Gaussian: the sample's deviation is known from the fourth cumulant
+        s2 = shown.form.values**2 / noise.variance
+        weights = s2 / (1 + s2) ** 2
+        excess = 12 * np.sum(weights**4) / np.sum(weights**2) ** 2
+        found = trials.from_noise[level].std(ddof=1) / trials.noise_part[level]
+        assert found == pytest.approx(trials.spread[level], rel=3 * np.sqrt((2 + excess) / (4 * count)))
+
+
+def test_noise_is_repeated_by_its_seed_and_shared_by_nothing(computed: Tiles) -> None:
+    shown, noises = computed[19, THREE], (NoiseTable(variance=1e-2),) * 2
+    images = np.tile(from_prior(shown, 1, 5), (3, 1))
+    trials = measure(shown, images, noises, record, seeds(6, 0))
+    assert np.unique(trials.measured).size == 6, "one image, one level of noise: errors of their own all the same"
+    fewer = measure(shown, images[:2], noises, record, seeds(6, 0))
+    np.testing.assert_array_equal(fewer.from_noise, trials.from_noise[:, :2])
+    for other in (seeds(6, 1), seeds(7, 0)):
+        assert not np.intersect1d(measure(shown, images, noises, record, other).from_noise, trials.from_noise).size
+
+
+def test_pictures_like_the_prior_are_no_photographs(computed: Tiles) -> None:
+    """Twice the prior's deviation: worse than predicted where the prior decides."""
+    shown = computed[35, THREE]
+    images = 127.5 + 2 * (from_prior(shown, 6, 8) - 127.5)
+    found = simulate_trials(shown, "prior", TileCrops(images, ((0, 0),) * 6), record, 0)
+    assert pictures(found)[1].holds == NO
+    assert pictures(broken_quantisation(found))[0].holds == NO
+
+
+def broken_quantisation(found: Photograph) -> Photograph:
+    return replace(found, quantised=replace(found.quantised, from_noise=1.2 * found.quantised.from_noise))
+
+
+@pytest.mark.parametrize("shape", [(70, 105), (105, 70), (35, 210), (210, 35), (71, 300), (512, 512)])
+def test_tiles_are_cut_upright_and_apart(shape: tuple[int, int]) -> None:
+    pixels = np.random.default_rng(0).uniform(0, 255, shape)
+    chosen = cut(pixels, 35, "noise", np.random.default_rng(1))
+    covered = np.zeros(shape, dtype=int)
+    for image, (row, column) in zip(chosen.images, chosen.places, strict=True):
+        covered[row : row + 35, column : column + 35] += 1
+        fraction = image.reshape(35, 35) - pixels[row : row + 35, column : column + 35]
+        assert np.abs(fraction).max() <= 0.5, "rounded, a picture of whole numbers is itself"
+        assert stats.kstest(fraction.ravel() + 0.5, "uniform").pvalue > familywise(36)
+    assert len(chosen.places) == 6
+    assert (covered.max(), covered.sum()) == (1, 6 * 35**2), "whole tiles, none over another"
+
+
+def test_tiles_are_cut_where_there_is_something_to_see() -> None:
+    pixels = np.full((400, 600), 99.0)
+    pixels[300, 100] = 200.0
+    rng = np.random.default_rng(0)
+    assert any(
+        row <= 300 < row + 35 and column <= 100 < column + 35 for row, column in cut(pixels, 35, "dot", rng).places
+    )
+
+
+@pytest.mark.parametrize("shape", [(69, 105), (104, 104), (34, 1000), (1000, 34), (35, 209)])
+def test_a_picture_that_holds_no_six_tiles_is_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(InputError, match=f"6 tiles of 35 x 35 pixels.* got {shape[0]} x {shape[1]} in me.png"):
+        cut(np.zeros(shape), 35, "me.png", np.random.default_rng(0))
+
+
+def test_what_is_no_picture_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "note.npy").write_text("no picture", encoding="utf-8")
+    np.save(tmp_path / "small.npy", np.zeros((60, 60)))
+    for name, expected in (("note.npy", "could not be read"), ("none.png", "no picture"), ("small.npy", "6 tiles")):
+        with pytest.raises(InputError, match=f"--image.*{expected}") as refused:
+            paper.write_paper(tmp_path / "out", ideal_matrix, record, str(tmp_path / name))
+        assert "\n" not in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unusable_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way", encoding="utf-8")
+    with pytest.raises(InputError, match="expected a folder"):
+        paper.write_paper(tmp_path / "file", ideal_matrix, record)
+
+
+def test_the_readers_picture_is_not_written_over(tmp_path: Path) -> None:
+    from skimage import io
+
+    picture = tmp_path / "fig7.png"
+    save_image: Any = io.imsave  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    save_image(picture, np.arange(80 * 120, dtype=np.uint8).reshape(80, 120), check_contrast=False)
+    assert load(str(picture)).shape == (80, 120)
+    with pytest.raises(InputError, match=r"fig7\.png: would replace"):
+        paper.write_paper(tmp_path, ideal_matrix, record, str(picture))
+    assert {path.name for path in tmp_path.iterdir()} == {"fig7.png"}

@@ -1,0 +1,137 @@
+"""Eq. 5 against the errors of images drawn from the prior, for every form; and the diagnostics beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse, stats
+
+from ommatid.reconstruct.estimator.estimate import FORMS, factorise
+from ommatid.reconstruct.expected_error import expected_error, expected_given, variance_of_sum
+from ommatid.reconstruct.prior import Prior, exponential
+from ommatid.reconstruct.problem import Problem
+from ommatid.simulate.ideal import ideal_matrix
+
+from ..examples import camera
+from .test_estimate import problem, tile
+
+
+@given(st.integers(0, 10**6), st.floats(0.1, 10))
+@settings(max_examples=40, deadline=None, derandomize=True)
+def test_a_wrong_expectation_never_lowers_the_error(seed: int, factor: float) -> None:
+    """The estimate that expects the real noise has the least error of all linear ones."""
+    known = problem(seed, 8, 6)
+    noise = {"noise": known.noise_variance}
+    right = expected_error(factorise(known)[0], noise)
+    mistaken = Problem(known.matrix, known.prior, factor * known.noise_variance)
+    assert (expected_error(factorise(mistaken)[0], noise).variance >= right.variance * (1 - 1e-9)).all()
+
+
+def test_parts_add_up() -> None:
+    known = problem(5, 9, 6)
+    parts = {"noise": 0.3 * known.noise_variance, "rendering": 0.7 * known.noise_variance}
+    expected = expected_error(factorise(known)[0], parts)
+    assert expected.missing + sum(expected.parts.values()) == pytest.approx(expected.mse)
+    assert expected.parts["rendering"] == pytest.approx(expected.parts["noise"] * 7 / 3)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("lenses", [3, 2, 1])
+def test_eq_5_holds_over_a_thousand_images_drawn_from_the_prior(form: str, lenses: int) -> None:
+    """The whitened error is chi-squared, with every pixel and with all of them together.
+
+    One type leaves a null space, three leave none: the prior's part and the noise's are both put to the test.
+    """
+    known = tile(lenses, 0.5)
+    draws, unknowns = 1000, known.unknowns
+    factorised, _ = factorise(known, form)
+    covariance = factorised.covariance(np.eye(unknowns))
+    rng = np.random.default_rng(7)
+    images = rng.normal(127.5, known.prior.root[:, None], (unknowns, draws))
+    recorded = known.matrix @ images + rng.normal(0, 0.5**0.5, (known.measurements, draws))
+    mean = np.full((unknowns, 1), 127.5)
+    error = mean + factorised.gain(recorded - known.matrix @ mean) - images
+    score = np.sum(error**2, axis=1) / factorised.variance()
+    limit = stats.chi2.ppf([0.0005 / unknowns, 1 - 0.0005 / unknowns], draws)  # all pixels 999 times in 1000
+    assert limit[0] < score.min()
+    assert score.max() < limit[1]
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), error)
+    together = float(np.sum(whitened**2))
+    assert 0.0005 < float(stats.chi2.cdf(together, draws * unknowns)) < 0.9995
+
+
+def test_a_mismatched_expectation_is_predicted_too() -> None:
+    """Eq. 5 with another noise and another, even a correlated, prior than expected, against the errors themselves."""
+    known = tile(3, 1.0)
+    rng = np.random.default_rng(8)
+    draws = 300
+    really = exponential(127.5, 1000.0, (19, 19), 4.0)
+    form, _ = factorise(known)
+    expected = expected_error(form, {"noise": np.full(706, 4.0)}, really)
+    images = really.mean[:, None] + really.spread(rng.normal(size=(361, draws)))
+    recorded = known.matrix @ images + rng.normal(0, 2.0, (706, draws))
+    error = form.gain(recorded - known.matrix @ really.mean[:, None]) + really.mean[:, None] - images
+    assert np.mean(error**2) == pytest.approx(expected.mse, rel=0.05)
+    same = expected_error(form, {"noise": np.full(706, 4.0)}, known.prior)
+    assert same.variance == pytest.approx(expected_error(form, {"noise": np.full(706, 4.0)}).variance, rel=1e-9)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_the_interval_holds_99_errors_in_a_hundred(wide: bool) -> None:
+    """Of one given image, over many draws of the noise, for an estimator that expects another noise as well."""
+    rng = np.random.default_rng(2)
+    matrix = sparse.csr_array(rng.normal(size=(60, 30)) / np.geomspace(1, 300 if wide else 2, 30))
+    noise = rng.uniform(0.2, 2, 60)
+    truth = rng.normal(0, 2, 30)
+    form, _ = factorise(Problem(matrix, Prior(np.zeros(30), np.full(30, 3.0)), 2 * noise))
+    interval = expected_given(form, truth, noise)
+    draws = 20_000
+    recorded = (matrix @ truth)[:, None] + rng.normal(size=(60, draws)) * np.sqrt(noise)[:, None]
+    errors = np.mean((form.gain(recorded) - truth[:, None]) ** 2, axis=0)
+    assert errors.mean() == pytest.approx(interval.mse, rel=0.02)
+    outside = np.mean((errors < interval.low) | (errors > interval.high))
+    assert 0.005 < outside < 0.02
+
+
+def test_the_mean_of_a_region_has_an_error_of_its_own() -> None:
+    """Against the errors of such means over images drawn from the prior; errors of neighbours cancel in it."""
+    known = tile(2, 1.0)
+    form, _ = factorise(known)
+    weights = np.zeros((19, 19))
+    weights[5:11, 6:12] = 1 / 36
+    flat = weights.ravel()
+    variance = variance_of_sum(form, flat, known.noise_variance)
+    rng = np.random.default_rng(3)
+    draws = 4000
+    images = rng.normal(0, known.prior.root[:, None], (361, draws))
+    error = form.gain(known.matrix @ images + rng.normal(size=(known.measurements, draws))) - images
+    means = flat @ error
+    assert np.mean(means**2) == pytest.approx(variance, rel=4 * (2 / draws) ** 0.5)
+    assert variance == pytest.approx(flat @ form.covariance(flat), rel=1e-9)
+    assert variance < 0.5 * float(flat**2 @ form.variance()), "neighbours' errors cancel"
+
+
+def test_degrees_of_freedom_and_resolution() -> None:
+    """Without noise the degrees of freedom are the rank of H; a pixel seen alone at P0 / Rv = 3 has 3/4 of one."""
+    assert expected_error(factorise(tile(3, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(361, abs=1e-6)
+    assert expected_error(factorise(tile(2, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(329, abs=1e-6)
+    matrix = sparse.csr_array(np.diag([1.0, 1.0, 0.0]))
+    known = Problem(matrix, Prior(np.zeros(3), np.full(3, 3.0**0.5)), np.array([1.0, 1e-12, 1.0]))
+    found = expected_error(factorise(known)[0], {"noise": known.noise_variance})
+    assert found.resolved == pytest.approx([0.75, 1, 0])
+    assert found.resolution == pytest.approx([(4 / 3) ** 0.5, 1, np.inf])
+
+
+def test_resolution_of_a_blur_is_its_width() -> None:
+    """Sensor pixels that each average m x m target pixels, side by side: m pixels share one degree of freedom."""
+    one = camera((12, 12), (("1/3", [1, 1], [4, 4]),))
+    prior = Prior(np.zeros(144), np.full(144, 50.0))
+    form, _ = factorise(Problem(ideal_matrix(one), prior, np.full(16, 1e-9)))
+    assert expected_error(form, {}).resolution == pytest.approx(np.full(144, 3.0))
+
+
+def test_three_types_resolve_every_pixel_and_one_does_not() -> None:
+    widths = [float(np.median(expected_error(factorise(tile(count, 1e-6))[0], {}).resolution)) for count in (1, 2, 3)]
+    assert widths[0] > widths[1] > widths[2] == pytest.approx(1, abs=1e-3)

@@ -1,0 +1,166 @@
+"""Measures of error, predictions, and the paper's numbers by a second method."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from ommatid.reconstruct.prediction import compare, observability, predict, trimmed
+from ommatid.reconstruct.prior import independent
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import read
+from ommatid.scenes.tables.estimation import EstimatorTable
+from ommatid.scenes.tables.estimation import PriorTable as PriorTable
+from ommatid.simulate.ideal import ideal_matrix
+
+from ..examples import GALLERY
+
+PRIOR = PriorTable()
+
+
+@pytest.mark.parametrize(
+    ("name", "lenses", "reference", "rank"),
+    [
+        ("tile19", (), 2.79776586e-4, 361),
+        ("tile19", ("I", "I"), 2057.42393, 225),
+        ("tile19", ("I", "II"), 484.100274, 329),
+        ("tile35", (), 1.54401e-4, 1225),
+        ("tile35", ("I", "II"), 89.16378, 1205),
+        ("tile41", (), 1.24737e-3, 1681),
+    ],
+)
+def test_reference_values_of_extended_precision(
+    name: str, lenses: tuple[str, ...], reference: float, rank: int
+) -> None:
+    """Computed with 300 bits; expected and actual noise variance 1e-6."""
+    camera = derive(read(GALLERY / f"{name}.toml", (), lenses))
+    matrix = ideal_matrix(camera)
+    shape = camera.shape
+    found = predict(matrix, independent(PRIOR.mean, PRIOR.variance, camera.unknowns), 1e-6, EstimatorTable(), shape)
+    assert found.mse == pytest.approx(reference, rel=1e-5)
+    assert (found.rank, found.null_space) == (rank, camera.unknowns - rank)
+
+
+@pytest.mark.parametrize(
+    ("lenses", "actual", "expected", "reference"),
+    [
+        ((), 1e-4, 1e-2, 0.0330911224),
+        (("I", "II"), 1e-4, 1e-2, 484.191545),
+        ((), 1e-2, 1.0, 35.5841883),
+        (("I", "II"), 1e-2, 1.0, 589.811609),
+    ],
+)
+def test_reference_values_where_the_expectation_is_wrong(
+    lenses: tuple[str, ...], actual: float, expected: float, reference: float
+) -> None:
+    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+    prior = independent(PRIOR.mean, PRIOR.variance, 361)
+    found = predict(ideal_matrix(camera), prior, actual, EstimatorTable(noise_variance=expected), (19, 19))
+    assert found.mse == pytest.approx(reference, rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "lenses", "actual", "expected", "reference", "trimmed_reference"),
+    [
+        ("tile19", ("I", "I"), 1e-2, 1e-4, 2058.5, None),
+        ("tile19", ("I", "II"), 1e-2, 1e-4, 489.606, None),
+        ("tile19", (), 1e-2, 1e-4, 2.79766, 1.85623),
+        ("tile35", (), 1.0, 1.0, 139.233, None),
+        ("tile35", ("I", "II"), 1.0, 1.0, 397.08, None),
+    ],
+)
+def test_more_reference_values(
+    name: str,
+    lenses: tuple[str, ...],
+    actual: float,
+    expected: float,
+    reference: float,
+    trimmed_reference: float | None,
+) -> None:
+    """To all the digits that they were given with."""
+    camera = derive(read(GALLERY / f"{name}.toml", (), lenses))
+    prior = independent(PRIOR.mean, PRIOR.variance, camera.unknowns)
+    shape = camera.shape
+    found = predict(ideal_matrix(camera), prior, actual, EstimatorTable(noise_variance=expected), shape)
+    assert found.mse == pytest.approx(reference, rel=2.5e-5)
+    if trimmed_reference is not None:
+        assert found.trimmed_mse == pytest.approx(trimmed_reference, rel=5e-6)
+
+
+@pytest.mark.parametrize("form", ["square-root-information", "svd", "dual"])
+@pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I", "I")])
+def test_the_sturdy_forms_predict_the_same(form: str, lenses: tuple[str, ...]) -> None:
+    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+    matrix, prior = ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361)
+    references = {0: 2.79776586e-4, 2: 484.100274, 1: 2057.42393}
+    told = EstimatorTable.model_validate({"method": form})
+    found = predict(matrix, prior, 1e-6, told, (19, 19))
+    assert found.mse == pytest.approx(references[len(set(lenses))], rel=3e-9)
+    assert found.method == form
+
+
+@pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I",)])
+@pytest.mark.parametrize("noise", [1e-6, 1e-2, 1.0])
+def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> None:
+    """With a white prior the expected error is the mean over H's singular values s of v P0 / (v + s^2 P0)."""
+    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+    matrix = ideal_matrix(camera)
+    singular = np.zeros(361)
+    values = np.linalg.svd(matrix.toarray(), compute_uv=False)
+    singular[: values.size] = values
+    by_values = np.mean(noise * PRIOR.variance / (noise + singular**2 * PRIOR.variance))
+    found = predict(matrix, independent(PRIOR.mean, PRIOR.variance, 361), noise, EstimatorTable(), (19, 19))
+    assert found.mse == pytest.approx(by_values, rel=1e-6)
+    assert found.rank == np.linalg.matrix_rank(matrix.toarray(), tol=1e-9)
+    seen = values[: found.rank]
+    assert found.condition == pytest.approx(seen[0] / seen[-1], rel=1e-6)
+
+
+@pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I", "I")])
+def test_without_noise_the_error_is_the_null_space(lenses: tuple[str, ...]) -> None:
+    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+    found = predict(ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361), 0.0, EstimatorTable(), (19, 19))
+    assert found.null_space is not None
+    assert found.mse == pytest.approx(PRIOR.variance * found.null_space / 361, rel=1e-9, abs=1e-12)
+
+
+def test_the_papers_claims_that_two_and_one_type_are_worse() -> None:
+    mse = {}
+    for lenses in ((), ("I", "II"), ("I", "I")):
+        camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+        matrix = ideal_matrix(camera)
+        prior = independent(PRIOR.mean, PRIOR.variance, 361)
+        for noise in (1e-6, 1e-2):
+            mse[len(set(lenses)), noise] = predict(matrix, prior, noise, EstimatorTable(), (19, 19)).mse
+    assert mse[1, 1e-6] == pytest.approx(mse[1, 1e-2], rel=1e-3), "the null space keeps one type from improving"
+    assert mse[2, 1e-2] < mse[1, 1e-2] / 4
+    assert mse[2, 1e-6] > 0.95 * mse[2, 1e-2]
+    assert mse[0, 1e-2] < mse[2, 1e-2] / 100
+    assert mse[0, 1e-6] < 1e-3 * mse[0, 1e-2]
+
+
+def test_the_identity_sees_everything() -> None:
+    seen = observability(sparse.csr_array(np.eye(5)))
+    assert (seen.rank, seen.null_space, seen.condition) == (5, 0, pytest.approx(1))
+
+
+def test_measures_of_error() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 255, (20, 20))
+    noisy = truth + rng.normal(0, 2, truth.shape)
+    found = compare(noisy.ravel(), truth.ravel(), (20, 20))
+    assert found.mse == pytest.approx(np.mean((noisy - truth) ** 2))
+    assert found.psnr == pytest.approx(10 * np.log10(255**2 / found.mse))
+    assert found.ssim is not None
+    assert 0.9 < found.ssim < 1
+    same = compare(truth.ravel(), truth.ravel(), (20, 20))
+    assert (same.mse, same.psnr, same.ssim) == (0, None, pytest.approx(1))
+    assert compare(np.zeros(4), np.ones(4), (2, 2)).trimmed_mse is None
+    assert compare(np.zeros(4), np.ones(4), (2, 2)).ssim is None
+
+
+def test_trimming_takes_the_border_off() -> None:
+    image = np.ones((7, 9))
+    image[2:-2, 2:-2] = 5
+    assert trimmed(image.ravel(), (7, 9)) == 5

@@ -1,0 +1,139 @@
+"""The whole chain: rendered, calibrated, reconstructed; the error that comes is the error that was expected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ommatid.analysis import run_table
+from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.result_files import changed
+from ommatid.reconstruct.restore import Reconstruction, check_match, restore
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.calibrate import calibrate
+from ommatid.simulate.ideal import ideal_model
+from ommatid.simulate.render import render
+
+from ..examples import GALLERY, THREE, scene
+
+
+def chain(described: Scene) -> tuple[Stack, Model, Reconstruction]:
+    camera, image = derive(described), load(described)
+    stack, model = render(described, camera, image), calibrate(described, camera)
+    return stack, model, restore(stack, model, image.ravel())
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("tile19", []),
+        ("tile19", ["noise.variance=1", "noise.bits=8", "calibration.samples=1024"]),
+        ("photo", ["calibration.method=ideal"]),
+        ("single", []),
+    ],
+)
+def test_the_measured_error_is_the_expected_one(name: str, changes: list[str]) -> None:
+    """In the 99 % interval of its expectation given the image and everything known of the noise."""
+    _, _, restoration = chain(read(GALLERY / f"{name}.toml", changes))
+    assert restoration.error is not None
+    assert restoration.interval is not None
+    assert restoration.interval.low < restoration.error.mse < restoration.interval.high
+
+
+def test_fewer_lens_types_are_worse() -> None:
+    errors = []
+    for lenses in ((), ("I", "II"), ("I",)):
+        described = read(GALLERY / "tile19.toml", ["calibration.method=ideal"], lenses)
+        _, _, restoration = chain(described)
+        assert restoration.error is not None
+        errors.append(restoration.error.mse)
+    assert errors[0] < errors[1] / 100
+    assert errors[1] < errors[2]
+
+
+def test_noise_of_h_that_feigns_information_is_told() -> None:
+    """Two types leave a null space, which a noisy H seems to see: Eq. 5 then promises half of the real error."""
+    told: list[float] = []
+    for lenses in ((), ("I", "II")):
+        stack, model, restoration = chain(read(GALLERY / "tile19.toml", ["calibration.samples=1024"], lenses))
+        told.append(restoration.spurious_information)
+        lines = run_table.rows(run_json.describe(stack, model, restoration))
+        warned = any(line.startswith("do not trust") for line, _ in lines)
+        assert warned == bool(lenses)
+    assert told[1] > 10 * told[0]
+    _, _, exact = chain(read(GALLERY / "tile19.toml", ["calibration.method=ideal"], ("I", "II")))
+    assert exact.spurious_information == 0
+
+
+def test_the_budget_says_what_is_there_and_adds_up() -> None:
+    render = {"variant": "scalar_rgb", "samples": 64}
+    noise = {"variance": 1.0, "bits": 6}
+    _, _, whole = chain(scene(lenses=THREE, calibration={"samples": 64}, noise=noise, render=render))
+    assert sum(whole.budget().values()) == pytest.approx(whole.expected.mse)
+    assert all(part > 0 for part in whole.budget().values())
+    assert whole.budget()["quantisation"] == pytest.approx(whole.budget()["noise"] * (256 / 2**6) ** 2 / 12, rel=1e-9)
+    bare = chain(scene(lenses=THREE, calibration={"method": "ideal"}, render=render))[2]
+    assert [bare.budget()[name] for name in ("noise", "quantisation", "calibration")] == [0, 0, 0]
+
+
+def test_more_noise_than_expected_is_in_the_variance_whatever_the_estimator_was_told() -> None:
+    described = scene(lenses=THREE, noise={"variance": 4.0}, calibration={"method": "ideal"})
+    stack, model, honest = chain(described)
+    told = restore(changed(stack, ["estimator.noise_variance=1e-4"], GALLERY), model)
+    assert told.expected.mse > honest.expected.mse
+    assert told.budget()["noise"] > 100 * 4.0 / 361
+
+
+def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
+    described = scene(lenses=THREE, calibration={"method": "ideal"})
+    camera = derive(described)
+    model = ideal_model(described, camera)
+    other = scene(lenses=THREE, render={"seed": 9, "samples": 64}, noise={"variance": 2.0})
+    stack = render(other, camera, np.full((19, 19), 50.0))
+    check_match(stack, model, ("a", "b"))
+    restoration = restore(stack, model, np.full(361, 50.0))
+    assert restoration.interval is not None
+    assert restoration.error is not None
+    assert restoration.interval.low < restoration.error.mse < restoration.interval.high
+
+
+@pytest.mark.parametrize(
+    ("other", "key"),
+    [
+        (scene((19, 20), THREE), "target.shape"),
+        (scene(lenses=THREE[:2]), "camera.lens.C"),
+        (scene(lenses=(THREE[0], THREE[2], THREE[1])), "camera.lens.B"),
+    ],
+)
+def test_strangers_are_refused_with_the_first_difference(other: Scene, key: str) -> None:
+    described = scene(lenses=THREE, render={"samples": 16})
+    camera = derive(described)
+    stack = render(described, camera, load(described))
+    with pytest.raises(InputError, match=key):
+        check_match(stack, ideal_model(other, derive(other)), ("stack.exr", "model.npz"))
+
+
+def test_pitches_are_compared_too() -> None:
+    described = scene(lenses=THREE, render={"samples": 16})
+    camera = derive(described)
+    stack = render(described, camera, load(described))
+    model = replace(ideal_model(described, camera), camera=replace(camera, pixel_pitch=0.007))
+    with pytest.raises(InputError, match=r"camera\.pixel_pitch is 0\.006 in the stack and 0\.007"):
+        check_match(stack, model, ("stack.exr", "model.npz"))
+
+
+def test_without_the_truth_nothing_is_claimed_of_the_error() -> None:
+    described = scene(lenses=THREE, calibration={"method": "ideal"}, render={"samples": 16})
+    stack, model, _ = chain(described)
+    blind = restore(stack, model)
+    description = run_json.describe(stack, model, blind)
+    assert "mse" not in description["error"]
+    assert run_table.rows(description)
+    assert description["error"]["predicted_mse"] > 0

@@ -1,0 +1,242 @@
+"""What a sensor really delivers: dead and saturated pixels, nothing at all; and the priors that it is read with.
+
+Stacks come from the ideal model with known noise, so that nothing has to be rendered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ommatid.analysis import run_table
+from ommatid.reconstruct.noise import usable_pixels
+from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.restore import Reconstruction, restore
+from ommatid.runtime.errors import InputError
+from ommatid.scenes import stack as stacks
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.sensor import NoiseTable
+from ommatid.simulate.ideal import ideal_model
+from ommatid.simulate.sensor.gaussian import expose, generators
+
+from ..cli.test_commands import document
+from ..conftest import Command
+from ..examples import THREE, scene
+
+SENSOR = {"variance": 1.0}
+
+
+def recorded(described: Scene) -> tuple[Stack, Model, NDArray[np.float64]]:
+    """What a perfect camera records of the scene's picture, with the scene's noise."""
+    camera, truth = derive(described), load(described).ravel()
+    model = ideal_model(described, camera)
+    assert described.noise is not None
+    values = expose(model.forward(truth), described.noise, generators(camera, 3), camera.slices())
+    record = {"seconds": 0.0, "versions": {}, "seed": 3, "first_seed": 3}
+    model = replace(model, record={**model.record, "seconds": 0.0, "versions": {}})
+    return Stack(described, camera, values, np.zeros_like(values), record), model, truth
+
+
+def restored(described: Scene) -> Reconstruction:
+    return restore(*recorded(described))
+
+
+def rows(restoration: Reconstruction, stack: Stack, model: Model) -> dict[str, str]:
+    return dict(run_table.rows(run_json.describe(stack, model, restoration)))
+
+
+def test_dead_pixels_are_left_out_and_counted() -> None:
+    """The estimate is that of a camera without these pixels, to the last digit, whatever stood in them."""
+    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR))
+    dead = np.zeros(stack.values.size, dtype=bool)
+    dead[[0, 17, 400]] = True
+    broken = replace(stack, values=np.where(dead, np.nan, stack.values))
+    found = restore(broken, model, truth)
+    assert (found.usable.dead, found.usable.saturated, int(found.usable.used.sum())) == (3, 0, 703)
+    whole = restore(stack, model, truth)
+    assert found.expected.mse > whole.expected.mse
+    assert np.isfinite(found.estimate).all()
+    assert found.error is not None
+    assert found.interval is not None
+    assert found.interval.low < found.error.mse < found.interval.high
+    assert "3 dead" in rows(found, broken, model)["sensor pixels left out"]
+    assert "sensor pixels left out" not in rows(whole, stack, model)
+
+
+@pytest.mark.parametrize("bits", [None, 6])
+def test_saturated_pixels_are_left_out(bits: int | None) -> None:
+    """Believed, they show in the residual; left out, the error stays inside its interval."""
+    noise = {"variance": 1.0, "saturation": 30.3} | ({} if bits is None else {"bits": bits})
+    stack, model, truth = recorded(scene(lenses=THREE, noise=noise))
+    assert stack.values.max() == 30.3
+    found = restore(stack, model, truth)
+    assert found.usable.saturated > 30
+    assert found.error is not None
+    assert found.interval is not None
+    assert found.error.mse < found.interval.high
+    blind = replace(stack, scene=stack.scene.model_copy(update={"noise": NoiseTable(variance=1.0, bits=bits)}))
+    believed = restore(blind, model, truth).residual
+    assert believed is not None
+    assert found.residual is not None
+    assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
+    assert abs(believed.chi_squared - believed.expected) > 4 * believed.deviation
+
+
+def test_saturation_survives_the_file(tmp_path: Path) -> None:
+    """The stack holds float32: a level that float32 rounds down is still known."""
+    stack, _, _ = recorded(scene(lenses=THREE, noise={"variance": 1.0, "saturation": 30.3}))
+    stacks.write(tmp_path / "stack.exr", stack)
+    assert usable_pixels(stacks.read(tmp_path / "stack.exr")).saturated == usable_pixels(stack).saturated > 0
+
+
+def test_a_stack_of_which_nothing_is_left_gives_the_prior_and_says_so() -> None:
+    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR, prior={"mean": 99.0, "variance": 16.0}))
+    for kind in ("independent", "fit"):
+        prior = stack.scene.prior.model_copy(update={"kind": kind})
+        nothing = replace(
+            stack,
+            values=np.full(706, np.nan),
+            scene=stack.scene.model_copy(update={"prior": prior}),
+        )
+        found = restore(nothing, model, truth)
+        assert found.estimate == pytest.approx(np.full(361, 99.0))
+        assert found.expected.variance == pytest.approx(np.full(361, 16.0))
+        assert found.usable.dead == 706
+        assert "no sensor pixel is left" in rows(found, nothing, model)["do not look for the image here"]
+
+
+def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:
+    """A stack with NaN in it goes through the command line, and run.json's fields count them."""
+    stack = stacks.read(kept / "stack.exr")
+    values = stack.values.copy()
+    values[5] = np.nan
+    stacks.write(kept / "stack.exr", replace(stack, values=values))
+    found = document(ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "dead.exr", "--json"))
+    assert found["diagnostics"]["pixels_dead"] == 1
+    assert found["diagnostics"]["pixels_used"] == found["measurements"] - 1
+
+
+def test_chi_squared_of_the_residual_tells_a_wrong_noise() -> None:
+    right = restored(scene(lenses=THREE, noise=SENSOR))
+    assert right.residual is not None
+    assert abs(right.residual.chi_squared - right.residual.expected) < 4 * right.residual.deviation
+    wrong = restored(scene(lenses=THREE, noise=SENSOR, estimator={"noise_variance": 0.25}))
+    assert wrong.residual is not None
+    assert wrong.residual.chi_squared > wrong.residual.expected + 10 * wrong.residual.deviation
+
+
+def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
+    """On a photograph: the error falls to a fraction, the noise is found, and both stand in the report."""
+    paper = restored(scene(lenses=THREE, noise=SENSOR))
+    told: dict[str, Any] = {"prior": {"kind": "fit"}, "estimator": {"noise_variance": "fit"}}
+    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR, **told))
+    found = restore(stack, model, truth)
+    assert paper.error is not None
+    assert found.error is not None
+    assert found.error.mse < paper.error.mse / 3
+    assert found.fit is not None
+    assert found.fit.noise_variance == pytest.approx(1.0, rel=4 * found.fit.spread[2])
+    lines = rows(found, stack, model)
+    assert {"found: variance", "found: correlation length", "found: noise variance"} <= set(lines)
+    known = restored(scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}))
+    assert known.fit is not None
+    assert known.fit.noise_variance is None
+    noise_alone = restored(scene(lenses=THREE, noise={"variance": 9.0}, estimator={"noise_variance": "fit"}))
+    assert noise_alone.fit is not None
+    assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.spread[0])
+    assert noise_alone.prior.kind == "independent"
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        {"kind": "exponential", "correlation_length": "40 mm"},
+        {"kind": "power", "exponent": 2.0},
+    ],
+)
+def test_correlated_priors_help_on_photographs(prior: dict[str, object]) -> None:
+    paper = restored(scene(lenses=THREE, noise=SENSOR))
+    smooth = restored(scene(lenses=THREE, noise=SENSOR, prior=prior))
+    assert paper.error is not None
+    assert smooth.error is not None
+    assert smooth.error.mse < paper.error.mse / 1.5
+    assert smooth.interval is not None
+    assert smooth.interval.low < smooth.error.mse < smooth.interval.high
+
+
+def test_the_mean_of_a_region() -> None:
+    """Within four of its deviations of the true mean, and far better known than a pixel."""
+    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR))
+    found = restore(stack, model, truth)
+    mean, deviation = found.region((4, 5), (6, 3))
+    assert abs(mean - truth.reshape(19, 19)[4:10, 5:8].mean()) < 4 * deviation
+    assert deviation < 0.3 * float(np.sqrt(found.expected.variance).mean())
+    with pytest.raises(InputError, match="does not lie inside an image of 19 x 19"):
+        found.region((18, 0), (2, 1))
+
+
+def test_a_region_from_the_command_line(kept: Path, ommatid: Command) -> None:
+    files = (kept / "stack.exr", kept / "model.npz", "-o", "region.exr", "--region")
+    found = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["region"]
+    assert (found["corner"], found["size"]) == ([2, 3], [4, 5])
+    assert found["deviation"] > 0
+    assert "mean of 4 x 5 pixels at 2, 3" in ommatid("reconstruct", *files, "2,3,4,5").out
+    for wrong in ("2,3", "a,b,c,d", "0,0,99,99"):
+        assert ommatid("reconstruct", *files, wrong).code == 2
+
+
+def test_nothing_that_is_no_number_is_printed(kept: Path, ommatid: Command) -> None:
+    """What a scene file may hold stays inside float32: beyond it is refused, and JSON has no Infinity."""
+    files = ("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "far.exr", "--json", "--set")
+    for setting in ("prior.mean=1e300", "prior.variance=1e300", "estimator.noise_variance=1e300"):
+        ended = ommatid(*files, setting)
+        assert (ended.code, ended.out) == (2, "")
+        assert setting.split("=")[0] in ended.err
+    document(ommatid(*files, "prior.mean=1e12"))
+
+
+def test_variances_below_nothing_are_refused(kept: Path, ommatid: Command) -> None:
+    stack = stacks.read(kept / "stack.exr")
+    variance = stack.variance.copy()
+    variance[0] = -1.0
+    stacks.write(kept / "stack.exr", replace(stack, variance=variance))
+    ended = ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "below.exr")
+    assert ended.code == 2
+    assert "variances below 0" in ended.err
+
+
+def test_without_noise_there_is_no_chi_squared() -> None:
+    stack, model, truth = recorded(scene(lenses=THREE, noise={"variance": 0.0}, estimator={"noise_variance": 0.0}))
+    found = restore(stack, model, truth)
+    assert found.residual is None
+    assert "chi-squared of the residual" not in rows(found, stack, model)
+    assert found.estimate == pytest.approx(truth, rel=1e-6)
+
+
+@pytest.mark.parametrize("told", [{"noise_variance": "fit"}, {}])
+def test_a_fit_with_an_uncertain_h(told: dict[str, Any]) -> None:
+    """What the uncertainty of H adds is taken at the fitted image: chi-squared is as expected."""
+    described = scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}, estimator=told)
+    stack, model, truth = recorded(described)
+    rng = np.random.default_rng(0)
+    spread = 0.002 * rng.normal(size=model.matrix.nnz)
+    uncertain = replace(
+        model,
+        stored=model.matrix
+        + type(model.matrix)((spread, model.matrix.indices, model.matrix.indptr), model.matrix.shape),
+        variance=np.full(model.matrix.nnz, 0.002**2),
+    )
+    found = restore(stack, uncertain, truth)
+    assert found.residual is not None
+    assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
+    assert found.fit is not None
+    assert not found.fit.doubtful

@@ -1,0 +1,73 @@
+"""Averages over boxes against the stored matrix, which tests/test_ideal.py holds against counting points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ommatid.scenes.model import Model
+from ommatid.scenes.optics import boxes
+from ommatid.scenes.optics.boxes import BoxFootprints
+from ommatid.simulate.ideal import ideal_matrix
+
+from ..examples import THREE, Lenses, camera, scene
+
+CAMERAS: list[tuple[tuple[int, int], Lenses]] = [
+    ((19, 19), THREE),
+    ((70, 61), tuple((magnification, array, "fit") for magnification, array, _ in THREE)),
+    ((13, 17), (("1/4", [2, 3], [2, 3]), ("1/5", [1, 2], [2, 3]))),
+    ((12, 12), (("2/5", [2, 2], [3, 4]),)),
+    ((11, 12), (("3/10", [2, 1], [2, 3]),)),
+    ((7, 5), (("1", [1, 1], [7, 5]),)),
+]
+
+
+@pytest.mark.parametrize(("shape", "lenses"), CAMERAS)
+def test_against_the_stored_matrix(shape: tuple[int, int], lenses: Lenses) -> None:
+    one = camera(shape, lenses)
+    matrix, found, rng = ideal_matrix(one), BoxFootprints(one), np.random.default_rng(0)
+    image, readings = rng.normal(size=one.unknowns), rng.normal(size=one.measurements)
+    np.testing.assert_allclose(found.forward(image), matrix @ image, atol=1e-14)
+    np.testing.assert_allclose(found.adjoint(readings), matrix.T @ readings, atol=1e-13)
+    assert found.entries == matrix.nnz
+
+
+@pytest.mark.parametrize(("shape", "lenses"), CAMERAS[1:3])
+@pytest.mark.parametrize("corner", [(0, 0), (2, 3), (4, 5)])
+def test_windows_have_the_measurements_that_see_nothing_else(
+    shape: tuple[int, int], lenses: Lenses, corner: tuple[int, int]
+) -> None:
+    one = camera(shape, lenses)
+    rows, columns = (slice(start, start + min(size - start, 30) - 1) for start, size in zip(corner, shape, strict=True))
+    dense = ideal_matrix(one).toarray().reshape(-1, *shape)
+    outside = dense.copy()
+    outside[:, rows, columns] = 0
+    expected = np.flatnonzero(~outside.any(axis=(1, 2)))
+    whole = ideal_matrix(one)
+    stored = Model(scene(), one, whole, np.zeros(whole.nnz), np.zeros((0, whole.nnz), np.float32), {"method": "points"})
+    for found in (BoxFootprints(one), stored):
+        numbers = found.measurements_inside(rows, columns)
+        np.testing.assert_array_equal(np.sort(numbers), expected)
+        np.testing.assert_allclose(
+            found.submatrix(rows, columns).toarray(),
+            dense[numbers][:, rows, columns].reshape(numbers.size, -1),
+            atol=1e-15,
+        )
+
+
+def test_windows_of_one_signature_have_the_same_h() -> None:
+    one = BoxFootprints(camera((70, 61), CAMERAS[1][1]))
+    first, second, edge = (slice(10, 40), slice(12, 42)), (slice(11, 41), slice(19, 49)), (slice(0, 30), slice(12, 42))
+    assert one.signature(*first) == one.signature(*second)
+    assert (one.submatrix(*first) - one.submatrix(*second)).nnz == 0
+    assert one.signature(*first) != one.signature(*edge)
+
+
+def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = camera((150, 140), CAMERAS[1][1])
+    image, readings = np.random.default_rng(1).normal(size=one.unknowns), np.ones(one.measurements)
+    found = BoxFootprints(one).forward(image), BoxFootprints(one).adjoint(readings)
+    monkeypatch.setattr(boxes, "processors", lambda: 1)
+    np.testing.assert_array_equal(BoxFootprints(one).forward(image), found[0])
+    np.testing.assert_array_equal(BoxFootprints(one).adjoint(readings), found[1])
+    assert boxes.ROWS_AT_ONCE < 150, "else there is one piece of work only"

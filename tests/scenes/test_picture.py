@@ -1,0 +1,132 @@
+"""Pictures become values from 0 to 255, whatever they were stored as."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from skimage import data, io
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.formats.picture import LUMINANCE, load, luminance, write_truth
+from ommatid.scenes.scene import Scene, with_changes
+
+from ..examples import scene
+
+
+def looking_at(path: Path, **target: object) -> Scene:
+    plain = scene().plain()
+    plain["target"] = {"image": path.name, "pixel_pitch": "1 mm", "distance": "1 m", **target}
+    return with_changes(plain, path.with_name("scene.toml"), (), ())
+
+
+def save(path: Path, pixels: NDArray[Any]) -> Path:
+    if path.suffix == ".npy":
+        np.save(path, pixels)
+    elif path.suffix == ".exr":
+        write_truth(path, pixels)
+    else:
+        save_image: Any = io.imsave  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        save_image(path, pixels, check_contrast=False)
+    return path
+
+
+GREY = np.arange(20 * 30, dtype=np.uint8).reshape(20, 30)
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "expected"),
+    [
+        ("grey.png", GREY, GREY),
+        ("deep.png", GREY.astype(np.uint16) * 257, GREY),
+        ("grey.tiff", GREY, GREY),
+        ("big.npy", (GREY.astype(np.uint16) * 257).astype(">u2"), GREY),
+        ("float.tiff", GREY.astype(np.float32) / 7, GREY / np.float32(7)),
+        ("grey.npy", GREY, GREY),
+        ("signed.npy", GREY - 300.25, GREY - 300.25),
+        ("grey.exr", GREY * 0.5, GREY * 0.5),
+        ("bool.npy", GREY > 100, (GREY > 100) * 255.0),
+    ],
+)
+def test_every_format_gives_the_same_values(
+    tmp_path: Path, name: str, pixels: NDArray[Any], expected: NDArray[Any]
+) -> None:
+    image = load(looking_at(save(tmp_path / name, pixels)))
+    assert image.dtype == np.float64
+    np.testing.assert_array_equal(image, expected)
+
+
+def test_colour_becomes_luminance() -> None:
+    assert sum(LUMINANCE) == pytest.approx(1, abs=1e-12)
+    colour: Any = data.astronaut()
+    from skimage.color import rgb2gray
+
+    reference: NDArray[np.float64] = np.asarray(rgb2gray(colour)) * 255  # pyright: ignore
+    np.testing.assert_allclose(luminance(colour, "here"), reference, atol=1e-10)
+    opaque = np.dstack([colour, np.full(colour.shape[:2], 255, np.uint8)])
+    np.testing.assert_allclose(luminance(opaque, "here"), reference, atol=1e-10)
+    opaque[0, 0, 3] = 7
+    with pytest.raises(InputError, match="transparent"):
+        luminance(opaque, "here")
+
+
+def test_the_crop_is_the_one_asked_for(tmp_path: Path) -> None:
+    path = save(tmp_path / "grey.png", GREY)
+    np.testing.assert_array_equal(load(looking_at(path, origin=[3, 5], shape=[10, 12])), GREY[3:13, 5:17])
+    np.testing.assert_array_equal(load(looking_at(path, origin=[3, 5])), GREY[3:, 5:])
+
+
+@pytest.mark.parametrize("target", [{"origin": [15, 0], "shape": [10, 10]}, {"origin": [20, 0]}, {"shape": [19, 30]}])
+def test_crops_outside_the_picture_are_refused(tmp_path: Path, target: dict[str, object]) -> None:
+    path = save(tmp_path / "grey.png", GREY)
+    with pytest.raises(InputError, match=r"20 x 30"):
+        load(looking_at(path, **target))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e39])
+def test_nan_is_refused_where_it_is_seen_and_only_there(tmp_path: Path, bad: float) -> None:
+    pixels = GREY.astype(np.float64)
+    pixels[0, 0] = bad
+    path = save(tmp_path / "a.npy", pixels)
+    with pytest.raises(InputError, match="NaN"):
+        load(looking_at(path))
+    load(looking_at(path, origin=[1, 1]))
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "said"),
+    [
+        ("a.tif", "P", "a palette's colours"),
+        ("a.tif", "CMYK", r"inks \(CMYK\)"),
+        ("a.jpg", "CMYK", r"inks \(CMYK\)"),
+        ("white.tif", "L", "0 is white"),
+    ],
+)
+def test_numbers_that_are_no_light_are_refused(name: str, mode: str, said: str, tmp_path: Path) -> None:
+    from PIL import Image
+
+    colour = Image.fromarray(np.dstack([GREY, GREY[::-1], GREY[:, ::-1]]))
+    more: dict[str, Any] = {"tiffinfo": {262: 0}} if name == "white.tif" else {}  # its photometric interpretation
+    colour.convert(mode).save(tmp_path / name, **more)
+    with pytest.raises(InputError, match=f"{name}: expected grey or RGB, got .*{said}"):
+        load(looking_at(tmp_path / name))
+
+
+def test_the_palette_of_a_png_is_looked_up(tmp_path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(GREY).convert("P").save(tmp_path / "a.png")
+    np.testing.assert_allclose(load(looking_at(tmp_path / "a.png")), GREY, rtol=1e-6)
+
+
+@pytest.mark.skipif(find_spec("imagecodecs") is not None, reason="with this package it is read")
+def test_a_compression_that_is_not_known_is_named(tmp_path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(GREY).save(tmp_path / "a.tif", compression="tiff_lzw")
+    with pytest.raises(InputError, match=r"a.tif: its compression LZW is not read; save it without"):
+        load(looking_at(tmp_path / "a.tif"))

@@ -1,0 +1,213 @@
+"""Electrons from lux: the same light followed from the target's side, limits, ratios; what a prediction makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import constants, integrate
+
+from ommatid.reconstruct.frame_prediction import predict_frame
+from ommatid.reconstruct.method_choice import choose_method
+from ommatid.reconstruct.prediction import predict
+from ommatid.reconstruct.prior import independent
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
+from ommatid.scenes.optics import radiometry
+from ommatid.scenes.optics.radiometry import electrons, expected_noise, predicted_noise, rows, solid_angle, summary
+from ommatid.scenes.pose import NONE, Misalignment, pose_of
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.tables.camera import ToleranceTable
+from ommatid.scenes.tables.estimation import EstimatorTable
+from ommatid.scenes.tables.sensor import SensorTable
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
+
+from ..examples import THREE, Lenses, scene
+
+SENSOR: dict[str, Any] = {"illuminance": "500 lux", "exposure": "10 ms", "read_noise": 2.0, "black_level": 20.0}
+
+
+def real(lenses: Lenses = THREE, aperture: float = 0.1, **tables: Any) -> Scene:
+    """A scene of thin lenses and a real sensor."""
+    one = scene(lenses=lenses, **tables)
+    kinds = tuple(lens.model_copy(update={"aperture": aperture}) for lens in one.camera.lens)
+    camera = one.camera.model_copy(update={"lens": kinds})
+    return one.model_copy(update={"camera": camera, "sensor": SensorTable.model_validate(SENSOR)})
+
+
+def test_electrons_are_those_of_the_light_that_leaves_the_target_for_the_lens() -> None:
+    """A centred pixel sees m x m pixels of the target; what these send to the lens's disk is what the pixel gets."""
+    one = real((("1/5", [1, 1], [3, 3]),))
+    camera = derive(one)
+    found = float(electrons(one, camera)[4]) * 255
+    patch, lens, distance = 5e-3**2, pi * 0.05e-3**2, 1.0  # m^2, m^2, m
+    lumens = 500 / pi * patch * lens / distance**2
+    energy = constants.h * constants.c / 550e-9
+    assert found == pytest.approx(lumens * 10e-3 / 683 / energy, rel=2e-3)  # sin^2 for tan^2 of (0.05 / 1.2)
+    assert found == pytest.approx(lumens * 10e-3 / 683 / energy / (1 + (0.05 / 1.2) ** 2), rel=2e-4)
+
+
+def test_everything_that_electrons_are_proportional_to() -> None:
+    one = real()
+    camera, before = derive(one), electrons(real(), derive(real()))
+    for key, value, factor in (
+        ("illuminance", 1500.0, 3.0),
+        ("exposure", 0.005, 0.5),
+        ("quantum_efficiency", 0.25, 0.25),
+        ("gain", 7.0, 1.0),
+    ):
+        assert one.sensor is not None
+        changed = one.model_copy(update={"sensor": one.sensor.model_copy(update={key: value})})
+        np.testing.assert_allclose(electrons(changed, camera), factor * before, rtol=1e-12)
+    red = one.model_copy(update={"camera": one.camera.model_copy(update={"wavelength": 660e-6})})
+    np.testing.assert_allclose(electrons(red, camera), 660 / 550 * before, rtol=1e-12)
+
+
+def test_a_smaller_magnification_gathers_more() -> None:
+    """A shorter depth under the same aperture: by the square of the depths' ratio, for small apertures."""
+    one = real(aperture=1e-5)
+    camera = derive(one)
+    middle = [float(electrons(one, camera)[place].max()) for place in camera.type_slices()]
+    depths = [camera.depth(kind) for kind in camera.types]
+    assert middle[1] / middle[0] == pytest.approx((depths[0] / depths[1]) ** 2, rel=1e-4)
+    axis = [solid_angle(1e-5, depth) for depth in depths]
+    assert axis[1] / axis[0] == pytest.approx((5 / 3) ** 2, rel=1e-9)
+
+
+@pytest.mark.parametrize("aperture", [1e-3, 1.0, 5.0, 1e6])
+def test_the_solid_angle_is_the_integral_over_the_cone(aperture: float) -> None:
+    """Of cos sin over the half space that the disk covers; a hemisphere is pi."""
+    edge = np.arctan2(aperture / 2, 2.0)
+    whole, _ = integrate.quad(lambda angle: 2 * pi * np.cos(angle) * np.sin(angle), 0, edge)
+    assert solid_angle(aperture, 2.0) == pytest.approx(whole, rel=1e-9)
+    assert solid_angle(aperture, 2.0) <= pi
+
+
+def test_illumination_falls_with_the_fourth_power_of_the_cosine() -> None:
+    """Of the angle under which a pixel sees its lens: from the design's numbers alone."""
+    camera = derive(real())
+    for sub in camera.sub_imagers[:3]:
+        rows_, columns = sub.type.pixels
+        x = sub.patch[0] - sub.lens[0] + (np.arange(columns) - (columns - 1) / 2) * camera.pixel_pitch
+        y = sub.patch[1] - sub.lens[1] + (np.arange(rows_) - (rows_ - 1) / 2) * camera.pixel_pitch
+        cosine = np.cos(np.arctan(np.hypot(x[None, :], y[:, None]) / sub.depth))
+        np.testing.assert_allclose(
+            radiometry.relative_illumination(camera, sub, pose_of(sub, NONE)), (cosine**4).ravel(), rtol=1e-12
+        )
+
+
+def test_misaligned_sensors() -> None:
+    """Farther away: by the square of the distance. Turned about its axis: nothing. Tilted: a cosine, on the axis."""
+    camera = derive(real((("1/5", [1, 1], [1, 1]),)))
+    sub = camera.sub_imagers[0]
+    sub = replace(sub, patch=sub.lens)
+
+    def light(wrong: Misalignment) -> float:
+        return float(radiometry.relative_illumination(camera, sub, pose_of(sub, wrong))[0])
+
+    assert light(NONE) == pytest.approx(1, rel=1e-12)
+    assert light(Misalignment(focal_length=0.02)) == pytest.approx(1.02**-2, rel=1e-12)
+    assert light(Misalignment(rotation=0.4)) == pytest.approx(1, rel=1e-12)
+    assert light(Misalignment(tilt=(0.0, 0.1))) == pytest.approx(np.cos(0.1), rel=1e-12)
+    assert light(Misalignment(tilt=(0.1, 0.0))) == pytest.approx(np.cos(0.1), rel=1e-12)
+    loose = replace(derive(real()), tolerance=ToleranceTable.model_validate({"focal_length": 0.01}))
+    tight = electrons(real(), derive(real()))
+    assert 0.003 < float(np.std(electrons(real(), loose) / tight)) < 0.06
+
+
+def test_lenses_with_surfaces_are_told_what_they_gather() -> None:
+    one = real()
+    camera = derive(one)
+    glass = replace(camera.types[1].optics, aperture=None, surfaces=())
+    kinds = (camera.types[0], replace(camera.types[1], optics=glass), camera.types[2])
+    camera = replace(camera, types=kinds)
+    place = camera.type_slices()[1]
+    thin = electrons(one, derive(one))
+    angle = solid_angle(0.1, camera.depth(camera.types[1]))
+    vignetted = np.linspace(1.0, 0.2, camera.measurements)
+    found = electrons(one, camera, {"B": angle}, vignetted)
+    np.testing.assert_array_equal(np.delete(found, np.r_[place]), np.delete(thin, np.r_[place]))
+    even = found[place] / vignetted[place]
+    np.testing.assert_allclose(even, even[0])
+    assert even[0] == pytest.approx(float(thin[place].max()), rel=1e-2)
+    with pytest.raises(ValueError, match="'B' has no aperture"):
+        electrons(one, camera)
+    with pytest.raises(ValueError, match="it has none"):
+        electrons(one.model_copy(update={"sensor": None}), camera)
+
+
+def test_the_summary_says_what_each_type_collects() -> None:
+    one = real()
+    camera = derive(one)
+    response = electrons(one, camera)
+    found = summary(one, camera, response)
+    for kind, place in zip(found["lens_types"], camera.type_slices(), strict=True):
+        assert kind["white"] == pytest.approx(255 * float(response[place].mean()))
+        assert kind["mean"] == pytest.approx(kind["white"] / 2)
+        assert not kind["saturates"]
+        shot = (kind["mean"] + 4 + 1 / 12) ** 0.5 / kind["mean"] * 127.5  # at half of 255: frames add less than 1/64
+        assert shot < kind["noise"] < 1.03 * shot
+    assert [line[0] for line in rows(found)] == ["lens type A", "lens type B", "lens type C"]
+    assert one.sensor is not None
+    changes = {"exposure": 1.0, "black_level": 0.0, "dark_current": 1.0}
+    long = one.model_copy(update={"sensor": one.sensor.model_copy(update=changes)})
+    found = summary(long, camera, electrons(long, camera))
+    assert all(kind["saturates"] and kind["saturation"] < 255 for kind in found["lens_types"])
+    assert found["cut_off"]
+    assert {"without light", "warning"} <= {line[0] for line in rows(found)}
+    dark = summary(one, camera, np.zeros_like(response))
+    assert "no light" in rows(dark)[0][1]
+
+
+def test_a_prediction_with_noise_of_its_own_for_every_pixel() -> None:
+    """Measurements of unequal noise are as good as more or fewer of equal noise; without noise all are the same."""
+    camera = derive(scene(lenses=THREE))
+    matrix, prior = ideal_matrix(camera), independent(127.5, 5461.25, 361)
+    noise = np.random.default_rng(0).uniform(0.5, 4.0, camera.measurements)
+    dense = matrix.toarray()
+    exact = np.linalg.inv(dense.T @ (dense / noise[:, None]) + np.eye(361) / 5461.25)
+    found = predict(matrix, prior, noise, EstimatorTable(), (19, 19))
+    assert found.mse == pytest.approx(float(np.trace(exact)) / 361, rel=1e-9)
+    same = [predict(matrix, prior, one, EstimatorTable(), (19, 19)).mse for one in (2.0, np.full(noise.size, 2.0))]
+    assert same[0] == same[1]
+    believing = predict(matrix, prior, noise, EstimatorTable(noise_variance=0.0), (19, 19))
+    gain = np.linalg.pinv(dense)
+    limit = np.square(gain) @ noise + 5461.25 * np.diag(np.eye(361) - gain @ dense)
+    assert believing.mse == pytest.approx(float(limit.mean()), rel=1e-6)
+    noise[::7] = np.nan
+    some = predict(matrix, prior, noise, EstimatorTable(), (19, 19))
+    assert some.measurements == int(np.isfinite(noise).sum())
+    kept = dense[np.isfinite(noise)]
+    exact = np.linalg.inv(kept.T @ (kept / noise[np.isfinite(noise)][:, None]) + np.eye(361) / 5461.25)
+    assert some.mse == pytest.approx(float(np.trace(exact)) / 361, rel=1e-9)
+
+
+def test_full_pixels_count_for_nothing_in_a_prediction() -> None:
+    """Nearest to its sensor, the type of the smallest magnification is full first; when all are, one is told so."""
+    one = real()
+    camera = derive(one)
+    assert one.sensor is not None
+    limits = [kind["saturation"] for kind in summary(one, camera, electrons(one, camera))["lens_types"]]
+    between = one.sensor.exposure * float(np.sqrt(limits[1] * limits[2])) / 127.5
+    for exposure, seeing in ((one.sensor.exposure, 3), (between, 2)):
+        long = one.model_copy(update={"sensor": one.sensor.model_copy(update={"exposure": exposure})})
+        noise = predicted_noise(long, camera, electrons(long, camera))
+        assert [bool(np.isfinite(noise[place]).all()) for place in camera.type_slices()] == [True, seeing == 3, True]
+    long = one.model_copy(update={"sensor": one.sensor.model_copy(update={"exposure": 1e3})})
+    with pytest.raises(InputError, match=r"test\.toml: sensor: at the prior's mean, 127\.5, every pixel is full"):
+        predicted_noise(long, camera, electrons(long, camera))
+
+
+def test_a_prediction_by_tiles_is_the_dense_one() -> None:
+    """Where one tile holds all."""
+    one = real(estimator={"method": "tiles"})
+    camera = derive(one)
+    noise = expected_noise(one, camera, electrons(one, camera))
+    noise[3] = np.nan
+    dense = predict(ideal_matrix(camera), independent(127.5, 5461.25, 361), noise, EstimatorTable(), (19, 19))
+    tiled = predict_frame(choose_method(one, camera, exact=True), ideal_model(one, camera), noise)
+    assert tiled.mse == pytest.approx(dense.mse, rel=1e-6)
+    assert tiled.measurements == dense.measurements

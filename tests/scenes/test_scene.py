@@ -1,0 +1,114 @@
+"""The scene file: units, strictness, overrides, and what is written is what was read."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from math import radians
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.scene import Scene, read, resolved, with_changes, write
+
+from ..examples import GALLERY, scene
+
+
+@pytest.mark.parametrize("path", sorted(GALLERY.glob("*.toml")), ids=lambda path: path.stem)
+def test_gallery_reads_and_survives_writing(path: Path, tmp_path: Path) -> None:
+    first = resolved(read(path), (19, 19))
+    write(tmp_path / "scene.toml", first)
+    again = read(tmp_path / "scene.toml")
+    assert again.target.image == (None if first.world else str(tmp_path / "truth.exr"))
+    assert resolved(again, (19, 19)).plain() == first.plain()
+
+
+@pytest.mark.parametrize(
+    ("text", "millimetres"),
+    [
+        ("6 um", 0.006),
+        ("1 m", 1000.0),
+        ("2.5 cm", 25.0),
+        ("1 inch", 25.4),
+        ("500 nm", 0.0005),
+        ("3 mm", 3.0),
+        ("1e-3 m", 1.0),
+        ("0.5mm", 0.5),
+        ("1 µm", 0.001),
+        (" 6 um ", 0.006),
+        ("1/4 mm", 0.25),
+    ],
+)
+def test_lengths_become_millimetres(text: str, millimetres: float) -> None:
+    changed = with_changes(scene().plain(), Path("a.toml"), [f'target.pixel_pitch="{text}"'], ())
+    assert changed.target.pixel_pitch == pytest.approx(millimetres, rel=1e-12)
+
+
+@pytest.mark.parametrize(("text", "degrees"), [("1 deg", 1.0), ("1°", 1.0), ("60 arcmin", 1.0)])
+def test_angles_become_radians(text: str, degrees: float) -> None:
+    changed = with_changes(scene().plain(), Path("a.toml"), [f'camera.tolerance={{tilt="{text}"}}'], ())
+    assert changed.camera.tolerance is not None
+    assert changed.camera.tolerance.tilt == pytest.approx(radians(degrees), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "ratio"),
+    [('"1/3"', Fraction(1, 3)), ("0.25", Fraction(1, 4)), ("1", Fraction(1)), ('"3/10"', Fraction(3, 10))],
+)
+def test_magnification_is_an_exact_ratio(value: str, ratio: Fraction) -> None:
+    changed = with_changes(scene().plain(), Path("a.toml"), [f"camera.lens.A.magnification={value}"], ())
+    assert changed.camera.lens[0].magnification == ratio
+
+
+@given(st.floats(min_value=1e-6, max_value=1e6), st.sampled_from(["nm", "um", "mm", "cm", "m", "km"]))
+def test_a_length_survives_writing_to_the_last_bit(number: float, unit: str) -> None:
+    first = with_changes(scene().plain(), Path("a.toml"), [f'target.distance="{number!r} {unit}"'], ())
+    again = with_changes(first.plain(), Path("a.toml"), (), ())
+    assert again.target.distance == first.target.distance
+
+
+def test_overrides_set_create_and_remove() -> None:
+    changes = ["noise.variance=1e-6", "noise.bits=12", "title=plain words", "estimator.noise_variance=1e-3"]
+    changed = with_changes(scene().plain(), Path("a.toml"), changes, ())
+    assert changed.noise is not None
+    assert (changed.noise.variance, changed.noise.bits, changed.title) == (1e-6, 12, "plain words")
+    removed = with_changes(changed.plain(), Path("a.toml"), ["noise.bits=", "estimator.noise_variance="], ())
+    assert removed.noise is not None
+    assert removed.noise.bits is None
+    assert removed.estimator.noise_variance is None
+
+
+def test_lens_types_are_kept_in_the_order_named_and_doubled() -> None:
+    data = scene(lenses=(("1/3", [3, 3], [5, 5]), ("1/5", [5, 5], [3, 3]))).plain()
+    kept: Scene = with_changes(data, Path("a.toml"), (), ("B", "A", "B"))
+    assert [lens.name for lens in kept.camera.lens] == ["B", "A", "B-2"]
+    assert kept.camera.lens[2].magnification == Fraction(1, 5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("noise.varience=1", ["noise.varience", "unknown key", "'noise.variance'"]),
+        ("samples=16", ["unknown key 'samples'", "render.samples"]),
+        ("camera.lens.A.magnifcation=1", ["camera.lens.A.magnifcation", "camera.lens.magnification"]),
+        ("target.distance=1", ["target.distance", "unit", "1"]),
+        ('target.distance="1 kg"', ["target.distance", "1 kg"]),
+        ("camera.lens.A.magnification=2", ["camera.lens.A.magnification", "at most 1", "2"]),
+        ("camera.lens.A.array=[3]", ["camera.lens.A.array"]),
+        ("camera.lens.A.pixels=[0, 3]", ["camera.lens.A.pixels", "at least 1"]),
+        ("render.samples=8", ["render.samples", "16", "8"]),
+        ("render.samples=true", ["render.samples", "True"]),
+        ("prior.variance=inf", ["prior.variance", "finite"]),
+        ("camera.lens.Z.array=[1, 1]", ["'Z'", "'A'"]),
+    ],
+)
+def test_refusals_name_file_key_and_what_was_expected(change: str, words: list[str]) -> None:
+    with pytest.raises(InputError) as refusal:
+        with_changes(scene().plain(), Path("a.toml"), [change], ())
+    message = str(refusal.value)
+    assert message.startswith("a.toml: ")
+    assert "\n" not in message
+    for word in words:
+        assert word in message

@@ -1,0 +1,162 @@
+"""Stacks on disk: write then read is the identity, and damage is noticed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes import stack
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats import exr
+from ommatid.scenes.recording import Recording
+from ommatid.scenes.stack import Stack, recorded
+from ommatid.scenes.tables.sensor import SensorTable
+
+from ..examples import THREE, camera, scene
+
+
+def example(seed: int = 0) -> Stack:
+    rng = np.random.default_rng(seed)
+    one = camera()
+    values = rng.normal(100, 50, one.measurements).astype(np.float32).astype(np.float64)
+    variance = rng.uniform(1e-9, 1, one.measurements).astype(np.float32).astype(np.float64)
+    return Stack(scene(lenses=THREE), one, values, variance, {"seed": seed, "note": 'ü "quoted"'})
+
+
+def of_a_sensor(seed: int = 0) -> Stack:
+    """Digital numbers of a real sensor, one of its pixels dead."""
+    rng, first = np.random.default_rng(seed), example(seed)
+    thin = tuple(lens.model_copy(update={"aperture": 0.1}) for lens in first.scene.camera.lens)
+    told = SensorTable.model_validate({"illuminance": "500 lux", "exposure": "1 ms", "black_level": 10.0})
+    changes = {"sensor": told, "camera": first.scene.camera.model_copy(update={"lens": thin})}
+    described = first.scene.model_copy(update=changes)
+    one = derive(described)
+    dark = rng.normal(10, 1, one.measurements).astype(np.float32).astype(np.float64)
+    flat = dark + np.repeat([1000.0, 2000.0, 1500.0], [kind.measurements for kind in one.types])
+    flat[5] = dark[5]
+    level = np.repeat([1000 / 7, 1000 / 3, np.pi], [kind.measurements for kind in one.types])
+    digital = rng.integers(0, 4096, one.measurements).astype(np.float64)
+    flat = flat.astype(np.float32).astype(np.float64)
+    return recorded(described, one, Recording(told, digital, dark, flat, level), first.variance, first.record)
+
+
+def test_write_then_read_is_the_identity(tmp_path: Path) -> None:
+    first = example()
+    stack.write(tmp_path / "stack.exr", first)
+    again = stack.read(tmp_path / "stack.exr")
+    np.testing.assert_array_equal(again.values, first.values)
+    np.testing.assert_array_equal(again.variance, first.variance)
+    assert again.record == first.record
+    assert again.camera == first.camera
+    assert again.scene.plain() == first.scene.plain()
+    assert [path.name for path in tmp_path.iterdir()] == ["stack.exr"], "nothing else is left behind"
+
+
+def test_the_file_is_what_the_contract_says(tmp_path: Path) -> None:
+    """Read by OpenEXR itself: a part a sub-imager, its name, its channels, upright float32."""
+    import json
+
+    import OpenEXR
+
+    first = example()
+    stack.write(tmp_path / "stack.exr", first)
+    file = OpenEXR.File(str(tmp_path / "stack.exr"), separate_channels=True)
+    names = [part.name() for part in file.parts]
+    assert names[:2] == ["A.00.00", "A.00.01"]
+    assert len(names) == 50
+    part = file.parts[1]
+    assert set(part.channels) == {"Y", "variance"}
+    assert part.channels["Y"].pixels.dtype == np.float32
+    np.testing.assert_array_equal(part.channels["Y"].pixels, first.images()[1])
+    assert {"type", "k", "l", "sha256"} <= json.loads(part.header["ommatid"]).keys()
+
+
+def test_any_flipped_byte_or_missing_end_is_noticed_or_harmless(tmp_path: Path) -> None:
+    path = tmp_path / "stack.exr"
+    first = example()
+    stack.write(path, first)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(1)
+    noticed = 0
+    for place in rng.integers(0, len(whole), 60):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            again = stack.read(path)
+        except InputError:
+            noticed += 1
+        else:
+            np.testing.assert_array_equal(again.values, first.values)
+            np.testing.assert_array_equal(again.variance, first.variance)
+    assert noticed > 30
+    for length in (0, 5, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError):
+            stack.read(path)
+
+
+def test_a_part_that_is_missing_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    exr.write(path, [exr.Part("a", {"Y": np.ones((2, 3), np.float32)}, {})])
+    with pytest.raises(InputError, match="another kind"):
+        stack.read(path)
+
+
+def test_non_contiguous_pixels_are_stored_as_they_are(tmp_path: Path) -> None:
+    pixels = np.arange(24, dtype=np.float32).reshape(4, 6)
+    for view in (pixels.T, pixels[::-1], pixels[:, ::2]):
+        exr.write(tmp_path / "a.exr", [exr.Part("a", {"Y": view}, {})])
+        np.testing.assert_array_equal(exr.read(tmp_path / "a.exr")[0].channels["Y"], view)
+
+
+def test_restrict_keeps_the_pixels_of_the_named_types() -> None:
+    first = example()
+    kept = first.restrict(("A", "C"))
+    assert kept.camera.measurements == 225 + 256
+    np.testing.assert_array_equal(kept.values, np.concatenate([first.values[:225], first.values[450:]]))
+    with pytest.raises(InputError, match="'D'"):
+        first.restrict(("D",))
+
+
+def test_a_sensors_recording_survives_being_stored(tmp_path: Path) -> None:
+    """What is read is what was written, values included; writing that gives the same file again."""
+    first = of_a_sensor()
+    stack.write(tmp_path / "stack.exr", first)
+    again = stack.read(tmp_path / "stack.exr")
+    assert first.recording is not None
+    assert again.recording is not None
+    assert again.recording.sensor == first.recording.sensor
+    for name in ("digital", "dark", "flat", "flat_value"):
+        np.testing.assert_array_equal(getattr(again.recording, name), getattr(first.recording, name))
+    np.testing.assert_array_equal(again.values, first.values)
+    assert np.flatnonzero(np.isnan(again.values)).tolist() == [5]
+    stack.write(tmp_path / "again.exr", again)
+    assert (tmp_path / "again.exr").read_bytes() == (tmp_path / "stack.exr").read_bytes()
+    names = set(exr.read(tmp_path / "stack.exr")[0].channels)
+    assert names == {"Y", "variance", "dark", "flat"}
+    np.testing.assert_array_equal(
+        exr.read(tmp_path / "stack.exr")[0].channels["Y"].ravel(), first.recording.digital[:25]
+    )
+    kept, whole = again.restrict(("A", "C")), first.restrict(("A", "C"))
+    assert kept.recording is not None
+    assert kept.recording.digital.size == kept.camera.measurements == 481
+    np.testing.assert_array_equal(kept.values, whole.values)
+    np.testing.assert_array_equal(kept.recording.values, kept.values)
+
+
+def test_a_sensors_stack_without_its_frames_is_refused(tmp_path: Path) -> None:
+    path, first = tmp_path / "stack.exr", of_a_sensor()
+    stack.write(path, Stack(first.scene, first.camera, first.values, first.variance, first.record))
+    with pytest.raises(InputError, match="should hold Y, variance, dark and flat"):
+        stack.read(path)
+    stack.write(path, first)
+    parts = exr.read(path)
+    for wrong in (None, "7", 0.0, -1.0):
+        parts[3].record["flat_value"] = wrong
+        exr.write(path, parts)
+        with pytest.raises(InputError, match=r"part 'A\.01\.00' should say flat_value"):
+            stack.read(path)

@@ -1,0 +1,323 @@
+"""Spending only what is needed: rendering until its variance is small, calibration until H is known well enough."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ommatid.analysis.calibration_goal import for_prior, for_stack
+from ommatid.reconstruct.restore import restore
+from ommatid.runtime.errors import MachineError
+from ommatid.runtime.progress import no_progress
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.scene import Scene, read
+from ommatid.simulate.adaptive_render import (
+    FLOAT32,
+    LEAST,
+    MOST,
+    SAMPLES,
+    TIME,
+    AdaptiveRendering,
+    SubImagerProgress,
+    render_until,
+)
+from ommatid.simulate.cache import cached_model, cached_stack
+from ommatid.simulate.calibrate import calibrate
+from ommatid.simulate.calibration.adaptive_rounds import GOAL
+from ommatid.simulate.calibration.stopping_rule import StoppingRule
+from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.noise_target import SHARE
+from ommatid.simulate.render import render
+from ommatid.simulate.sampling.passes import Plan, cells_of, on_grid, rounding_variance, samples_within
+
+from ..conftest import Command
+from ..examples import THREE, VARIANTS, needs, scene
+
+ODD = (("2/5", [2, 2], [5, 5]), ("3/8", [2, 2], [4, 4]))  # whose pixels see pixels of f in part
+
+
+def auto(shape: tuple[int, int] = (19, 19), lenses: Any = THREE, **render: Any) -> Scene:
+    told = {"samples": "auto", "variant": "scalar_rgb", **render}
+    return scene(shape, lenses, render=told, noise={"variance": 1e-2})
+
+
+def lit(described: Scene, **more: Any) -> AdaptiveRendering:
+    return render_until(described, derive(described), load(described), **more)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("sampler", ["multijitter", "independent", "ldsampler"])
+def test_the_goal_is_reached_in_every_pixel(variant: str, sampler: str) -> None:
+    needs(variant)
+    described = scene(
+        (12, 12),
+        (("1/3", [2, 2], [3, 3]),),
+        render={"samples": "auto", "variant": variant, "sampler": sampler},
+        noise={"variance": 1.0, "bits": 8},
+    )
+    stack = render(described, derive(described), load(described))
+    assert described.noise is not None
+    assert stack.record["reached"]
+    assert not stack.record["not_reached"]
+    assert (stack.variance <= SHARE * (1.0 + described.noise.quantisation_variance)).all()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_grid_that_fits_the_pixels_of_f_leaves_no_error(variant: str) -> None:
+    """But for rays that float32 rounds over an edge, at most one in a pass: 255 / (16 x 16) here."""
+    needs(variant)
+    described = auto(variant=variant)
+    camera, image = derive(described), load(described)
+    found = render_until(described, camera, image)
+    assert found.how["samples"] < 1024, "where a fixed number takes ten thousand"
+    away = np.abs(found.mean - ideal_matrix(camera) @ image.ravel())
+    assert np.median(away) < 1e-4
+    assert away.max() < 1.0
+
+
+def test_stated_variance_is_that_of_the_error() -> None:
+    """Over seeds: sum of squared errors over sum of stated variances, against its own scatter; no less is stated."""
+    ratios: list[float] = []
+    for seed in range(16):
+        described = auto((19, 19), (("2/5", [2, 2], [5, 5]),), seed=seed, sampler="independent")
+        described = described.model_copy(update={"noise": described.noise and described.noise.model_copy(
+            update={"variance": 2.0})})  # fmt: skip
+        camera, image = derive(described), load(described)
+        found = render_until(described, camera, image)
+        error = found.mean - ideal_matrix(camera) @ image.ravel()
+        ratios.append(float(np.sum(error**2) / np.sum(found.variance)))
+    mean, deviation = np.mean(ratios), np.std(ratios, ddof=1) / len(ratios) ** 0.5
+    limit = float(stats.t.isf(0.005, len(ratios) - 1))
+    assert abs(mean - 1) < limit * deviation, f"{mean:.3f} +- {deviation:.3f}"
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_other_sub_imagers_change_no_numbers(variant: str) -> None:
+    needs(variant)
+    both = auto(lenses=THREE, variant=variant, sampler="stratified")
+    alone = auto(lenses=THREE[:1], variant=variant, sampler="stratified")
+    first, other = lit(both), lit(alone)
+    count = other.mean.size
+    assert first.mean[:count].tobytes() == other.mean.tobytes()
+    assert first.variance[:count].tobytes() == other.variance.tobytes()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_threads_change_no_numbers(variant: str) -> None:
+    needs(variant)
+    import drjit as dr
+
+    described = auto(variant=variant, lenses=ODD)
+    before, found = dr.thread_count(), list[AdaptiveRendering]()
+    try:
+        for threads in (1, 5):
+            dr.set_thread_count(threads)
+            found.append(lit(described))
+    finally:
+        dr.set_thread_count(before)
+    assert found[0].mean.tobytes() == found[1].mean.tobytes()
+    assert found[0].variance.tobytes() == found[1].variance.tobytes()
+    assert found[0].how == found[1].how
+
+
+def test_time_ends_it_after_a_round_for_every_pixel() -> None:
+    ticks = iter(range(10**6))
+    described = auto(sampler="independent", time="3 s")
+    found = lit(described, clock=lambda: float(next(ticks)))
+    assert not found.how["reached"]
+    assert set(found.how["not_reached"].values()) == {TIME}
+    assert (found.variance > 0).all()
+    assert found.how["fewest_samples"] >= LEAST
+    endless = lit(auto(lenses=THREE[:1], time="1e9 s"), clock=lambda: 0.0)
+    assert endless.mean.tobytes() == lit(auto(lenses=THREE[:1])).mean.tobytes(), "time that is not over does nothing"
+
+
+def test_what_cannot_be_reached_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    silent = scene((14, 14), ODD[:1], render={"samples": "auto", "variant": "scalar_rgb"}, noise={"variance": 1e-12})
+    assert set(lit(silent).how["not_reached"].values()) <= {FLOAT32, SAMPLES}
+    assert lit(silent).how["not_reached"], "float32 does not tell 1e-6 of 255"
+    monkeypatch.setattr("ommatid.simulate.adaptive_render.MOST", 2048)
+    few = auto((14, 14), ODD[:1], sampler="independent")
+    found = lit(few)
+    assert set(found.how["not_reached"].values()) == {SAMPLES}
+    assert found.how["samples"] <= 2 * 2048 + LEAST
+
+
+@pytest.mark.parametrize("sets", [["noise.variance="], ["noise.variance=0"]], ids=["no noise", "noise of 0"])
+def test_without_noise_it_is_refused_before_any_work(here: Path, ommatid: Command, sets: list[str]) -> None:
+    told = [part for one in [*sets, "render.samples=auto"] for part in ("--set", one)]
+    ended = ommatid("run", "tiny.toml", "-o", "out", *told)
+    assert ended.code == 2
+    assert "render.samples 'auto'" in ended.err
+    assert "noise.variance" in ended.err
+    assert not (here / "out" / "tiny" / "stack.exr").exists()
+    ended = ommatid("calibrate", "tiny.toml", "-o", "h.npz", "--set", "calibration.samples=auto", "--set", sets[0])
+    assert ended.code == 2
+    assert "calibration.samples 'auto'" in ended.err
+
+
+@pytest.mark.usefixtures("here")
+def test_time_belongs_to_auto(ommatid: Command) -> None:
+    ended = ommatid("show", "tiny.toml", "--set", "render.time=3 s")
+    assert ended.code == 2
+    assert "render" in ended.err
+    assert 'samples = "auto"' in ended.err
+    described = json.loads(
+        ommatid("show", "tiny.toml", "--json", "--set", "render.time=3 s", "--set", "render.samples=auto").out
+    )
+    assert described["plan"]["render"]["samples"] == "auto for 3 s at most"
+    keys = json.loads(ommatid("schema").out)["$defs"]["RenderTable"]["properties"]
+    assert {"const": "auto"} in keys["samples"]["anyOf"]
+    assert "time" in keys
+
+
+def test_a_broken_off_rendering_goes_on(tmp_path: Path) -> None:
+    described = auto(lenses=ODD)
+    camera, image = derive(described), load(described)
+
+    def patience(done: float) -> None:
+        if done >= 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cached_stack(tmp_path / "stack.exr", described, camera, image, patience)
+    assert [path.name for path in tmp_path.iterdir()] == [".stack.exr.partial.npz"]
+    found, _ = cached_stack(tmp_path / "stack.exr", described, camera, image, no_progress)
+    whole, _ = cached_stack(tmp_path / "whole.exr", described, camera, image, no_progress)
+    np.testing.assert_array_equal(found.values, whole.values)
+    np.testing.assert_array_equal(found.variance, whole.variance)
+    assert found.record["spent"] == whole.record["spent"]
+
+
+def test_foreseen_samples_divide_the_variance_as_asked() -> None:
+    for exponent in (1.0, 1.5, 2.0):
+        course = SubImagerProgress(Plan(16, 16), exponent, last=Plan(16, 64))
+        for too_large, most in ((10.0, 10**6), (1e4, 512)):
+            total = course.foreseen(too_large, most)
+            each = min(total / 16, most)
+            ratio = (each / 64) ** exponent * total / (16 * each)
+            bound = max(course.last.total * 2, min(total, course.last.total * 64))
+            assert ratio == pytest.approx(too_large, rel=0.01) or total == bound
+
+
+def test_grids_fit_and_rounding_inverts() -> None:
+    for cells in (1, 2, 3, 5, 7, 16):
+        for samples in (16, 256, 1000, 40000, MOST):
+            work = on_grid(samples, "multijitter", cells)
+            side = round(work.samples**0.5)
+            assert side**2 == work.samples
+            assert side % cells == 0
+            assert work.total >= samples
+            assert work.samples <= 4096
+    values = np.array([3.0, 255.0])
+    assert cells_of(derive(auto()).types[0].ratio) == 3
+    for samples in (64, 1024, 4096):
+        variance = rounding_variance(values, samples)
+        assert samples_within(values, variance) == pytest.approx(samples, abs=8)
+
+
+@pytest.mark.parametrize(("variant", "method"), [("scalar_rgb", "points"), ("llvm_ad_mono", "transport")])
+def test_calibration_goes_on_until_h_adds_little(tmp_path: Path, variant: str, method: str) -> None:
+    needs(variant)
+    described = scene(
+        (14, 14),
+        (("1/3", [3, 3], [4, 4]), ("1/4", [4, 4], [2, 2])),
+        render={"samples": 256, "variant": variant, "sampler": "ldsampler"},
+        calibration={"samples": "auto", "method": method},
+        noise={"variance": 4.0},
+    )
+    camera, image = derive(described), load(described)
+    stack = render(described, camera, image)
+    judge = for_stack(stack)
+    model, made = cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)
+    assert made
+    assert model.record["auto"]["reached"]
+    assert judge.added_error(model) == pytest.approx(model.record["auto"]["adds"])
+    budget = restore(stack, model).budget()
+    assert budget["calibration"] <= GOAL * (sum(budget.values()) - budget["calibration"])
+    assert model.scene.calibration.samples == "auto"
+    assert not cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)[1], "up to date"
+    fixed = described.model_copy(update={"calibration": described.calibration.model_copy(update={"samples": 256})})
+    assert cached_model(tmp_path / "model.npz", fixed, camera, no_progress, judge)[1], "another model"
+
+
+def endless() -> tuple[Scene, Camera]:
+    """A small camera whose calibration goes on for as long as it is told to."""
+    described = scene(
+        (9, 9),
+        (("1/3", [1, 1], [3, 3]),),
+        render={"variant": "scalar_rgb"},
+        calibration={"samples": "auto"},
+        noise={"variance": 1.0},
+    )
+    return described, derive(described)
+
+
+def test_a_calibration_whose_writing_failed_comes_out_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The round that was good enough is done again: no further one follows it."""
+    described, camera = endless()
+    judge = StoppingRule(lambda model: 0.0 if model.record["samples"] > 1000 else 1.0, "step", "a step")
+
+    def full(*told: object) -> None:
+        raise MachineError(f"{told[0]}: could not be written")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ommatid.scenes.model_file.write", full)
+        with pytest.raises(MachineError):
+            cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)
+    found, _ = cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)
+    whole, _ = cached_model(tmp_path / "whole.npz", described, camera, no_progress, judge)
+    assert len(whole.record["auto"]["tried"]) > 1
+    assert found.record["auto"] == whole.record["auto"]
+    np.testing.assert_array_equal(found.matrix.data, whole.matrix.data)
+
+
+def test_jumps_are_few_and_what_cannot_be_reached_is_said() -> None:
+    """Judged by a law: what H adds falls like 1 / samples^1.5 from 100, as the total in the record says."""
+    described, camera = endless()
+
+    def judged(first: float) -> dict[str, Any]:
+        judge = StoppingRule(lambda model: first * (model.record["samples"] / 256) ** -1.5, "law", "a law")
+        return calibrate(described, camera, judge=judge).record
+
+    record = judged(1.0)
+    assert record["auto"]["reached"]
+    assert len(record["auto"]["tried"]) == 2, "one jump by the exponent"
+    never = judged(1e9)
+    assert not never["auto"]["reached"]
+    assert len(never["auto"]["tried"]) <= 5
+
+
+def test_without_a_stack_it_is_judged_by_the_prior() -> None:
+    """What H adds to Eq. 5 falls as H is known better, though its part of the error alone may rise at first."""
+    described = auto((12, 12), (("1/3", [3, 3], [3, 3]),), sampler="independent")
+    camera = derive(described)
+    judge, found = for_prior(described, camera), list[float]()
+    for samples in (64, 256, 1024):
+        told = described.calibration.model_copy(update={"samples": samples})
+        found.append(judge.added_error(calibrate(described.model_copy(update={"calibration": told}), camera)))
+    assert found[0] > found[1] > found[2] > 0
+
+
+def test_a_whole_run(here: Path, ommatid: Command) -> None:
+    told = ["--set", "render.samples=auto", "--set", "calibration.samples=auto"]
+    ended = ommatid("run", "tiny.toml", "-o", "out", *told)
+    assert ended.code == 0, ended.err
+    assert "samples a pixel" in " ".join(ended.out.split())
+    run = json.loads((here / "out/tiny/run.json").read_text("utf-8"))
+    assert run["stages"]["render"]["reached"]
+    assert run["stages"]["render"]["fewest_samples"] >= LEAST
+    assert run["stages"]["calibrate"]["auto"]["reached"]
+    budget = run["error"]["budget"]
+    assert budget["calibration"] <= GOAL * (run["error"]["predicted_mse"] - budget["calibration"])
+    again = ommatid("run", "tiny.toml", "-o", "out", *told)
+    assert again.err.count("up to date") == 4
+    kept = read(here / "out/tiny/scene.toml")
+    assert kept.render.samples == "auto"
+    assert ommatid("calibrate", "tiny.toml", "-o", "h.npz", "--set", "calibration.samples=auto").code == 0

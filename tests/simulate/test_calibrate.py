@@ -1,0 +1,147 @@
+"""Calibration: rows, grids, and uncertainties that are what they say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from ommatid.runtime.errors import InputError, MachineError
+from ommatid.scenes import model_file
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.scene import Scene
+from ommatid.simulate import calibrate
+from ommatid.simulate.calibration import entries, point_sources
+from ommatid.simulate.calibration.visible_pixels import VisiblePixels, of_pinholes
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
+
+from ..examples import scene
+
+
+def small(seed: int = 0, samples: int = 64) -> Scene:
+    render = {"variant": "scalar_rgb", "seed": seed}
+    return scene((12, 12), (("1/3", [2, 2], [3, 3]),), render=render, calibration={"samples": samples})
+
+
+def test_no_two_sources_of_a_grid_reach_one_sensor_pixel() -> None:
+    described = scene((23, 23), (("1/3", [3, 3], "fit"), ("2/7", [2, 2], "fit"), ("1/5", [2, 2], "fit")))
+    camera = derive(described)
+    ideal = ideal_matrix(camera)
+    start = 0
+    for kind in camera.types:
+        rows = ideal[start : start + kind.measurements]
+        start += kind.measurements
+        apart = of_pinholes(camera, kind).apart
+        lit = np.zeros((23, 23))
+        for row in range(apart):
+            for column in range(apart):
+                sources = point_sources.grid(camera, apart, row, column)
+                lit += sources
+                seen = (rows != 0).astype(np.float64) @ sources.ravel()
+                assert seen.max() <= 1
+        assert (lit == 1).all(), "every pixel of f has its turn once"
+
+
+def test_rows_sum_to_what_a_uniform_target_reads() -> None:
+    described = small()
+    found = point_sources.responses_from_points(described, derive(described))
+    np.testing.assert_allclose(found.matrix.sum(axis=1), 1, atol=2e-6)
+
+
+def test_a_source_given_to_the_wrong_pixel_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    described = small()
+    camera = derive(described)
+    right = point_sources.visible_pixels
+
+    def wrong(rig: Any, group: str) -> VisiblePixels:
+        found = right(rig, group)
+        return replace(found, row=found.row + 3, column=found.column + 3)
+
+    monkeypatch.setattr(point_sources, "visible_pixels", wrong)
+    with pytest.raises(MachineError, match="uniform"):
+        point_sources.responses_from_points(described, camera)
+
+
+def test_the_stated_uncertainty_of_h_is_its_real_error() -> None:
+    """Over thirty seeds: of its entries, and of what they do to the measurements of a photograph."""
+    ideal = ideal_matrix(derive(small()))
+    image = load(small())
+    entries: list[float] = []
+    measured: list[float] = []
+    for seed in range(30):
+        described = small(seed)
+        found = calibrate.calibrate(described, derive(described))
+        difference = sparse.csr_array(found.matrix - ideal)
+        entries.append(float((difference.data**2).sum() / found.variance.sum()))
+        error = found.forward(image) - ideal @ image.ravel()
+        measured.append(float((error**2).sum() / found.variance_from_model(image).sum()))
+    for ratios in (entries, measured):
+        assert abs(np.mean(ratios) - 1) < 4 * np.std(ratios, ddof=1) / 30**0.5 + 0.05
+
+
+def test_agreement_with_the_ideal_model_is_tested_and_can_fail() -> None:
+    described = small(samples=1024)
+    camera = derive(described)
+    found = calibrate.calibrate(described, camera)
+    assert found.record["agreement"]["p_value"] > 0.01
+    wrong = found.matrix.copy()
+    wrong.data[40] += 0.05
+    worse = entries.agreement(sparse.csr_array(wrong), found.variance, camera, 16)
+    assert worse["p_value"] < 1e-4
+    missing = found.matrix.copy()
+    missing.data[40] = 0.0
+    missing.eliminate_zeros()
+    kept = np.delete(found.variance, 40)
+    assert entries.agreement(sparse.csr_array(missing), kept, camera, 16)["p_value"] < 1e-4
+
+
+def test_ideal_calibration_has_no_uncertainty() -> None:
+    described = scene(calibration={"method": "ideal"})
+    found = calibrate.calibrate(described, derive(described))
+    assert not found.variance.any()
+    assert not found.variance_from_model(load(described)).any()
+
+
+def test_model_files(tmp_path: Path) -> None:
+    described = small()
+    found = calibrate.calibrate(described, derive(described))
+    model_file.write(tmp_path / "model.npz", found)
+    again = model_file.read(tmp_path / "model.npz")
+    assert (again.matrix != found.matrix).nnz == 0
+    np.testing.assert_array_equal(again.variance, found.variance)
+    np.testing.assert_array_equal(again.batches, found.batches)
+    assert again.record == found.record
+    plain = sparse.load_npz(tmp_path / "model.npz")
+    assert (plain != found.matrix).nnz == 0
+    assert np.load(tmp_path / "model.npz")["variance"].shape == plain.data.shape
+
+
+def test_forward_and_adjoint_pass_the_dot_test() -> None:
+    described = scene(lenses=(("1/3", [3, 3], [5, 5]), ("2/5", [2, 2], "fit")))
+    one = ideal_model(described, derive(described))
+    rng = np.random.default_rng(0)
+    f, g = rng.normal(size=one.unknowns), rng.normal(size=one.measurements)
+    assert np.vdot(one.forward(f), g) == pytest.approx(np.vdot(f, one.adjoint(g)), rel=1e-12)
+    np.testing.assert_array_equal(one.forward(f.reshape(19, 19)), one.forward(f))
+
+
+def test_restrict_keeps_rows_and_their_uncertainty() -> None:
+    described = scene(
+        (12, 12),
+        (("1/3", [2, 2], [3, 3]), ("1/4", [2, 2], [2, 2])),
+        render={"variant": "scalar_rgb"},
+        calibration={"samples": 16},
+    )
+    found = calibrate.calibrate(described, derive(described))
+    second = found.restrict(("B",))
+    assert second.measurements == 16
+    image = load(described)
+    np.testing.assert_array_equal(second.forward(image), found.forward(image)[36:])
+    np.testing.assert_allclose(second.variance_from_model(image), found.variance_from_model(image)[36:])
+    with pytest.raises(InputError, match="'Z'"):
+        found.restrict(("Z",))

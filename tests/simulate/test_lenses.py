@@ -1,0 +1,177 @@
+"""Whole runs through lenses and sensors that are more than the paper's: what is measured is what was promised."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ommatid.reconstruct.noise import usable_pixels
+from ommatid.reconstruct.restore import restore
+from ommatid.runtime.errors import InputError
+from ommatid.scenes import stack as stacks
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.scene import Scene, parse
+from ommatid.simulate.calibrate import calibrate
+from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.lenses import sharpness
+from ommatid.simulate.render import render
+from ommatid.simulate.renderer.export import export
+from ommatid.simulate.sensor.response import response
+
+from ..conftest import Command
+from ..examples import THREE, Lenses, needs, scene
+
+BIPLANE = [
+    {"thickness": "5 mm", "semi_diameter": "0.1 mm"},  # a baffle, far before the lens
+    {"radius": "1.0333 mm", "thickness": "0.3 mm", "index": 1.5, "semi_diameter": "0.1 mm", "stop": True},
+    {"semi_diameter": "0.2 mm"},
+]
+SENSOR = {"illuminance": "300 lux", "exposure": "10 ms", "read_noise": 3, "gain": 0.5, "black_level": 40, "prnu": 0.01}
+
+
+def built(lens: dict[str, Any], lenses: Lenses = THREE, shape: tuple[int, int] = (19, 19), **tables: Any) -> Scene:
+    """A scene whose every lens type is this one, calibrated by transport."""
+    calibration = {"method": "transport", "samples": 1024}
+    data = scene(shape, lenses, render={"samples": 1024}, calibration=calibration).plain()
+    for described in data["camera"]["lens"]:
+        described.update(lens)
+    return parse({**data, **tables}, Path("test.toml"))
+
+
+@pytest.mark.parametrize(
+    ("lens", "tables"),
+    [
+        ({"aperture": "0.4 mm", "focus": "700 mm"}, {"noise": {"variance": 1.0}}),
+        ({"distortion": [0.05, 0.0]}, {"noise": {"variance": 1.0}}),
+        ({"aperture": "0.4 mm", "focus": "900 mm"}, {"sensor": SENSOR}),
+        ({"surfaces": BIPLANE[1:]}, {"sensor": SENSOR}),
+    ],
+    ids=["defocus", "distortion", "sensor", "surfaces and sensor"],
+)
+def test_the_measured_error_is_the_promised_one(lens: dict[str, Any], tables: dict[str, Any], tmp_path: Path) -> None:
+    needs("llvm_ad_mono")
+    described = built(lens, **tables)
+    camera, truth = derive(described), load(described)
+    stacks.write(tmp_path / "stack.exr", render(described, camera, truth))
+    stack = stacks.read(tmp_path / "stack.exr")
+    assert (stack.recording is not None) == ("sensor" in tables)
+    found = restore(stack, calibrate(described, camera), truth.ravel())
+    assert found.error is not None
+    assert found.interval is not None
+    assert found.interval.low < found.error.mse < found.interval.high
+
+
+def test_pixels_that_no_light_can_reach_are_dead() -> None:
+    """A baffle cuts the corners off the field: they are NaN, their rows of H are empty, and the estimate knows."""
+    needs("llvm_ad_mono")
+    described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
+    camera, truth = derive(described), load(described)
+    stack, model = render(described, camera, truth), calibrate(described, camera)
+    dark = np.isnan(stack.values)
+    picture = dark.reshape(25, 25)
+    assert picture[0, 0]
+    assert picture[-1, -1]
+    assert not picture[12, 12]
+    sums = np.asarray(model.matrix.sum(axis=1)).ravel()
+    inner = sums.reshape(25, 25)[2:-2, 2:-2]  # at the target's edges some light comes from beside it
+    assert ((inner == 0) | (np.abs(inner - 1) < 1e-9)).all(), "what is known of a pixel is known wholly"
+    assert sums[0] == sums[-1] == 0
+    assert usable_pixels(stack).dead == dark.sum() > 40
+    assert usable_pixels(stack, model).dead >= dark.sum()
+    with_sensor = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), sensor=SENSOR)
+    # Dark is where one of 16 passes of 64 rays brought nothing: a fifth of the light makes that a chance of 1e-5.
+    assert (response(with_sensor, camera)[dark] < 0.2 * response(with_sensor, camera).max()).all()
+    counted = render(with_sensor, camera, truth)
+    assert np.isnan(counted.values[dark]).all()
+
+
+def test_what_a_lens_type_collects_is_what_the_rendering_shows() -> None:
+    """Electrons from traced solid angles against the light that rendered rays bring: within 1 per cent."""
+    needs("llvm_ad_mono")
+    from ommatid.simulate.renderer.renderer import Renderer
+    from ommatid.simulate.sampling.seeds import sampler_seeds
+
+    described = built({"surfaces": BIPLANE[1:]}, sensor=SENSOR)
+    camera = derive(described)
+    freed = response(described, camera)
+    rig = Renderer(camera, "llvm_ad_mono", together=False)
+    for group in rig.groups:
+        light = rig.gathered(group, 2**14, sampler_seeds(0, "data", 0, 1))
+        np.testing.assert_allclose(
+            light / light.mean(), freed[rig.places(group)] / freed[rig.places(group)].mean(), rtol=0.01
+        )
+    # One f-number for all types brings a pixel the same light, whatever the magnification.
+    means = [freed[place].mean() for place in camera.type_slices()]
+    assert max(means) / min(means) == pytest.approx(1, abs=0.05)
+
+
+def test_what_has_no_closed_form_is_calibrated_all_the_same() -> None:
+    """Distortion with defocus: H is there, only nothing to compare it with; and points see it as transport does."""
+    needs("llvm_ad_mono")
+    lens = {"aperture": "0.4 mm", "focus": "700 mm", "distortion": [0.05, 0.0]}
+    described = built(lens, (("1/3", [2, 2], [3, 3]),), (12, 12), noise={"variance": 1e-2})
+    model = calibrate(described, derive(described))
+    assert "agreement" not in model.record
+    assert model.matrix.sum(axis=1).max() == pytest.approx(1)
+
+
+def test_lens_types_that_are_left_out_leave_the_others_where_they_are() -> None:
+    """And a model of a camera that was made without them is not taken for theirs."""
+    described = built({"distortion": [0.05, 0.0]})
+    camera = derive(described)
+    some, kept = camera.restrict(("B",))
+    assert [sub.lens for sub in some.sub_imagers] == [sub.lens for sub in camera.sub_imagers if sub.type.name == "B"]
+    assert abs(ideal_matrix(some) - ideal_matrix(camera)[kept]).max() == 0
+    alone = derive(
+        described.model_copy(
+            update={"camera": described.camera.model_copy(update={"lens": described.camera.lens[1:2]})}
+        )
+    )
+    assert alone.describe() != some.describe()
+    pinholes = derive(scene(lenses=THREE))
+    assert pinholes.restrict(("B",))[0].describe() == derive(scene(lenses=THREE)).restrict(("B",))[0].describe()
+
+
+def test_more_than_pinholes_cannot_be_exported(tmp_path: Path) -> None:
+    described = built({"aperture": "0.4 mm"})
+    with pytest.raises(InputError, match="cannot be exported"):
+        export(described, derive(described), load(described), tmp_path / "lens.xml")
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (
+            'camera.lens.I.surfaces=[{radius="-1 mm", thickness="0.1 mm", index=1.5, semi_diameter="0.1 mm"}, '
+            '{semi_diameter="0.1 mm"}]',
+            "expected a lens that collects light",
+        ),
+        ("camera.lens.I.distortion=[-0.9, 0]", "folds"),
+        ("calibration.method=transport", "needs Mitsuba's fast backend"),
+        ('camera.tolerance.rotation="1 deg"', "need Mitsuba's fast backend"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_there_is_a_file(
+    told: str, words: str, here: Path, ommatid: Command
+) -> None:
+    """The tiny scene renders on the slow backend. One sentence, which names the scene file."""
+    for command in (("run", "tiny.toml", "-o", "out"), ("calibrate", "tiny.toml", "-o", "h.npz")):
+        ended = ommatid(*command, "--set", told)
+        assert ended.code == 2
+        assert words in ended.err
+        assert "tiny.toml" in ended.err
+        assert len(ended.err.strip().splitlines()) == 1
+    assert [path.name for path in here.iterdir()] == ["tiny.toml"]
+
+
+def test_a_corner_without_light_is_said_and_is_no_number() -> None:
+    """JSON has no NaN, and a table no `nan um`."""
+    described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
+    (found,) = sharpness.describe(derive(described))
+    assert found["spot_corner"] is None
+    assert found["spot_axis"] > 0
+    assert "no light at the corner" in sharpness.words(found)

@@ -1,0 +1,441 @@
+"""Rays through real lenses against Snell's law, closed forms of aberration, symmetries, and a second arithmetic."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, pi, sqrt
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
+from ommatid.scenes.lens_type import LensOptics
+from ommatid.scenes.scene import read
+from ommatid.simulate.lenses import sharpness
+from ommatid.simulate.lenses.etendue import relative_illumination, solid_angle, solid_angles
+from ommatid.simulate.lenses.prescription import Prescription, prescribe, prescription_of
+from ommatid.simulate.lenses.ray_trace import (
+    NUMPY,
+    Disk,
+    Functions,
+    exit_disk,
+    exit_disk_of,
+    path,
+    reach,
+    spread,
+    through,
+    trace,
+)
+
+from ..examples import GALLERY, needs
+from .test_prescription import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens
+
+Array = NDArray[np.float64]
+
+
+def straight(lens: Prescription, height: Any) -> tuple[Array, Array, Any]:
+    """Where axial rays from the sensor's side cross the lens's first vertex, their slopes, and whether they pass."""
+    height = np.asarray(height, dtype=np.float64)
+    numbers = path(lens, Disk(lens.rear_principal - float(lens.vertices[-1]), 1.0))[2:-5]
+    (x, y), (u, v, w), passed = through(
+        [*numbers, 0.0, 0.0, 1.0, 1.0, 1e30], (height, 0 * height), (0.0, 0.0, 1.0), NUMPY, True
+    )
+    assert not np.any(y)
+    assert not np.any(v)
+    return x, u / w, passed
+
+
+def crossing(lens: Prescription, height: Any) -> Array:
+    """How far in front of the lens's first vertex such rays cross the axis."""
+    x, slope, passed = straight(lens, height)
+    assert np.all(passed)
+    return -x / slope
+
+
+def double_gauss(tmp_path: Any) -> Prescription:
+    from ommatid.scenes.tables.lens_file import read_lens
+
+    (tmp_path / "gauss.dat").write_text(DOUBLE_GAUSS, encoding="utf-8")
+    return prescribe(read_lens(tmp_path / "gauss.dat"))
+
+
+radii = st.floats(2.5, 9.0) | st.floats(-9.0, -2.5)
+small = st.floats(-0.3, 0.3)  # with these sines stay below 0.55: short of total reflection in an index of 1.7
+
+
+@given(radii, st.floats(1.2, 1.7), small, small, st.floats(-0.25, 0.25), st.floats(-0.25, 0.25))
+def test_snell_s_law_holds_at_a_sphere(radius: float, index: float, x: float, y: float, u: float, v: float) -> None:
+    """n (d x N) is the same on both sides, N from the sphere's centre to the point, which lies on the sphere."""
+    one = lens([radius], [], [index])
+    step, *rest = path(one, Disk(0.0, 1.0))[2:7]
+    start = np.array([u, v, 1.0]) / sqrt(u * u + v * v + 1)
+    (a, b), out, passed = through([0 * step, *rest], (np.float64(x), np.float64(y)), tuple(start), NUMPY, True)
+    assert passed
+    centre = np.array([0.0, 0.0, -radius])  # the prescription's axis runs to the sensor, the ray's to the target
+    point = np.array([a, b, centre[2] + np.sign(radius) * sqrt(radius**2 - a * a - b * b)])
+    normal = point - centre
+    np.testing.assert_allclose(np.cross(point - [x, y, 0], start), 0, atol=1e-12)  # it lies on the ray
+    assert np.linalg.norm(out) == pytest.approx(1, rel=1e-12)
+    # `index` is behind the surface, on the sensor's side, from which the ray comes
+    np.testing.assert_allclose(index * np.cross(start, normal), np.cross(out, normal), atol=1e-12)
+
+
+def test_a_plane_parallel_plate_shifts_a_ray() -> None:
+    """By t sin(a) (1 - cos(a) / sqrt(n^2 - sin(a)^2)) across it, and turns it by nothing."""
+    angle, thickness, index = np.linspace(-1.4, 1.4, 9), 0.7, 1.6
+    planes = [0.0, 0.0, 1.0, 1 / index, inf, thickness, 0.0, 1.0, index, inf]
+    (x, _), (u, _, w), passed = through(
+        planes, (0 * angle, 0 * angle), (np.sin(angle), 0 * angle, np.cos(angle)), NUMPY, True
+    )
+    assert np.all(passed)
+    shift = thickness * np.sin(angle) * (1 - np.cos(angle) / np.sqrt(index**2 - np.sin(angle) ** 2))
+    np.testing.assert_allclose(np.cos(angle) * (thickness * np.tan(angle) - x), shift, atol=1e-14)
+    np.testing.assert_allclose((u, w), (np.sin(angle), np.cos(angle)), atol=1e-14)
+
+
+def test_total_reflection_and_rims_block_and_leave_numbers() -> None:
+    """From glass of index 1.5 nothing leaves beyond asin(1 / 1.5) = 41.8 degrees."""
+    angle = np.radians([41.0, 42.0, 80.0])
+    for surface in ([0.0, 0.0, 1.0, 1.5, inf], [0.0, 1.0, 1.0, 1.5, inf]):
+        (x, y), direction, passed = through(
+            surface, (0 * angle, 0 * angle), (np.sin(angle), 0 * angle, np.cos(angle)), NUMPY, True
+        )
+        assert list(passed) == [True, False, False]
+        assert np.all(np.isfinite([x, y, *direction]))
+        assert np.all(direction[2][1:] == 1)
+    x = np.array([0.0, 0.99, 1.01, 50.0])
+    assert list(straight(ball(1.0), x)[2]) == [True, True, False, False]
+
+
+def test_an_axial_point_and_one_beside_it_have_the_paraxial_images() -> None:
+    """Through a narrow pupil: in the conjugate plane, upside down, times the ratio of the distances."""
+    for one in (ball(), lens([1.5, -4.0, inf, 1.1, -3.0], [0.3, 0.2, 0.3, 0.4], [1.7, 1.0, 1.0, 1.6, 1.0], stop=2)):
+        distance = 50.0
+        depth = one.image_distance(distance)
+        across, down = 1e-3 * np.array([-1.0, 0.0, 1.0, 0.0]), 1e-3 * np.array([0.0, 1.0, 0.0, 0.0])
+        numbers = path(one, Disk(0.0, 1.0))
+        (x, y), (u, v, w), _ = trace(numbers, 1e-4, 0.0, across, down, depth)
+        np.testing.assert_allclose(x + distance * u / w, -1e-4 * distance / depth, rtol=1e-4)
+        np.testing.assert_allclose(y + distance * v / w, 0, atol=1e-6)
+
+
+def test_a_hyperbolic_face_brings_light_from_the_glass_to_a_point() -> None:
+    """The Cartesian oval of a far point: conic constant -n^2 (E. Hecht, Optics, section 5.2.1)."""
+    index = 1.6
+    perfect = lens([1.0, inf], [0.9], [index, 1.0], 0.9, conic=[-(index**2), 0.0])
+    heights = np.linspace(0.05, 0.85, 9)
+    np.testing.assert_allclose(crossing(perfect, heights), perfect.focal_length, rtol=1e-12)
+    sphere = lens([1.0, inf], [0.9], [index, 1.0], 0.9)
+    assert np.ptp(crossing(sphere, heights[:5])) > 0.1
+
+
+def test_an_ellipsoid_brings_light_into_glass_to_a_point() -> None:
+    """Conic constant -1 / n^2: parallel light from air meets, in the glass, at n R / (n - 1)."""
+    index = 1.6
+    numbers = [0.0, -1.0, 1 - index**-2, 1 / index, inf, 0.0, 0.0, 1.0, 1.0, inf]
+    x = np.linspace(0.05, 0.7, 9)
+    # the ray runs towards the target, so a face that collects has its centre there: curvature above 0
+    numbers[1] = 1.0
+    (x, _), (u, _, w), passed = through(numbers, (x, 0 * x), (0.0, 0.0, 1.0), NUMPY, True)
+    assert np.all(passed)
+    np.testing.assert_allclose(-x * w / u, index / (index - 1), rtol=1e-12)
+
+
+@pytest.mark.parametrize("curved_first", [True, False])
+def test_spherical_aberration_of_a_plano_convex_lens(curved_first: bool) -> None:
+    """Of third order, both ways round: F. Jenkins, H. White, Fundamentals of Optics, chapter 9, a far point,
+
+    1/s_h - 1/s_p = h^2 / (8 f^3 n (n-1)) ((n+2)/(n-1) q^2 - 4 (n+1) q + (3n+2)(n-1) + n^3/(n-1)).
+    """
+    index, focal_length, height = 1.5, 10.0, 0.1
+    radius = (index - 1) * focal_length
+    # rays come from the sensor's side, which the last surface faces
+    one = lens([inf, -radius], [1e-6], [index, 1.0]) if curved_first else lens([radius, inf], [1e-6], [index, 1.0])
+    q = 1 if curved_first else -1
+    brackets = (index + 2) / (index - 1) * q**2 - 4 * (index + 1) * q + (3 * index + 2) * (index - 1)
+    brackets += index**3 / (index - 1)
+    shift = height**2 / (8 * focal_length**3 * index * (index - 1)) * brackets
+    assert 1 / crossing(one, height) - 1 / focal_length == pytest.approx(shift, rel=2e-3)
+    assert shift * focal_length**3 / height**2 == pytest.approx(7 / 6 if curved_first else 4.5)
+
+
+def test_light_goes_the_same_way_back(tmp_path: Any) -> None:
+    """Out through the lens, then back through the lens turned round: the principal planes change places."""
+    one = double_gauss(tmp_path)
+    rng = np.random.default_rng(0)
+    x, y, across, down = rng.uniform(-6, 6, (4, 200))
+    depth = 55.0
+    (a, b), (u, v, w), weight = trace(path(one, Disk(0.0, 1.0)), x, y, across, down, depth)
+    kept = weight > 0
+    assert kept.mean() > 0.5
+    back = path(one.reversed(), Disk(0.0, 1.0))[2:]
+    (c, d), (p, q, r), passed = through(back, (a, b), (-u, -v, w), NUMPY, kept)
+    np.testing.assert_array_equal(passed, kept)
+    expected = np.array([across, down, (across - x) / depth, (down - y) / depth])[:, kept]
+    np.testing.assert_allclose(np.array([c, d, -p / r, -q / r])[:, kept], expected, atol=1e-10)
+
+
+def test_the_disk_holds_every_ray_that_passes(tmp_path: Any) -> None:
+    """Wide angles, vignetting, a pupil behind or beyond the sensor: and hardly more than them."""
+    gauss = double_gauss(tmp_path)
+    shaded = lens([inf, 10.0, -10.0], [5.0, 1.0], [1.0, 1.5, 1.0], [3.0, 0.5, 0.5])  # its stop stops nothing
+    remote = lens([inf, 10.0, -10.0], [9.0, 1.0], [1.0, 1.5, 1.0], [0.5, 3.0, 3.0])  # telecentric, but for the glass
+    for one, depth, field in (
+        (gauss, 52.0, 12.0),
+        (remote, 11.0, 2.0),
+        (shaded, 11.0, 2.0),
+        (ball(), 1.55, 0.1),
+        (gauss.reversed(), 60.0, 0.0),
+    ):
+        disk = exit_disk(one, depth, field)
+        wide = Disk(disk.height, disk.radius * 1.6)
+        far = 0.0
+        for height in np.linspace(0, field, 4):
+            across, down = spread(20000)
+            weight = trace(path(one, wide), 0.0, height, across, down, depth)[2]
+            far = max(far, float((np.hypot(across, down) * (weight > 0)).max()) * wide.radius)
+        assert 0.93 * disk.radius < far < disk.radius
+
+
+def test_a_lens_that_lets_no_light_through_is_refused() -> None:
+    shut = lens([inf, 1.0, -1.0], [50.0, 0.2], [1.0, 1.5, 1.0], [1e-9, 1e-9, 1.0])
+    with pytest.raises(InputError, match="no light comes through"):
+        exit_disk(shut, 1.2, 0.3)
+
+
+def test_a_small_lens_collects_its_area_over_the_square_of_the_distance() -> None:
+    """pi / 4 (A / d)^2, and cos^4 of the angle beside the axis."""
+    one = lens([10.0, -10.0], [1e-3], [1.5, 1.0], 0.3)
+    depth = one.focal_length
+    disk = exit_disk(one, depth, 5.0)
+    assert solid_angle(one, disk, depth) == pytest.approx(pi / 4 * (0.6 / depth) ** 2, rel=0.01)
+    cosine = depth / np.hypot(depth, 5.0)
+    assert solid_angle(one, disk, depth, 3.0, 4.0) / solid_angle(one, disk, depth) == pytest.approx(cosine**4, rel=0.01)
+
+
+@pytest.mark.parametrize("sine", [0.2, 0.7, 0.95])
+def test_on_the_axis_a_wide_cone_gives_pi_times_its_sine_squared(sine: float) -> None:
+    """Whatever stands before it: here a bare stop behind a lens that cuts nothing."""
+    depth, gap = 5.0, 2.0
+    stop = (depth - gap) * sine / sqrt(1 - sine**2)
+    one = lens([1e4, -1e4, inf], [0.0, gap], [1.5, 1.0, 1.0], [1e3, 1e3, stop], stop=2)
+    disk = exit_disk(one, depth, 0.0)
+    assert solid_angle(one, disk, depth) == pytest.approx(pi * sine**2, rel=0.01)
+
+
+def test_a_camera_s_lenses_collect_what_their_f_numbers_say() -> None:
+    """pi / 4 N^2 on the axis, N at the sensor, to the square of the slope; cos^4 beside it, of a thin lens."""
+    camera = derive(read(GALLERY / "doublet.toml", (), ["I", "III"]))
+    found = solid_angles(camera)
+    assert list(found) == ["I", "III"]
+    reported = {one["lens"]: one["working_f_number"] for one in sharpness.describe(camera)}
+    for name, angle in found.items():
+        assert angle == pytest.approx(pi / (4 * reported[name] ** 2), rel=0.015)
+    data = [
+        'target.distance="20 mm"',
+        'camera.lens.I.surfaces=[{radius="2 mm", thickness="1 um", index=1.5, semi_diameter="75 um"},'
+        ' {radius="-2 mm", semi_diameter="75 um"}]',
+    ]
+    camera = derive(read(GALLERY / "tile19.toml", data, ["I"]))
+    places = [sub.patch[axis] - sub.lens[axis] for sub in camera.sub_imagers for axis in (0, 1)]
+    corners = np.array(places).reshape(-1, 2) - 2 * camera.pixel_pitch  # the middle of each first pixel
+    tangent = np.hypot(*corners.T) / camera.depth(camera.types[0])
+    assert tangent.max() > 0.4
+    expected = (1 + tangent**2) ** -2
+    np.testing.assert_allclose(relative_illumination(camera)[::25], expected, rtol=0.01)
+    pinholes = derive(read(GALLERY / "tile19.toml"))
+    assert solid_angles(pinholes) == {}
+    assert np.all(relative_illumination(pinholes) == 1)
+
+
+def test_numpy_and_dr_jit_agree_to_float32() -> None:
+    """Numbers of two lenses with surfaces of their own count stand in one table, and are looked up by the ray."""
+    needs("llvm_ad_mono")
+    from ommatid.simulate.renderer.variant import activate
+
+    activate("llvm_ad_mono")
+    import drjit as dr
+    import mitsuba as mi
+
+    camera = camera_with(BICONVEX)
+    two = [prescription_of(camera, camera.types[0])]
+    two.append(prescription_of(derive(read(GALLERY / "doublet.toml")), derive(read(GALLERY / "doublet.toml")).types[0]))
+    depth = camera.depth(camera.types[0])
+    table = np.array([path(one, exit_disk(one, depth, 0.1), surfaces=3) for one in two])
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-0.07, 0.07, (2, 2000))
+    across, down = spread(2000)
+    which = rng.integers(0, 2, 2000)
+    columns = [
+        dr.gather(mi.Float, mi.Float(np.float32(column)), mi.UInt32(which.astype(np.uint32))) for column in table.T
+    ]
+    functions = Functions(dr.sqrt, dr.select, dr.maximum)
+    rays = [mi.Float(np.float32(values)) for values in (x, y, across, down)]
+    place, direction, weight = trace(columns, rays[0], rays[1], rays[2], rays[3], mi.Float(depth), functions)
+    found = np.array([np.array(values) for values in (*place, *direction, weight)])
+    place, direction, weight = trace(table[which].T, x, y, across, down, depth)
+    expected = np.array([*place, *direction, weight])
+    edge = (weight > 0) == (found[-1] > 0)  # which float32 may put on the other side of a rim
+    assert np.mean(edge) > 0.998
+    assert 0.9 < np.mean(weight > 0) < 1
+    np.testing.assert_allclose(found[:, edge], expected[:, edge], atol=1e-6)
+
+
+class Fixed:
+    """A sampler that always gives the same points of the unit square."""
+
+    def __init__(self, points: Array) -> None:
+        self.points = points
+
+    def next_2d(self) -> Any:
+        import mitsuba as mi
+
+        return mi.Point2f(*(np.float32(row) for row in self.points))
+
+
+def test_the_renderer_s_rays_are_the_traced_ones() -> None:
+    """From the middle and the rim of the disk: where the map of the square onto it needs no formula."""
+    needs("llvm_ad_mono")
+    from ommatid.simulate.renderer.variant import activate
+
+    activate("llvm_ad_mono")
+    import mitsuba as mi
+
+    from ommatid.simulate.renderer.real_lens import RealLens
+
+    camera = derive(read(GALLERY / "planoconvex.toml"))
+    kind = camera.types[0]
+    one, depth = prescription_of(camera, kind), camera.depth(kind)
+    square = np.array([[0.5, 0.75, 0.5, 1.0], [0.5, 0.5, 0.25, 0.5]])
+    x, y = np.array([0.01, 0.0, -0.01, 0.0]), np.array([0.0, 0.01, 0.0, 0.0])
+    renderer = RealLens(camera, kind)
+    start, way, weight = renderer.leave(
+        mi.Float(np.float32(x)), mi.Float(np.float32(y)), mi.Float(depth), Fixed(square)
+    )
+    place, direction, light = trace(
+        path(one, exit_disk_of(camera, kind, one)), x, y, 2 * square[0] - 1, 2 * square[1] - 1, depth
+    )
+    np.testing.assert_allclose([np.array(start[0]), np.array(start[1])], place, atol=1e-6)
+    np.testing.assert_allclose([np.array(part) for part in way], direction, atol=1e-6)
+    np.testing.assert_allclose(np.array(weight), light, atol=1e-6)
+    assert list(light > 0) == [True, True, True, False]  # the disk is a little wider than the pupil
+
+
+def test_a_thin_real_lens_diffracts_as_a_thin_lens() -> None:
+    needs("llvm_ad_mono")
+    from ommatid.simulate.renderer.rays import lens_of
+    from ommatid.simulate.renderer.variant import activate
+
+    activate("llvm_ad_mono")
+    rows = [
+        {"radius": "2 mm", "thickness": "1 um", "index": 1.5, "semi_diameter": "75 um"},
+        {"radius": "-2 mm", "semi_diameter": "75 um"},
+    ]
+    camera = replace(camera_with(rows), wavelength=550e-6)
+    real = camera.types[0]
+    thin = replace(real, optics=LensOptics(aperture=0.15 * camera.focal_length(real) / 2))
+    tails = [lens_of(camera, kind).tail for kind in (real, thin)]
+    assert tails[0] == pytest.approx(tails[1], rel=2e-3)
+
+
+def test_a_padded_path_is_the_same_path() -> None:
+    camera = camera_with(BICONVEX)
+    one, depth = prescription_of(camera, camera.types[0]), camera.depth(camera.types[0])
+    disk = exit_disk(one, depth, 0.1)
+    across, down = spread(50)
+    plain, padded = (trace(path(one, disk, count), 0.02, 0.05, across, down, depth) for count in (0, 9))
+    for first, second in zip((*plain[0], *plain[1], plain[2]), (*padded[0], *padded[1], padded[2]), strict=True):
+        np.testing.assert_allclose(first, second, atol=1e-14)
+
+
+def test_the_reach_is_the_farthest_corner_of_a_patch() -> None:
+    """Type I of the tile: patches of 5 x 5 pixels of 6 um, so a little more than their own half diagonal."""
+    camera = camera_with(BICONVEX)
+    kind = camera.types[0]
+    far, least, largest = reach(camera, kind)
+    assert least == largest == camera.depth(kind)
+    half = 2.5 * camera.pixel_pitch
+    offsets = [np.abs(np.subtract(sub.patch, sub.lens)) for sub in camera.sub_imagers if sub.type == kind]
+    assert far == pytest.approx(max(float(np.hypot(*(offset + half))) for offset in offsets))
+
+
+def test_a_camera_s_disk_serves_sensors_that_stand_askew() -> None:
+    data = ["camera.tolerance.focal_length=0.02", 'camera.tolerance.tilt="2 deg"']
+    camera = derive(read(GALLERY / "planoconvex.toml", data))
+    kind = camera.types[0]
+    _, least, largest = reach(camera, kind)
+    assert least < camera.depth(kind) < largest
+    one = prescription_of(camera, kind)
+    assert exit_disk_of(camera, kind, one).radius == pytest.approx(one.exit_pupil.radius, rel=0.1)
+
+
+def test_depth_of_field_ends_where_the_thin_lens_blurs_over_a_pixel() -> None:
+    """By the thin-lens equation: image at v, blur A |v - d| / v."""
+    focal_length, aperture, depth, blur = 2.0, 0.5, 2.1, 0.02
+    ends = sharpness.depth_of_field(depth, 1 / focal_length - 1 / depth, aperture, blur)
+    for distance in ends:
+        assert distance is not None
+        image = 1 / (1 / focal_length - 1 / distance)
+        assert aperture * abs(image - depth) / image == pytest.approx(blur)
+    # With a stop before the lens the cone from the target is cut there, and is D z / (z - e) wide at the lens.
+    pupil = 5.0
+    for distance in sharpness.depth_of_field(depth, 1 / focal_length - 1 / depth, aperture, blur, pupil):
+        assert distance is not None
+        image = 1 / (1 / focal_length - 1 / distance)
+        wide = aperture * distance / (distance - pupil)
+        assert wide * abs(image - depth) / image == pytest.approx(blur)
+    # Focused at the hyperfocal distance it reaches from half of that to infinity.
+    hyperfocal = depth * aperture / blur
+    near, far = sharpness.depth_of_field(depth, 1 / hyperfocal * (1 - 1e-15), aperture, blur)
+    assert near == pytest.approx(hyperfocal / 2)
+    assert far is None
+
+
+def test_a_thin_real_lens_is_reported_as_a_thin_lens() -> None:
+    """Biconvex, thickness next to nothing, out of focus: only its spherical aberration stays, at f/13 small."""
+    rows = [
+        {"radius": "2 mm", "thickness": "1 um", "index": 1.5, "semi_diameter": "75 um"},
+        {"radius": "-2 mm", "semi_diameter": "75 um"},
+    ]
+    (real,) = sharpness.describe(camera_with(rows, focus="100 mm"))
+    camera = camera_with(rows, focus="100 mm")
+    diameter = 0.15 * camera.focal_length(camera.types[0]) / 2
+    data = [f'camera.lens.I.aperture="{diameter} mm"', 'camera.lens.I.focus="100 mm"']
+    (ideal,) = sharpness.describe(derive(read(GALLERY / "tile19.toml", data, ["I"])))
+    assert real.keys() == ideal.keys()
+    for name, value in ideal.items():
+        loose = {"sharpest": 0.1, "spot_axis": 0.15, "spot_corner": 0.15}.get(name, 2e-3)
+        assert real[name] == (value if value is None or name == "lens" else pytest.approx(value, rel=loose)), name
+    assert "f/13.3" in sharpness.words(real)
+
+
+def test_a_lens_s_rays_are_sharpest_short_of_the_paraxial_focus() -> None:
+    """Spherical aberration of a single lens; the distance of least spot is one that no other beats."""
+    camera = derive(read(GALLERY / "planoconvex.toml"))
+    best = sharpness.describe(camera)[0]
+    assert best["sharpest"] < best["focus"] == pytest.approx(camera.distance)
+    kind = camera.types[0]
+    one = prescription_of(camera, kind)
+    (x, _), (u, _, w), weight = trace(
+        path(one, exit_disk_of(camera, kind, one)), 0.0, 0.0, *spread(4096), camera.depth(kind)
+    )
+    distances = best["sharpest"] * np.array([0.9, 0.99, 1.0, 1.01, 1.1])
+    angles = [np.sqrt(np.sum(weight * (x + z * u / w) ** 2)) / z for z in distances]
+    assert int(np.argmin(angles)) == 2
+
+
+def test_the_gallery_s_doublet_is_far_sharper_than_its_plano_convex_lens() -> None:
+    single, double = (sharpness.describe(derive(read(GALLERY / f"{name}.toml"))) for name in ("planoconvex", "doublet"))
+    assert len(single) == len(double) == 3
+    for one, two in zip(single, double, strict=True):
+        assert two["spot_corner"] < one["spot_corner"] / 10
+        assert 6 <= two["working_f_number"] < 6.1
+
+
+def test_pinholes_are_not_reported() -> None:
+    assert sharpness.describe(derive(read(GALLERY / "tile19.toml"))) == []

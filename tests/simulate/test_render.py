@@ -1,0 +1,82 @@
+"""Rendering as a whole: what a stack holds, repeatable to the bit whatever the number of threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.render import made_from, render
+
+from ..examples import THREE, VARIANTS, needs, scene
+from ..modules import existing
+
+
+def recorded(described: Scene) -> Stack:
+    return render(described, derive(described), load(described))
+
+
+@pytest.fixture
+def threads() -> Iterator[Any]:
+    import drjit as dr
+
+    before = dr.thread_count()
+    yield dr.set_thread_count
+    dr.set_thread_count(before)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_same_seed_same_bits_on_one_and_eight_threads(variant: str, threads: Any) -> None:
+    needs(variant)
+    described = scene((19, 19), THREE, render={"variant": variant, "samples": 256}, noise={"variance": 1e-2})
+    threads(1)
+    alone = recorded(described)
+    threads(8)
+    together = recorded(described)
+    assert alone.values.tobytes() == together.values.tobytes()
+    assert alone.variance.tobytes() == together.variance.tobytes()
+
+
+def test_another_seed_gives_other_noise() -> None:
+    one = recorded(scene(render={"variant": "scalar_rgb", "samples": 16, "seed": 1}))
+    other = recorded(scene(render={"variant": "scalar_rgb", "samples": 16, "seed": 2}))
+    assert (one.values != other.values).mean() > 0.5
+
+
+def test_progress_ends_at_one_and_never_falls() -> None:
+    described = scene(render={"variant": "scalar_rgb", "samples": 16})
+    seen: list[float] = []
+    render(described, derive(described), load(described), seen.append)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+
+
+def test_variances_are_stored_and_never_zero() -> None:
+    stack = recorded(scene((19, 19), THREE, render={"variant": "scalar_rgb", "samples": 256}))
+    assert (stack.variance > 0).all()
+    assert stack.variance.astype(np.float32).min() > 0, "not in the file's precision either"
+
+
+def test_a_scene_without_noise_runs_no_noise_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    [noise] = existing("ommatid.simulate.sensor.gaussian")
+    monkeypatch.delitem(sys.modules, noise, raising=False)
+    recorded(scene(render={"variant": "scalar_rgb", "samples": 16}))
+    assert noise not in sys.modules
+
+
+def test_fingerprint_changes_with_what_the_values_depend_on_and_only_with_that() -> None:
+    plain = scene()
+    camera, image = derive(plain), load(plain)
+    first = made_from(plain, camera, image)
+    assert made_from(scene(prior={"mean": 100.0}), camera, image) == first
+    assert made_from(scene(noise={"variance": 1.0}), camera, image) != first
+    assert made_from(scene(render={"seed": 3}), camera, image) != first
+    assert made_from(plain, camera, image + 1) != first

@@ -1,0 +1,97 @@
+"""Rays from sensor points through ideal lenses: where they go and how much light they bring, in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ommatid.scenes.camera import derive
+from ommatid.scenes.pose import corner_offset, pose_of
+from ommatid.scenes.scene import parse
+from ommatid.simulate.lenses import thin_lens
+from ommatid.simulate.sampling.seeds import sampler_seeds
+
+from ..examples import camera, needs, scene
+
+PLACES = st.floats(-1, 1)
+
+
+@given(st.integers(0, 49), st.floats(0, 1), st.floats(0, 1))
+def test_a_ray_meets_the_target_where_the_magnification_says(number: int, down: float, across: float) -> None:
+    """From sensor through pinhole to target: pixel (i + u, j + v) looks at window + m (i + u, j + v)."""
+    one = camera()
+    sub = one.sub_imagers[number]
+    stand, (u, v) = pose_of(sub), corner_offset(one, sub)
+    i, j = down * sub.type.pixels[0], across * sub.type.pixels[1]
+    x, y, z = stand.middle + stand.axes @ [u + j * one.pixel_pitch, v + i * one.pixel_pitch]
+    slopes = np.array(thin_lens.through_centre(x, y, -z))
+    m = float(sub.type.ratio)
+    expected = one.position(float(sub.window[0]) + m * i, float(sub.window[1]) + m * j)
+    assert np.array(sub.lens) + slopes * one.distance == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_image_on_the_sensor_is_upside_down() -> None:
+    one = camera()
+    sub = one.sub_imagers[4]
+    left, top = corner_offset(one, sub)
+    assert top < 0, "the top of the target lands at the smallest y"
+    assert left < 0, "and its left, at the largest x, at the smallest x"
+
+
+@given(PLACES, PLACES, PLACES)
+def test_the_thin_lens_equation(slope: float, one: float, other: float) -> None:
+    """1/f = 1/s + 1/d: two rays of one sensor point, d behind a lens of focal length f, meet s before it."""
+    f, d = 25.0, 30.0  # so s = 150
+    ways = [thin_lens.through_thin_lens(slope, place, d, f) for place in (one, other)]
+    assert one + 150.0 * ways[0] == pytest.approx(other + 150.0 * ways[1], abs=1e-9)
+    assert one + 150.0 * ways[0] == pytest.approx(150.0 * slope, abs=1e-9), "and with the ray through the centre"
+
+
+def test_parallel_light_meets_in_the_focal_point() -> None:
+    """From the focal plane rays leave parallel, and to it they come from far away."""
+    for place in (-1.0, 0.0, 2.0):
+        assert thin_lens.through_thin_lens(0.1, place, 25.0, 25.0) == pytest.approx(0.1)
+
+
+def test_the_disk_of_defocus() -> None:
+    """A lens focused on s shows a point of a screen at Z as a disk of A |1 - Z / s|: similar triangles."""
+    aperture, s, screen, d = 2.0, 400.0, 500.0, 3.0
+    f = 1 / (1 / s + 1 / d)
+    edges = [place + screen * thin_lens.through_thin_lens(0.2, place, d, f) for place in (-aperture / 2, aperture / 2)]
+    assert abs(edges[1] - edges[0]) == pytest.approx(aperture * 100 / 400)
+
+
+@pytest.mark.parametrize("tangent", [0.0, 0.3, 1.0])
+def test_irradiance_behind_a_small_lens_falls_with_the_fourth_power_of_the_cosine(tangent: float) -> None:
+    found = thin_lens.falloff(tangent * 2.0, 0.0, 0.0, 0.0, 2.0)
+    assert found == pytest.approx(np.cos(np.arctan(tangent)) ** 4)
+
+
+def test_light_through_a_wide_lens_onto_its_axis() -> None:
+    """Its projected solid angle is pi sin^2 of half the cone, whatever the width (Boyd 1983)."""
+    a, d = 1.5, 2.0
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    radius = a * (nodes + 1) / 2
+    mean = float(np.sum(weights * radius * thin_lens.falloff(0.0, 0.0, radius, 0.0, d))) * a / 2 / (a**2 / 2)
+    assert mean == pytest.approx(d**2 / (d**2 + a**2), rel=1e-9)
+
+
+def test_rendered_light_of_a_lens_type_is_that_of_its_solid_angle() -> None:
+    """Every pixel's mean weight against the solid angle of the lens in closed form: within the noise and 1 per cent."""
+    needs("llvm_ad_mono")
+    from ommatid.simulate.renderer.renderer import Renderer
+
+    data = scene((100, 100), (("1/4", [1, 1], [25, 25]),)).plain()
+    data["target"]["pixel_pitch"] = "20 mm"  # so that the corner is seen at 45 degrees and more
+    data["camera"] |= {"pixel_pitch": "80 um", "lens_pitch": "9 mm"}
+    data["camera"]["lens"][0]["aperture"] = "40 um"
+    one = derive(parse(data, Path("test.toml")))
+    found = Renderer(one, "llvm_ad_mono").gathered("A", 256, sampler_seeds(0, "data", 0, 1)).reshape(25, 25)
+    away = (np.arange(25) - 12) * one.pixel_pitch / one.depth(one.types[0])
+    cosine = 1 / np.sqrt(1 + away[:, None] ** 2 + away[None, :] ** 2)
+    assert cosine.min() < 0.6
+    np.testing.assert_allclose(found, cosine**4, rtol=0.01)

@@ -1,0 +1,84 @@
+"""Choice of a backend: a broken LLVM must never be touched, let alone kill the process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ommatid.runtime.errors import InputError
+from ommatid.simulate.renderer import variant
+from ommatid.simulate.renderer.variant import BackendStatus, choose, diagnosis, probe, unusable_reason
+
+BROKEN = [path for version in (15, 16) for path in Path("/usr/lib").glob(f"*/libLLVM-{version}.so*")]
+
+
+@pytest.fixture
+def llvm(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let Dr.Jit claim to have an LLVM of some version."""
+    import drjit as dr
+
+    def claim(version: tuple[int, int, int] | None) -> None:
+        backend = dr.JitBackend.LLVM
+        monkeypatch.setattr(dr, "has_backend", lambda asked: asked == backend and version is not None)
+        monkeypatch.setattr(dr.detail, "llvm_version", lambda: version)
+
+    return claim
+
+
+@pytest.mark.parametrize("version", [(15, 0, 7), (16, 0, 6)])
+def test_a_broken_llvm_is_not_chosen(llvm: Any, version: tuple[int, int, int]) -> None:
+    llvm(version)
+    assert choose("auto") == "scalar_rgb"
+    with pytest.raises(InputError, match=rf"LLVM {version[0]}.*run: |LLVM {version[0]}.*install"):
+        choose("llvm_ad_mono")
+
+
+def test_no_llvm_at_all(llvm: Any) -> None:
+    llvm(None)
+    assert choose("auto") == "scalar_rgb"
+    assert "no usable LLVM" in unusable_reason("llvm_ad_mono")
+
+
+def test_a_good_llvm_is_chosen(llvm: Any) -> None:
+    llvm((19, 1, 7))
+    assert choose("auto") == "llvm_ad_mono"
+
+
+def test_a_version_that_cannot_be_found_out_is_not_trusted(llvm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import drjit as dr
+
+    llvm((19, 1, 7))
+    monkeypatch.delattr(dr.detail, "llvm_version")
+    assert choose("auto") == "scalar_rgb"
+
+
+@pytest.mark.skipif(not BROKEN, reason="no LLVM 15 or 16 on this machine")
+def test_a_real_broken_llvm_does_not_kill_the_process() -> None:
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(BROKEN[0])}
+    script = "from ommatid.simulate.renderer.variant import unusable_reason, choose, probe\n"
+    script += "print(choose('auto'), '|', unusable_reason('llvm_ad_mono'), '|', probe('llvm_ad_mono').reason)"
+    ended = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    chosen, why, probed = ended.stdout.strip().split(" | ")
+    assert chosen == "scalar_rgb"
+    assert "LLVM 15" in why or "LLVM 16" in why
+    assert probed == why
+
+
+def test_a_probe_that_dies_is_a_reason_and_not_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant, "_PROBE", "import os; os.abort()")
+    assert "trial rendering failed" in probe("llvm_ad_mono").reason
+
+
+def test_the_working_backend_renders_in_its_probe() -> None:
+    assert probe("scalar_rgb").speed > 0
+
+
+def test_the_advice_names_one_command() -> None:
+    slow = [BackendStatus("llvm_ad_mono", "none", 0), BackendStatus("scalar_rgb", "", 1e6)]
+    assert "slow" in diagnosis(slow)
+    assert "nothing to repair" in diagnosis([BackendStatus("llvm_ad_mono", "", 1e7)])

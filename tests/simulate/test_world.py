@@ -1,0 +1,334 @@
+"""What the camera sees of a world: against flat targets, closed forms of perspective and of occlusion, and itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ommatid.analysis.depth_error import disparity
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import digest
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.formats.exr import read
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.scene import TRUTH, Scene, parse
+from ommatid.simulate.cache import cached_stack
+from ommatid.simulate.ground_truth import truth
+from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.render import Rendering, light
+from ommatid.simulate.renderer.variant import activate
+from ommatid.simulate.renderer.world import bounces, files, stage
+from ommatid.simulate.sampling.passes import rounding_variance
+
+from ..conftest import TINY, Command
+from ..examples import GALLERY, VARIANTS, Lenses, assert_student, needs
+from ..examples import scene as flat_scene
+
+Z = 1000.0
+FAST = "llvm_ad_mono"
+THIRDS: Lenses = (("1/3", [3, 3], [3, 3]), ("1/4", [2, 2], [2, 2]))
+
+
+def glow(radiance: object) -> str:
+    return f'<emitter type="area"><float name="radiance" value="{radiance}"/></emitter>'
+
+
+def rectangle(width: float, height: float, x: float, y: float, z: float, rest: str) -> str:
+    """One that faces the camera, and what it is made of."""
+    return f"""<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/>
+        <scale x="{width / 2}" y="{height / 2}"/><translate x="{x}" y="{y}" z="{z}"/></transform>{rest}</shape>"""
+
+
+def cube(x: float, y: float, z: float, half: float, rest: str) -> str:
+    return f"""<shape type="cube"><transform name="to_world"><scale x="{half}" y="{half}" z="0.05"/>
+        <translate x="{x}" y="{y}" z="{z}"/></transform>{rest}</shape>"""
+
+
+def world(
+    folder: Path, content: str, lenses: Lenses = THIRDS, target: dict[str, Any] | None = None, **more: Any
+) -> tuple[Scene, Camera]:
+    """A scene of 12 x 12 pixels of 1 mm at 1 m that looks into a world of this content."""
+    path = folder / "world.xml"
+    path.write_text(f'<scene version="3.0.0">{content}</scene>', encoding="utf-8")
+    data = flat_scene((12, 12), lenses, render={"variant": more.pop("variant", FAST), "samples": 256}).plain()
+    data["world"] = {"file": str(path), "white": more.pop("white", 1.0)}
+    data["target"] |= target or {}
+    if target is None:
+        del data["target"]["image"], data["target"]["origin"]
+    for name, table in more.items():
+        data[name] = {**data[name], **table}
+    described = parse(data, Path("test.toml"))
+    return described, derive(described)
+
+
+def floored(rendering: Rendering) -> Any:
+    return np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
+
+
+CHECKS = (
+    '<emitter type="area"><texture type="checkerboard" name="radiance"><float name="color0" value="1.6"/>'
+    '<float name="color1" value="0.4"/><transform name="to_uv"><scale x="2" y="2"/></transform></texture></emitter>'
+)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_glowing_checkerboard_is_the_flat_target_with_that_picture(tmp_path: Path, variant: str) -> None:
+    needs(variant)
+    board = rectangle(12, 12, 0, 0, Z, CHECKS)
+    described, camera = world(tmp_path, board, variant=variant, white=2.0)
+    row, column = np.indices((12, 12)) // 3
+    picture = np.where((row + column) % 2 == 1, 1.6, 0.4) / 2 * 255  # color0 in the corner where u = v = 0, lower left
+    seen = light(described, camera, load(described))
+    shown = light(flat_scene((12, 12), THIRDS, render=described.render.model_dump()), camera, picture)
+    assert_student(seen.mean - ideal_matrix(camera) @ picture.ravel(), floored(seen), seen.passes)
+    assert_student(seen.mean - shown.mean, floored(seen) + floored(shown), seen.passes)
+    exact = truth(described, camera, load(described))
+    np.testing.assert_allclose(exact.image, picture, atol=0.5)
+    np.testing.assert_allclose(exact.depth, Z, rtol=1e-6)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: str) -> None:
+    """A glowing rectangle whose edges cut pixels at three quarters and at a half: what shines is the covered share."""
+    needs(variant)
+    described, camera = world(tmp_path, rectangle(5.5, 7, 0.25, 0, Z, glow(0.5)), variant=variant)
+    found = truth(described, camera, load(described))
+    across, along = np.zeros(12), np.zeros(12)
+    across[3:9] = 1, 1, 1, 1, 1, 0.5  # x from 3 to -2.5 mm, which is to the right
+    along[2:10] = 0.5, 1, 1, 1, 1, 1, 1, 0.5
+    np.testing.assert_allclose(found.image, 127.5 * np.outer(along, across), atol=0.5)
+    assert np.isnan(found.depth[0, 0])
+    assert np.isfinite(found.depth[5, 5])
+    assert found.variance.mean() < 0.01
+    assert found.samples == 4 * 256
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_ball_hides_what_is_behind_it(tmp_path: Path, variant: str) -> None:
+    needs(variant)
+    x, y, z, radius = 0.7, 0.4, 500.0, 1.2
+    ball = f'<shape type="sphere"><point name="center" x="{x}" y="{y}" z="{z}"/>'
+    ball += f'<float name="radius" value="{radius}"/>{glow(0.8)}</shape>'
+    described, camera = world(tmp_path, rectangle(40, 40, 0, 0, 1500, glow(0.2)) + ball, variant=variant)
+    found = truth(described, camera, load(described))
+    corners = np.arange(13)
+    at_x, at_y = 6.0 - corners[None, :], 6.0 - corners[:, None]
+    along = (at_x * x + at_y * y + Z * z) / np.sqrt(at_x**2 + at_y**2 + Z**2)
+    hit = along > np.sqrt(x**2 + y**2 + z**2 - radius**2)  # the cone of rays that touch a ball
+    quarters = np.stack([hit[:-1, :-1], hit[:-1, 1:], hit[1:, :-1], hit[1:, 1:]])
+    inside, outside = quarters.all(axis=0), ~quarters.any(axis=0)
+    assert inside.sum() > 5
+    assert outside.sum() > 80
+    np.testing.assert_allclose(found.image[inside], 0.8 * 255, rtol=1e-4)
+    clear = outside & (np.hypot(at_x[:, :-1] - 0.5 - 2 * x, at_y[:-1] - 0.5 - 2 * y) > 2 * radius + 1)
+    np.testing.assert_allclose(found.image[clear], 0.2 * 255, rtol=1e-4)
+    assert (np.abs(found.depth[inside] - z) <= radius).all()
+    np.testing.assert_allclose(found.depth[clear], 1500, rtol=1e-6)
+
+
+LETTER = np.zeros((12, 12), dtype=bool)
+LETTER[2:10, 3] = LETTER[2, 3:8] = LETTER[5, 3:6] = True
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_letter_f_of_cubes_is_upright_and_not_mirrored(tmp_path: Path, variant: str) -> None:
+    needs(variant)
+    cubes = "".join(cube(5.5 - column, 5.5 - row, Z + 0.05, 0.5, glow(0.8)) for row, column in np.argwhere(LETTER))
+    described, camera = world(tmp_path, cubes, ((1, [1, 1], [12, 12]),), variant=variant)
+    np.testing.assert_allclose(truth(described, camera, load(described)).image, LETTER * 204.0, atol=0.5)
+    rendering = light(described, camera, load(described))
+    np.testing.assert_allclose(rendering.mean.reshape(12, 12), LETTER * 204.0, atol=0.5)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_disparity_is_how_far_a_near_square_moves(tmp_path: Path, variant: str) -> None:
+    """At half the target's distance, by as much as the lens stands beside the centre, and to the same side."""
+    needs(variant)
+    square = rectangle(2, 2, 0, 0, Z / 2, glow(1))
+    lens_pitch = {"camera": {"lens_pitch": "3 mm"}}
+    described, camera = world(tmp_path, square, ((1, [2, 2], [11, 11]),), variant=variant, **lens_pitch)
+    rendering = light(described, camera, load(described))
+    moved: list[float] = []
+    for sub, place in zip(camera.sub_imagers, camera.slices(), strict=True):
+        share = rendering.mean[place].reshape(11, 11)
+        row, column = (
+            float((share * (np.indices(share.shape)[axis] + 0.5)).sum() / share.sum() + float(sub.window[axis]))
+            for axis in (0, 1)
+        )
+        expected = [6 - offset * (1 - Z / (Z / 2)) / camera.target_pitch for offset in (sub.lens[1], sub.lens[0])]
+        assert [row, column] == pytest.approx(expected, abs=0.01)
+        moved.append((row - 6) ** 2 + (column - 6) ** 2)
+    rms = float(np.mean(moved)) ** 0.5
+    assert rms == pytest.approx(float(disparity(camera, Z / 2)["A"]), abs=0.01)
+
+
+def test_a_picture_stands_before_its_world(tmp_path: Path) -> None:
+    """The flat target keeps its own values, whatever is called white; what is before it hides it."""
+    needs(FAST)
+    content = '<emitter type="constant"/>' + rectangle(2, 2, 0, 0, Z / 2, glow(3))
+    picture = {"image": "photo:camera", "origin": [96, 224]}
+    described, camera = world(tmp_path, content, target=picture, white=3.0)
+    image = load(described)
+    found = truth(described, camera, image)
+    hidden = np.zeros((12, 12), dtype=bool)
+    hidden[4:8, 4:8] = True
+    np.testing.assert_allclose(found.image[~hidden], image[~hidden], rtol=1e-4, atol=0.5)
+    np.testing.assert_allclose(found.image[hidden], 255, rtol=1e-4)
+    np.testing.assert_allclose(found.depth, np.where(hidden, Z / 2, Z), rtol=1e-6)
+
+
+def test_every_lens_reads_a_uniform_world_as_it_is(tmp_path: Path) -> None:
+    needs(FAST)
+    described, _ = world(tmp_path, '<emitter type="constant"><float name="radiance" value="0.4"/></emitter>')
+    data = described.plain()
+    data["camera"]["lens"][1] |= {"aperture": "0.1 mm", "focus": "700 mm"}
+    blurred = parse(data, Path("test.toml"))
+    camera = derive(blurred)
+    np.testing.assert_allclose(light(blurred, camera, load(blurred)).mean, 0.4 * 255, rtol=2e-6)
+    assert np.isnan(truth(blurred, camera, load(blurred)).depth).all()
+
+
+def test_an_aperture_blurs_what_is_not_in_focus(tmp_path: Path) -> None:
+    """At half the focused distance by a disk as wide as the aperture, less bright towards its rim.
+
+    Variances along an axis add: of a square of 2 pixels, 2^2/12, of a pixel, 1/12, and of the disk: with u the squared
+    tangent of a ray's angle at the sensor and cos^4 = 1/(1 + u)^2, half the mean of u depth^2 so weighted.
+    """
+    needs(FAST)
+    square = rectangle(1, 1, 0, 0, Z / 2, glow(1))
+    described, camera = world(tmp_path, square, ((1, [1, 1], [12, 12]),), render={"samples": 16384})
+    data = described.plain()
+    data["camera"]["lens"][0]["aperture"] = "4 mm"
+    blurred = parse(data, Path("test.toml"))
+    seen = light(blurred, derive(blurred), load(blurred)).mean.reshape(12, 12)
+    away = (np.arange(12) - 5.5) ** 2
+    spread = [float((seen.sum(axis=axis) * away).sum() / seen.sum()) for axis in (0, 1)]
+    steepest = (2.0 / camera.depth(camera.types[0])) ** 2
+    share = steepest / (1 + steepest)
+    disk = camera.depth(camera.types[0]) ** 2 / 2 * (np.log1p(steepest) / share - 1)
+    assert spread == pytest.approx([4 / 12 + disk + 1 / 12] * 2, rel=0.01)
+
+
+LIT = (
+    rectangle(40, 40, 0, 0, 1200, '<bsdf type="diffuse"/>')
+    + '<shape type="sphere"><point name="center" x="0" y="0" z="900"/><float name="radius" value="3"/></shape>'
+    + '<shape type="rectangle"><transform name="to_world"><scale value="20"/>'
+    + f'<lookat origin="60, 50, 850" target="0, 0, 1000" up="0, 1, 0"/></transform>{glow(9)}</shape>'
+)
+
+
+def test_light_that_bounces_is_the_same_on_both_backends(tmp_path: Path) -> None:
+    """Shadows and light from wall to ball and back; different seeds, so independent noise."""
+    needs(FAST)
+    found: list[Rendering] = []
+    for variant in VARIANTS:
+        described, camera = world(tmp_path, LIT, variant=variant)
+        found.append(light(described, camera, load(described)))
+    assert found[0].mean.std() > 5 < found[0].mean.mean()
+    assert_student(found[0].mean - found[1].mean, floored(found[0]) + floored(found[1]), found[0].passes)
+
+
+BLACK = '<shape type="sphere"><bsdf type="diffuse"><float name="reflectance" value="0"/></bsdf></shape>'
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (rectangle(1, 1, 0, 0, Z, glow(1)) + BLACK, False),
+        (LIT, True),
+        (rectangle(1, 1, 0, 0, Z, glow(1) + '<bsdf type="null"/>'), True),  # what is behind shines through
+        (rectangle(1, 1, 0, 0, Z, glow(1) + '<bsdf type="dielectric"/>'), True),
+    ],
+)
+def test_light_bounces_unless_all_is_black(tmp_path: Path, content: str, expected: bool) -> None:
+    described, _ = world(tmp_path, content)
+    assert bounces(stage(described, "scalar_rgb", None).scene) is expected
+
+
+def test_light_that_cannot_bounce_is_left_out_to_the_last_digit(tmp_path: Path) -> None:
+    """The bound is 0: with and without it every pixel is the same, and the record says what was left out."""
+    needs(FAST)
+    content = rectangle(6, 6, 1, 2, Z, CHECKS + '<bsdf type="diffuse"><float name="reflectance" value="0"/></bsdf>')
+    found: list[Rendering] = []
+    for inside, render in ((content, {}), (content, {"complete": True}), (LIT, {})):
+        described, camera = world(tmp_path, inside, render=render)
+        found.append(light(described, camera, load(described)))
+    assert [one.straight for one in found] == [True, False, False]
+    np.testing.assert_allclose(found[0].mean, found[1].mean, rtol=1e-6)
+
+
+def test_the_gallerys_still_life_has_bouncing_light_and_its_corridor_none() -> None:
+    for name, expected in (("still_life", True), ("corridor", False)):
+        data = flat_scene().plain() | {"world": {"file": str(GALLERY / "worlds" / f"{name}.xml")}}
+        assert bounces(stage(parse(data, Path("test.toml")), "scalar_rgb", None).scene) is expected
+
+
+def test_a_world_is_rendered_again_where_it_or_what_it_names_has_changed(tmp_path: Path) -> None:
+    needs(FAST)
+    part = tmp_path / "part.xml"
+
+    def shining(radiance: float) -> None:
+        lamp = f'<emitter type="constant"><float name="radiance" value="{radiance}"/></emitter>'
+        part.write_text(f'<scene version="3.0.0">{lamp}</scene>', encoding="utf-8")
+
+    shining(0.25)
+    described, camera = world(tmp_path, '<include filename="part.xml"/>')
+    assert files(described) == [tmp_path / "world.xml", part]
+    image, path = load(described), tmp_path / "stack.exr"
+
+    def keep() -> tuple[float, bool]:
+        stack, made = cached_stack(path, described, camera, image, lambda _: None)
+        known = read(tmp_path / TRUTH)[0].channels
+        assert stack.record["truth"] == digest(known["Y"])
+        assert known["Y"].mean() == pytest.approx(float(stack.values.mean()), rel=1e-5)
+        assert np.isnan(known["depth"]).all()
+        return float(stack.values.mean()), made
+
+    assert keep() == (pytest.approx(255 / 4), True)
+    before = (tmp_path / TRUTH).stat().st_mtime_ns
+    assert keep() == (pytest.approx(255 / 4), False)
+    assert (tmp_path / TRUTH).stat().st_mtime_ns == before
+    shining(0.5)
+    assert keep() == (pytest.approx(255 / 2), True)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("<shape", "is not valid XML"),
+        ('<shape type="egg"/>', '"egg" not found'),
+        ('<shape type="sphere"><float name="weight" value="1"/></shape>', "unreferenced property"),
+        ('<shape type="obj"><string name="filename" value="none.obj"/></shape>', "none.obj"),
+        ('<shape type="sphere"/>', "has no emitter"),
+        ('<emitter type="constant"/><integrator type="ptracer"/>', "does not follow rays from a camera"),
+    ],
+)
+def test_a_world_that_cannot_be_built_is_refused_in_a_sentence(tmp_path: Path, content: str, complaint: str) -> None:
+    described, camera = world(tmp_path, content, variant="scalar_rgb")
+    with pytest.raises(InputError, match=complaint) as told:
+        truth(described, camera, load(described))
+    text = str(told.value)
+    assert text.startswith("test.toml: world.file: ")
+    assert "\n" not in text
+    assert ".cpp" not in text
+
+
+def test_a_shape_alone_is_no_world(tmp_path: Path) -> None:
+    described, _ = world(tmp_path, "")
+    (tmp_path / "world.xml").write_text('<shape version="3.0.0" type="sphere"/>', encoding="utf-8")
+    activate("scalar_rgb")
+    with pytest.raises(InputError, match="holds a single shape; expected a whole <scene>"):
+        stage(described, "scalar_rgb", None)
+
+
+def test_a_missing_world_ends_with_2_before_anything_is_written(here: Path, ommatid: Command) -> None:
+    table = TINY.replace("[target]", '[world]\nfile = "none.xml"\n\n[target]')
+    (here / "tiny.toml").write_text(table, encoding="utf-8")
+    ended = ommatid("run", "tiny.toml", "-o", "out")
+    assert (ended.code, ended.out) == (2, "")
+    assert "tiny.toml: world.file: there is no Mitsuba scene" in ended.err
+    assert len(ended.err.splitlines()) == 1
+    assert not (here / "out").exists()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 
-from ommatid.reconstruct.method_choice import BASE, allowed_memory, choose_method
+from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, choose_method
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import IN_PLACE_OF_AUTO, Scene, read
@@ -37,7 +37,7 @@ def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str])
         choice = choose_method(scene, camera, scene.calibration.method == "ideal" and camera.has_box_footprints)
     except InputError:
         return CostEstimate(0.0, 0)
-    return CostEstimate(LEAST + _rays(scene, camera) / RAYS + choice.seconds, BASE + choice.memory)
+    return CostEstimate(LEAST + _rays(scene, camera) / RAYS + choice.seconds, PROGRAM_MEMORY + choice.memory)
 
 
 def _rays(scene: Scene, camera: Camera) -> float:

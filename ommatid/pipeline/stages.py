@@ -9,6 +9,7 @@ from typing import Any
 
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
+from ommatid.reconstruct.output.run_json import RunReport, StudyCase
 from ommatid.runtime.errors import naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
@@ -52,19 +53,19 @@ def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Mem
 
 def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
-    description = results(scene, camera, image, folder, watch)
+    report = results(scene, camera, image, folder, watch)
     write_page(camera, folder, watch)
-    return description
+    return report.plain()
 
 
 @one_thread()
-def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> RunReport:
     """All of a run but its page, and what run.json says of it."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.method_choice import choose_method
-    from ommatid.reconstruct.output.result_files import RUN, cached_results
-    from ommatid.reconstruct.output.run_json import write_run
+    from ommatid.reconstruct.output import run_json
+    from ommatid.reconstruct.output.result_files import cached_results
 
     exact = scene.calibration.method == "ideal" and camera.has_box_footprints
     check_scene(scene, camera)
@@ -78,18 +79,18 @@ def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: Run
         model, made = cached_model(folder / "model.npz", scene, camera, progress, for_stack(stack))
     watch.done("calibrate", made)
     with watch.progress("reconstruct") as progress:
-        description, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
+        report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     watch.done("reconstruct", made)
-    more: dict[str, Any] = {}
+    complete = report
     if scene.world is not None:
-        from ommatid.analysis.depth_error import of_run
+        from ommatid.analysis.depth_error import depth_error_of_run
 
-        more["depth"] = of_run(folder, camera)
+        complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        more["study"] = _studied(scene, camera, stack, folder, watch)
-    if any(description.get(key) != value for key, value in more.items()):
-        write_run(folder / RUN, {**description, **more})
-    return {**description, **more}
+        complete = complete.with_changes(study=_studied(scene, camera, stack, folder, watch))
+    if complete.plain() != report.plain():
+        run_json.write(folder, complete)
+    return complete
 
 
 def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
@@ -111,10 +112,11 @@ def render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunO
 def predict_scene(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
     from ommatid.analysis.predict import predict_scene
+    from ommatid.analysis.prediction_table import json_of
 
     del camera, image, folder, watch
     with naming_source(scene.source):
-        return predict_scene(scene).describe()
+        return json_of(predict_scene(scene))
 
 
 def calibrated(scene: Scene, camera: Camera, path: Path, progress: Progress) -> tuple[Model, bool]:
@@ -147,7 +149,7 @@ def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: R
     return stack
 
 
-def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: RunObserver) -> list[dict[str, Any]]:
+def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: RunObserver) -> tuple[StudyCase, ...]:
     """The same stack with every idea of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models

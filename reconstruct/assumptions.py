@@ -62,7 +62,7 @@ def method_for(stack: Stack, model: Model) -> Method:
 
 
 def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Result]) -> Result:
-    """Return work(choice) for the chosen method, or for tiles where the automatically chosen frame does not converge."""
+    """Return work(choice) for the chosen method, or for tiles where a frame chosen by "auto" does not converge."""
     check_noise_fit(stack)
     choice = choose_method(stack.scene, model.camera, model.is_exact)
     try:
@@ -118,7 +118,7 @@ def _certain(noise: Noise) -> Noise:
 
 
 def _fit(stack: Stack, model: Model, usable: UsablePixels, prior: PriorTable, noise: Noise) -> PriorFit | None:
-    """Return the prior, and the noise if asked for, of largest marginal likelihood; None where neither is to be fitted."""
+    """Return prior and noise, as far as they are to be fitted, of largest evidence; None where neither is."""
     prior_known = stack.scene.prior.kind != "fit"
     noise_known = stack.scene.estimator.noise_variance != "fit"
     if not usable.used.any() or (noise_known and prior_known):

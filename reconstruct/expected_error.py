@@ -147,7 +147,7 @@ def _parts_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -
 
 
 def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, FloatArray, FloatArray]]:
-    """Yield chunks of pixels: their range, indices, u, (K, q), whose squares are the prior's part, and -A^T e_i, (M, q)."""
+    """Yield for chunks of pixels their range, indices, u, (K, q), whose squares are the prior's part, and -A^T e_i."""
     for start in range(0, pixels.size, CHUNK):
         chunk = slice(start, min(start + CHUNK, pixels.size))
         u, negative = form.columns(pixels[chunk])

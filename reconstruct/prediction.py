@@ -168,7 +168,7 @@ def _median_width(resolved: FloatArray) -> float | None:
 
 
 def _noiseless_limit(limit: Svd, noise: FloatArray) -> FloatArray:
-    """Return Eq. 5, (N,), of an estimator that expects no noise; `limit` is of noise 1, `noise` the actual one, (M,)."""
+    """Return Eq. 5, (N,), of an estimator that expects no noise; limit : form for noise 1;  noise : actual, (M,)."""
     if not np.ptp(noise):
         return limit.expected_variance(0.0, float(noise.max(initial=0.0)))
     spread, rank = limit.problem.prior.spread, limit.rank

@@ -14,9 +14,9 @@ from ommatid.reconstruct.noise import Noise, known_noise, uniform, usable_pixels
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibration.stopping_rule import StoppingRule
 
@@ -43,13 +43,14 @@ def for_stack(stack: Stack) -> StoppingRule:
     return StoppingRule(added_error, fingerprint(made_from), "the error budget of this stack")
 
 
-def for_prior(scene: Scene, camera: Camera) -> StoppingRule:
+def for_prior(setup: Setup) -> StoppingRule:
     """Return the rule by Eq. 5 for images drawn from the prior, for a calibration without a stack.
 
     A prior that is to be fitted counts as one of independent pixels, and light as the prior's mean.
     Raises InputError without noise.
     """
-    actual = expected_noise(scene, camera)
+    scene, camera = setup.scene, setup.camera
+    actual = expected_noise(setup)
     noise = actual if isinstance(actual, np.ndarray) else uniform(actual, camera.measurements)
     if not (noise[np.isfinite(noise)] > 0).all():
         raise InputError(
@@ -93,9 +94,10 @@ def _negligible_bound(stack: Stack, model: Model) -> float | None:
 def _added(noise: Noise, expected: ExpectedError, mse_without: Callable[[], float]) -> float:
     """Return the error that the uncertainty of H adds, relative to the expected error without it.
 
-    Its part of the budget is too small a measure where it is large, since the estimator then also gives the measurements
-    less weight, and other parts grow: the error is computed without it. Where it is negligible beside the other noise of
-    every measurement, by a factor r at most, the error is no more than 1 + r times that without it, and the part will do.
+    Its part of the budget is too small a measure where it is large, since the estimator then also gives the
+    measurements less weight, and other parts grow: the error without it is computed. Where it is negligible beside the
+    other noise of every measurement, by a factor r at most, the error is no more than 1 + r times that without it, and
+    the part is measure enough.
     """
     part = expected.parts.get("calibration", 0.0)
     rest = expected.mse - part

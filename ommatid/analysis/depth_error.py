@@ -1,8 +1,8 @@
 """The error that depth adds: H is calibrated on the target's plane, and surfaces off that plane are displaced.
 
 Lengths are millimetres. By similar triangles, a lens at offset b from the array's centre sees a point at distance z
-displaced by b (Z/z - 1)/p_f pixels of f against an ideal camera in the centre, Z the target's distance and p_f the pitch
-of its pixels. This disparity is 0 on the target's plane, and -b/p_f at infinity.
+displaced by b (Z/z - 1)/p_f pixels of f against an ideal camera in the centre, Z the target's distance and p_f the
+pitch of its pixels. This disparity is 0 on the target's plane, and -b/p_f at infinity.
 """
 
 from __future__ import annotations

@@ -12,17 +12,19 @@ from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 
 @one_thread()
 def predict_scene(scene: Scene) -> Prediction:
     """Predict the error of a scene with the ideal H. Raises InputError where the estimator takes a recorded stack."""
-    camera = derive(scene)
+    setup = Setup.from_scene(scene)
+    camera = setup.camera
     choice = choose_method(scene, camera, exact=camera.has_box_footprints)
-    actual = expected_noise(scene, camera)
+    actual = expected_noise(setup)
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.method != "dense":
@@ -34,13 +36,14 @@ def predict_scene(scene: Scene) -> Prediction:
     return predict(ideal_matrix(camera), prior, actual, scene.estimator, camera.shape, added)
 
 
-def expected_noise(scene: Scene, camera: Camera) -> float | FloatArray:
+def expected_noise(setup: Setup) -> float | FloatArray:
     """Return the variance of all measurements, or of each, (M,): with a [sensor] that of light of the prior's mean."""
+    scene = setup.scene
     if scene.sensor is not None:
         from ommatid.scenes.optics.radiometry import predicted_noise
         from ommatid.simulate.sensor.response import response
 
-        return predicted_noise(scene, camera, response(scene, camera))
+        return predicted_noise(scene, setup.camera, response(setup))
     return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0
 
 
@@ -53,11 +56,11 @@ def optics(camera: Camera) -> list[dict[str, Any]]:
     return describe(camera)
 
 
-def electrons(scene: Scene, camera: Camera) -> dict[str, Any] | None:
+def electrons(setup: Setup) -> dict[str, Any] | None:
     """Return the electrons that the pixels of each lens type collect; None without a [sensor]."""
-    if scene.sensor is None:
+    if setup.scene.sensor is None:
         return None
     from ommatid.scenes.optics.radiometry import summary
     from ommatid.simulate.sensor.response import response
 
-    return summary(scene, camera, response(scene, camera))
+    return summary(setup.scene, setup.camera, response(setup))

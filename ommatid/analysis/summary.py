@@ -10,7 +10,7 @@ from ommatid.reconstruct.method_choice import MethodChoice
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
-from ommatid.scenes.skipped import skipped_effects
+from ommatid.scenes.setup import Setup
 
 METHODS = {
     "dense": "one dense problem",
@@ -22,8 +22,7 @@ METHODS = {
 
 
 def describe(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     variant: str,
     choice: MethodChoice | None,
     optics: list[dict[str, Any]] | None = None,
@@ -34,6 +33,7 @@ def describe(
     choice : of the estimator's method;  optics : the sharpness of lens types with an aperture
     light : collected electrons, of a scene with a [sensor]
     """
+    scene, camera = setup.scene, setup.camera
     seen = camera.types_seeing()
     counts = range(len(camera.types))
     return {
@@ -55,7 +55,7 @@ def describe(
         **({"optics": optics} if optics else {}),
         **({"light": light} if light is not None else {}),
         "plan": _plan(scene, camera, variant, choice),
-        "skipped": [skipped.describe() for skipped in skipped_effects(scene, camera)],
+        "skipped": [skipped.describe() for skipped in setup.skipped],
     }
 
 

@@ -8,6 +8,7 @@ from ommatid.analysis import depth_error, run_table, study
 from ommatid.analysis.summary import describe as show
 from ommatid.analysis.summary import skipped_words
 from ommatid.reconstruct.output.run_json import StageReport
+from ommatid.scenes.setup import Setup
 
 from .data import Run
 
@@ -78,7 +79,7 @@ def skipped(run: Run) -> PageTable:
 
 def geometry(run: Run) -> tuple[PageTable, list[tuple[str, str]]]:
     """A row a lens type, and the rest in names and values."""
-    described = show(run.stack.scene, run.stack.camera, "", None)
+    described = show(Setup(run.stack.scene, run.stack.camera), "", None)
     header = ("lens type", "magnification", "array", "pixels of a sub-image", "sees rows", "sees columns")
     header += ("focal length", "sensor behind lens", "measurements")
     rows = [

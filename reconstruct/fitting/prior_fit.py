@@ -57,8 +57,8 @@ class PriorFit:
 def evidence_of(task: EstimationTask, *, prior_known: bool, noise_known: bool) -> tuple[Evidence, list[Evidence]]:
     """Return the evidence of a task's measurements, and the tiles whose likelihoods are multiplied.
 
-    The task's expected noise is the part that is known. Of a large image only some tiles are used, side by side at equal
-    distances: enough for three parameters.
+    The task's expected noise is the part that is known. Of a large image only some tiles are used, at equal distances:
+    enough for three parameters.
     """
     mean = task.prior.mean
     if task.model.unknowns <= MAX_COMPLETE:

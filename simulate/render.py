@@ -13,11 +13,11 @@ from ommatid.runtime.files import digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.optics.negligible import without_negligible_effects, without_shot_noise
+from ommatid.scenes.optics.negligible import negligible_shot_noise, without_negligible_effects
 from ommatid.scenes.recording import Recording
 from ommatid.scenes.scene import Scene, resolved
 from ommatid.scenes.shrinkage import shrink_variances
-from ommatid.scenes.stack import STRAIGHT, Stack, recorded
+from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.variant import choose
@@ -149,7 +149,7 @@ def exposed(
     """What the scene's sensor records of light, (M,), whose variances are known; noise by the scene's seed."""
     kept, values = resolved(scene, camera.shape), light
     if scene.sensor is not None:
-        return recorded(kept, camera, _exposed(scene, scene.sensor, camera, light), variance, record)
+        return stack_from_recording(kept, camera, _exposed(scene, scene.sensor, camera, light), variance, record)
     if scene.noise is not None:
         from .sensor.gaussian import expose, generators
 
@@ -163,5 +163,5 @@ def _exposed(scene: Scene, sensor: SensorTable, camera: Camera, light: NDArray[n
 
     dark = np.isnan(light)  # no light can reach these pixels; so they are dead, and known by their flat
     freed = np.where(dark, 0.0, response(scene, camera))
-    shot = without_shot_noise(scene, camera) is None
+    shot = negligible_shot_noise(scene, camera) is None
     return record(np.where(dark, 0.0, light), freed, sensor, camera, scene.render.seed, shot)

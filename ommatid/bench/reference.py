@@ -126,7 +126,7 @@ def rendered(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Render
     """The light alone, as `run` renders it."""
     if scene.render.samples == "auto":
         return render_until(scene, camera, image)
-    return light(scene, camera, image, work=work_of(scene.render.counted, scene.render.sampler))
+    return light(scene, camera, image, work=work_of(scene.render.sample_count, scene.render.sampler))
 
 
 def error_of_light(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:

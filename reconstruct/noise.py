@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import without_shot_noise
+from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables import estimation
 
@@ -53,7 +53,7 @@ def known_noise(stack: Stack) -> Noise:
     """Variances, (M,), of what is known of the noise before anything is estimated; absent effects have no entry."""
     noise = {"rendering": stack.variance}
     if stack.recording is not None:
-        return noise | stack.recording.noise(stack.recording.light_nearby(stack.camera))
+        return noise | stack.recording.noise(stack.recording.smoothed_light(stack.camera))
     described = stack.scene.noise
     if described is not None and described.variance > 0:
         noise["noise"] = everywhere(described.variance, stack.values.size)
@@ -72,7 +72,7 @@ def noise_at_first(stack: Stack, model: Model, usable: UsablePixels, prior: esti
 
 def depends_on_light(stack: Stack, model: Model) -> bool:
     """Whether some of the noise is only known once there is an estimate."""
-    counted = stack.recording is not None and without_shot_noise(stack.scene, stack.camera) is None
+    counted = stack.recording is not None and negligible_shot_noise(stack.scene, stack.camera) is None
     return counted or bool(model.variance.any())
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.tables.estimation import EstimatorTable
 
 from .estimator.estimate import factorise
@@ -22,7 +23,6 @@ from .prior import Prior
 from .problem import Problem
 
 TRIM = 2
-PEAK = 255.0
 RANK_TOLERANCE = 1e-7  # of singular values, relative; their squares come from an eigenvalue problem in float64
 SMALLEST_SSIM = 7  # pixels, the window of structural similarity
 
@@ -56,13 +56,13 @@ def compare(estimate: Vector, truth: Vector, shape: tuple[int, int]) -> Measured
     """Measured error of an estimate, both (N,): mean squares, PSNR (peak 255) and structural similarity."""
     squared = (estimate - truth) ** 2
     mse = float(squared.mean())
-    psnr = 10 * float(np.log10(PEAK**2 / mse)) if mse > 0 else None
+    psnr = 10 * float(np.log10(WHITE**2 / mse)) if mse > 0 else None
     ssim: float | None = None
     if min(shape) >= SMALLEST_SSIM:
         from skimage import metrics
 
         similarity = cast(Any, metrics).structural_similarity
-        ssim = float(similarity(truth.reshape(shape), estimate.reshape(shape), data_range=PEAK))
+        ssim = float(similarity(truth.reshape(shape), estimate.reshape(shape), data_range=WHITE))
     return MeasuredError(mse, trimmed(squared, shape), psnr, ssim)
 
 

@@ -53,7 +53,7 @@ def expected_noise(setup: Setup) -> float | NDArray[np.float64]:
 
 def optics(camera: Camera) -> list[dict[str, Any]]:
     """What lenses that are more than pinholes do to sharpness."""
-    if all(kind.optics.pinhole for kind in camera.types):
+    if all(kind.optics.is_pinhole for kind in camera.types):
         return []
     from ommatid.simulate.lenses.sharpness import describe
 

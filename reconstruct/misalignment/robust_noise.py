@@ -56,7 +56,7 @@ class MisalignmentNoise:
 def tolerances(camera: Camera) -> Matrix:
     """Standard deviations of all that may be misaligned: (sub-imagers, 6). Raises InputError for blurred lenses."""
     for kind in camera.types:
-        if kind.optics.surfaces is not None or not blur_of(camera, kind).none:
+        if kind.optics.surfaces is not None or not blur_of(camera, kind).is_zero:
             raise InputError(
                 f"camera.lens.{kind.name}: H of misaligned lenses is known of pinholes and of thin ones in focus"
                 " without a camera.wavelength, got another lens; take estimator.misalignment = 'trust'"

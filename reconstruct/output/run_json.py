@@ -136,7 +136,7 @@ def _of_world(stack: Stack) -> tuple[SkippedEffect, ...]:
     """What rendering left out once it had seen the world."""
     if not stack.record.get(STRAIGHT):
         return ()
-    return (SkippedEffect("light that bounces", "nothing in the world reflects any: paths have one segment"),)
+    return (SkippedEffect("interreflection", "nothing in the world reflects any: paths have one segment"),)
 
 
 def _as_run(stack: Stack, model: Model) -> Scene:

@@ -109,5 +109,5 @@ def test_the_command_line_imports_nothing_heavy() -> None:
     """`ommatid --help` in under 0.3 s: what it loads decides, and that can be tested on any machine."""
     script = "import sys, ommatid.__main__; print(*sys.modules)"
     ended = subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, capture_output=True, text=True)
-    heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR"}
+    heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR", "psutil"}
     assert not heavy & set(ended.stdout.split())

@@ -76,6 +76,15 @@ def test_no_module_is_long(module: str) -> None:
     assert len(modules()[module].read_text(encoding="utf-8").splitlines()) <= TOO_LONG.get(module, LONGEST)
 
 
+def test_no_class_name_stands_for_two_things() -> None:
+    defined: dict[str, list[str]] = {}
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                defined.setdefault(node.name, []).append(module)
+    assert {name: where for name, where in defined.items() if len(where) > 1} == {}
+
+
 def test_no_folder_is_crowded() -> None:
     inside = Counter(path.parent for path in modules().values() if path.stem != "__init__")
     assert {folder: count for folder, count in inside.items() if count > LARGEST} == {}

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.runtime.files import cached, fingerprint, write_csv, write_text
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -96,29 +94,26 @@ def cached_study(
     models : by name, made only where they are needed
     """
     wanted = fingerprint([list(models), stack.record, stack.scene.plain(), truth is not None])
-    old = _standing(folder)
-    if old is not None and old["fingerprint"] == wanted:
-        return list(old["cases"]), False
-    cases: list[dict[str, Any]] = []
-    for name, make in models.items():
-        cases.append(asdict(study_case(stack, name, make(), truth)))
-        progress(len(cases) / len(models))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(cases[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(cases)
-    write_text(folder / TABLE, text.getvalue())
-    write_text(folder / NUMBERS, json.dumps({"fingerprint": wanted, "cases": cases}, indent=2) + "\n")
-    return cases, True
+
+    def make() -> list[StudyCase]:
+        cases: list[StudyCase] = []
+        for name, model in models.items():
+            cases.append(study_case(stack, name, model(), truth))
+            progress(len(cases) / len(models))
+        return cases
+
+    def write(folder: Path, cases: list[StudyCase]) -> None:
+        write_csv(folder / TABLE, [field.name for field in fields(StudyCase)], (astuple(case) for case in cases))
+        document = {"fingerprint": wanted, "cases": [asdict(case) for case in cases]}
+        write_text(folder / NUMBERS, json.dumps(document, indent=2) + "\n")
+
+    return cached(folder, wanted, _read_study, make, write)
 
 
-def _standing(folder: Path) -> dict[str, Any] | None:
-    """study.json of a folder that has both files of a study, whole; else None."""
-    try:
-        old: dict[str, Any] = json.loads((folder / NUMBERS).read_text(encoding="utf-8"))
-        return old if (folder / TABLE).is_file() and {"fingerprint", "cases"} <= old.keys() else None
-    except (OSError, ValueError, AttributeError):
-        return None
+def _read_study(folder: Path) -> tuple[list[dict[str, Any]], str | None]:
+    """The cases in study.json, and its fingerprint if study.csv is there too."""
+    document: dict[str, Any] = json.loads((folder / NUMBERS).read_text(encoding="utf-8"))
+    return list(document["cases"]), document["fingerprint"] if (folder / TABLE).is_file() else None
 
 
 def rows(cases: list[dict[str, Any]]) -> list[tuple[str, str]]:

@@ -719,7 +719,8 @@ def _each(
 
 
 def _tell_sweep(documents: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
-    from ommatid.batch.sweep_table import lines, summary, write_sweep
+    from ommatid.batch.sweep_row import summary
+    from ommatid.batch.sweep_table import lines, write_sweep
 
     rows = [summary(document) for document in documents]
     if output is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
 from ommatid.scenes.formats.exr import read
@@ -86,16 +86,12 @@ def made_from(stack: Stack, model: Model) -> str:
     return fingerprint([digest(*arrays), records, stack.scene.plain()])
 
 
-def _standing(folder: Path) -> dict[str, Any] | None:
-    """run.json of a folder whose results are all there, whole and of one reconstruction; else None."""
-    if not all((folder / name).is_file() for name in (ESTIMATE, PICTURE, OVERVIEW, RUN)):
-        return None
-    try:
-        old: dict[str, Any] = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        estimated = read(folder / ESTIMATE)[0].record["fingerprint"]
-        return old if old["fingerprint"] == estimated else None
-    except (InputError, ValueError, KeyError, TypeError):
-        return None
+def _read_results(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """run.json, and its fingerprint if all results are there, whole and of one reconstruction."""
+    description: dict[str, Any] = json.loads((folder / RUN).read_text(encoding="utf-8"))
+    made_from = read(folder / ESTIMATE)[0].record["fingerprint"]
+    whole = description["fingerprint"] == made_from and all((folder / name).is_file() for name in (PICTURE, OVERVIEW))
+    return description, made_from if whole else None
 
 
 def cached_results(
@@ -103,10 +99,9 @@ def cached_results(
 ) -> tuple[dict[str, Any], bool]:
     """What run.json in `folder` says, and whether the reconstruction had to be made for it."""
     wanted = made_from(stack, model)
-    old = _standing(folder)
-    if old is not None and old["fingerprint"] == wanted:
-        return old, False
-    restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
-    description = {"fingerprint": wanted, **description}
-    write_results(folder, stack, restoration, description)
-    return description, True
+
+    def make() -> tuple[Reconstruction, dict[str, Any]]:
+        restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
+        return restoration, {"fingerprint": wanted, **description}
+
+    return cached(folder, wanted, _read_results, make, lambda _, made: write_results(folder, stack, *made))

@@ -149,7 +149,7 @@ def follow(line: str, comment: str, folder: Path, ommatid: Command) -> None:
     assert ended.code == 0, f"{line}: {ended.err}"
     if claimed:
         assert json.loads(ended.out)["mse"] == pytest.approx(float(claimed[1]), rel=1e-3), line
-    for said in re.findall(r"says `([^`]+)`", comment):
+    for said in re.findall(r"prints `([^`]+)`", comment):
         assert said in ended.err, line
     if words[0] == "init":
         make_smaller(folder / words[1])

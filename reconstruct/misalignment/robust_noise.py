@@ -49,7 +49,7 @@ class MisalignmentNoise:
 def tolerances(camera: Camera) -> FloatArray:
     """Return the standard deviations of all parameters: (sub-imagers, 6). Raises InputError for blurred lenses."""
     for lens_type in camera.types:
-        if lens_type.optics.surfaces is not None or not blur_of(camera, lens_type).none:
+        if lens_type.optics.surfaces is not None or not blur_of(camera, lens_type).is_zero:
             raise InputError(
                 f"camera.lens.{lens_type.name}: H of misaligned lenses is known of pinholes and of thin ones in focus"
                 " without a camera.wavelength, got another lens; take estimator.misalignment = 'trust'"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
+from ..constants import WHITE
 from ..scene import Scene
 from . import npz, tiff
 from .exr import Part, read_channels, write
@@ -57,7 +58,7 @@ def load(scene: Scene) -> Image:
     return rounded
 
 
-def shape(scene: Scene) -> tuple[int, int]:
+def target_shape(scene: Scene) -> tuple[int, int]:
     """Rows and columns of the target, from the scene file alone where it says."""
     if scene.target.shape is not None:
         return scene.target.shape
@@ -77,7 +78,7 @@ def luminance(pixels: NDArray[Any], where: str) -> Image:
     """Any (rows, columns[, channels]) picture as one channel of values from 0 to 255. Raises InputError."""
     numbers = grey(pixels, where)
     if pixels.dtype == np.bool_:
-        return numbers * 255.0
+        return numbers * WHITE
     if pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
         return numbers
     if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
+from ..constants import WHITE
 from ..formats import tiff
 from ..formats.picture import decode, grey
 
@@ -44,7 +45,7 @@ class AcquisitionSettings:
 
     dark: tuple[Path, ...] = ()
     flat: tuple[Path, ...] = ()
-    flat_value: float = 255.0
+    flat_value: float = WHITE
     origin: tuple[int, int] | None = None
     upright: bool | None = None
 

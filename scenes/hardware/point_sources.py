@@ -22,6 +22,7 @@ from ommatid.runtime.files import fingerprint
 from ommatid.runtime.versions import versions
 
 from ..camera import Camera
+from ..constants import WHITE
 from ..model import RECORDED, Model
 from ..scene import Scene
 from ..setup import Setup
@@ -34,7 +35,6 @@ Vector = NDArray[np.float64]
 Grid = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
-UNLIKE_ONE = 0.2  # by which rows of H may miss the sum of 1 before it is said
 MARGIN = 2.0  # pixels of f around an ideal footprint
 CHANCE = 0.01  # that anything beyond all footprints is taken for light when all of it is noise
 UNKNOWN = 1.0  # variance of an entry whose sensor pixel told nothing: it is a share, so anything up to 1
@@ -81,7 +81,7 @@ def from_recorded_points(
     images: Sequence[Path],
     bench: AcquisitionSettings,
     places: Path | None = None,
-    value: float = 255.0,
+    value: float = WHITE,
 ) -> RecordedCalibration:
     """H from frames of point sources of a `value`, with the variance of its every entry.
 
@@ -138,29 +138,6 @@ def _refuse_several(camera: Camera, shown: list[Whole], places: Path | None) -> 
             f"{places}: several points in an image are told apart by the footprints of pinholes, which this camera's"
             " lenses do not have; record one point an image"
         )
-
-
-def warnings(calibrated: RecordedCalibration) -> list[str]:
-    """What the user should know, a sentence each."""
-    said: list[str] = []
-    sums = np.asarray(calibrated.model.matrix.sum(axis=1)).ravel()
-    whole = float(np.median(sums[sums > 0])) if (sums > 0).any() else 0.0
-    if abs(whole - 1) > UNLIKE_ONE:
-        said.append(
-            f"all points together give a sensor pixel {whole:.3g} of the value of one, expected about 1: look at"
-            " --point-value, and take dark and flat frames with --dark and --flat"
-        )
-    if calibrated.once:
-        said.append(
-            "every point was recorded once, so that the variance of H holds the noise of the dark and not that of"
-            " photons: record each point twice or more, or describe the sensor in [sensor]"
-        )
-    if calibrated.stray:
-        said.append(
-            f"{calibrated.stray} readings beyond the footprints are more than noise and belong to no point: let fewer"
-            " points shine at once, or look for light that should not be there"
-        )
-    return said
 
 
 def _readings(scene: Scene, frames: RecordedFrames, value: float) -> Grid:

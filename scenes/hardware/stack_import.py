@@ -15,11 +15,9 @@ from ommatid.runtime.versions import versions
 
 from ..recording import Recording
 from ..setup import Setup
-from ..stack import Stack, recorded
+from ..stack import Stack, stack_from_recording
 from ..tables.sensor import SensorTable
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
-
-FAR = 0.1  # sensor pixels beside whole ones, above which H of the design is not that of the frames
 
 
 def import_stack(setup: Setup, images: Sequence[Path], bench: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:
@@ -43,7 +41,7 @@ def import_stack(setup: Setup, images: Sequence[Path], bench: AcquisitionSetting
         return Stack(kept, camera, _as_stored(frames.values()[0]), none, record), frames
     recording = _recording(kept.source, kept.sensor, frames)
     kept = kept.model_copy(update={"sensor": recording.sensor})
-    return recorded(kept, camera, recording, none, record), frames
+    return stack_from_recording(kept, camera, recording, none, record), frames
 
 
 def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Recording:
@@ -62,20 +60,3 @@ def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Rec
 def _as_stored(values: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(over="ignore"):  # what the file cannot hold is as dead as what is infinite
         return values.astype(np.float32).astype(np.float64)
-
-
-def warnings(frames: RecordedFrames) -> list[str]:
-    """What the user should know of the frames, a sentence each."""
-    said: list[str] = []
-    if frames.layout.beside > FAR:
-        said.append(
-            f"the sub-images stand up to {frames.layout.beside:.2f} sensor pixels beside whole pixels of the mosaic, so"
-            " that H of the design is not theirs: calibrate it from recorded points (ommatid calibrate --points)"
-        )
-    return [*said, *dead(frames)]
-
-
-def dead(frames: RecordedFrames) -> list[str]:
-    """A sentence where pixels are dead."""
-    count = int(np.sum(~np.isfinite(frames.scale)))
-    return [f"{count} sensor pixels are dead: their flat frame is not above the dark one"] if count else []

@@ -56,7 +56,7 @@ class Blur:
     weight: float = 0.0
 
     @property
-    def none(self) -> bool:
+    def is_zero(self) -> bool:
         """Whether rays go where a pinhole's would."""
         return self.disk == 0 and self.airy == 0
 
@@ -156,7 +156,7 @@ def transfer(ratio: float, known: Whole, unit: int, blur: Blur) -> Numbers:
     """
     trapezoid, _ = _trapezoid(ratio, known, unit)
     sharp = np.outer(trapezoid, trapezoid)
-    if blur.none:
+    if blur.is_zero:
         return sharp
     places, even, _ = _differences(ratio, known, unit)
     beyond, corner = moments(places, blur.disk, blur.airy, blur.weight)

@@ -1,7 +1,7 @@
 """Radial distortion: how a lens's magnification changes from its axis outwards.
 
 A chief ray is its tangent (x, y) to the lens's axis, on the target's side and on the sensor's side. With r = 1 at
-`1 / scale`, for a camera's targets Camera.corner / Camera.distance,
+`1 / scale`, for a camera's targets Camera.half_diagonal / Camera.distance,
 
     image tangent = object tangent (1 + k1 r^2 + k2 r^4).
 
@@ -67,7 +67,7 @@ def field(camera: Camera, sub: SubImager, pose: Pose) -> float:
     `undistort` fails there, which takes a k1 or k2 of about 1.
     """
     across, down = camera.position(0, 0)
-    limit = float(np.hypot(across + abs(pose.lens[0]), down + abs(pose.lens[1]))) / camera.corner
+    limit = float(np.hypot(across + abs(pose.lens[0]), down + abs(pose.lens[1]))) / camera.half_diagonal
     if sub.type.optics.distortion is not None:
         fault = _fault(*sub.type.optics.distortion, limit)
         if fault:

@@ -45,8 +45,8 @@ def sub_matrix(camera: Camera, sub: SubImager, pose: Pose) -> sparse.csr_array:
     y = (camera.rows / 2 - np.arange(camera.rows + 1)) * camera.target_pitch - pose.lens[1]
     k1, k2 = coefficients(sub)
     project = _from_tangents(camera, sub, pose)
-    project[:, :2] *= camera.corner / camera.distance  # tangents in units of r
-    places = x / camera.corner, y / camera.corner
+    project[:, :2] *= camera.half_diagonal / camera.distance  # tangents in units of r
+    places = x / camera.half_diagonal, y / camera.half_diagonal
     found = shares(*places, k1, k2, project, (columns, rows), LEAST_SHARE)
     pixels, texels, values = cast(tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]], found)
     return sparse.csr_array((values, (pixels, texels)), shape=(rows * columns, camera.unknowns))
@@ -69,7 +69,7 @@ def footprint(
     limit = field(camera, sub, pose)
     point = [at + along[0] * u + along[1] * v for at, along in zip(pose.middle, pose.axes, strict=True)]
     image = point[0] / point[2], point[1] / point[2]
-    x, y = undistort(*image, *coefficients(sub), camera.distance / camera.corner, limit)
+    x, y = undistort(*image, *coefficients(sub), camera.distance / camera.half_diagonal, limit)
     row = camera.rows / 2 - (pose.lens[1] + y * camera.distance) / camera.target_pitch
     return row, camera.columns / 2 - (pose.lens[0] + x * camera.distance) / camera.target_pitch
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from ..camera import Camera
+from ..constants import AIRY_FIRST_ZERO, WHITE
 from ..lens_type import LensOptics, LensType
 from ..scene import Scene
 from ..tables.sensor import SensorTable
@@ -26,8 +27,6 @@ MOST_DISK = 1 / 20  # of a pixel of f: a disk of defocus that may be left out
 MOST_AIRY = 1 / 5  # of a sensor pixel: an Airy disk, to its first dark ring, that may be left out
 MOST_OF_NOISE = 0.1  # of the noise's variance: what leaving out may change
 MOST_SHOT = 0.1  # of the variance of read noise: shot noise that hides below it
-FIRST_ZERO = 1.21967  # of J1(pi x): the Airy disk's radius in units of wavelength times f-number
-WHITE = 255.0
 SURE = 5.0  # standard deviations
 
 
@@ -92,7 +91,7 @@ def shot_noise_hides(sensor: SensorTable, white: float) -> bool:
     return white + sensor.dark_current * sensor.exposure < MOST_SHOT * sensor.read_noise**2
 
 
-def without_shot_noise(scene: Scene, camera: Camera) -> SkippedEffect | None:
+def negligible_shot_noise(scene: Scene, camera: Camera) -> SkippedEffect | None:
     """None where the counting of electrons shows, or where it is not known how many there are.
 
     The bound is five standard deviations of what is left out, at a value of 255.
@@ -124,7 +123,7 @@ def _without_diffraction(camera: Camera, wavelength: float, contrast: float, all
             return None
         if kind.optics.aperture is None:
             continue
-        disk = 2 * FIRST_ZERO * wavelength * camera.depth(kind) / kind.optics.aperture / camera.pixel_pitch
+        disk = 2 * AIRY_FIRST_ZERO * wavelength * camera.depth(kind) / kind.optics.aperture / camera.pixel_pitch
         if disk >= MOST_AIRY:
             return None
         change = _change(camera, kind, replace(blur_of(camera, kind), airy=0.0))

@@ -17,23 +17,22 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
+from ..constants import GREEN, WHITE
 from ..lens_type import LensType, SubImager
 from ..pose import Pose, corner_offset, poses
-from ..recording import charge_of_full, dark_level, expected_recording, reaching_below_zero
+from ..recording import clips_dark_noise, dark_electrons, expected_recording, saturation_electrons
 from ..scene import Scene
 from ..tables.sensor import SensorTable
 
 Vector = NDArray[np.float64]
 
 PLANCK, LIGHT_SPEED, EFFICACY = 6.62607015e-34, 299792458.0, 683.0  # J s, m/s, lm/W: exact in the SI
-WAVELENGTH = 550e-6  # mm, where the camera names none
-WHITE = 255.0
 METRES = 1e-3  # a millimetre
 
 
 def electrons_a_steradian(scene: Scene, sensor: SensorTable) -> float:
     """Electrons that each unit of f frees in a pixel for every steradian of projected solid angle."""
-    wavelength = (scene.camera.wavelength or WAVELENGTH) * METRES
+    wavelength = (scene.camera.wavelength or GREEN) * METRES
     radiance = sensor.illuminance / pi / WHITE / EFFICACY  # W / (m^2 sr) for each unit of f
     photons = radiance * wavelength / (PLANCK * LIGHT_SPEED)
     area = (scene.camera.pixel_pitch * METRES) ** 2
@@ -109,7 +108,7 @@ def predicted_noise(scene: Scene, camera: Camera, response: Vector) -> Vector:
     """
     noise = expected_noise(scene, camera, response)
     if scene.sensor is not None:
-        noise[scene.prior.mean * response >= charge_of_full(scene.sensor)] = np.nan
+        noise[scene.prior.mean * response >= saturation_electrons(scene.sensor)] = np.nan
     if np.isnan(noise).all():
         raise InputError(
             f"{scene.source}: sensor: at the prior's mean, {scene.prior.mean:g}, every pixel is full, or nothing stands"
@@ -132,7 +131,7 @@ def summary(scene: Scene, camera: Camera, response: Vector) -> dict[str, Any]:
     kinds: list[dict[str, Any]] = []
     for kind, place in zip(camera.types, camera.type_slices(), strict=True):
         average, brightest = float(response[place].mean()), float(response[place].max())
-        full = charge_of_full(sensor) / brightest if brightest > 0 else None
+        full = saturation_electrons(sensor) / brightest if brightest > 0 else None
         alive = noise[place][np.isfinite(noise[place])]
         kinds.append(
             {
@@ -144,22 +143,4 @@ def summary(scene: Scene, camera: Camera, response: Vector) -> dict[str, Any]:
                 "noise": float(np.sqrt(alive.mean())) if alive.size else None,
             }
         )
-    return {"lens_types": kinds, "dark": dark_level(sensor), "cut_off": reaching_below_zero(sensor)}
-
-
-def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of the printed table of `summary`: what, and how much."""
-    lines = [(f"lens type {kind['name']}", _words(kind)) for kind in description["lens_types"]]
-    if description["dark"] > 0:
-        lines.append(("without light", f"{description['dark']:.4g} electrons in every pixel"))
-    if description["cut_off"]:
-        lines.append(("warning", "the dark's noise is cut off at 0 DN: dim values come out too low; raise black_level"))
-    return lines
-
-
-def _words(kind: dict[str, Any]) -> str:
-    if kind["noise"] is None:
-        return "no light arrives that could be told from the dark"
-    said = f"{kind['white']:.4g} electrons a pixel at 255, {kind['mean']:.4g} at the prior's mean"
-    said += f", where a value is {kind['noise']:.3g} uncertain"
-    return f"{said}; full from {kind['saturation']:.4g} on" if kind["saturates"] else f"{said}; never full"
+    return {"lens_types": kinds, "dark": dark_electrons(sensor), "cut_off": clips_dark_noise(sensor)}

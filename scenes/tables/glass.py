@@ -17,7 +17,8 @@ from math import sqrt
 
 from ommatid.runtime.errors import InputError
 
-GREEN = 550e-6  # mm, where a scene names no wavelength
+from ..constants import GREEN
+
 AIR = "air"
 
 

@@ -61,7 +61,7 @@ def test_the_first_dark_ring_stands_at_1_22_wavelengths_over_the_aperture() -> N
 
 def test_pinholes_are_sharp_and_surfaces_are_refused() -> None:
     one = of_glass(LensOptics(), wavelength=550e-6)
-    assert blur_of(one, one.types[0]).none
+    assert blur_of(one, one.types[0]).is_zero
     real = of_glass(LensOptics(surfaces=(Surface(semi_diameter="1 mm"),)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="thin lens"):
         blur_of(real, real.types[0])

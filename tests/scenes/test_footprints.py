@@ -55,7 +55,7 @@ def image_tangents(cam: Camera, sub: SubImager, sight: Pose, row: Vector, column
     x, y = cam.position(row, column)  # pyright: ignore[reportArgumentType]
     k = sub.type.optics.distortion or (0.0, 0.0)
     tangents = (x - sight.lens[0]) / cam.distance, (y - sight.lens[1]) / cam.distance
-    return np.column_stack(distort(*tangents, *k, cam.distance / cam.corner))
+    return np.column_stack(distort(*tangents, *k, cam.distance / cam.half_diagonal))
 
 
 @pytest.mark.parametrize(("shape", "lenses"), [((19, 19), THREE), ((23, 17), TWO_FIFTHS)])
@@ -180,7 +180,7 @@ def test_a_texels_column_is_the_area_of_its_image(lenses: Lenses, k: tuple[float
         row, column = (axis.ravel() for axis in np.meshgrid(at, at, indexing="ij"))
         tangents = image_tangents(cam, sub, sight, row, column)
         x, y = cam.position(row, column)  # pyright: ignore[reportArgumentType]
-        square = ((x - sight.lens[0]) ** 2 + (y - sight.lens[1]) ** 2) / cam.corner**2
+        square = ((x - sight.lens[0]) ** 2 + (y - sight.lens[1]) ** 2) / cam.half_diagonal**2
         bent = (1 + k[0] * square + k[1] * square**2) * (1 + 3 * k[0] * square + 5 * k[1] * square**2)
         rays = np.column_stack([tangents, np.ones(row.size)])
         normal = np.cross(sight.axes[:, 0], sight.axes[:, 1])

@@ -26,11 +26,9 @@ if TYPE_CHECKING:
     from ommatid.batch.remote import RunObserver, Stages
     from ommatid.runtime.progress import Progress
     from ommatid.runtime.workers import Workers as Crew
-    from ommatid.scenes.camera import Camera
     from ommatid.scenes.hardware.frames import AcquisitionSettings
     from ommatid.scenes.model import Model
     from ommatid.scenes.setup import Setup
-    from ommatid.scenes.tables.sensor import NoiseTable
 
 app = typer.Typer(
     add_completion=False,
@@ -433,14 +431,9 @@ def paper(
 ) -> None:
     """The paper's figures and claims, computed anew."""
     from ommatid.paper.paper import rows, write_paper
-    from ommatid.simulate.ideal import ideal_matrix
-    from ommatid.simulate.sensor.gaussian import expose, generators
-
-    def record(camera: Camera, light: Any, noise: NoiseTable, number: int) -> Any:
-        return expose(light, noise, generators(camera, number), camera.slices())
 
     with _progress("paper") as progress:
-        description = write_paper(output, ideal_matrix, record, image, seed, progress)
+        description = write_paper(output, image, seed, progress)
     if as_json:
         _print_json(description)
     else:

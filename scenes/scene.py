@@ -16,6 +16,7 @@ from pydantic import Field, PrivateAttr, ValidationError, model_validator
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 
+from .gallery import find_scene, missing_scene
 from .tables import toml
 from .tables.camera import CameraTable
 from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
@@ -188,13 +189,14 @@ def _moved(scene: Scene, source: Path) -> Scene:
 def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) -> Scene:
     """Read a scene file, apply `--set` overrides and keep only the named lens types, if any are named.
 
-    The target's picture, where it is a file, is looked for beside the scene file.
-    Raises InputError that names the file, the key, what was expected and what came.
+    `path` may be the name of a gallery scene. The target's picture, where it is a file, is looked for beside the scene
+    file. Raises InputError that names the file, the key, what was expected and what came.
     """
+    path = find_scene(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such scene file; `ommatid init {path.name}` writes one to start from") from error
+        raise InputError(missing_scene(path)) from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: could not be read as a scene file ({error})") from error
     try:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from ommatid.reconstruct.prediction import Prediction
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.progress import Progress, no_progress
+from ommatid.scenes.scene import Scene
+
+from .candidates import with_lens
+from .predict import predict_scene
 
 
 @dataclass(frozen=True)
@@ -22,6 +30,40 @@ class DesignCandidate:
         """In JSON's types."""
         expected = None if self.expected is None else self.expected.describe()
         return {"magnification": self.magnification, "expected": expected, "reason": self.reason}
+
+
+@dataclass(frozen=True)
+class DesignComparison:
+    """The expected error of a scene, and the candidates ranked by the expected error with each."""
+
+    before: Prediction
+    candidates: list[DesignCandidate]
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the comparison in JSON's types."""
+        return {
+            "before": self.before.describe(),
+            "candidates": [candidate.describe() for candidate in self.candidates],
+        }
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Tabulate magnification, expected error, and the factor by which it falls."""
+        return rows(self.before, self.candidates)
+
+
+def compare(scene: Scene, wanted: Sequence[Fraction], progress: Progress = no_progress) -> DesignComparison:
+    """Predict the error of the scene with one more lens type of each magnification."""
+    before = predict_scene(scene)
+    candidates: list[DesignCandidate] = []
+    for index, magnification in enumerate(wanted):
+        try:
+            expected = predict_scene(with_lens(scene, magnification))
+            candidates.append(DesignCandidate(str(magnification), expected))
+        except InputError as error:
+            reason = str(error).removeprefix(f"{scene.source}: ")
+            candidates.append(DesignCandidate(str(magnification), None, reason))
+        progress((index + 1) / len(wanted))
+    return DesignComparison(before, ranked(candidates))
 
 
 def ranked(choices: list[DesignCandidate]) -> list[DesignCandidate]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,28 @@ from ommatid.reconstruct.frame_prediction import predict_frame
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.prediction import Prediction, predict
 from ommatid.reconstruct.prior import prior_of
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.processors import one_thread
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.scene import Scene, read
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
+
+
+def predict_file(
+    path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()
+) -> tuple[Scene, Prediction, dict[str, Any] | None]:
+    """Read a scene, and predict its error and the electrons that its pixels collect (None without a sensor).
+
+    Raises InputError that names the scene file.
+    """
+    scene = read(path, changes, lenses)
+    with naming_source(scene.source):
+        return scene, predict_scene(scene), electrons(scene, derive(scene))
+
+
+def describe_prediction(prediction: Prediction, light: dict[str, Any] | None) -> dict[str, Any]:
+    """Describe a prediction in JSON's types."""
+    return prediction.describe() | ({} if light is None else {"light": light})
 
 
 @one_thread()

@@ -6,9 +6,24 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.scenes.camera import Camera
+from ommatid.reconstruct.method_choice import choose_method
+from ommatid.runtime.errors import naming_source
+from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.skipped import skipped_effects
+from ommatid.simulate.renderer.variant import choose as choose_variant
+
+from .predict import electrons, optics
+
+
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Describe the geometry and the plan of a scene in JSON's types. Raises InputError that names the scene file."""
+    camera = derive(scene)
+    exact = scene.calibration.method == "ideal" and camera.has_box_footprints
+    choice = choose_method(scene, camera, exact)
+    with naming_source(scene.source):
+        lens_optics, light = optics(camera), electrons(scene, camera)
+    return describe(scene, camera, choose_variant(scene.render.variant), choice.plan(), lens_optics, light)
 
 
 def describe(
@@ -16,12 +31,12 @@ def describe(
     camera: Camera,
     variant: str,
     reconstruction: dict[str, Any],
-    optics: list[dict[str, Any]] | None = None,
+    lens_optics: list[dict[str, Any]] | None = None,
     light: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Geometry and plan in JSON's types; lengths are millimetres.
 
-    reconstruction : the plan of the last stage;  optics : what each lens type with an aperture does to sharpness
+    reconstruction : the plan of the last stage;  lens_optics : what each lens type with an aperture does to sharpness
     light : electrons that are collected, of a scene with a [sensor]
     """
     seen = camera.types_seeing()
@@ -42,7 +57,7 @@ def describe(
         "unknowns": camera.unknowns,
         "pixels_seen_by_fewer_types": fewer,
         "where": _where(camera),
-        **({"optics": optics} if optics else {}),
+        **({"optics": lens_optics} if lens_optics else {}),
         **({"light": light} if light is not None else {}),
         "plan": _plan(scene, camera, variant, reconstruction),
         "skipped": [left.describe() for left in skipped_effects(scene, camera)],

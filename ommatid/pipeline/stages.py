@@ -9,7 +9,7 @@ from typing import Any
 
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
-from ommatid.runtime.errors import naming_source
+from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
@@ -128,6 +128,22 @@ def calibrated(scene: Scene, camera: Camera, path: Path, progress: Progress) -> 
 
         judge = for_prior(scene, camera)
     return cached_model(path, scene, camera, progress, judge)
+
+
+def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
+    """Write the scene in `path` as a plain Mitsuba scene, and describe its files and sensors.
+
+    Raises InputError for a scene with a world or with lenses that are more than pinholes.
+    """
+    from ommatid.runtime.files import check_output
+    from ommatid.simulate.renderer.export import export
+
+    check_output(output, path)
+    scene, camera, image = opened(path, changes, lenses)
+    if scene.world is not None:
+        raise InputError(f"{path}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
+    picture = export(scene, camera, image, output)
+    return {"file": str(output), "picture": str(picture), "sensors": [sub.name for sub in camera.sub_imagers]}
 
 
 def facts(chosen: bool) -> dict[str, str]:

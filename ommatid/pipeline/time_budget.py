@@ -15,14 +15,17 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ommatid.batch.batch import Member
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.reconstruct.output.result_files import RUN
 from ommatid.reconstruct.output.run_json import write_run
 from ommatid.reconstruct.output.time_spent import STAGES
+from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import Image
 from ommatid.scenes.scene import Scene, resolved, with_tables
+from ommatid.scenes.tables.units import duration
 
 from . import bench_curves, stages, time_allocation
 
@@ -35,6 +38,29 @@ COMPILED = 1.0  # seconds for a number of samples that Mitsuba has not met
 
 Clock = Callable[[], float]
 Samples = int | Literal["auto"]
+
+
+def stages_within(
+    time: str,
+    members: Sequence[Member],
+    started: float,
+    say: Callable[[str], None],
+    scheduler: str = "",
+    workers: int | None = None,
+) -> tuple[Stages, int | None]:
+    """Choose the stages of `run` and the number of processes for scenes that have a `time` together, such as "30 s".
+
+    Without a time these are the ordinary stages and `workers`. Raises InputError if `time` is no duration, or if
+    `scheduler` or `workers` are given with it.
+    """
+    if not time:
+        return stages.run, workers
+    if scheduler or workers is not None:
+        raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
+    try:
+        return shared_time(duration(time), [member.folder for member in members], started, say), 1
+    except ValueError as error:
+        raise InputError(f"--within: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,9 @@ def missing_scene(path: Path) -> str:
     """Explain that neither a file nor a gallery scene is called `path`, naming the nearest gallery scene, if any."""
     names = gallery_names()
     nearest = get_close_matches(path.stem, names, 1)
-    return (
-        f"{path}: no such scene file; "
-        + (f"did you mean '{nearest[0]}'? " if nearest else "")
-        + f"The gallery has {', '.join(names)}; `ommatid init {path.stem}.toml` writes a scene to start from"
-    )
+    hint = f"did you mean '{nearest[0]}'? The" if nearest else "the"
+    listed = f"{hint} gallery has {', '.join(names)}"
+    return f"{path}: no such scene file; {listed}; `ommatid init {path.stem}.toml` writes a scene to start from"
 
 
 def write_starter(path: Path) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.runtime.errors import naming_source
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.skipped import skipped_effects
 from ommatid.simulate.renderer.variant import choose as choose_variant
 
@@ -18,11 +19,11 @@ from .predict import electrons, optics
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
     """Describe the geometry and the plan of a scene in JSON's types. Raises InputError that names the scene file."""
-    camera = derive(scene)
-    exact = scene.calibration.method == "ideal" and camera.has_box_footprints
-    choice = choose_method(scene, camera, exact)
+    setup = Setup.from_scene(scene)
+    camera = setup.camera
+    choice = choose_method(scene, camera, setup.has_structured_matrix)
     with naming_source(scene.source):
-        lens_optics, light = optics(camera), electrons(scene, camera)
+        lens_optics, light = optics(camera), electrons(setup)
     return describe(scene, camera, choose_variant(scene.render.variant), choice.plan(), lens_optics, light)
 
 

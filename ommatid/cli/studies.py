@@ -66,9 +66,9 @@ def bench(
     from ommatid.bench.bench import rows
     from ommatid.pipeline.stages import opened
 
-    opened_scene = opened(scene, options.changes(sets), options.lens_names(lens))
+    setup = opened(scene, options.changes(sets), options.lens_names(lens))
     with output.progress_bar("bench") as progress:
-        table, made = measure(*opened_scene, folder, seconds, progress)
+        table, made = measure(setup, folder, seconds, progress)
     output.say_done("bench", made, folder / "bench.json")
     output.print_result(table.describe(), [(f"Error against run time: {table.title}", rows(table))], as_json)
 

@@ -11,11 +11,11 @@ from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.files import check_output
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file
-from ommatid.scenes.camera import derive
 from ommatid.scenes.hardware import point_sources, stack_import
 from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.scene import read
+from ommatid.scenes.setup import Setup
 
 from .stages import calibrated
 
@@ -78,20 +78,19 @@ def calibrate_file(
     Raises InputError for a wrong scene, option or frame, MachineError for a full disk.
     """
     check_output(output, path)
-    scene = read(path, changes, lenses)
+    setup = Setup.from_scene(read(path, changes, lenses))
     if recording is not None:
         if lenses:
             raise InputError("--lens: recorded frames are of the whole camera; choose lens types in `reconstruct`")
-        return _from_points(scene, output, recording)
+        return _from_points(setup, output, recording)
     with naming_source(path):
-        return CalibrationOutcome(*calibrated(scene, derive(scene), output, progress), warnings=[])
+        return CalibrationOutcome(*calibrated(setup, output, progress), warnings=[])
 
 
-def _from_points(scene: Scene, output: Path, recording: PointRecording) -> CalibrationOutcome:
-    camera = derive(scene)
+def _from_points(setup: Setup, output: Path, recording: PointRecording) -> CalibrationOutcome:
     check_output(output, *recording.files)
     outcome = point_sources.from_recorded_points(
-        scene, camera, recording.images, recording.settings, recording.positions, recording.value
+        setup, recording.images, recording.settings, recording.positions, recording.value
     )
     model_file.write(output, outcome.model)
     warnings = [*stack_import.dead(outcome.frames), *point_sources.warnings(outcome)]

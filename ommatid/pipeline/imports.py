@@ -10,10 +10,10 @@ from typing import Any
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import check_output
 from ommatid.scenes import stack
-from ommatid.scenes.camera import derive
 from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
 from ommatid.scenes.hardware.stack_import import import_stack, warnings
 from ommatid.scenes.scene import read
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 
 
@@ -45,13 +45,12 @@ def import_file(
     """
     frames = (*images, *settings.dark, *settings.flat)
     check_output(output, path, *(file for frame in frames for file in files_in(frame)))
-    scene = read(path, changes)
-    camera = derive(scene)  # with all lens types, since all of them are on the sensor
-    if lenses and not camera.is_ideal_pinhole:
+    setup = Setup.from_scene(read(path, changes))  # with all lens types, since all of them are on the sensor
+    if lenses and not setup.camera.is_ideal_pinhole:
         raise InputError(
             f"--lens {','.join(lenses)}: lenses that are more than pinholes are imported all; choose in `reconstruct`"
         )
-    whole, recorded = import_stack(scene, camera, images, settings)
+    whole, recorded = import_stack(setup, images, settings)
     kept = whole.restrict(tuple(lenses)) if lenses else whole
     stack.write(output, kept)
     return ImportOutcome(kept, recorded.layout.beside, warnings(recorded))

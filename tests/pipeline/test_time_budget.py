@@ -25,6 +25,7 @@ from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.units import duration
 
 from ..conftest import Command
@@ -96,7 +97,7 @@ def within(folder: Path, one: Scene, seconds: float, clock: Callable[[], float])
     said: list[str] = []
     folder.mkdir(exist_ok=True)
     watch = RunObserver(lambda _: nullcontext(no_progress), dict[str, bool]().__setitem__)
-    return run_within(one, derive(one), load(one), folder, watch, seconds, said.append, clock), said
+    return run_within(Setup.from_scene(one), folder, watch, seconds, said.append, clock), said
 
 
 def ticking(step: float) -> Callable[[], float]:

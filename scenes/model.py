@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 from ommatid.runtime.errors import InputError
 
@@ -94,6 +95,17 @@ class Model:
         if self.stored is None:
             return self.boxes.adjoint(measurements)
         return self.stored.T @ np.asarray(measurements, dtype=np.float64)
+
+    def as_linear_operator(self) -> LinearOperator:
+        """Return H as a SciPy linear operator, (M, N), for iterative solvers; H need not be stored."""
+        if self.stored is not None:
+            return aslinearoperator(self.stored)
+        return LinearOperator(
+            (self.measurements, self.unknowns),
+            matvec=lambda image: self.forward(image.ravel()),
+            rmatvec=lambda measurements: self.adjoint(measurements.ravel()),
+            dtype=np.float64,
+        )
 
     def measurements_inside(self, rows: slice, columns: slice) -> NDArray[np.int64]:
         """Which measurements see nothing but a window of f: (m,)."""

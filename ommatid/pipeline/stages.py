@@ -16,7 +16,7 @@ from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.cache import cached_model, cached_stack
@@ -28,7 +28,11 @@ from ommatid.simulate.validation import check_scene, check_scene_memory
 
 def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
     """A scene, its camera and its target, all checked before anything is written."""
-    scene = read(path, changes, lenses)
+    return checked(read(path, changes, lenses))
+
+
+def checked(scene: Scene) -> Setup:
+    """Derive the camera of a scene and load its image. Raises InputError if either cannot be done."""
     camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
     if scene.world is not None:
         from ommatid.simulate.renderer.world import files

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import typer.main
@@ -13,7 +13,7 @@ from ommatid.cli.app import app
 from ..modules import modules
 
 LONGEST = 40  # lines of a function, its signature and docstring included
-COMMANDS: dict[str, Any] = dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+COMMANDS: dict[str, Any] = cast(Any, typer.main.get_command(app)).commands
 
 
 @pytest.mark.parametrize("module", [name for name in modules() if name.startswith("ommatid.cli.")])

@@ -175,7 +175,7 @@ def test_averaging_does_not_help_against_rounding_without_noise() -> None:
     found = exposed(told, field(28), 0.0, 0)
     exact = 20 + 0.01 * np.concatenate([_offsets(told, field(28))])
     measured = float(np.var(found.dark - exact))
-    said = float(found._of_mean(np.zeros(1))[0])  # pyright: ignore[reportPrivateUsage]
+    said = float(found._mean_variance(np.zeros(1))[0])  # pyright: ignore[reportPrivateUsage]
     assert measured == pytest.approx(1 / 12, rel=0.1)
     assert said == pytest.approx(measured, rel=0.1)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import cast
@@ -17,8 +18,8 @@ from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
-from ommatid.scenes.formats.picture import Image
 from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
 from ommatid.simulate.sampling.samplers import corners, law
 from ommatid.simulate.validation import check_scene
@@ -37,18 +38,16 @@ PATIENCE = 0.1  # of the time: how long the noise alone may take
 SETTING_UP = 0.02  # of the progress: the reference, and what the noise alone leaves
 
 
-def bench(
-    scene: Scene, camera: Camera, image: Image, folder: Path, seconds: float, progress: Progress
-) -> tuple[BenchTable, bool]:
+def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
     """The table of a scene, and whether anything had to be measured for it; what stands in `folder` is not repeated.
 
     seconds : that it may take; cells that do not fit are left out
     Raises InputError for a scene that cannot be measured, and where `folder` holds the table of another scene.
     """
     start = perf_counter()
-    scene = _as_measured(scene)
-    _refuse(scene, camera)
-    what = _described(scene, camera, image)
+    setup = replace(setup, scene=_as_measured(setup.scene))
+    _refuse(setup)
+    what = _described(setup)
     made = fingerprint([what, versions("mitsuba", "drjit", "scipy")])
     old = _standing(folder, what)
     if old is not None and old.fingerprint == made and not (old.budget < seconds and any(o.late for o in old.left_out)):
@@ -60,9 +59,9 @@ def bench(
             finished.cells.setdefault(name_of(cell), cell)
         finished.seconds = max(finished.seconds, old.seconds)
     before = finished.seconds
-    with naming_source(scene.source):
-        found = reference(scene, camera, image, folder, lambda done: progress(SETTING_UP * done))
-        subject = Subject(scene, camera, image, found, PATIENCE * seconds)
+    with naming_source(setup.scene.source):
+        found = reference(setup, folder, lambda done: progress(SETTING_UP * done))
+        subject = Subject(setup, found, PATIENCE * seconds)
         told, left_out = jobs(subject)
     spent = perf_counter() - start
     late = measure(told, seconds, finished, lambda done: progress(SETTING_UP + (1 - SETTING_UP) * done), spent)
@@ -82,22 +81,22 @@ def _as_measured(scene: Scene) -> Scene:
     return scene.model_copy(update={"estimator": estimator, "study": None})
 
 
-def _refuse(scene: Scene, camera: Camera) -> None:
-    if scene.world is not None:
+def _refuse(setup: Setup) -> None:
+    if setup.scene.world is not None:
         raise InputError(
-            f"{scene.source}: bench measures flat targets, got a [world]; remove it, or take another scene"
+            f"{setup.scene.source}: bench measures flat targets, got a [world]; remove it, or take another scene"
         )
-    check_scene(scene, camera, calibrates=False)
+    check_scene(setup, calibrates=False)
 
 
-def _described(scene: Scene, camera: Camera, image: Image) -> str:
+def _described(setup: Setup) -> str:
     """Fingerprint of what is measured, whatever samples and methods the scene itself asks for."""
-    tables = scene.plain()
+    tables = setup.scene.plain()
     for table, keys in {"render": ("samples", "variant"), "calibration": ("samples", "method", "fit")}.items():
         tables[table] = {key: value for key, value in tables[table].items() if key not in keys}
     for name in ("title", "target"):
         tables.pop(name, None)
-    return fingerprint([camera.describe(), tables, digest(image.astype("float32"))])
+    return fingerprint([setup.camera.describe(), tables, digest(setup.image.astype("float32"))])
 
 
 def _standing(folder: Path, what: str) -> BenchTable | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
 from time import perf_counter
@@ -20,8 +20,10 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.adaptive_render import AdaptiveRendering
+from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.calibration.point_sources import RENDERINGS
 from ommatid.simulate.render import Rendering
 from ommatid.simulate.renderer.variant import PREFERENCE, release, unusable_reason
@@ -54,14 +56,22 @@ class Subject:
     patience : seconds after which no more estimates are made of what the noise alone leaves
     """
 
-    scene: Scene
-    camera: Camera
-    image: Image
+    setup: Setup
     reference: Reference
     patience: float = inf
 
-    def noise(self, repeat: int) -> Scene:
-        """The scene with the sensor's noise of a repeat, which all cells share."""
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.setup.scene
+
+    @property
+    def camera(self) -> Camera:
+        """Its camera."""
+        return self.setup.camera
+
+    def noise(self, repeat: int) -> Setup:
+        """The setup with the sensor's noise of a repeat, which all cells share."""
         return self._seeded("noise", repeat)
 
     def seed(self, name: str, repeat: int) -> int:
@@ -70,11 +80,11 @@ class Subject:
 
     def stack(self, repeat: int) -> Stack:
         """Exact light, recorded."""
-        return reference.stack_of_light(self.noise(repeat), self.camera, self.reference.light, self.reference)
+        return reference.stack_of_light(self.noise(repeat), self.reference.light, self.reference)
 
     def squares(self, image: Image) -> float:
         """Mean squared error of an estimate, (N,)."""
-        return float(np.mean(np.square(image - self.image.ravel())))
+        return float(np.mean(np.square(image - self.setup.image.ravel())))
 
     @property
     def large(self) -> bool:
@@ -83,11 +93,11 @@ class Subject:
 
     def of_rendering(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
         """Mean squared error of the estimate from a rendering and exact H, freed of this noise's luck."""
-        scene = self.noise(repeat)
+        setup = self.noise(repeat)
         once = isinstance(rendering, Rendering) and rendering.passes == 1  # whose variance nobody knows
         if self.large or once:
-            return self._brought(reference.stack_of_light(scene, self.camera, rendering.mean, self.reference), repeat)
-        return self._brought(reference.stack_of(scene, self.camera, rendering), repeat)
+            return self._brought(reference.stack_of_light(setup, rendering.mean, self.reference), repeat)
+        return self._brought(reference.stack_of(setup, rendering), repeat)
 
     def of_model(self, model: Model, repeat: int) -> float:
         """Mean squared error of the estimate from exact light with a calibrated H, freed of this noise's luck.
@@ -97,8 +107,8 @@ class Subject:
         """
         if not self.large:
             return self.freed(self.squares(method_for(self.stack(repeat), model).image), repeat)
-        light = model.forward(self.image.ravel())
-        return self._brought(reference.stack_of_light(self.noise(repeat), self.camera, light, self.reference), repeat)
+        light = model.forward(self.setup.image.ravel())
+        return self._brought(reference.stack_of_light(self.noise(repeat), light, self.reference), repeat)
 
     def _brought(self, stack: Stack, repeat: int) -> float:
         return self.freed(self.squares(method_for(stack, self.reference.model).image), repeat)
@@ -138,9 +148,9 @@ class Subject:
         """Their median: what the noise alone leaves."""
         return float(np.median(self._alone[0]))
 
-    def _seeded(self, what: str, repeat: int) -> Scene:
+    def _seeded(self, what: str, repeat: int) -> Setup:
         render = self.scene.render.model_copy(update={"seed": self.seed(what, repeat)})
-        return self.scene.model_copy(update={"render": render})
+        return replace(self.setup, scene=self.scene.model_copy(update={"render": render}))
 
 
 def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
@@ -179,7 +189,7 @@ def _counted(asked: int, sampler: Sampler) -> JobSettings:
 def _as_needed(subject: Subject, variants: list[str]) -> list[Job]:
     """With samples "auto" and the scene's own sampler. Raises InputError where there is no noise to compare with."""
     scene = subject.scene
-    work = JobSettings(None, reference.foreseen_samples(scene, subject.camera, subject.image, subject.reference), AUTO)
+    work = JobSettings(None, reference.foreseen_samples(subject.setup, subject.reference), AUTO)
     found: list[Job] = []
     for variant in variants:
         found.append(_rendering(subject, variant, scene.render.sampler, AUTO, work))
@@ -203,7 +213,7 @@ def _rendering(subject: Subject, variant: str, sampler: Sampler, asked: Samples,
 
     def one(repeat: int) -> Repeat:
         scene = reference.with_rendering(subject.scene, sampler, variant, asked, subject.seed(name, repeat))
-        rendering, cost = _costed(lambda: reference.rendered(scene, subject.camera, subject.image))
+        rendering, cost = _costed(lambda: reference.rendered(replace(subject.setup, scene=scene)))
         error = reference.error_of_light(rendering, subject.reference)
         mse = subject.of_rendering(rendering, repeat) if repeat < FEWER else None
         return Repeat(error, cost, mse, int(rendering.record()["samples"]))
@@ -235,7 +245,7 @@ def _calibration(
         seed = subject.seed(name, repeat)
         scene = reference.with_calibration(subject.scene, method, sampler, variant, asked, seed)
         judge = for_stack(subject.stack(repeat)) if asked == AUTO else None
-        model, cost = _costed(lambda: reference.calibrated(scene, subject.camera, judge))
+        model, cost = _costed(lambda: calibrate(replace(subject.setup, scene=scene), judge=judge))
         error = reference.error_of_model(model, subject.reference)
         mse = subject.of_model(model, repeat) if repeat < FEWER else None
         return Repeat(error, cost, mse, int(model.record["samples"]))

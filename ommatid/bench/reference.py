@@ -5,7 +5,7 @@ Every repeat has a seed of its own, and none of these streams is one of the scen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,15 +14,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import without_negligible_effects
-from ommatid.scenes.scene import Sampler, Scene, resolved
+from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.adaptive_render import AIM, EXPONENTS, LEAST, MOST, STRATIFIED, AdaptiveRendering, render_until
 from ommatid.simulate.cache import cached_model
-from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.calibration.stopping_rule import StoppingRule
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 from ommatid.simulate.noise_target import allowed_variance
 from ommatid.simulate.render import Rendering, exposed, light
@@ -53,34 +50,24 @@ class Reference:
     words: str
 
 
-def has_closed_form(camera: Camera) -> bool:
-    """Whether H of a camera as it stands has a closed form."""
-    for kind in camera.types:
-        blurred = camera.is_blurred(kind)
-        if kind.optics.surfaces is not None or (blurred and kind.optics.distortion is not None):
-            return False
-    return camera.tolerance is None or camera.has_sharp_footprints
-
-
-def reference(
-    scene: Scene, camera: Camera, image: NDArray[np.float64], folder: Path, progress: Progress = no_progress
-) -> Reference:
+def reference(setup: Setup, folder: Path, progress: Progress = no_progress) -> Reference:
     """The closed form where there is one; else H from 64 times the rays, or from as many as can be waited for.
 
     Such a reference is kept in `folder`. Raises InputError where it takes a backend that does not work here.
     """
-    simulated = without_negligible_effects(scene, camera)[0]
-    flat = image.ravel()
-    if has_closed_form(simulated):
-        kept = resolved(scene, camera.shape)
+    scene, camera, flat = setup.scene, setup.camera, setup.image.ravel()
+    if setup.has_closed_form:
+        kept = setup.resolved
         perfect = camera.has_box_footprints and camera.tolerance is None
-        model = ideal_model(kept, camera) if perfect else exact_model(kept, camera, true_matrix(simulated), "true")
+        model = (
+            ideal_model(kept, camera) if perfect else exact_model(kept, camera, true_matrix(setup.simulated), "true")
+        )
         return Reference(model, model.forward(flat), np.zeros(camera.measurements), "the closed form")
     samples = min(TRUER * MOST_SAMPLES, MOST_RAYS // camera.measurements)
     told = with_calibration(
         scene, "transport", "multijitter", "auto", samples, repeat_seed(scene.render.seed, "right", 0)
     )
-    model, _ = cached_model(folder / REFERENCE, told, camera, progress)
+    model, _ = cached_model(folder / REFERENCE, replace(setup, scene=told), progress)
     return Reference(
         model, model.forward(flat), model.variance_from_model(flat), f"a reference of {model.record['samples']} samples"
     )
@@ -108,25 +95,26 @@ def work_of(samples: int, sampler: Sampler) -> Plan:
     return plan(samples, sampler) if samples >= FEWEST_PASSES else Plan(1, fitting(sampler, samples))
 
 
-def foreseen_samples(scene: Scene, camera: Camera, image: NDArray[np.float64], right: Reference) -> int:
+def foreseen_samples(setup: Setup, right: Reference) -> int:
     """About how many samples a pixel 'auto' will take: those of a first round where grids fit the edges of pixels of f.
 
     Elsewhere as many as leave a quarter of the variance that is allowed, if a pixel's rays scatter like the image.
     Raises InputError where there is no noise, so that 'auto' cannot tell when it is enough.
     """
-    allowed = float(np.nanmean(allowed_variance(scene, camera)(right.light)))
-    sampler = scene.render.sampler
+    camera, sampler = setup.camera, setup.scene.render.sampler
+    allowed = float(np.nanmean(allowed_variance(setup)(right.light)))
     if camera.has_box_footprints and sampler in JITTERED:
         return max(on_grid(LEAST, sampler, cells_of(kind.ratio)).total for kind in camera.types)
-    ratio = float(image.var()) / (FEWEST_PASSES * AIM * allowed)
+    ratio = float(setup.image.var()) / (FEWEST_PASSES * AIM * allowed)
     return int(min(max(FEWEST_PASSES * ratio ** (1 / EXPONENTS.get(sampler, STRATIFIED)), LEAST), MOST))
 
 
-def rendered(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Rendering | AdaptiveRendering:
+def rendered(setup: Setup) -> Rendering | AdaptiveRendering:
     """The light alone, as `run` renders it."""
-    if scene.render.samples == "auto":
-        return render_until(scene, camera, image)
-    return light(scene, camera, image, work=work_of(scene.render.sample_count, scene.render.sampler))
+    render = setup.scene.render
+    if render.samples == "auto":
+        return render_until(setup)
+    return light(setup, work=work_of(render.sample_count, render.sampler))
 
 
 def error_of_light(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:
@@ -135,23 +123,18 @@ def error_of_light(rendering: Rendering | AdaptiveRendering, right: Reference) -
     return float(np.sqrt(max(np.nanmean(squares), 0.0)))
 
 
-def stack_of(scene: Scene, camera: Camera, rendering: Rendering | AdaptiveRendering) -> Stack:
+def stack_of(setup: Setup, rendering: Rendering | AdaptiveRendering) -> Stack:
     """A rendering of several passes as the scene's sensor records it, with noise by the scene's seed."""
-    return exposed(scene, camera, rendering.mean, rendering.stated(camera), {})
+    return exposed(setup, rendering.mean, rendering.stated(setup.camera), {})
 
 
-def stack_of_light(scene: Scene, camera: Camera, light: Vector, right: Reference) -> Stack:
+def stack_of_light(setup: Setup, light: Vector, right: Reference) -> Stack:
     """Light, (M,), as the scene's sensor records it; every pixel is said to be as far from right as all are on average.
 
     Of exact light that is not at all.
     """
     away = float(np.nanmean(np.square(light - right.light)))
-    return exposed(scene, camera, light, np.broadcast_to(away, light.shape), {})
-
-
-def calibrated(scene: Scene, camera: Camera, judge: StoppingRule | None = None) -> Model:
-    """H as `run` finds it; `judge` says when 'auto' is enough."""
-    return calibrate(scene, camera, judge=judge)
+    return exposed(setup, light, np.broadcast_to(away, light.shape), {})
 
 
 def error_of_model(model: Model, right: Reference) -> float:

@@ -24,7 +24,8 @@ from ommatid.runtime.versions import versions
 from ..camera import Camera
 from ..constants import WHITE
 from ..model import RECORDED, Model
-from ..scene import Scene, resolved
+from ..scene import Scene
+from ..setup import Setup
 from .assignment import FootprintAssignment, unrecorded
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
 from .photon_transfer import background, photon_transfer, rounding
@@ -72,8 +73,7 @@ class RecordedCalibration:
 
 
 def from_recorded_points(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     images: Sequence[Path],
     settings: AcquisitionSettings,
     places: Path | None = None,
@@ -85,7 +85,7 @@ def from_recorded_points(
     places : a CSV file of image, row, column;  None: one image per pixel of f by rows, the whole sweep once or more
     Raises InputError for frames that do not fit the camera, positions outside f, and pixels of f without a source.
     """
-    start = perf_counter()
+    scene, camera, start = setup.scene, setup.camera, perf_counter()
     frames = read_frames(camera, images, settings, mosaics=True)
     if scene.sensor is not None and (frames.dark is None or frames.flat is None):
         raise InputError(
@@ -121,9 +121,9 @@ def from_recorded_points(
         "versions": versions("scipy", "scikit-image", "OpenEXR"),
     }
     batches = np.zeros((0, entries.mean.size), dtype=np.float32)
-    stored = resolved(scene, camera.shape)
     once = scene.sensor is None and not (entries.count > 1).any()
-    return RecordedCalibration(Model(stored, camera, matrix, variance, batches, record), frames, stray, once)
+    model = Model(setup.resolved, camera, matrix, variance, batches, record)
+    return RecordedCalibration(model, frames, stray, once)
 
 
 def _check_complete(camera: Camera, positions: list[IntArray], places: Path | None) -> None:

@@ -13,24 +13,21 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import fingerprint
 from ommatid.runtime.versions import versions
 
-from ..camera import Camera
 from ..recording import Recording
-from ..scene import Scene, resolved
+from ..setup import Setup
 from ..stack import Stack, stack_from_recording
 from ..tables.sensor import SensorTable
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
 
 
-def import_stack(
-    scene: Scene, camera: Camera, images: Sequence[Path], settings: AcquisitionSettings
-) -> tuple[Stack, RecordedFrames]:
+def import_stack(setup: Setup, images: Sequence[Path], settings: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:
     """Read recorded images as a stack; also return the frames.
 
     images : one mosaic, or one picture per sub-imager in the order of measurements
     The stack's variance, which is that of a rendering, is 0; dead pixels are NaN. Raises InputError for images that do
     not fit the camera.
     """
-    start = perf_counter()
+    camera, start = setup.camera, perf_counter()
     frames = read_frames(camera, images, settings, mosaics=False)
     made_from = {"camera": camera.describe(), "bench": settings.describe(), "source": frames.sources}
     record = {
@@ -40,10 +37,10 @@ def import_stack(
         "seconds": perf_counter() - start,
         "versions": versions("scikit-image", "OpenEXR"),
     }
-    stored, zeros = resolved(scene, camera.shape), np.zeros(camera.measurements)
+    stored, zeros = setup.resolved, np.zeros(camera.measurements)
     if stored.sensor is None:
         return Stack(stored, camera, _as_float32(frames.values()[0]), zeros, record), frames
-    recording = _recording(scene.source, stored.sensor, frames)
+    recording = _recording(stored.source, stored.sensor, frames)
     stored = stored.model_copy(update={"sensor": recording.sensor})
     return stack_from_recording(stored, camera, recording, zeros, record), frames
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ommatid.bench.bench import curves, rows
 from ommatid.bench.jobs import SAMPLERS, Subject, jobs
-from ommatid.bench.reference import has_closed_form, reference, work_of
+from ommatid.bench.reference import reference, work_of
 from ommatid.bench.resources import FORGET, Cost, measure_cost
 from ommatid.bench.scheduler import Job, Journal, Repeat, cell_from_repeats, measure, name_of
 from ommatid.bench.slopes import Slope, excess, pareto, recommend, slope
@@ -136,7 +136,7 @@ def test_what_takes_as_many_as_needed_is_recommended_as_a_scene_asks_for_it() ->
     half = recommend([*counted, needed[0], estimate], 2.0)
     assert (half["render"]["samples"], half["calibrate"]["samples"]) == (AUTO, 256)
     assert "calibrate, transport, multijitter, would take about 1000 samples" in half["why"]
-    of_tile = opened(GALLERY / "tile19.toml")[1]
+    of_tile = opened(GALLERY / "tile19.toml").camera
     assert curves([*counted, *needed], of_tile) == curves(counted, of_tile)
 
 
@@ -242,8 +242,8 @@ def test_write_then_read_is_the_identity(one: Cell) -> None:
 @pytest.fixture
 def subject(here: Path) -> Subject:
     """What is measured of the tiny scene."""
-    scene, camera, image = opened(here / "tiny.toml")
-    return Subject(scene, camera, image, reference(scene, camera, image, here))
+    setup = opened(here / "tiny.toml")
+    return Subject(setup, reference(setup, here))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -296,8 +296,8 @@ def test_as_many_samples_as_are_needed_leave_the_noise_alone(subject: Subject) -
 
 
 def test_without_noise_no_cell_takes_as_many_as_needed(here: Path) -> None:
-    scene, camera, image = opened(here / "tiny.toml", ["noise="])
-    told, left_out = jobs(Subject(scene, camera, image, reference(scene, camera, image, here)))
+    setup = opened(here / "tiny.toml", ["noise="])
+    told, left_out = jobs(Subject(setup, reference(setup, here)))
     assert all(job.setting != AUTO for job in told)
     assert ["noise.variance above 0" in one.why for one in left_out if "auto" in one.what] == [True]
 
@@ -311,8 +311,7 @@ def test_light_and_h_of_a_cell_are_those_of_no_run(subject: Subject) -> None:
 
 @pytest.mark.parametrize(("name", "whether"), [("tile19", True), ("planoconvex", False), ("misaligned", True)])
 def test_which_cameras_have_a_closed_form(name: str, whether: bool) -> None:
-    _, camera, _ = opened(GALLERY / f"{name}.toml")
-    assert has_closed_form(camera) == whether
+    assert opened(GALLERY / f"{name}.toml").has_closed_form == whether
 
 
 def check(table: BenchTable, document: dict[str, object]) -> None:

@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ommatid.batch.remote import RunObserver
 from ommatid.pipeline import stages
 from ommatid.reconstruct.output import result_files
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.reconstruct.restore import Reconstruction
 from ommatid.runtime.arrays import FloatArray
@@ -46,7 +47,7 @@ class Result:
     """A reconstructed image with its posterior standard deviation.
 
     image, deviation : (rows, columns);  truth : (rows, columns), None where it is not known
-    description : the content of run.json
+    summary : the content of run.json
     reconstruction : the estimator's own record, with its budget of errors and `region`; None for a run read from files
     """
 
@@ -55,18 +56,18 @@ class Result:
     image: FloatArray
     deviation: FloatArray
     truth: FloatArray | None
-    description: dict[str, Any]
+    summary: RunReport
     reconstruction: Reconstruction | None = None
 
     @property
     def expected_mse(self) -> float:
         """Expected mean squared error per pixel (Wood et al. 2005, Eq. 5), in squared units of the target."""
-        return float(self.description["error"]["predicted_mse"])
+        return self.summary.error.predicted_mse
 
     @property
     def mse(self) -> float | None:
         """Measured mean squared error per pixel, None without the truth."""
-        return self.description["error"].get("mse")
+        return self.summary.error.mse
 
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML page, and return its path. Raises InputError or MachineError."""
@@ -77,7 +78,7 @@ class Result:
 
         run = Run(
             folder=Path(path).parent,
-            description=self.description,
+            description=self.summary,
             stack=self.stack,
             model=self.model,
             estimate=self.image.astype(np.float32),
@@ -85,7 +86,7 @@ class Result:
             truth=None if self.truth is None else self.truth.astype(np.float32),
         )
         ideal = partial(matrix_as_designed, self.model.camera)
-        write_text(Path(path), page(run, ideal, None, self.description["fingerprint"]))
+        write_text(Path(path), page(run, ideal, None, self.summary.fingerprint))
         return Path(path)
 
     def to_xarray(self) -> xarray.Dataset:
@@ -115,7 +116,7 @@ class Result:
         )
 
     def _repr_html_(self) -> str:
-        return notebook.result_html(self.stack.scene.title, self.image, self.deviation, self.truth, self.description)
+        return notebook.result_html(self.stack.scene.title, self.image, self.deviation, self.truth, self.summary)
 
 
 def read_scene(path: str | Path, set: str | Sequence[str] = (), lens: str | Sequence[str] = ()) -> Scene:
@@ -223,11 +224,11 @@ def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> 
     if flat is not None and flat.size != model.unknowns:
         raise InputError(f"truth: expected {model.camera.rows} x {model.camera.columns} pixels, got {flat.size}")
     names = Path("the stack"), Path("the model")
-    outcome, description = result_files.reconstruct(stack, model, flat, names)
-    description = {"fingerprint": result_files.made_from(stack, model), **description}
+    outcome, report = result_files.reconstruct(stack, model, flat, names)
+    report = report.with_changes(fingerprint=result_files.fingerprint_of(stack, model))
     image, deviation = outcome.estimate.reshape(outcome.shape), np.sqrt(outcome.expected.variance)
     shaped = None if flat is None else flat.reshape(outcome.shape)
-    return Result(stack, model, image, deviation.reshape(outcome.shape), shaped, description, outcome)
+    return Result(stack, model, image, deviation.reshape(outcome.shape), shaped, report, outcome)
 
 
 def run(scene: Scene | str | Path, folder: str | Path) -> Result:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -69,20 +70,18 @@ def result_html(
     image: NDArray[np.float64],
     deviation: NDArray[np.float64],
     truth: NDArray[np.float64] | None,
-    description: dict[str, Any],
+    summary: RunReport,
 ) -> str:
     """Show the image, its posterior standard deviation and, where the truth is known, its error: (rows, columns)."""
     values = 0.0, 255.0
     pictures: list[Picture] = [("image", image, values), ("posterior standard deviation", deviation, None)]
-    error = description["error"]
-    rows = [("expected mean squared error", f"{error['predicted_mse']:.4g}")]
+    rows = [("expected mean squared error", f"{summary.error.predicted_mse:.4g}")]
     if truth is not None:
         pictures = [("truth", truth, values), *pictures, ("error", image - truth, None)]
-        rows.append(("measured mean squared error", f"{error['mse']:.4g}"))
-    solver, freedom = description["solver"], description["diagnostics"]["degrees_of_freedom"]
+        rows.append(("measured mean squared error", f"{summary.error.mse:.4g}"))
     rows += [
-        ("degrees of freedom", f"{freedom:.4g} of {image.size}"),
-        ("method", f"{solver['way']}, {solver['method']}"),
+        ("degrees of freedom", f"{summary.diagnostics.degrees_of_freedom:.4g} of {image.size}"),
+        ("method", f"{summary.solver.way}, {summary.solver.method}"),
     ]
     return _html(title, pictures, rows)
 

@@ -7,10 +7,8 @@ of H; reconstruct, over pixels of f in posterior standard deviations of each.
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import asdict, dataclass, fields
-from io import StringIO
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,7 +16,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import write_text
+from ommatid.runtime.files import write_csv, write_text
 
 JSON, CSV = "bench.json", "bench.csv"
 ALONE = "alone"  # the setting of a dense form without refinement, which no scene can ask for
@@ -148,7 +146,9 @@ def bench_files(folder: Path) -> tuple[Path, Path]:
 
 def write(folder: Path, table: BenchTable) -> None:
     """Write bench.csv, then bench.json, which stands for both. Raises InputError or DeniedError."""
-    write_text(folder / CSV, rows_of(table.cells))
+    rows = [row_of(cell) for cell in table.cells]
+    columns = list(rows[0]) if rows else [field.name for field in fields(Cell)]
+    write_csv(folder / CSV, columns, (row.values() for row in rows))
     write_text(folder / JSON, json.dumps(table.describe(), indent=2, allow_nan=False) + "\n")
 
 
@@ -167,18 +167,8 @@ def cell_of(line: str) -> Cell:
     return TypeAdapter(Cell).validate_json(line, strict=True)
 
 
-def rows_of(cells: tuple[Cell, ...]) -> str:
-    """One row a cell, columns by name; quantities with quantiles have three columns, absent ones stay empty."""
-    stream = StringIO()
-    rows = [_row(cell) for cell in cells]
-    names = list(rows[0]) if rows else [field.name for field in fields(Cell)]
-    writer = csv.DictWriter(stream, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
-
-
-def _row(cell: Cell) -> dict[str, Any]:
+def row_of(cell: Cell) -> dict[str, Any]:
+    """Columns by name; quantities with quantiles have three columns, absent ones stay empty."""
     row: dict[str, Any] = {}
     for field in fields(Cell):
         value = getattr(cell, field.name)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.gallery import gallery_names
+from ommatid.scenes.tables.gallery import gallery_names
 
 if TYPE_CHECKING:
     from ommatid.scenes.hardware.frames import AcquisitionSettings

@@ -39,10 +39,12 @@ def predict(
         return
     if folder is not None:
         raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
-    from ommatid.analysis.predict import describe_prediction, predict_file
-    from ommatid.analysis.sections import prediction_sections
+    from ommatid.pipeline.descriptions import describe_prediction, predict_with_light
+    from ommatid.pipeline.sections import prediction_sections
+    from ommatid.scenes.scene import read
 
-    described, prediction, light = predict_file(scene, *asked)
+    described = read(scene, *asked)
+    prediction, light = predict_with_light(described)
     sections = prediction_sections(described, prediction, light)
     output.print_result(describe_prediction(prediction, light), sections, as_json)
 
@@ -58,14 +60,14 @@ def design(
 
     Ranks magnifications by the expected error (Eq. 5) with each.
     """
-    from ommatid.analysis.candidates import magnifications
-    from ommatid.analysis.design import compare
+    from ommatid.analysis.design import magnifications
+    from ommatid.pipeline.descriptions import compare_lens_types
     from ommatid.scenes.scene import read
 
     wanted = magnifications(candidates)
     described = read(scene, options.changes(sets), options.lens_names(lens))
     with output.progress_bar("design") as progress:
-        comparison = compare(described, wanted, progress)
+        comparison = compare_lens_types(described, wanted, progress)
     title = f"{described.title or scene.stem}: the expected error with one more lens type"
     output.print_result(comparison.describe(), [(title, comparison.rows())], as_json)
 

@@ -46,5 +46,5 @@ def reconstruct(
 
     asked = options.changes(sets), options.lens_names(lens), options.region(region)
     with output.progress_bar("reconstruct") as progress:
-        description = reconstruct_files(stack, model, file, *asked, progress, scheduler, workers)
-    output.print_result({"file": str(file), **description}, [(str(file), run_table.rows(description))], as_json)
+        report = reconstruct_files(stack, model, file, *asked, progress, scheduler, workers)
+    output.print_result({"file": str(file), **report.plain()}, [(str(file), run_table.rows(report))], as_json)

@@ -42,12 +42,12 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
-    from ommatid.analysis.sections import run_sections
     from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
+    from ommatid.pipeline.sections import run_sections
     from ommatid.pipeline.time_budget import stages_within
 
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
-        output.print_tables([] if as_json else run_sections(member, description))
+        output.print_tables([] if as_json else run_sections(member.folder, description))
         return description
 
     asked = changes(sets, complete), lens_names(lens)

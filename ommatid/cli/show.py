@@ -17,8 +17,8 @@ def show(
     scene: SceneFile, sets: Sets = None, lens: Lenses = "", complete: Complete = False, as_json: Json = False
 ) -> None:
     """Show the geometry, the plan, and the skipped effects."""
-    from ommatid.analysis.sections import scene_sections
-    from ommatid.analysis.summary import describe_scene
+    from ommatid.pipeline.descriptions import describe_scene
+    from ommatid.pipeline.sections import scene_sections
     from ommatid.scenes.scene import read
 
     description = describe_scene(read(scene, options.changes(sets, complete), options.lens_names(lens)))
@@ -37,7 +37,7 @@ def export(scene: SceneFile, file: Output, sets: Sets = None, lens: Lenses = "",
 
 def init(file: NewFile, as_json: Json = False) -> None:
     """Write a scene file to start from."""
-    from ommatid.scenes.gallery import write_starter
+    from ommatid.scenes.tables.gallery import write_starter
 
     write_starter(file)
     output.say(f"{file}: written; next: ommatid run {file} -o out")
@@ -54,7 +54,8 @@ def schema(as_json: Json = False) -> None:
 
 def doctor(as_json: Json = False) -> None:
     """Test the rendering backends, and say how to repair them."""
-    from ommatid.analysis.backends import describe_backends, sections
+    from ommatid.pipeline.descriptions import describe_backends
+    from ommatid.pipeline.sections import backend_sections
 
     description = describe_backends()
-    output.print_result(description, sections(description), as_json, description["advice"])
+    output.print_result(description, backend_sections(description), as_json, description["advice"])

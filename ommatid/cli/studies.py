@@ -37,8 +37,8 @@ def paper(
 def stability(folder: Folder = Path("stability"), as_json: Json = False) -> None:
     """Count correct digits on stiff and extreme cases, against exact arithmetic."""
     from ommatid.scenes.camera import derive
-    from ommatid.scenes.gallery import GALLERY
     from ommatid.scenes.scene import read
+    from ommatid.scenes.tables.gallery import GALLERY
     from ommatid.simulate.ideal import ideal_matrix
     from ommatid.stability.cases import CHANGES, LENSES
     from ommatid.stability.stability import rows, write_stability

@@ -5,7 +5,6 @@ Where the batch is a sweep, `sweep.json` beside it lists the folders with the `v
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -14,15 +13,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from ommatid.batch.sweep_row import NUMBERS, read_rows
+from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 
-from .cached import REPORT, own_files, stamp_of
-from .data import run_description
+from .cached import REPORT, own_files, read_stamp
 
-INDEX, SWEEP = "index.html", "sweep.json"
+INDEX = "index.html"
 
 
 @dataclass(frozen=True)
@@ -71,55 +71,52 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
         return False
     more = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
     found = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *more)]
-    swept = sweep_of(output / SWEEP)
+    swept = sweep_of(output / NUMBERS)
     told = [[asdict(entry) for entry in found], None if swept is None else asdict(swept)]
     stamp = fingerprint([told, versions("bokeh"), own_files()])
-    if stamp_of(output / INDEX) == stamp:
-        return False
-    write_text(output / INDEX, page(found, swept, output.resolve().name, stamp))
-    return True
+    name = output.resolve().name
+    return cached(output / INDEX, stamp, read_stamp, lambda: page(found, swept, name, stamp), write_text)[1]
 
 
 def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
         return BatchEntry(folder.name, folder.name, failure=failure)
     try:
-        run = run_description(folder)
-        error, stages = run["error"], run["stages"]
-        given: dict[str, float] = error.get("expected_given_truth") or {}
+        run = run_json.read(folder)
+        given = run.error.expected_given_truth
         return BatchEntry(
             name=folder.name,
-            title=run["title"] or folder.name,
+            title=run.title or folder.name,
             link=quote(f"{folder.name}/{REPORT}"),
             picture=quote(f"{folder.name}/{PICTURE}"),
-            mse=error.get("mse"),
-            predicted=error["predicted_mse"],
-            low=given.get("low"),
-            high=given.get("high"),
-            psnr=error.get("psnr"),
-            ssim=error.get("ssim"),
-            seconds=sum(stage["seconds"] for stage in stages.values()),
+            mse=run.error.mse,
+            predicted=run.error.predicted_mse,
+            low=None if given is None else given.low,
+            high=None if given is None else given.high,
+            psnr=run.error.psnr,
+            ssim=run.error.ssim,
+            seconds=sum(stage.seconds for stage in run.stages.values()),
         )
-    except (InputError, KeyError, TypeError, AttributeError) as wrong:
+    except InputError as wrong:
         return BatchEntry(folder.name, folder.name, failure=str(wrong))
 
 
 def sweep_of(path: Path) -> SweepTable | None:
     """What sweep.json tells; None where there is none, or none that can be read."""
     try:
-        listed: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-        keys = tuple(dict.fromkeys(key for one in listed for key in one["values"]))
-        rows = [
-            (
-                "" if "failed" in one else quote(f"{Path(one['folder']).name}/{REPORT}"),
-                tuple(str(one["values"].get(key, "")) for key in keys),
-                one.get("mse"),
-                one.get("predicted_mse"),
-            )
-            for one in listed
-        ]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        listed = read_rows(path)
+    except InputError:
         return None
+    keys = tuple(dict.fromkeys(key for row in listed for key in row.values))
+    rows = [
+        (
+            "" if row.failed is not None or row.folder is None else quote(f"{Path(row.folder).name}/{REPORT}"),
+            tuple(str(row.values.get(key, "")) for key in keys),
+            row.mse,
+            row.predicted_mse,
+        )
+        for row in listed
+    ]
     return SweepTable(keys, rows) if keys and rows else None
 
 

@@ -6,12 +6,13 @@ import hashlib
 import re
 from pathlib import Path
 
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.reconstruct.output import run_json
+from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
-from .data import read_run, run_description
+from .data import read_run
 from .point_response import Ideal
 from .time_curves import bench_of
 
@@ -32,24 +33,21 @@ def cached_page(
 
     recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
     bench = bench_of(folder, recorded.camera.describe())
-    made_from = fingerprint([run_description(folder), bench, versions("bokeh"), own_files()])
-    path = folder / REPORT
-    if stamp_of(path) == made_from:
-        return False
-    from .document import page
+    made_from = fingerprint([run_json.read(folder).plain(), bench, versions("bokeh"), own_files()])
 
-    write_text(path, page(read_run(folder, recorded, calibrated), ideal, bench, made_from))
-    return True
+    def make() -> str:
+        from .document import page
+
+        return page(read_run(folder, recorded, calibrated), ideal, bench, made_from)
+
+    return cached(folder / REPORT, made_from, read_stamp, make, write_text)[1]
 
 
-def stamp_of(path: Path) -> str:
-    """Of a page on disk; empty where there is none of ours, or half of one."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return ""
+def read_stamp(path: Path) -> tuple[None, str | None]:
+    """The fingerprint of a page on disk; None where it is none of ours, or half of one."""
+    text = path.read_text(encoding="utf-8")
     found = re.search(r'<meta name="ommatid" content="([0-9a-f]+)">', text[:BEGIN])
-    return found[1] if found and text.rstrip().endswith("</html>") else ""
+    return None, found[1] if found and text.rstrip().endswith("</html>") else None
 
 
 def own_files() -> str:

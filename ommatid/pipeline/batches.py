@@ -11,7 +11,8 @@ from typing import Any
 from ommatid.batch import sweep
 from ommatid.batch.batch import Batch, Description, Member
 from ommatid.batch.remote import RunObserver, Stages
-from ommatid.batch.sweep_table import lines, summary, write_sweep
+from ommatid.batch.sweep_row import summary
+from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.page.batch_index import cached_index
 
 from .stages import facts, fitting, member_opened

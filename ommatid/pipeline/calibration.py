@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ommatid.analysis.recording_warnings import calibration_warnings
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.files import check_output
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file
-from ommatid.scenes.hardware import point_sources, stack_import
 from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
+from ommatid.scenes.hardware.point_sources import from_recorded_points
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
@@ -89,9 +90,6 @@ def calibrate_file(
 
 def _from_points(setup: Setup, output: Path, recording: PointRecording) -> CalibrationOutcome:
     check_output(output, *recording.files)
-    outcome = point_sources.from_recorded_points(
-        setup, recording.images, recording.settings, recording.positions, recording.value
-    )
+    outcome = from_recorded_points(setup, recording.images, recording.settings, recording.positions, recording.value)
     model_file.write(output, outcome.model)
-    warnings = [*stack_import.dead(outcome.frames), *point_sources.warnings(outcome)]
-    return CalibrationOutcome(outcome.model, True, warnings)
+    return CalibrationOutcome(outcome.model, True, calibration_warnings(outcome))

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ommatid.analysis.recording_warnings import import_warnings
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import check_output
 from ommatid.scenes import stack
 from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
-from ommatid.scenes.hardware.stack_import import import_stack, warnings
+from ommatid.scenes.hardware.stack_import import import_stack
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
@@ -53,4 +54,4 @@ def import_file(
     whole, recorded = import_stack(setup, images, settings)
     kept = whole.restrict(tuple(lenses)) if lenses else whole
     stack.write(output, kept)
-    return ImportOutcome(kept, recorded.layout.beside, warnings(recorded))
+    return ImportOutcome(kept, recorded.layout.beside, import_warnings(recorded))

@@ -6,9 +6,9 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from ommatid.reconstruct.output import figures, result_files, run_json
+from ommatid.reconstruct.output import figures, result_files
+from ommatid.reconstruct.output.run_json import RegionReport, RunReport
 from ommatid.reconstruct.restore import check_region
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import check_output
@@ -33,10 +33,10 @@ def reconstruct_files(
     progress: Progress,
     scheduler: str = "",
     workers: int | None = None,
-) -> dict[str, Any]:
-    """Reconstruct a stack with a model, write the estimate (OpenEXR) and its picture, and describe it as run.json does.
+) -> RunReport:
+    """Reconstruct a stack with a model, and write the estimate (OpenEXR) and its picture.
 
-    region : row and column of its corner, its rows and columns; its mean is added to the description
+    Returns the content of run.json, with the mean of a `region`: row and column of its corner, its rows and columns.
     Raises InputError for wrong files and options, MachineError for a full disk.
     """
     if output.suffix == ".png":
@@ -48,16 +48,17 @@ def reconstruct_files(
         recorded, calibrated = recorded.restrict(tuple(lenses)), calibrated.restrict(tuple(lenses))
     if region is not None:
         check_region(*region, recorded.camera.shape)
-    recorded = result_files.changed(recorded, list(changes), stack)
+    recorded = result_files.with_estimator_changes(recorded, list(changes), stack)
     truth = result_files.truth_beside(stack, recorded)
     with _tile_workers(scheduler, workers) as pool:
-        result, description = result_files.reconstruct(recorded, calibrated, truth, (stack, model), pool, progress)
+        result, report = result_files.reconstruct(recorded, calibrated, truth, (stack, model), pool, progress)
     if region is not None:
         mean, deviation = result.region(*region)
-        description["region"] = {"corner": region[0], "size": region[1], "mean": mean, "deviation": deviation}
-    run_json.write_estimate(output, result, {"title": recorded.scene.title})
+        average = RegionReport(corner=region[0], size=region[1], mean=mean, deviation=deviation)
+        report = report.with_changes(region=average)
+    result_files.write_estimate(output, result, {"title": recorded.scene.title})
     figures.write_estimate(output.with_suffix(".png"), result.estimate.reshape(result.shape))
-    return description
+    return report
 
 
 @contextmanager

@@ -20,10 +20,10 @@ from ommatid.bench.table import BenchTable, Cell, Quantiles
 from ommatid.pipeline import bench_curves
 from ommatid.pipeline.time_allocation import NEGLIGIBLE, ErrorCurve, allocate_time, error_curve
 from ommatid.pipeline.time_budget import KEYS, run_within, shared_time
-from ommatid.reconstruct.output.time_spent import spent
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.output.time_spent import time_spent
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
-from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.units import duration
@@ -144,7 +144,7 @@ def test_scenes_that_share_a_time_are_repeated_too(tmp_path: Path, monkeypatch: 
 
     def done(seconds: float, which: list[Path], later: float) -> list[dict[str, Any]]:
         does = shared_time(seconds, which, 0.0, lambda _: None, ticking(later))
-        return [does(one, derive(one), load(one), folder, watch)["spent"] for folder in which if folder.name != "fails"]
+        return [does(Setup.from_scene(one), folder, watch)["spent"] for folder in which if folder.name != "fails"]
 
     for folder in folders[1:]:
         folder.mkdir()
@@ -246,7 +246,8 @@ def test_every_run_says_what_more_would_buy(here: Path, ommatid: Command) -> Non
     assert found["noise_alone"] == pytest.approx(
         error["predicted_mse"] - error["budget"]["rendering"] - error["budget"]["calibration"]
     )
-    assert spent(run, calibrated=True) == found
+    report = RunReport.model_validate(run)
+    assert time_spent(report.stages, report.error, calibrated=True) == report.spent
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("30s", 30.0), ("2 min", 120.0), ("0.5 h", 1800.0)])

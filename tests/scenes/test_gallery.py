@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.gallery import GALLERY, gallery_names, write_starter
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.gallery import GALLERY, gallery_names, write_starter
 
 from ..conftest import TINY, Command
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from difflib import get_close_matches
 from pathlib import Path
 
-GALLERY = Path(__file__).parent
+GALLERY = Path(__file__).parents[1]
 STARTER = "starter"
 
 

@@ -6,12 +6,11 @@ error of the reconstruction, `mse`, that this brings, both with their median.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ommatid.bench.table import bench_files
+from ommatid.bench.table import bench_tables
 
 from . import plots
 from .data import Run
@@ -40,16 +39,8 @@ class TimeCurves:
 
 
 def bench_of(folder: Path, camera: dict[str, Any]) -> dict[str, Any] | None:
-    """bench.json in a run's folder or the one above, if it is whole and of the same camera; else None."""
-    for path in bench_files(folder):
-        try:
-            found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            same = found["camera"] == json.loads(json.dumps(camera))
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        if same:
-            return found
-    return None
+    """Return bench.json of the same camera in a run's folder or in its parent, None if there is none."""
+    return next((table.describe() for table in bench_tables(folder, camera)), None)
 
 
 def time_curves(run: Run, bench: dict[str, Any] | None) -> TimeCurves | None:

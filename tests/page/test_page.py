@@ -28,7 +28,7 @@ from ommatid.page import batch_index, data, error_groups, point_response, sensor
 from ommatid.page.cached import cached_page
 from ommatid.page.document import page
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import derive
+from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats import exr
 from ommatid.scenes.hardware import stack_import
 from ommatid.scenes.hardware.frames import AcquisitionSettings
@@ -37,6 +37,7 @@ from ommatid.scenes.scene import parse
 from ommatid.scenes.tables.sensor import SensorTable
 from ommatid.simulate.ideal import ideal_matrix, matrix_as_designed
 
+from ..bench.tables import bench_table, cell, exactly
 from ..conftest import Command
 from ..examples import familywise, scene
 from .runs import F, lettered, seen, synthetic
@@ -454,16 +455,14 @@ def test_nothing_is_faster_and_better_than_the_front(points: list[time_curves.Ti
         assert not any(other.seconds < one.seconds and other.mse <= one.mse for other in points)
 
 
-def bench(camera: dict[str, Any]) -> dict[str, Any]:
-    def cell(stage: str, seconds: float, mse: float | None, samples: int) -> dict[str, Any]:
-        of = {"low": seconds, "median": seconds, "high": seconds}
-        brought = None if mse is None else {"low": mse, "median": mse, "high": mse}
-        return {"stage": stage, "way": "multijitter", "variant": None, "samples": samples, "setting": "",
-                "repeats": 1, "error": of, "seconds": of, "memory": None, "mse": brought}  # fmt: skip
-
-    cells = [cell("render", 0.1 * n, 1 / n, n) for n in (1, 2, 4)]
-    cells += [cell("reconstruct", 0.01, 0.5, 0), cell("calibrate", 1.0, None, 16)]
-    return {"camera": camera, "cells": cells, "curves": [], "recommended": {"why": "Four samples reach the floor."}}
+def bench(camera: Camera) -> dict[str, Any]:
+    """Content of a bench.json with three renderings, an estimate, and a calibration without a known error."""
+    cells = [
+        cell("render", way="multijitter", samples=n, seconds=exactly(0.1 * n), mse=exactly(1 / n)) for n in (1, 2, 4)
+    ]
+    cells.append(cell("reconstruct", way="frame", samples=None, seconds=exactly(0.01), mse=exactly(0.5)))
+    cells.append(cell("calibrate", way="points, multijitter", mse=None))
+    return bench_table(camera, cells, why="Four samples reach the floor.").describe()
 
 
 def test_a_bench_of_the_same_camera_is_drawn_and_of_another_is_not(drawn: data.Run, tmp_path: Path) -> None:
@@ -471,14 +470,15 @@ def test_a_bench_of_the_same_camera_is_drawn_and_of_another_is_not(drawn: data.R
     (tmp_path / "run").mkdir()
     camera = run.stack.camera.describe()
     assert "There is no bench" in page(run, None, time_curves.bench_of(tmp_path / "run", camera), "0")
-    other = {**bench(camera), "camera": {**camera, "target.distance": 7.0}}
+    table = bench(run.stack.camera)
+    other = {**table, "camera": {**camera, "target.distance": 7.0}}
     (tmp_path / "bench.json").write_text(json.dumps(other), encoding="utf-8")
     assert time_curves.bench_of(tmp_path / "run", camera) is None
-    (tmp_path / "bench.json").write_text(json.dumps(bench(camera)), encoding="utf-8")
+    (tmp_path / "bench.json").write_text(json.dumps(table), encoding="utf-8")
     text = page(run, None, time_curves.bench_of(tmp_path / "run", camera), "0")
     assert 'id="plot-effort"' in text
     assert "Four samples reach the floor." in text
-    curves = time_curves.time_curves(run, bench(camera))
+    curves = time_curves.time_curves(run, table)
     assert curves is not None
     assert {point.stage for point in curves.run} == {"render", "calibrate", "reconstruct"}
     assert len(curves.points) == 4, "what brings no known error is not drawn"
@@ -549,8 +549,8 @@ def test_a_page_is_kept_until_what_it_shows_changes(finished: Path, tmp_path: Pa
     (folder / "run.json").write_text(json.dumps({**told, "title": "Another"}), encoding="utf-8")
     assert cached_page(folder, None)
     assert not cached_page(folder, None)
-    camera = data.read_run(folder).stack.camera.describe()
-    (folder / "bench.json").write_text(json.dumps(bench(camera)), encoding="utf-8")
+    table = bench(data.read_run(folder).stack.camera)
+    (folder / "bench.json").write_text(json.dumps(table), encoding="utf-8")
     assert cached_page(folder, None)
     assert 'id="plot-effort"' in (folder / "report.html").read_text(encoding="utf-8")
 

@@ -14,9 +14,9 @@ from ommatid.reconstruct.noise import Noise, everywhere, known_noise, usable_pix
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibration.stopping_rule import StoppingRule
 
@@ -43,12 +43,13 @@ def for_stack(stack: Stack) -> StoppingRule:
     return StoppingRule(adds, fingerprint(["stack", known, _told(stack.scene)]), "the error budget of this stack")
 
 
-def for_prior(scene: Scene, camera: Camera) -> StoppingRule:
+def for_prior(setup: Setup) -> StoppingRule:
     """By Eq. 5 for images drawn from the prior, where there is no stack. Raises InputError without noise.
 
     A prior that is to be found in a stack counts as one of independent pixels, and light as the prior's mean.
     """
-    found = expected_noise(scene, camera)
+    scene, camera = setup.scene, setup.camera
+    found = expected_noise(setup)
     noise = found if isinstance(found, np.ndarray) else everywhere(found, camera.measurements)
     if not (noise[np.isfinite(noise)] > 0).all():
         raise InputError(

@@ -14,17 +14,19 @@ from ommatid.reconstruct.prediction import Prediction, predict
 from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 
 @one_thread()
 def predict_scene(scene: Scene) -> Prediction:
     """What Eq. 5 and the ideal model promise of a scene."""
-    camera = derive(scene)
+    setup = Setup.from_scene(scene)
+    camera = setup.camera
     choice = choose_method(scene, camera, exact=camera.has_box_footprints)
-    actual, shape = expected_noise(scene, camera), camera.shape
+    actual, shape = expected_noise(setup), camera.shape
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.method != "dense":
@@ -38,13 +40,14 @@ def predict_scene(scene: Scene) -> Prediction:
     return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape, tolerated)
 
 
-def expected_noise(scene: Scene, camera: Camera) -> float | NDArray[np.float64]:
+def expected_noise(setup: Setup) -> float | NDArray[np.float64]:
     """Variance of every measurement, one number or an array: with a [sensor] that of light of the prior's mean."""
+    scene = setup.scene
     if scene.sensor is not None:
         from ommatid.scenes.optics.radiometry import predicted_noise
         from ommatid.simulate.sensor.response import response
 
-        return predicted_noise(scene, camera, response(scene, camera))
+        return predicted_noise(scene, setup.camera, response(setup))
     return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0
 
 
@@ -57,11 +60,11 @@ def optics(camera: Camera) -> list[dict[str, Any]]:
     return describe(camera)
 
 
-def electrons(scene: Scene, camera: Camera) -> dict[str, Any] | None:
+def electrons(setup: Setup) -> dict[str, Any] | None:
     """The electrons that each lens type's pixels collect, where they are counted."""
-    if scene.sensor is None:
+    if setup.scene.sensor is None:
         return None
     from ommatid.scenes.optics.radiometry import summary
     from ommatid.simulate.sensor.response import response
 
-    return summary(scene, camera, response(scene, camera))
+    return summary(setup.scene, setup.camera, response(setup))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Sequence
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from time import perf_counter
@@ -17,8 +18,8 @@ from ommatid.runtime.files import digest, fingerprint, make_folder
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.formats.picture import Image
 from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
 from ommatid.simulate.sampling.samplers import corners, law
 from ommatid.simulate.validation import check_scene
@@ -37,9 +38,7 @@ FLOOR_SHARE = 0.1  # of the time limit, for the noise floor
 SETUP_SHARE = 0.02  # of the progress, for the reference and the noise floor
 
 
-def bench(
-    scene: Scene, camera: Camera, image: Image, folder: Path, seconds: float, progress: Progress
-) -> tuple[BenchTable, bool]:
+def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
     """Return the bench table of a scene, and True if anything had to be measured for it.
 
     Cells that are already in `folder` are not measured again; those that do not fit into the time limit are left out.
@@ -48,9 +47,14 @@ def bench(
     Raises InputError for a scene that cannot be measured, and if `folder` holds the table of another scene.
     """
     start = perf_counter()
-    scene = _with_exact_assumptions(scene)
-    _check(scene, camera)
-    subject_print = _fingerprint(scene, camera, image)
+    if setup.scene.world is not None:
+        raise InputError(
+            f"{setup.scene.source}: bench measures flat targets, got a [world]; remove it, or choose another scene"
+        )
+    setup = replace(setup, scene=_with_exact_assumptions(setup.scene), given_image=setup.image)
+    scene, camera = setup.scene, setup.camera
+    check_scene(setup, calibrates=False)
+    subject_print = _fingerprint(setup)
     made_from = fingerprint([subject_print, versions("mitsuba", "drjit", "scipy")])
     previous = _previous(folder, subject_print)
     if previous is not None and previous.fingerprint == made_from:
@@ -66,8 +70,8 @@ def bench(
         journal.seconds = max(journal.seconds, previous.seconds)
     seconds_before = journal.seconds
     with naming_source(scene.source):
-        right = reference(scene, camera, image, folder, lambda share: progress(SETUP_SHARE * share))
-        subject = Subject(scene, camera, image, right, FLOOR_SHARE * seconds)
+        right = reference(setup, folder, lambda share: progress(SETUP_SHARE * share))
+        subject = Subject(setup, right, FLOOR_SHARE * seconds)
         listed, left_out = jobs(subject)
     late = measure(
         listed,
@@ -107,22 +111,14 @@ def _with_exact_assumptions(scene: Scene) -> Scene:
     return scene.model_copy(update={"estimator": estimator, "study": None})
 
 
-def _check(scene: Scene, camera: Camera) -> None:
-    if scene.world is not None:
-        raise InputError(
-            f"{scene.source}: bench measures flat targets, got a [world]; remove it, or choose another scene"
-        )
-    check_scene(scene, camera, calibrates=False)
-
-
-def _fingerprint(scene: Scene, camera: Camera, image: Image) -> str:
+def _fingerprint(setup: Setup) -> str:
     """Return the fingerprint of camera, image and scene without the keys that the cells set."""
-    tables = scene.plain()
+    tables = setup.scene.plain()
     for table, keys in {"render": ("samples", "variant"), "calibration": ("samples", "method", "fit")}.items():
         tables[table] = {key: value for key, value in tables[table].items() if key not in keys}
     for name in ("title", "target"):
         tables.pop(name, None)
-    return fingerprint([camera.describe(), tables, digest(image.astype("float32"))])
+    return fingerprint([setup.camera.describe(), tables, digest(setup.image.astype("float32"))])
 
 
 def _previous(folder: Path, subject_print: str) -> BenchTable | None:

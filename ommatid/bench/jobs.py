@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
 from time import perf_counter
@@ -20,6 +20,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.adaptive_render import AdaptiveRendering
 from ommatid.simulate.calibrate import calibrate
@@ -50,21 +51,33 @@ STOPPING_ESTIMATES = 2  # in addition, where the calibration stops at a goal for
 
 @dataclass(frozen=True)
 class Subject:
-    """The scene that is measured, with its camera, its image and the reference.
+    """The scene that is measured, with its image, and the reference.
 
     time_limit : seconds after which no more estimates of the noise floor are made
     """
 
-    scene: Scene
-    camera: Camera
-    image: FloatArray
+    setup: Setup
     reference: Reference
     time_limit: float = inf
 
-    def noise(self, repeat: int) -> Scene:
-        """Return the scene with the seed of the sensor's noise of a repeat, which all cells share."""
+    @property
+    def scene(self) -> Scene:
+        """The scene of the setup."""
+        return self.setup.scene
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the setup."""
+        return self.setup.camera
+
+    def changed(self, scene: Scene) -> Setup:
+        """Return the setup with other settings of its stages."""
+        return replace(self.setup, scene=scene)
+
+    def noise(self, repeat: int) -> Setup:
+        """Return the setup with the seed of the sensor's noise of a repeat, which all cells share."""
         render = self.scene.render.model_copy(update={"seed": self.seed("noise", repeat)})
-        return self.scene.model_copy(update={"render": render})
+        return self.changed(self.scene.model_copy(update={"render": render}))
 
     def seed(self, name: str, repeat: int) -> int:
         """Return the seed of the rays of a cell's repeat."""
@@ -72,11 +85,11 @@ class Subject:
 
     def stack(self, repeat: int) -> Stack:
         """Return exact light, recorded with the noise of a repeat."""
-        return reference.record_light(self.noise(repeat), self.camera, self.reference.light, self.reference)
+        return reference.record_light(self.noise(repeat), self.reference.light, self.reference)
 
     def mean_squared_error(self, image: FloatArray) -> float:
         """Return the mean squared error of an estimate, (N,)."""
-        return float(np.mean(np.square(image - self.image.ravel())))
+        return float(np.mean(np.square(image - self.setup.image.ravel())))
 
     @property
     def is_large(self) -> bool:
@@ -85,12 +98,12 @@ class Subject:
 
     def rendering_mse(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
         """Return the mean squared error of the image from a rendering and exact H, normalised."""
-        scene = self.noise(repeat)
+        setup = self.noise(repeat)
         single_pass = isinstance(rendering, Rendering) and rendering.passes == 1  # with unknown variance
         if self.is_large or single_pass:
-            stack = reference.record_light(scene, self.camera, rendering.mean, self.reference)
+            stack = reference.record_light(setup, rendering.mean, self.reference)
         else:
-            stack = reference.record_rendering(scene, self.camera, rendering)
+            stack = reference.record_rendering(setup, rendering)
         return self.normalised(self._mse_with_exact_model(stack), repeat)
 
     def model_mse(self, model: Model, repeat: int) -> float:
@@ -101,8 +114,8 @@ class Subject:
         """
         if not self.is_large:
             return self.normalised(self.mean_squared_error(method_for(self.stack(repeat), model).image), repeat)
-        light = model.forward(self.image.ravel())
-        stack = reference.record_light(self.noise(repeat), self.camera, light, self.reference)
+        light = model.forward(self.setup.image.ravel())
+        stack = reference.record_light(self.noise(repeat), light, self.reference)
         return self.normalised(self._mse_with_exact_model(stack), repeat)
 
     def normalised(self, mse: float, repeat: int) -> float:
@@ -180,7 +193,7 @@ def _fixed_samples(samples: int, sampler: Sampler) -> JobSettings:
 def _adaptive_jobs(subject: Subject, variants: list[str]) -> list[Job]:
     """Return cells with samples "auto" and the scene's own sampler. Raises InputError for a scene without noise."""
     scene = subject.scene
-    expected = reference.expected_samples(scene, subject.camera, subject.image, subject.reference)
+    expected = reference.expected_samples(subject.setup, subject.reference)
     work = JobSettings(None, expected, AUTO)
     found: list[Job] = []
     for variant in variants:
@@ -205,7 +218,7 @@ def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Sample
 
     def repeated(repeat: int) -> Repeat:
         scene = reference.with_rendering(subject.scene, sampler, variant, samples, subject.seed(name, repeat))
-        rendering, cost = _measured(lambda: reference.render_light(scene, subject.camera, subject.image))
+        rendering, cost = _measured(lambda: reference.render_light(subject.changed(scene)))
         error = reference.light_error(rendering, subject.reference)
         mse = subject.rendering_mse(rendering, repeat) if repeat < FEWER_REPEATS else None
         return Repeat(error, cost, mse, int(rendering.record()["samples"]))
@@ -243,7 +256,7 @@ def _calibration(
         seed = subject.seed(name, repeat)
         scene = reference.with_calibration(subject.scene, method, sampler, variant, samples, seed)
         rule = for_stack(subject.stack(repeat)) if samples == AUTO else None
-        model, cost = _measured(lambda: calibrate(scene, subject.camera, judge=rule))
+        model, cost = _measured(lambda: calibrate(subject.changed(scene), judge=rule))
         error = reference.model_error(model, subject.reference)
         mse = subject.model_mse(model, repeat) if repeat < FEWER_REPEATS else None
         return Repeat(error, cost, mse, int(model.record["samples"]))

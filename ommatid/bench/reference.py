@@ -5,7 +5,7 @@ Every repeat has its own seed, and none of these random streams is one of the sc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,10 +14,9 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import without_negligible_effects
-from ommatid.scenes.scene import Sampler, Scene, resolved
+from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.adaptive_render import AIM, EXPONENTS, LEAST, MOST, STRATIFIED, AdaptiveRendering, render_until
 from ommatid.simulate.cache import cached_model
@@ -50,35 +49,24 @@ class Reference:
     description: str
 
 
-def has_closed_form(camera: Camera) -> bool:
-    """Return True if H of the camera, with all its effects, has a closed form."""
-    for lens_type in camera.types:
-        blurred = camera.is_blurred(lens_type)
-        if lens_type.optics.surfaces is not None or (blurred and lens_type.optics.distortion is not None):
-            return False
-    return camera.tolerance is None or camera.has_sharp_footprints
-
-
-def reference(
-    scene: Scene, camera: Camera, image: FloatArray, folder: Path, progress: Progress = no_progress
-) -> Reference:
+def reference(setup: Setup, folder: Path, progress: Progress = no_progress) -> Reference:
     """Return the closed form where there is one, else H from 64 times the rays, or as many as MOST_RAYS permits.
 
     Such an estimate is cached in `folder`. Raises InputError if its backend does not work on this machine.
     """
-    simulated = without_negligible_effects(scene, camera)[0]
-    flat = image.ravel()
-    if has_closed_form(simulated):
-        plain = resolved(scene, camera.shape)
-        is_ideal = camera.has_box_footprints and camera.tolerance is None
-        model = ideal_model(plain, camera) if is_ideal else exact_model(plain, camera, true_matrix(simulated), "true")
-        return Reference(model, model.forward(flat), np.zeros(camera.measurements), "the closed form")
+    scene, camera, image = setup.scene, setup.camera, setup.image.ravel()
+    if setup.has_closed_form:
+        if camera.has_box_footprints and camera.tolerance is None:
+            model = ideal_model(setup.resolved, camera)
+        else:
+            model = exact_model(setup.resolved, camera, true_matrix(setup.simulated), "true")
+        return Reference(model, model.forward(image), np.zeros(camera.measurements), "the closed form")
     samples = min(SAMPLE_RATIO * MOST_SAMPLES, MOST_RAYS // camera.measurements)
     seed = repeat_seed(scene.render.seed, "right", 0)
     many = with_calibration(scene, "transport", "multijitter", "auto", samples, seed)
-    model, _ = cached_model(folder / REFERENCE, many, camera, progress)
+    model, _ = cached_model(folder / REFERENCE, replace(setup, scene=many), progress)
     description = f"a reference of {model.record['samples']} samples"
-    return Reference(model, model.forward(flat), model.variance_from_model(flat), description)
+    return Reference(model, model.forward(image), model.variance_from_model(image), description)
 
 
 def with_rendering(scene: Scene, sampler: Sampler, variant: str, samples: Samples, seed: int) -> Scene:
@@ -103,26 +91,27 @@ def sample_plan(samples: int, sampler: Sampler) -> Plan:
     return plan(samples, sampler) if samples >= FEWEST_PASSES else Plan(1, fitting(sampler, samples))
 
 
-def expected_samples(scene: Scene, camera: Camera, image: FloatArray, right: Reference) -> int:
+def expected_samples(setup: Setup, right: Reference) -> int:
     """Estimate the samples per pixel that samples = "auto" will take.
 
     Where a grid of strata fits the edges of the pixels of f this is a first round. Elsewhere it is the number that
     leaves a quarter of the allowed variance if the rays of a pixel vary as the image does.
     Raises InputError without noise, to which the variance could be compared.
     """
-    allowed = float(np.nanmean(allowed_variance(scene, camera)(right.light)))
-    sampler = scene.render.sampler
+    camera, sampler = setup.camera, setup.scene.render.sampler
+    allowed = float(np.nanmean(allowed_variance(setup)(right.light)))
     if camera.has_box_footprints and sampler in JITTERED:
         return max(on_grid(LEAST, sampler, cells_of(lens_type.ratio)).total for lens_type in camera.types)
-    ratio = float(image.var()) / (FEWEST_PASSES * AIM * allowed)
+    ratio = float(setup.image.var()) / (FEWEST_PASSES * AIM * allowed)
     return int(min(max(FEWEST_PASSES * ratio ** (1 / EXPONENTS.get(sampler, STRATIFIED)), LEAST), MOST))
 
 
-def render_light(scene: Scene, camera: Camera, image: FloatArray) -> Rendering | AdaptiveRendering:
+def render_light(setup: Setup) -> Rendering | AdaptiveRendering:
     """Render the light without the sensor's noise, as `run` does."""
-    if scene.render.samples == "auto":
-        return render_until(scene, camera, image)
-    return light(scene, camera, image, work=sample_plan(scene.render.counted, scene.render.sampler))
+    render = setup.scene.render
+    if render.samples == "auto":
+        return render_until(setup)
+    return light(setup, work=sample_plan(render.counted, render.sampler))
 
 
 def light_error(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:
@@ -138,15 +127,15 @@ def model_error(model: Model, right: Reference) -> float:
     return float(np.sqrt(max(squares, 0.0) / right.model.entries))
 
 
-def record_rendering(scene: Scene, camera: Camera, rendering: Rendering | AdaptiveRendering) -> Stack:
+def record_rendering(setup: Setup, rendering: Rendering | AdaptiveRendering) -> Stack:
     """Return a rendering of several passes as the scene's sensor records it, with noise from the scene's seed."""
-    return exposed(scene, camera, rendering.mean, rendering.stated(camera), {})
+    return exposed(setup, rendering.mean, rendering.stated(setup.camera), {})
 
 
-def record_light(scene: Scene, camera: Camera, light: FloatArray, right: Reference) -> Stack:
+def record_light(setup: Setup, light: FloatArray, right: Reference) -> Stack:
     """Return light, (M,), as the scene's sensor records it.
 
     The stated variance of the light is the same for all pixels: its mean squared error, 0 for exact light.
     """
     mse = float(np.nanmean(np.square(light - right.light)))
-    return exposed(scene, camera, light, np.broadcast_to(mse, light.shape), {})
+    return exposed(setup, light, np.broadcast_to(mse, light.shape), {})

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
     from ommatid.scenes.hardware.frames import AcquisitionSettings
     from ommatid.scenes.model import Model
-    from ommatid.scenes.scene import Scene
+    from ommatid.scenes.setup import Setup
     from ommatid.scenes.tables.sensor import NoiseTable
 
 app = typer.Typer(
@@ -214,22 +214,21 @@ def calibrate(
     sets = _complete(sets, complete)
     from ommatid.pipeline.stages import calibrated
     from ommatid.runtime.files import check_output
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
 
     check_output(output, scene)
-    described = read(scene, sets or (), _names(lens))
-    camera = derive(described)
+    setup = Setup.from_scene(read(scene, sets or (), _names(lens)))
     if points:
         if lens:
             raise InputError("--lens: recorded frames are of the whole camera; choose lens types in `reconstruct`")
         bench = _bench(dark, flat, flat_value, origin, upright)
-        model, made = _told_by_points(described, camera, output, [*points, *(more or [])], bench, places, point_value)
+        model, made = _told_by_points(setup, output, [*points, *(more or [])], bench, places, point_value)
     elif more or places or dark or flat or origin:
         raise InputError("calibrate: images, --places, --dark, --flat and --origin belong to --points; name its images")
     else:
         with naming_source(scene), _progress("calibrate") as progress:
-            model, made = calibrated(described, camera, output, progress)
+            model, made = calibrated(setup, output, progress)
     _say(f"calibrate: {_done(made)}, {output}")
     if as_json:
         facts = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
@@ -316,18 +315,19 @@ def import_(
     """
     from ommatid.runtime.files import check_output
     from ommatid.scenes import stack
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.hardware.frames import files_in
     from ommatid.scenes.hardware.stack_import import import_stack, warnings
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
 
     bench = _bench(dark, flat, flat_value, origin, upright)
     check_output(output, scene, *(file for path in (*images, *bench.dark, *bench.flat) for file in files_in(path)))
-    described = read(scene, sets or ())
-    camera = derive(described)  # all of it: lens types that are left out stand on the sensor nevertheless
-    if lens and not camera.is_ideal_pinhole:
+    setup = Setup.from_scene(
+        read(scene, sets or ())
+    )  # all of it: lens types that are left out stand on the sensor nevertheless
+    if lens and not setup.camera.is_ideal_pinhole:
         raise InputError(f"--lens {lens}: lenses that are more than pinholes are imported all; choose in `reconstruct`")
-    made, frames = import_stack(described, camera, images, bench)
+    made, frames = import_stack(setup, images, bench)
     made = made.restrict(_names(lens)) if lens else made
     stack.write(output, made)
     for warning in warnings(frames):
@@ -356,8 +356,8 @@ def predict(
     from ommatid.analysis.predict import electrons, predict_scene
     from ommatid.pipeline import stages
     from ommatid.reconstruct import prediction as accuracy
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
 
     if sweep:
         members = _members([scene], Path(), sweep, sets, lens)
@@ -368,7 +368,7 @@ def predict(
         raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
     described = read(scene, sets or (), _names(lens))
     with naming_source(scene):
-        prediction, light = predict_scene(described), electrons(described, derive(described))
+        prediction, light = predict_scene(described), electrons(Setup.from_scene(described))
     if as_json:
         _print_json(prediction.describe() | ({} if light is None else {"light": light}))
         return
@@ -480,9 +480,9 @@ def bench(
     from ommatid.bench.bench import rows
     from ommatid.pipeline.stages import opened
 
-    described, camera, image = opened(scene, sets or (), _names(lens))
+    setup = opened(scene, sets or (), _names(lens))
     with _progress("bench") as progress:
-        table, made = measured(described, camera, image, output, seconds, progress)
+        table, made = measured(setup, output, seconds, progress)
     _say(f"bench: {_done(made)}, {output / 'bench.json'}")
     if as_json:
         _print_json(table.describe())
@@ -499,15 +499,15 @@ def show(
     from ommatid.analysis.predict import optics as optics_of
     from ommatid.analysis.summary import describe, sections
     from ommatid.reconstruct.method_choice import choose_method as choose_way
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
     from ommatid.simulate.renderer.variant import choose
 
-    described = read(scene, _complete(sets, complete), _names(lens))
-    camera = derive(described)
-    choice = choose_way(described, camera, described.calibration.method == "ideal" and camera.has_box_footprints)
+    setup = Setup.from_scene(read(scene, _complete(sets, complete), _names(lens)))
+    described, camera = setup.scene, setup.camera
+    choice = choose_way(described, camera, setup.has_structured_matrix)
     with naming_source(scene):
-        optics, light = optics_of(camera), electrons(described, camera)
+        optics, light = optics_of(camera), electrons(setup)
     description = describe(described, camera, choose(described.render.variant), choice.plan(), optics, light)
     if as_json:
         _print_json(description)
@@ -525,11 +525,11 @@ def export(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "
     from ommatid.simulate.renderer.export import export as write
 
     check_output(output, scene)
-    described, camera, image = opened(scene, sets or (), _names(lens))
-    if described.world is not None:
+    setup = opened(scene, sets or (), _names(lens))
+    if setup.scene.world is not None:
         raise InputError(f"{scene}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
-    picture = write(described, camera, image, output)
-    sensors = [sub.name for sub in camera.sub_imagers]
+    picture = write(setup, output)
+    sensors = [sub.name for sub in setup.camera.sub_imagers]
     _say(f"{output} and {picture}: {len(sensors)} sensors; render one with: mitsuba -m scalar_rgb -s 0 {output}")
     if as_json:
         _print_json({"file": str(output), "picture": str(picture), "sensors": sensors})
@@ -784,8 +784,7 @@ def _refuse_no_value(option: str, value: float) -> None:
 
 
 def _told_by_points(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     output: Path,
     points: list[Path],
     bench: AcquisitionSettings,
@@ -801,7 +800,7 @@ def _told_by_points(
     _refuse_no_value("--point-value", value)
     read = [file for path in (*points, *bench.dark, *bench.flat) for file in files_in(path)]
     check_output(output, *read, *([] if places is None else [places]))
-    told = point_sources.from_recorded_points(scene, camera, points, bench, places, value)
+    told = point_sources.from_recorded_points(setup, points, bench, places, value)
     model_file.write(output, told.model)
     for warning in (*stack_import.dead(told.frames), *point_sources.warnings(told)):
         _say(f"calibrate: {warning}")

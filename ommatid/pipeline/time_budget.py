@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -21,8 +21,8 @@ from ommatid.reconstruct.output.run_json import write_run
 from ommatid.reconstruct.output.time_spent import STAGES
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.formats.picture import Image
-from ommatid.scenes.scene import Scene, resolved, with_tables
+from ommatid.scenes.scene import Scene, with_tables
+from ommatid.scenes.setup import Setup
 
 from . import bench_curves, stages, time_allocation
 
@@ -54,18 +54,16 @@ def shared_time(
     """
     asked = TimeRequest(seconds, len(folders))
 
-    def does(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+    def does(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
         begun = started if asked.scenes == 1 else clock()
         rest = (seconds - (begun - started)) / (asked.scenes - folders.index(folder))
-        return run_within(scene, camera, image, folder, watch, rest, say, clock, begun, asked)
+        return run_within(setup, folder, watch, rest, say, clock, begun, asked)
 
     return does
 
 
 def run_within(
-    scene: Scene,
-    camera: Camera,
-    image: Image,
+    setup: Setup,
     folder: Path,
     watch: RunObserver,
     seconds: float,
@@ -79,15 +77,14 @@ def run_within(
     say : hears where even the least did not fit;  begun : when the time began to count, absent: now
     asked : what these seconds are a share of, which differs from run to run; absent: of nothing else
     """
+    scene, camera = setup.scene, setup.camera
     begun = clock() if begun is None else begun
     told = asdict(TimeRequest(seconds) if asked is None else asked)
-    again = _again(folder, scene, camera, told)
+    again = _again(folder, setup, told)
     if again is not None:
-        description = stages.results(
-            with_samples(scene, *(again["chosen"][key] for key in KEYS)), camera, image, folder, watch
-        )
+        description = stages.results(with_samples(setup, *(again["chosen"][key] for key in KEYS)), folder, watch)
         return _told(camera, folder, watch, description, again)
-    few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
+    few = _measured(with_samples(setup, FEW[0], FEW[0]), folder, watch, clock)
     chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
     page = _page(camera, folder, watch, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
     description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun)) - page
@@ -96,16 +93,16 @@ def run_within(
     if _needs_little(scene, camera):
         if left > ROUND * sampled + few.seconds("reconstruct") + rest:
             chosen = "auto", "auto"
-            description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
+            description = stages.results(with_samples(setup, *chosen), folder, watch)
     elif (curves := _of_bench(folder, scene, camera)) is not None or left > 2 * few.wall:
         if curves is None:
-            more = _measured(with_samples(scene, FEW[1], FEW[1]), camera, image, folder, watch, clock)
+            more = _measured(with_samples(setup, FEW[1], FEW[1]), folder, watch, clock)
             chosen, description, curves = (FEW[1], FEW[1]), more.description, _curves(scene, few, more)
             left = (1 - SPARE) * (seconds - (clock() - begun)) - page
         division = _better(description["error"], curves, left - rest - COMPILED)
         if division is not None:
             chosen = division.render, division.calibrate
-            description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
+            description = stages.results(with_samples(setup, *chosen), folder, watch)
     total = clock() - begun + page  # the last one is still to come
     if total > seconds:
         what = "even the least" if chosen[0] == FEW[0] else "this"
@@ -114,11 +111,12 @@ def run_within(
     return _told(camera, folder, watch, description, spent)
 
 
-def with_samples(scene: Scene, rendering: Samples, calibration: Samples) -> Scene:
-    """The scene with these numbers of samples, and no time that would end a stage."""
+def with_samples(setup: Setup, rendering: Samples, calibration: Samples) -> Setup:
+    """The setup with these numbers of samples, and no time that would end a stage."""
+    scene = setup.scene
     render = scene.render.model_copy(update={"samples": rendering, "time": None})
     calibrate = scene.calibration.model_copy(update={"samples": calibration})
-    return with_tables(scene, render=render, calibration=calibrate)
+    return replace(setup, scene=with_tables(scene, render=render, calibration=calibrate))
 
 
 def _needs_little(scene: Scene, camera: Camera) -> bool:
@@ -146,11 +144,9 @@ class MeasuredRun:
         return max(self.wall - sum(self.seconds(stage) for stage in (*STAGES, "reconstruct")), 0.0)
 
 
-def _measured(
-    scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver, clock: Clock
-) -> MeasuredRun:
+def _measured(setup: Setup, folder: Path, watch: RunObserver, clock: Clock) -> MeasuredRun:
     start = clock()
-    description = stages.results(scene, camera, image, folder, watch)
+    description = stages.results(setup, folder, watch)
     wall = clock() - start
     found = model_file.read(folder / "model.npz")
     spread = found.prior_variance_from_model(np.ones(found.unknowns)) if found.variance.any() else np.zeros(1)
@@ -198,12 +194,12 @@ def _curves(
     return found[0], found[1]
 
 
-def _again(folder: Path, scene: Scene, camera: Camera, asked: dict[str, Any]) -> dict[str, Any] | None:
+def _again(folder: Path, setup: Setup, asked: dict[str, Any]) -> dict[str, Any] | None:
     """What an earlier run within the same time spent, if it was of the same scene among as many."""
     try:
         old = json.loads((folder / RUN).read_text(encoding="utf-8"))["spent"]
         rendering, calibration = (old["chosen"][key] for key in KEYS)
-        now = resolved(with_samples(scene, rendering, calibration), camera.shape).plain()
+        now = with_samples(setup, rendering, calibration).resolved.plain()
         same = old["asked"] == asked and tomllib.loads((folder / "scene.toml").read_text("utf-8")) == now
     except (OSError, ValueError, KeyError, TypeError):
         return None

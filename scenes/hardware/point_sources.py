@@ -23,7 +23,8 @@ from ommatid.runtime.versions import versions
 
 from ..camera import Camera
 from ..model import RECORDED, Model
-from ..scene import Scene, resolved
+from ..scene import Scene
+from ..setup import Setup
 from .assignment import FootprintAssignment, unseen
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
 from .photon_transfer import background, photon_transfer, rounding
@@ -76,8 +77,7 @@ class RecordedCalibration:
 
 
 def from_recorded_points(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     images: Sequence[Path],
     bench: AcquisitionSettings,
     places: Path | None = None,
@@ -89,7 +89,7 @@ def from_recorded_points(
     places : a CSV file of image, row, column;  None: one image a pixel of f by rows, the whole sweep once or more
     Raises InputError for frames that cannot be cut, places outside f, and pixels of f without a source.
     """
-    start = perf_counter()
+    scene, camera, start = setup.scene, setup.camera, perf_counter()
     frames = read_frames(camera, images, bench, mosaics=True)
     if scene.sensor is not None and (frames.dark is None or frames.flat is None):
         raise InputError(
@@ -117,9 +117,8 @@ def from_recorded_points(
         "versions": versions("scipy", "scikit-image", "OpenEXR"),
     }
     batches: NDArray[np.float32] = np.zeros((0, known.mean.size), dtype=np.float32)
-    kept = resolved(scene, camera.shape)
     once = scene.sensor is None and not (known.count > 1).any()
-    return RecordedCalibration(Model(kept, camera, matrix, variance, batches, record), frames, stray, once)
+    return RecordedCalibration(Model(setup.resolved, camera, matrix, variance, batches, record), frames, stray, once)
 
 
 def _refuse_unseen(camera: Camera, shown: list[Whole], places: Path | None) -> None:

@@ -13,9 +13,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import fingerprint
 from ommatid.runtime.versions import versions
 
-from ..camera import Camera
 from ..recording import Recording
-from ..scene import Scene, resolved
+from ..setup import Setup
 from ..stack import Stack, recorded
 from ..tables.sensor import SensorTable
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
@@ -23,15 +22,13 @@ from .frames import AcquisitionSettings, RecordedFrames, read_frames
 FAR = 0.1  # sensor pixels beside whole ones, above which H of the design is not that of the frames
 
 
-def import_stack(
-    scene: Scene, camera: Camera, images: Sequence[Path], bench: AcquisitionSettings
-) -> tuple[Stack, RecordedFrames]:
+def import_stack(setup: Setup, images: Sequence[Path], bench: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:
     """The stack that recorded images make, and what it was cut from.
 
     images : one mosaic, or one picture a sub-imager in the order of measurements
     The variance is a rendering's and so 0; dead pixels are NaN. Raises InputError for what cannot be cut.
     """
-    start = perf_counter()
+    camera, start = setup.camera, perf_counter()
     frames = read_frames(camera, images, bench, mosaics=False)
     made_from = {"camera": camera.describe(), "bench": bench.describe(), "source": frames.sources}
     record = {
@@ -41,10 +38,10 @@ def import_stack(
         "seconds": perf_counter() - start,
         "versions": versions("scikit-image", "OpenEXR"),
     }
-    kept, none = resolved(scene, camera.shape), np.zeros(camera.measurements)
+    kept, none = setup.resolved, np.zeros(camera.measurements)
     if kept.sensor is None:
         return Stack(kept, camera, _as_stored(frames.values()[0]), none, record), frames
-    recording = _recording(scene.source, kept.sensor, frames)
+    recording = _recording(kept.source, kept.sensor, frames)
     kept = kept.model_copy(update={"sensor": recording.sensor})
     return recorded(kept, camera, recording, none, record), frames
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from ommatid.bench.bench import curves, rows
 from ommatid.bench.jobs import SAMPLERS, Subject, jobs
-from ommatid.bench.reference import has_closed_form, reference, sample_plan
+from ommatid.bench.reference import reference, sample_plan
 from ommatid.bench.resources import CLEAR_REFS, Cost, measure_cost
 from ommatid.bench.scheduler import Job, Journal, Repeat, cell_from_repeats, measure, name_of
 from ommatid.bench.slopes import Slope, excess, pareto_front, recommend, slope
@@ -128,7 +128,7 @@ def test_adaptive_samples_are_recommended_as_a_scene_asks_for_them() -> None:
     half = recommend([*counted, adaptive[0], estimate], 2.0)
     assert [setting.samples for setting in (half.render, half.calibrate) if setting] == [AUTO, 256]
     assert "calibrate, transport, multijitter, would need about 1000 samples" in half.why
-    tile = opened(GALLERY / "tile19.toml")[1]
+    tile = opened(GALLERY / "tile19.toml").camera
     assert curves([*counted, *adaptive], tile) == curves(counted, tile)
 
 
@@ -242,8 +242,8 @@ def test_a_table_that_is_read_is_the_one_that_was_written(
 @pytest.fixture
 def subject(here: Path) -> Subject:
     """The tiny scene, to be measured."""
-    tiny, camera, image = opened(here / "tiny.toml")
-    return Subject(tiny, camera, image, reference(tiny, camera, image, here))
+    setup = opened(here / "tiny.toml")
+    return Subject(setup, reference(setup, here))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -294,8 +294,8 @@ def test_adaptive_samples_leave_the_noise_alone(subject: Subject) -> None:
 
 
 def test_without_noise_no_cell_has_adaptive_samples(here: Path) -> None:
-    tiny, camera, image = opened(here / "tiny.toml", ["noise="])
-    listed, left_out = jobs(Subject(tiny, camera, image, reference(tiny, camera, image, here)))
+    setup = opened(here / "tiny.toml", ["noise="])
+    listed, left_out = jobs(Subject(setup, reference(setup, here)))
     assert all(job.setting != AUTO for job in listed)
     assert ["noise.variance above 0" in skipped.why for skipped in left_out if "auto" in skipped.what] == [True]
 
@@ -308,8 +308,7 @@ def test_seeds_differ_between_cells_and_repeats_and_from_the_scenes_own(subject:
 
 @pytest.mark.parametrize(("name", "closed"), [("tile19", True), ("planoconvex", False), ("misaligned", True)])
 def test_which_cameras_have_a_closed_form(name: str, closed: bool) -> None:
-    _, camera, _ = opened(GALLERY / f"{name}.toml")
-    assert has_closed_form(camera) == closed
+    assert opened(GALLERY / f"{name}.toml").has_closed_form == closed
 
 
 def check(table: BenchTable, document: dict[str, object]) -> None:

@@ -34,6 +34,7 @@ from ommatid.scenes.hardware import stack_import
 from ommatid.scenes.hardware.frames import AcquisitionSettings
 from ommatid.scenes.recording import Recording
 from ommatid.scenes.scene import parse
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.sensor import SensorTable
 from ommatid.simulate.ideal import ideal_matrix, matrix_as_designed
 
@@ -222,12 +223,10 @@ def test_a_letter_is_upright_in_the_maps_and_upside_down_on_the_sensor(drawn: da
     # What hardware records is what `import` cuts: the mosaic of the page gives the stack back.
     mosaic, origin, step = mosaic_of(columns(text, "sensor"), sensor.mosaic(run.stack))
     np.save(tmp_path / "mosaic.npy", mosaic)
-    bench = AcquisitionSettings(origin=origin)
-    back, _ = stack_import.import_stack(run.stack.scene, run.stack.camera, [tmp_path / "mosaic.npy"], bench)
+    bench, setup = AcquisitionSettings(origin=origin), Setup(run.stack.scene, run.stack.camera)
+    back, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], bench)
     np.testing.assert_allclose(back.values, run.stack.values, atol=0.51 * step + 1e-4)
-    turned, _ = stack_import.import_stack(
-        run.stack.scene, run.stack.camera, [tmp_path / "mosaic.npy"], replace(bench, upright=True)
-    )
+    turned, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], replace(bench, upright=True))
     assert np.abs(turned.values - run.stack.values).max() > 50, "the comparison can tell"
 
 

@@ -16,6 +16,7 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import ideal_model
@@ -26,7 +27,7 @@ from ..examples import GALLERY, THREE, scene
 
 def chain(described: Scene) -> tuple[Stack, Model, Reconstruction]:
     camera, image = derive(described), load(described)
-    stack, model = render(described, camera, image), calibrate(described, camera)
+    stack, model = render(Setup(described, camera, image)), calibrate(Setup(described, camera))
     return stack, model, restore(stack, model, image.ravel())
 
 
@@ -96,7 +97,7 @@ def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
     camera = derive(described)
     model = ideal_model(described, camera)
     other = scene(lenses=THREE, render={"seed": 9, "samples": 64}, noise={"variance": 2.0})
-    stack = render(other, camera, np.full((19, 19), 50.0))
+    stack = render(Setup(other, camera, np.full((19, 19), 50.0)))
     check_match(stack, model, ("a", "b"))
     restoration = restore(stack, model, np.full(361, 50.0))
     assert restoration.interval is not None
@@ -115,7 +116,7 @@ def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
 def test_strangers_are_refused_with_the_first_difference(other: Scene, key: str) -> None:
     described = scene(lenses=THREE, render={"samples": 16})
     camera = derive(described)
-    stack = render(described, camera, load(described))
+    stack = render(Setup(described, camera))
     with pytest.raises(InputError, match=key):
         check_match(stack, ideal_model(other, derive(other)), ("stack.exr", "model.npz"))
 
@@ -123,7 +124,7 @@ def test_strangers_are_refused_with_the_first_difference(other: Scene, key: str)
 def test_pitches_are_compared_too() -> None:
     described = scene(lenses=THREE, render={"samples": 16})
     camera = derive(described)
-    stack = render(described, camera, load(described))
+    stack = render(Setup(described, camera))
     model = replace(ideal_model(described, camera), camera=replace(camera, pixel_pitch=0.007))
     with pytest.raises(InputError, match=r"camera\.pixel_pitch is 0\.006 in the stack and 0\.007"):
         check_match(stack, model, ("stack.exr", "model.npz"))

@@ -12,7 +12,6 @@ import pytest
 
 from ommatid.reconstruct.noise import depends_on_light
 from ommatid.scenes.camera import derive
-from ommatid.scenes.formats.picture import load
 from ommatid.scenes.optics.negligible import (
     SkippedEffect,
     noise_variance,
@@ -21,6 +20,7 @@ from ommatid.scenes.optics.negligible import (
 )
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import parse
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.skipped import skipped_effects
 from ommatid.scenes.stack import recorded
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
@@ -63,7 +63,7 @@ def test_the_short_run_agrees_with_the_complete_one(kind: str) -> None:
     described, _, found = short(kind, render=samples)
     complete, camera = built(*RULES[kind], TWO, **NOISY, render={**samples, "complete": True})
     assert without_negligible_effects(complete, camera) == (camera, ())
-    one, other = light(described, camera, load(described)), light(complete, camera, load(complete))
+    one, other = light(Setup(described, camera)), light(Setup(complete, camera))
     chance = 6 * np.sqrt(one.variance + other.variance)
     assert (np.abs(one.mean - other.mean) <= sum(left.bound for left in found) + chance).all()
 
@@ -150,11 +150,10 @@ def test_a_pinhole_camera_loads_nothing_of_lenses() -> None:
     needs("llvm_ad_mono")
     script = (
         "import sys; from pathlib import Path\n"
-        "from tests.examples import scene; from ommatid.scenes.camera import derive\n"
-        "from ommatid.scenes.formats.picture import load\n"
+        "from tests.examples import scene; from ommatid.scenes.setup import Setup\n"
         "from ommatid.simulate.render import light; from ommatid.simulate.calibrate import calibrate\n"
-        "described = scene(render={'samples': 16}, calibration={'samples': 16}); camera = derive(described)\n"
-        "light(described, camera, load(described)); calibrate(described, camera)\n"
+        "described = scene(render={'samples': 16}, calibration={'samples': 16}); setup = Setup.from_scene(described)\n"
+        "light(setup); calibrate(setup)\n"
         "print(*sys.modules)"
     )
     ended = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ommatid.analysis.pareto import pareto_front
 from ommatid.runtime.files import write_whole
 
 from .labels import Label, label_points
-from .slopes import TOLERANCE, median_error, median_seconds, pareto_front
+from .slopes import TOLERANCE, median_error, median_seconds
 from .table import ALONE, AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quantiles, Stage
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito

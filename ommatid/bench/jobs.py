@@ -13,7 +13,7 @@ import numpy as np
 
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.assumptions import method_for
-from ommatid.reconstruct.method_choice import DENSE
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -94,7 +94,7 @@ class Subject:
     @property
     def is_large(self) -> bool:
         """True if the solver is a frame or tiles, which are slow for a different noise variance in every pixel."""
-        return self.camera.unknowns > DENSE
+        return self.camera.unknowns > MAX_DENSE_PIXELS
 
     def rendering_mse(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
         """Return the mean squared error of the image from a rendering and exact H, normalised."""

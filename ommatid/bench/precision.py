@@ -17,7 +17,7 @@ from ommatid.reconstruct.estimator.memory import needed_memory
 from ommatid.reconstruct.forms.form import NotSolvableError
 from ommatid.reconstruct.frame.frame_method import FrameMethod
 from ommatid.reconstruct.frame.preconditioner import is_sliding
-from ommatid.reconstruct.method_choice import DENSE
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
@@ -63,7 +63,7 @@ class ExactSolution:
 
 def is_dense(task: EstimationTask) -> bool:
     """Return True if a single dense problem is small enough."""
-    return task.model.unknowns <= DENSE
+    return task.model.unknowns <= MAX_DENSE_PIXELS
 
 
 def exact_solution(task: EstimationTask, deviation: FloatArray | None = None) -> ExactSolution:
@@ -85,7 +85,7 @@ def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tup
     sliding = all(is_sliding(lens_type) for lens_type in task.model.camera.types)
     has_frame = sliding and bool((task.expected_noise > 0).all())
     if not is_dense(task):
-        left_out.append(("dense forms", f"{task.model.unknowns} pixels, and the limit is {DENSE}"))
+        left_out.append(("dense forms", f"{task.model.unknowns} pixels, and the limit is {MAX_DENSE_PIXELS}"))
         if not has_frame:
             why = "too many pixels for a dense form, and a frame does not apply: there is no exact solution"
             return [], [("reconstruct", why)]

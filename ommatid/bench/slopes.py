@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import exp, inf, log
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.analysis.pareto import pareto_front
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.shrinkage import shrink_variances
 
 from .table import ALONE, AUTO, STAGES, Cell, Recommendation, RecommendedSetting
-
-Item = TypeVar("Item")
 
 CRITICAL_SCORE = 3.0  # standard errors within which a slope agrees with theory
 FEWEST_POINTS = 3  # of a fitted slope
@@ -63,15 +62,6 @@ def variance_of_median(repeats: NDArray[Any]) -> FloatArray:
     even n.
     """
     return np.pi / (2 * repeats + np.pi - 2)
-
-
-def pareto_front(items: Iterable[Item], cost: Callable[[Item], float], error: Callable[[Item], float]) -> list[Item]:
-    """Return the items to which no other is preferable in both cost and error, in order of increasing cost."""
-    front: list[Item] = []
-    for item in sorted(items, key=lambda item: (cost(item), error(item))):
-        if not front or error(item) < error(front[-1]):
-            front.append(item)
-    return front
 
 
 def median_seconds(cell: Cell) -> float:

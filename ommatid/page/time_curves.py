@@ -6,11 +6,13 @@ error of the reconstruction, `mse`, that this brings, both with their median.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ommatid.bench.table import bench_tables
+from ommatid.analysis.pareto import pareto_front
+from ommatid.bench.table import bench_files
 
 from . import plots
 from .data import Run
@@ -39,13 +41,21 @@ class TimeCurves:
 
 
 def bench_of(folder: Path, camera: dict[str, Any]) -> dict[str, Any] | None:
-    """Return bench.json of the same camera in a run's folder or in its parent, None if there is none."""
-    return next((table.describe() for table in bench_tables(folder, camera)), None)
+    """bench.json in a run's folder or the one above, if it is whole and of the same camera; else None."""
+    for path in bench_files(folder):
+        try:
+            found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            same = found["camera"] == json.loads(json.dumps(camera))
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        if same:
+            return found
+    return None
 
 
 def time_curves(run: Run, bench: dict[str, Any] | None) -> TimeCurves | None:
     """A bench as curves, with this run on them; None where there is no bench or it tells nothing."""
-    mse = run.description["error"].get("mse")
+    mse = run.description.error.mse
     if bench is None or mse is None:
         return None
     try:
@@ -53,10 +63,8 @@ def time_curves(run: Run, bench: dict[str, Any] | None) -> TimeCurves | None:
         advice = str(bench.get("recommended", {}).get("why", ""))
     except (KeyError, TypeError, AttributeError, ValueError):
         return None
-    stages = run.description["stages"]
-    here = [
-        TimePoint(name, "this run", float(one["seconds"]), mse) for name, one in stages.items() if one["seconds"] > 0
-    ]
+    stages = run.description.stages
+    here = [TimePoint(name, "this run", stage.seconds, mse) for name, stage in stages.items() if stage.seconds > 0]
     return TimeCurves(points, here, advice) if points else None
 
 
@@ -71,15 +79,6 @@ def _point(cell: dict[str, Any]) -> TimePoint | None:
     return TimePoint(str(cell["stage"]), ", ".join(word for word in told if word), seconds, mse)
 
 
-def front(points: list[TimePoint]) -> list[TimePoint]:
-    """The Pareto front: those than which none is both faster and better, the fastest first."""
-    best: list[TimePoint] = []
-    for point in sorted(points, key=lambda point: (point.seconds, point.mse)):
-        if not best or point.mse < best[-1].mse:
-            best.append(point)
-    return best
-
-
 def figure(found: TimeCurves) -> Any:
     """Mean squared error against seconds, a colour a stage, with each stage's front and this run's points."""
     drawn = plots.chart("effort", ("seconds of the stage", "mean squared error"), x_axis_type="log", y_axis_type="log")
@@ -89,7 +88,7 @@ def figure(found: TimeCurves) -> Any:
         here = [point for point in found.run if point.stage == stage]
         if not points:
             continue
-        edge = front(points)
+        edge = pareto_front(points, lambda point: point.seconds, lambda point: point.mse)
         drawn.line(
             [point.seconds for point in edge], [point.mse for point in edge], line_color=colour, line_width=2,
             legend_label=stage,

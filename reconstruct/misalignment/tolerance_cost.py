@@ -19,13 +19,13 @@ from scipy import sparse
 
 from ommatid.scenes.camera import Camera
 
-from ..expected_error import columns
+from ..expected_error import solved_columns
 from ..forms.form import Form, Vector
 from ..prior import Prior
 from .robust_noise import robust_noise
 
 
-def cost(form: Form, telling: NDArray[np.bool_], camera: Camera, prior: Prior) -> Vector:
+def misalignment_variance(form: Form, telling: NDArray[np.bool_], camera: Camera, prior: Prior) -> Vector:
     """The addition to Eq. 5, (N,); `form` is of the camera's designed H, of the measurements `telling`, (M,)."""
     told = robust_noise(camera, prior)
     shift = sparse.csr_array(told.matrix[telling] - form.problem.matrix)  # E[D]
@@ -34,7 +34,7 @@ def cost(form: Form, telling: NDArray[np.bool_], camera: Camera, prior: Prior) -
     places = [slice(int(first), int(last)) for first, last in pairwise(ends)]
     blocks = [block[np.ix_(some, some)] for block, some in zip(told.covariances, kept, strict=True)]
     found = np.empty(form.problem.unknowns)
-    for place, _, u, negative in columns(form, np.arange(form.problem.unknowns)):
+    for place, _, u, negative in solved_columns(form, np.arange(form.problem.unknowns)):
         moved = shift.T @ negative
         on_average = prior.gather(moved)
         about_it = np.zeros(negative.shape[1])

@@ -17,18 +17,8 @@ from ommatid.bench.jobs import SAMPLERS, Subject, jobs
 from ommatid.bench.reference import reference, sample_plan
 from ommatid.bench.resources import CLEAR_REFS, Cost, measure_cost
 from ommatid.bench.scheduler import Job, Journal, Repeat, cell_from_repeats, measure, name_of
-from ommatid.bench.slopes import Slope, excess, pareto_front, recommend, slope
-from ommatid.bench.table import (
-    AUTO,
-    CSV,
-    JSON,
-    BenchTable,
-    Cell,
-    Quantiles,
-    Stage,
-    read,
-    write,
-)
+from ommatid.bench.slopes import Slope, excess, recommend, slope
+from ommatid.bench.table import AUTO, CSV, JSON, BenchTable, Cell, Quantiles, Stage, read, write
 from ommatid.pipeline.stages import opened
 from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.runtime.errors import InputError
@@ -74,17 +64,6 @@ def test_too_few_points_have_no_slope() -> None:
     assert slope([*cells, cell(samples=64, scatter=None)]) is None
     assert Slope(-0.738, 0.002).agrees(-0.75, 0.01)
     assert not Slope(-0.738, 0.002).agrees(-0.75)
-
-
-@given(st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-9, 1e3)), min_size=1, max_size=12))
-def test_no_point_beats_the_pareto_front(points: list[tuple[float, float]]) -> None:
-    front = pareto_front(points, lambda point: point[0], lambda point: point[1])
-    for seconds, error in points:
-        assert any(best[0] <= seconds and best[1] <= error for best in front)
-    for best in front:
-        assert not any(seconds < best[0] and error <= best[1] for seconds, error in points)
-    assert [seconds for seconds, _ in front] == sorted(seconds for seconds, _ in front)
-    assert [error for _, error in front] == sorted({error for _, error in front}, reverse=True)
 
 
 def test_the_cheapest_settings_that_reach_the_floor_are_recommended() -> None:

@@ -78,7 +78,7 @@ class Result:
 
         run = Run(
             folder=Path(path).parent,
-            description=self.summary,
+            report=self.summary,
             stack=self.stack,
             model=self.model,
             estimate=self.image.astype(np.float32),
@@ -149,7 +149,7 @@ def read_run(folder: str | Path) -> Result:
     run = read_run(Path(folder))
     truth = None if run.truth is None else run.truth.astype(np.float64)
     deviation = np.sqrt(run.variance.astype(np.float64))
-    return Result(run.stack, run.model, run.estimate.astype(np.float64), deviation, truth, run.description)
+    return Result(run.stack, run.model, run.estimate.astype(np.float64), deviation, truth, run.report)
 
 
 def target_image(scene: Scene | str | Path) -> FloatArray:

@@ -23,7 +23,6 @@ from ommatid.pipeline.time_budget import KEYS, run_within, shared_time
 from ommatid.reconstruct.output.time_spent import spent
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
-from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.units import duration
@@ -144,7 +143,7 @@ def test_scenes_that_share_a_time_are_repeated_too(tmp_path: Path, monkeypatch: 
 
     def done(seconds: float, which: list[Path], later: float) -> list[dict[str, Any]]:
         does = shared_time(seconds, which, 0.0, lambda _: None, ticking(later))
-        return [does(one, derive(one), load(one), folder, watch)["spent"] for folder in which if folder.name != "fails"]
+        return [does(Setup.from_scene(one), folder, watch)["spent"] for folder in which if folder.name != "fails"]
 
     for folder in folders[1:]:
         folder.mkdir()

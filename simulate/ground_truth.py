@@ -85,7 +85,7 @@ def truth(setup: Setup) -> Truth:
 
 def _plan(scene: Scene, camera: Camera) -> Plan:
     """TRUER times the samples of a sensor pixel, in passes of a size that memory holds."""
-    work = plan(TRUER * scene.render.counted, scene.render.sampler)
+    work = plan(TRUER * scene.render.sample_count, scene.render.sampler)
     most = max(1, MOST_RAYS // camera.unknowns)
     if work.samples <= most:
         return work

@@ -17,6 +17,7 @@ from ommatid.runtime.files import digest, fingerprint, make_folder
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.scene import Sampler, Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
@@ -32,7 +33,7 @@ from .slopes import recommend, slope
 from .table import JSON, BenchTable, Cell, ConvergenceCurve, SkippedJob, Stage
 
 PARTIAL = ".bench.partial.jsonl"
-FLAT: dict[Stage, float] = {"render": 1e-5 * 255, "calibrate": 1e-5}  # errors below which float32 shows, and no slope
+FLAT: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below which float32 shows, and no slope
 PATIENCE = 0.1  # of the time: how long the noise alone may take
 SETTING_UP = 0.02  # of the progress: the reference, and what the noise alone leaves
 

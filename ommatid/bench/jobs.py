@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.assumptions import method_for
-from ommatid.reconstruct.method_choice import DENSE
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
@@ -89,7 +89,7 @@ class Subject:
     @property
     def large(self) -> bool:
         """Whether the estimate is one of a frame or of tiles, which noise of its own in every pixel would slow down."""
-        return self.camera.unknowns > DENSE
+        return self.camera.unknowns > MAX_DENSE_PIXELS
 
     def of_rendering(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
         """Mean squared error of the estimate from a rendering and exact H, freed of this noise's luck."""

@@ -17,7 +17,7 @@ from ommatid.reconstruct.estimator.memory import needed_memory
 from ommatid.reconstruct.forms.form import NotSolvableError
 from ommatid.reconstruct.frame.frame_method import FrameMethod
 from ommatid.reconstruct.frame.preconditioner import is_sliding
-from ommatid.reconstruct.method_choice import DENSE
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
@@ -61,7 +61,7 @@ class ExactSolution:
 
 def is_dense(task: EstimationTask) -> bool:
     """Whether one dense problem serves."""
-    return task.model.unknowns <= DENSE
+    return task.model.unknowns <= MAX_DENSE_PIXELS
 
 
 def exact_solution(task: EstimationTask, deviation: Vector | None = None) -> ExactSolution:
@@ -81,7 +81,7 @@ def settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tuple[str,
     found, left_out = _forms(task), list[tuple[str, str]]()
     sliding, noisy = all(is_sliding(kind) for kind in task.model.camera.types), bool((task.expected_noise > 0).all())
     if not is_dense(task):
-        left_out.append(("dense forms", f"{task.model.unknowns} pixels, up to {DENSE} are served"))
+        left_out.append(("dense forms", f"{task.model.unknowns} pixels, up to {MAX_DENSE_PIXELS} are served"))
         if not (sliding and noisy):
             why = "too many pixels for a dense form, and no frame: there is no exact answer to hold estimates against"
             return [], [("reconstruct", why)]

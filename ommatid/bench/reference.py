@@ -114,7 +114,7 @@ def rendered(setup: Setup) -> Rendering | AdaptiveRendering:
     render = setup.scene.render
     if render.samples == "auto":
         return render_until(setup)
-    return light(setup, work=work_of(render.counted, render.sampler))
+    return light(setup, work=work_of(render.sample_count, render.sampler))
 
 
 def error_of_light(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:

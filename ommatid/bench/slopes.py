@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.analysis.pareto import pareto_front
 from ommatid.scenes.shrinkage import shrink_variances
 
 from .table import ALONE, AUTO, Cell
@@ -64,11 +65,7 @@ def of_medians(repeats: NDArray[Any]) -> NDArray[Any]:
 
 def pareto(cells: Sequence[Cell]) -> list[Cell]:
     """Cells that none is both faster and better than, from the fastest on."""
-    front: list[Cell] = []
-    for cell in sorted(cells, key=lambda one: (one.seconds.median, one.error.median)):
-        if not front or cell.error.median < front[-1].error.median:
-            front.append(cell)
-    return front
+    return pareto_front(cells, lambda cell: cell.seconds.median, lambda cell: cell.error.median)
 
 
 def excess(cell: Cell, floor: float) -> float:
@@ -132,12 +129,8 @@ def _seconds_of(some: Sequence[Cell]) -> float:
 
 def _worth(cells: Sequence[Cell], floor: float) -> list[Cell]:
     """Cells that none is both faster than and brings less excess."""
-    front: list[Cell] = []
-    some = [cell for cell in cells if excess(cell, floor) < float("inf")]
-    for cell in sorted(some, key=lambda one: (one.seconds.median, excess(one, floor))):
-        if not front or excess(cell, floor) < excess(front[-1], floor):
-            front.append(cell)
-    return front
+    finite = [cell for cell in cells if excess(cell, floor) < float("inf")]
+    return pareto_front(finite, lambda cell: cell.seconds.median, lambda cell: excess(cell, floor))
 
 
 def _told(cell: Cell) -> dict[str, Any]:

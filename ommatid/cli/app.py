@@ -149,13 +149,15 @@ def run(
 
     def tell(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         from ommatid.analysis import depth_error, run_table, study
+        from ommatid.reconstruct.output.run_json import RunReport
 
         if not as_json:
-            _table(f"{description['title'] or member.scene.stem}: {member.folder}", run_table.rows(description))
-            if "depth" in description:
-                _table("Error against distance", depth_error.rows(description["depth"]))
-            if "study" in description:
-                _table("The same stack with other ideas of H", study.rows(description["study"]))
+            report = RunReport.model_validate(description)
+            _table(f"{report.title or member.scene.stem}: {member.folder}", run_table.rows(report))
+            if report.depth:
+                _table("Error against distance", depth_error.rows(report.depth))
+            if report.study:
+                _table("The same stack with other models of H", study.rows(report.study))
         return description
 
     sets = _complete(sets, complete)
@@ -256,8 +258,9 @@ def reconstruct(
 ) -> None:
     """Reconstruct from files alone."""
     from ommatid.analysis import run_table
-    from ommatid.reconstruct.output import figures, run_json
+    from ommatid.reconstruct.output import figures
     from ommatid.reconstruct.output import result_files as results
+    from ommatid.reconstruct.output.run_json import RegionReport
     from ommatid.reconstruct.restore import check_region
     from ommatid.runtime.files import check_output
     from ommatid.runtime.pool import check_options
@@ -274,19 +277,20 @@ def reconstruct(
     if lens:
         recorded, calibrated = recorded.restrict(_names(lens)), calibrated.restrict(_names(lens))
     check_region(corner, size, recorded.camera.shape)
-    recorded = results.changed(recorded, sets or [], stack)
+    recorded = results.with_estimator_changes(recorded, sets or [], stack)
     truth = results.truth_beside(stack, recorded)
     with _crew(scheduler, workers) as crew, _progress("reconstruct") as progress:
-        restoration, description = results.reconstruct(recorded, calibrated, truth, (stack, model), crew, progress)
+        restoration, report = results.reconstruct(recorded, calibrated, truth, (stack, model), crew, progress)
     if region:
         mean, deviation = restoration.region(corner, size)
-        description["region"] = {"corner": corner, "size": size, "mean": mean, "deviation": deviation}
-    run_json.write_estimate(output, restoration, {"title": recorded.scene.title})
+        region_mean = RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
+        report = report.with_changes(region=region_mean)
+    results.write_estimate(output, restoration, {"title": recorded.scene.title})
     figures.write_estimate(output.with_suffix(".png"), restoration.estimate.reshape(restoration.shape))
     if as_json:
-        _print_json({"file": str(output), **description})
+        _print_json({"file": str(output), **report.plain()})
     else:
-        _table(str(output), run_table.rows(description))
+        _table(str(output), run_table.rows(report))
 
 
 @app.command("import")
@@ -313,10 +317,11 @@ def import_(
 
     A mosaic is the sensor seen from behind the camera, rows downwards; its numbers are taken as they are.
     """
+    from ommatid.analysis.recording_warnings import import_warnings
     from ommatid.runtime.files import check_output
     from ommatid.scenes import stack
     from ommatid.scenes.hardware.frames import files_in
-    from ommatid.scenes.hardware.stack_import import import_stack, warnings
+    from ommatid.scenes.hardware.stack_import import import_stack
     from ommatid.scenes.scene import read
     from ommatid.scenes.setup import Setup
 
@@ -330,7 +335,7 @@ def import_(
     made, frames = import_stack(setup, images, bench)
     made = made.restrict(_names(lens)) if lens else made
     stack.write(output, made)
-    for warning in warnings(frames):
+    for warning in import_warnings(frames):
         _say(f"import: {warning}")
     _say(f"import: done, {output}")
     if as_json:
@@ -353,9 +358,9 @@ def predict(
 
     From Eq. 5 and the ideal model: nothing is rendered.
     """
+    from ommatid.analysis import prediction_table
     from ommatid.analysis.predict import electrons, predict_scene
     from ommatid.pipeline import stages
-    from ommatid.reconstruct import prediction as accuracy
     from ommatid.scenes.scene import read
     from ommatid.scenes.setup import Setup
 
@@ -370,9 +375,9 @@ def predict(
     with naming_source(scene):
         prediction, light = predict_scene(described), electrons(Setup.from_scene(described))
     if as_json:
-        _print_json(prediction.describe() | ({} if light is None else {"light": light}))
+        _print_json(prediction_table.json_of(prediction) | ({} if light is None else {"light": light}))
         return
-    lines, tolerance = accuracy.rows(prediction), described.camera.tolerance
+    lines, tolerance = prediction_table.rows(prediction), described.camera.tolerance
     if tolerance is not None and prediction.misalignment is None and described.estimator.misalignment == "trust":
         lines.append(("misalignment", "not in these numbers: what it adds is known for small targets and no blur"))
     _table(described.title or scene.stem, lines)
@@ -394,9 +399,9 @@ def design(
 
     Ranks magnifications by the expected error (Eq. 5) with each.
     """
-    from ommatid.analysis.candidates import magnifications, with_lens
-    from ommatid.analysis.design import DesignCandidate, ranked, rows
+    from ommatid.analysis.design import DesignCandidate, magnifications, ranked, rows, with_lens
     from ommatid.analysis.predict import predict_scene
+    from ommatid.analysis.prediction_table import json_of
     from ommatid.scenes.scene import read
 
     wanted = magnifications(candidates)
@@ -412,7 +417,7 @@ def design(
             progress((place + 1) / len(wanted))
     choices = ranked(choices)
     if as_json:
-        _print_json({"before": before.describe(), "candidates": [choice.describe() for choice in choices]})
+        _print_json({"before": json_of(before), "candidates": [choice.describe() for choice in choices]})
     else:
         _table(f"{described.title or scene.stem}: what one more lens type would bring", rows(before, choices))
 
@@ -508,7 +513,7 @@ def show(
     choice = choose_way(described, camera, setup.has_structured_matrix)
     with naming_source(scene):
         optics, light = optics_of(camera), electrons(setup)
-    description = describe(described, camera, choose(described.render.variant), choice.plan(), optics, light)
+    description = describe(setup, choose(described.render.variant), choice, optics, light)
     if as_json:
         _print_json(description)
         return
@@ -751,7 +756,7 @@ def _optics_sections(
 
         found.append(("Optics", [(f"lens type {one['lens']}", words(one)) for one in optics]))
     if light is not None:
-        from ommatid.scenes.optics.radiometry import rows
+        from ommatid.analysis.light_table import rows
 
         found.append(("Electrons", rows(light)))
     return found
@@ -793,17 +798,18 @@ def _told_by_points(
     value: float,
 ) -> tuple[Model, bool]:
     """H told from recorded frames, written, with what the user should know of it."""
+    from ommatid.analysis.recording_warnings import calibration_warnings
     from ommatid.runtime.files import check_output
     from ommatid.scenes import model_file
-    from ommatid.scenes.hardware import point_sources, stack_import
     from ommatid.scenes.hardware.frames import files_in
+    from ommatid.scenes.hardware.point_sources import from_recorded_points
 
     _refuse_no_value("--point-value", value)
     read = [file for path in (*points, *bench.dark, *bench.flat) for file in files_in(path)]
     check_output(output, *read, *([] if places is None else [places]))
-    told = point_sources.from_recorded_points(setup, points, bench, places, value)
+    told = from_recorded_points(setup, points, bench, places, value)
     model_file.write(output, told.model)
-    for warning in (*stack_import.dead(told.frames), *point_sources.warnings(told)):
+    for warning in calibration_warnings(told):
         _say(f"calibrate: {warning}")
     return told.model, True
 

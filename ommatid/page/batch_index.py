@@ -14,13 +14,13 @@ from typing import Any
 from urllib.parse import quote
 
 from ommatid.batch.sweep_row import NUMBERS, read_rows
+from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 
 from .cached import REPORT, own_files, read_stamp
-from .data import run_description
 
 INDEX = "index.html"
 
@@ -82,23 +82,22 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
         return BatchEntry(folder.name, folder.name, failure=failure)
     try:
-        run = run_description(folder)
-        error, stages = run["error"], run["stages"]
-        given: dict[str, float] = error.get("expected_given_truth") or {}
+        run = run_json.read(folder)
+        given = run.error.expected_given_truth
         return BatchEntry(
             name=folder.name,
-            title=run["title"] or folder.name,
+            title=run.title or folder.name,
             link=quote(f"{folder.name}/{REPORT}"),
             picture=quote(f"{folder.name}/{PICTURE}"),
-            mse=error.get("mse"),
-            predicted=error["predicted_mse"],
-            low=given.get("low"),
-            high=given.get("high"),
-            psnr=error.get("psnr"),
-            ssim=error.get("ssim"),
-            seconds=sum(stage["seconds"] for stage in stages.values()),
+            mse=run.error.mse,
+            predicted=run.error.predicted_mse,
+            low=None if given is None else given.low,
+            high=None if given is None else given.high,
+            psnr=run.error.psnr,
+            ssim=run.error.ssim,
+            seconds=sum(stage.seconds for stage in run.stages.values()),
         )
-    except (InputError, KeyError, TypeError, AttributeError) as wrong:
+    except InputError as wrong:
         return BatchEntry(folder.name, folder.name, failure=str(wrong))
 
 

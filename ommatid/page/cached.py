@@ -6,12 +6,13 @@ import hashlib
 import re
 from pathlib import Path
 
+from ommatid.reconstruct.output import run_json
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
-from .data import read_run, run_description
+from .data import read_run
 from .point_response import Ideal
 from .time_curves import bench_of
 
@@ -32,7 +33,7 @@ def cached_page(
 
     recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
     bench = bench_of(folder, recorded.camera.describe())
-    made_from = fingerprint([run_description(folder), bench, versions("bokeh"), own_files()])
+    made_from = fingerprint([run_json.read(folder).plain(), bench, versions("bokeh"), own_files()])
 
     def make() -> str:
         from .document import page

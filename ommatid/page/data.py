@@ -5,7 +5,6 @@ Maps are (rows, columns) in the target's pixels, row 0 at the top; values are in
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from math import ceil, sqrt
 from pathlib import Path
@@ -14,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ommatid.reconstruct.output.result_files import ESTIMATE, RUN
-from ommatid.runtime.errors import InputError
+from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.result_files import ESTIMATE
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 from ommatid.scenes.model import Model
@@ -31,7 +31,7 @@ class Run:
     """A finished run: what run.json says, what was recorded, the model, and estimate.exr's maps; truth may be None."""
 
     folder: Path
-    description: dict[str, Any]
+    description: RunReport
     stack: Stack
     model: Model
     estimate: Image
@@ -69,25 +69,13 @@ def read_run(folder: Path, recorded: Stack | None = None, calibrated: Model | No
     channels = exr.read(folder / ESTIMATE)[0].channels
     return Run(
         folder=folder,
-        description=run_description(folder),
+        description=run_json.read(folder),
         stack=stack.read(folder / "stack.exr") if recorded is None else recorded,
         model=model_file.read(folder / "model.npz") if calibrated is None else calibrated,
         estimate=channels["estimate"],
         variance=channels["variance"],
         truth=channels.get("truth"),
     )
-
-
-def run_description(folder: Path) -> dict[str, Any]:
-    """What run.json says. Raises InputError where there is none, or one that is none of ours."""
-    path = folder / RUN
-    try:
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if not {"title", "error", "stages", "fingerprint"} <= found.keys():
-            raise ValueError("it lacks what every run says")
-    except (OSError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: expected what a run says of itself, got a file without it ({error})") from error
-    return found
 
 
 def maps(run: Run) -> ResultMaps:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.scenes.constants import WHITE
+
 from . import plots
 from .data import Image, ResultMaps
 from .plots import Colours
@@ -87,7 +89,7 @@ def _ends(image: Image, doubtful: bool) -> tuple[float, float]:
     """The range of a picture; of one that may have gone astray in places without its outermost values."""
     known = image[np.isfinite(image)]
     if not known.size:
-        return 0.0, 255.0
+        return 0.0, WHITE
     aside = (100 - SHOWN) / 2 if doubtful else 0.0
     low, high = (float(end) for end in np.percentile(known, [aside, 100 - aside]))
     return (low, high) if high > low else (low - 0.5, high + 0.5)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.hardware.frames import patches
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.stack import Stack
@@ -66,7 +67,7 @@ class Mosaic:
     def ends(self) -> tuple[float, float]:
         """Smallest and largest value."""
         known = np.concatenate([patch.image[np.isfinite(patch.image)] for patch in self.patches])
-        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 255.0)
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, WHITE)
         return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 

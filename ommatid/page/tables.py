@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from ommatid.analysis import depth_error, run_table, study
 from ommatid.analysis.summary import describe as show
 from ommatid.analysis.summary import skipped_words
+from ommatid.reconstruct.output.run_json import StageReport
+from ommatid.scenes.setup import Setup
 
 from .data import Run
 
@@ -25,10 +26,10 @@ class PageTable:
 
 def plan(run: Run) -> PageTable:
     """What ran, how, and how long."""
-    stages = run.description["stages"]
-    total = sum(stage["seconds"] for stage in stages.values()) or 1.0
+    stages = run.description.stages
+    total = sum(stage.seconds for stage in stages.values()) or 1.0
     rows = [
-        (name, _how(name, stage, run), f"{stage['seconds']:.3g}{GAP}s", f"{100 * stage['seconds'] / total:.0f}{GAP}%")
+        (name, _how(name, stage, run), f"{stage.seconds:.3g}{GAP}s", f"{100 * stage.seconds / total:.0f}{GAP}%")
         for name, stage in stages.items()
     ]
     return PageTable("What ran", ("stage", "how", "time", "share"), rows)
@@ -39,46 +40,46 @@ def more_time(run: Run) -> PageTable | None:
 
     The estimator is taken as it is. Of less noise another follows, which leans less on the prior and errs less.
     """
-    spent = run.description.get("spent", {})
-    if not spent.get("more"):
+    spent = run.description.spent
+    if not spent.more:
         return None
-    here = {"seconds": sum(spent["stages"].values()), "predicted_mse": run.description["error"]["predicted_mse"]}
-    known = [("as here", here), *((f"{one['times']} times as many", one) for one in spent["more"])]
-    rows = [(name, f"{one['seconds']:.3g}{GAP}s", f"{one['predicted_mse']:.4g}") for name, one in known]
-    rows.append(("without end", "", f"{spent['noise_alone']:.4g}"))
+    here = ("as here", sum(spent.stages.values()), run.description.error.predicted_mse)
+    known = [here, *((f"{more.times} times as many", more.seconds, more.predicted_mse) for more in spent.more)]
+    rows = [(name, f"{seconds:.3g}{GAP}s", f"{mse:.4g}") for name, seconds, mse in known]
+    rows.append(("without end", "", f"{spent.noise_alone:.4g}"))
     return PageTable("What more samples would bring", ("samples", "time", "squared error of this estimator"), rows)
 
 
 def given_time(run: Run) -> str:
     """What became of the time that a run was given; nothing where it was given none."""
-    spent = run.description.get("spent", {})
-    if "within" not in spent:
+    spent = run.description.spent
+    if spent.within is None:
         return ""
-    chosen = ", ".join(f"{key} = {value}" for key, value in spent["chosen"].items())
-    taken = f"took {spent['seconds']:.3g}{GAP}s with what it measured beforehand"
-    return f"The run was given {spent['within']:g}{GAP}s and {taken}; it chose {chosen}."
+    chosen = ", ".join(f"{key} = {value}" for key, value in spent.chosen.items())
+    taken = f"took {spent.seconds:.3g}{GAP}s with what it measured beforehand"
+    return f"The run was given {spent.within:g}{GAP}s and {taken}; it chose {chosen}."
 
 
-def _how(name: str, stage: dict[str, Any], run: Run) -> str:
-    told = [str(stage["method"])] if "method" in stage else []
-    if "samples" in stage:
+def _how(name: str, stage: StageReport, run: Run) -> str:
+    told = [] if stage.method is None else [stage.method]
+    if stage.samples is not None:
         told.append(run_table.samples_of(stage))
-    told += [str(stage[key]) for key in ("sampler", "variant") if key in stage]
+    told += [value for value in (stage.sampler, stage.variant) if value is not None]
     if name == "reconstruct":
-        solver = run.description["solver"]
-        told.append(f"{solver['method']}: {solver['why']}")
+        solver = run.description.solver
+        told.append(f"{solver.method}: {solver.why}")
     return ", ".join(told)
 
 
 def skipped(run: Run) -> PageTable:
     """What was not computed, and why."""
-    rows = [(skip["what"], skipped_words(skip)) for skip in run.description["skipped"]]
+    rows = [(skip.what, skipped_words(skip.why, skip.bound)) for skip in run.description.skipped]
     return PageTable("What was left out", ("what", "why"), rows)
 
 
 def geometry(run: Run) -> tuple[PageTable, list[tuple[str, str]]]:
     """A row a lens type, and the rest in names and values."""
-    described = show(run.stack.scene, run.stack.camera, "", {})
+    described = show(Setup(run.stack.scene, run.stack.camera), "", None)
     header = ("lens type", "magnification", "array", "pixels of a sub-image", "sees rows", "sees columns")
     header += ("focal length", "sensor behind lens", "measurements")
     rows = [
@@ -131,18 +132,17 @@ def numbers(run: Run) -> PageTable:
 def further(run: Run) -> list[PageTable]:
     """Error against distance, and the study, where there are any."""
     found: list[PageTable] = []
-    if run.description.get("depth"):
-        found.append(
-            PageTable("Error against distance", ("distance", "error"), list(depth_error.rows(run.description["depth"])))
-        )
-    if run.description.get("study"):
+    if run.description.depth:
+        rows = depth_error.rows(run.description.depth)
+        found.append(PageTable("Error against distance", ("distance", "error"), list(rows)))
+    if run.description.study:
         caption = "The same stack with other ideas of H"
-        found.append(PageTable(caption, ("H", "error"), list(study.rows(run.description["study"]))))
+        found.append(PageTable(caption, ("H", "error"), list(study.rows(run.description.study))))
     return found
 
 
 def origins(run: Run) -> list[PageTable]:
     """Seeds and versions, from which the run can be repeated."""
-    seeds = [(name, "none" if seed is None else str(seed)) for name, seed in run.description["seeds"].items()]
-    versions = [(name, str(release)) for name, release in run.description["versions"].items()]
+    seeds = [(name, "none" if seed is None else str(seed)) for name, seed in run.description.seeds]
+    versions = [(name, release) for name, release in run.description.versions.items()]
     return [PageTable("Seeds", ("of", "seed"), seeds), PageTable("Versions", ("package", "release"), versions)]

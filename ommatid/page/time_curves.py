@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ommatid.analysis.pareto import pareto_front
 from ommatid.bench.table import bench_files
 
 from . import plots
@@ -54,7 +55,7 @@ def bench_of(folder: Path, camera: dict[str, Any]) -> dict[str, Any] | None:
 
 def time_curves(run: Run, bench: dict[str, Any] | None) -> TimeCurves | None:
     """A bench as curves, with this run on them; None where there is no bench or it tells nothing."""
-    mse = run.description["error"].get("mse")
+    mse = run.description.error.mse
     if bench is None or mse is None:
         return None
     try:
@@ -62,10 +63,8 @@ def time_curves(run: Run, bench: dict[str, Any] | None) -> TimeCurves | None:
         advice = str(bench.get("recommended", {}).get("why", ""))
     except (KeyError, TypeError, AttributeError, ValueError):
         return None
-    stages = run.description["stages"]
-    here = [
-        TimePoint(name, "this run", float(one["seconds"]), mse) for name, one in stages.items() if one["seconds"] > 0
-    ]
+    stages = run.description.stages
+    here = [TimePoint(name, "this run", stage.seconds, mse) for name, stage in stages.items() if stage.seconds > 0]
     return TimeCurves(points, here, advice) if points else None
 
 
@@ -80,15 +79,6 @@ def _point(cell: dict[str, Any]) -> TimePoint | None:
     return TimePoint(str(cell["stage"]), ", ".join(word for word in told if word), seconds, mse)
 
 
-def front(points: list[TimePoint]) -> list[TimePoint]:
-    """The Pareto front: those than which none is both faster and better, the fastest first."""
-    best: list[TimePoint] = []
-    for point in sorted(points, key=lambda point: (point.seconds, point.mse)):
-        if not best or point.mse < best[-1].mse:
-            best.append(point)
-    return best
-
-
 def figure(found: TimeCurves) -> Any:
     """Mean squared error against seconds, a colour a stage, with each stage's front and this run's points."""
     drawn = plots.chart("effort", ("seconds of the stage", "mean squared error"), x_axis_type="log", y_axis_type="log")
@@ -98,7 +88,7 @@ def figure(found: TimeCurves) -> Any:
         here = [point for point in found.run if point.stage == stage]
         if not points:
             continue
-        edge = front(points)
+        edge = pareto_front(points, lambda point: point.seconds, lambda point: point.mse)
         drawn.line(
             [point.seconds for point in edge], [point.mse for point in edge], line_color=colour, line_width=2,
             legend_label=stage,

@@ -9,6 +9,7 @@ from typing import Any
 
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
+from ommatid.reconstruct.output.run_json import RunReport, StudyCase
 from ommatid.runtime.errors import naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
@@ -53,19 +54,19 @@ def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Mem
 
 def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
-    description = results(setup, folder, watch)
+    report = results(setup, folder, watch)
     write_page(setup.camera, folder, watch)
-    return description
+    return report.plain()
 
 
 @one_thread()
-def results(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
     """All of a run but its page, and what run.json says of it."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.method_choice import choose_method
-    from ommatid.reconstruct.output.result_files import RUN, cached_results
-    from ommatid.reconstruct.output.run_json import write_run
+    from ommatid.reconstruct.output import run_json
+    from ommatid.reconstruct.output.result_files import cached_results
 
     scene, camera = setup.scene, setup.camera
     check_scene(setup)
@@ -79,18 +80,18 @@ def results(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
         model, made = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
     watch.done("calibrate", made)
     with watch.progress("reconstruct") as progress:
-        description, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
+        report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     watch.done("reconstruct", made)
-    more: dict[str, Any] = {}
+    complete = report
     if scene.world is not None:
-        from ommatid.analysis.depth_error import of_run
+        from ommatid.analysis.depth_error import depth_error_of_run
 
-        more["depth"] = of_run(folder, camera)
+        complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        more["study"] = _studied(setup, stack, folder, watch)
-    if any(description.get(key) != value for key, value in more.items()):
-        write_run(folder / RUN, {**description, **more})
-    return {**description, **more}
+        complete = complete.with_changes(study=_studied(setup, stack, folder, watch))
+    if complete.plain() != report.plain():
+        run_json.write(folder, complete)
+    return complete
 
 
 def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
@@ -112,10 +113,11 @@ def render(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
 def predict_scene(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
     from ommatid.analysis.predict import predict_scene
+    from ommatid.analysis.prediction_table import json_of
 
     del folder, watch
     with naming_source(setup.scene.source):
-        return predict_scene(setup.scene).describe()
+        return json_of(predict_scene(setup.scene))
 
 
 def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
@@ -148,7 +150,7 @@ def _rendered(setup: Setup, folder: Path, watch: RunObserver) -> Stack:
     return stack
 
 
-def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> list[dict[str, Any]]:
+def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> tuple[StudyCase, ...]:
     """The same stack with every idea of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models

@@ -24,7 +24,7 @@ from ommatid.batch import batch
 from ommatid.batch.batch import Batch, Member, Works
 from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
 from ommatid.reconstruct import method_choice
-from ommatid.reconstruct.method_choice import BASE
+from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files
 from ommatid.runtime.processors import one_thread, processors
 
@@ -248,7 +248,7 @@ def test_as_many_scenes_are_done_side_by_side_as_there_are_processors_and_memory
 def test_memory_is_asked_of_the_scenes_that_need_most(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     large = [Member(here / "tiny.toml", here, ("target.shape=[60,60]", "camera.lens.I.pixels=fit"))] * 3
     small = [Member(here / "tiny.toml", here), Member(here / "missing.toml", here)]
-    needs = [BASE + 7 * 8 * pixels**2 for pixels in (3600, 3600, 3600)]
+    needs = [PROGRAM_MEMORY + 7 * 8 * pixels**2 for pixels in (3600, 3600, 3600)]
     for free, expected in ((needs[0] * 1.5, 1), (needs[0] * 2.5, 2), (needs[0] * 50, 5)):
         monkeypatch.setattr(method_choice, "free_memory", lambda free=free: 2 * int(free))
         assert concurrent_by_memory([estimate_cost(member, (), ()).memory for member in (*small, *large)]) == expected

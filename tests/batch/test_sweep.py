@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ommatid.analysis.predict import predict_scene
+from ommatid.analysis.prediction_table import json_of
 from ommatid.batch import sweep_figure
 from ommatid.batch.sweep import SweepAxis, members, sweep_axes
 from ommatid.batch.sweep_row import read_rows, summary
@@ -153,7 +154,7 @@ def test_predictions_of_a_sweep_are_those_of_each_scene(here: Path, ommatid: Com
     assert {path.name for path in (here / "out").iterdir()} == {"sweep.csv", "sweep.json", "sweep.png"}
     rows = table(here / "out" / "sweep.csv")
     for noise, document, row in zip(NOISES, json.loads(ended.out), rows, strict=True):
-        expected = predict_scene(read(here / "tiny.toml", [f"noise.variance={noise}"])).describe()
+        expected = json_of(predict_scene(read(here / "tiny.toml", [f"noise.variance={noise}"])))
         assert {name: document[name] for name in expected} == expected
         assert document["values"] == {"noise.variance": noise}
         assert float(row["predicted_mse"]) == expected["mse"]

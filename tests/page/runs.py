@@ -48,12 +48,10 @@ def lettered(folder: Path, *, dead: int = 0, truth: bool = True) -> Run:
     picture = np.where(F, 220.0, 30.0)
     stack, model = seen(scene((24, 24), tuple(three), noise={"variance": 1e-2}), picture, dead)
     known = picture.ravel() if truth else None
-    restoration, description = result_files.reconstruct(
-        stack, model, known, (folder / "stack.exr", folder / "model.npz")
-    )
+    restoration, report = result_files.reconstruct(stack, model, known, (folder / "stack.exr", folder / "model.npz"))
     make_folder(folder)
-    run_json.write_estimate(folder / result_files.ESTIMATE, restoration, {})
-    run_json.write_run(folder / result_files.RUN, {"fingerprint": "f", **description})
+    result_files.write_estimate(folder / result_files.ESTIMATE, restoration, {})
+    run_json.write(folder, report.with_changes(fingerprint="f"))
     return read_run(folder, stack, model)
 
 

@@ -27,6 +27,14 @@ from scipy import stats
 from ommatid.page import batch_index, data, error_groups, point_response, sensor, time_curves, words
 from ommatid.page.cached import cached_page
 from ommatid.page.document import page
+from ommatid.reconstruct.output.run_json import (
+    DepthBin,
+    DiagnosticsReport,
+    ErrorReport,
+    RunReport,
+    StudyCase,
+    TimeReport,
+)
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats import exr
@@ -174,7 +182,7 @@ def test_a_title_is_text_whatever_stands_in_it(finished: Path, tmp_path: Path) -
     assert parsed(text).text["h1"] == title
     folder = tmp_path / "batch" / "a"
     shutil.copytree(finished, folder)
-    described = {**run.description, "title": title}
+    described = {**run.description.plain(), "title": title}
     (folder / "run.json").write_text(json.dumps(described), encoding="utf-8")
     shutil.copytree(folder, tmp_path / "batch" / "b")
     assert batch_index.cached_index(tmp_path / "batch", {folder: "", folder.parent / "<i>": "because of <script>alert"})
@@ -319,10 +327,11 @@ def test_means_over_blocks_leave_out_what_is_missing() -> None:
 
 
 def test_a_study_and_the_error_against_distance_have_tables(drawn: data.Run) -> None:
-    case = {"model": "ideal", "mse": 3.0, "predicted": 1.0, "expected": 1.0, "low": 0.5, "high": 2.0}
-    far = {"nearest": 900.0, "farthest": 950.0, "pixels": 7, "rms_error": 4.0, "expected_deviation": 0.5}
-    more = {"study": [case], "depth": [{**far, "rms_disparity": 0.1}]}
-    text = page(replace(drawn, description={**drawn.description, **more}), None, None, "0")
+    case = StudyCase(model="ideal", mse=3.0, predicted=1.0, expected=1.0, low=0.5, high=2.0, seconds=1.0)
+    far = DepthBin(nearest=900.0, farthest=950.0, pixels=7, rms_error=4.0, expected_deviation=0.5, rms_disparity=0.1,
+                   rms_disparity_by_type={})  # fmt: skip
+    report = drawn.description.with_changes(study=(case,), depth=(far,))
+    text = page(replace(drawn, description=report), None, None, "0")
     assert "OUTSIDE 0.5 to 2" in text
     assert "error 4 rms in 7 pixels" in text
     reader = parsed(text)
@@ -337,15 +346,19 @@ def test_a_page_tells_what_was_spent_and_what_more_would_bring(drawn: data.Run) 
         "noise_alone": 0.125,
         "more": [{"times": 2, "seconds": 7.75, "predicted_mse": 0.1875}],
     }
+
+    def with_spent(spent: dict[str, Any]) -> RunReport:
+        return drawn.description.with_changes(spent=TimeReport.model_validate(spent))
+
     rows = [("as here", "4", None), ("2 times as many", "7.75", "0.1875"), ("without end", "", "0.125")]
-    text = page(replace(drawn, description={**drawn.description, "spent": spent}), None, None, "0")
-    told = f"{drawn.description['error']['predicted_mse']:.4g}"
+    text = page(replace(drawn, description=with_spent(spent)), None, None, "0")
+    told = f"{drawn.description.error.predicted_mse:.4g}"
     for name, seconds, error in rows:
         time = f"{seconds}\N{NO-BREAK SPACE}s" if seconds else ""
         assert f'<th scope="row">{name}</th><td>{time}</td><td>{error or told}</td>' in text
     assert "The run was given" not in text
     within = {"within": 30.0, "chosen": {"render.samples": 700, "calibration.samples": "auto"}}
-    text = page(replace(drawn, description={**drawn.description, "spent": spent | within}), None, None, "0")
+    text = page(replace(drawn, description=with_spent(spent | within)), None, None, "0")
     assert "given 30\N{NO-BREAK SPACE}s and took 9\N{NO-BREAK SPACE}s" in text
     assert "it chose render.samples = 700, calibration.samples = auto." in text
 
@@ -438,21 +451,6 @@ def test_a_response_without_a_closed_form_stands_alone(finished: Path) -> None:
     assert "has no closed form here" in page(run, none, None, "0")
 
 
-POINTS = st.lists(
-    st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1e6)).map(lambda pair: time_curves.TimePoint("render", "", *pair)),
-    min_size=1,
-)
-
-
-@given(POINTS)
-def test_nothing_is_faster_and_better_than_the_front(points: list[time_curves.TimePoint]) -> None:
-    found = time_curves.front(points)
-    for point in points:
-        assert any(one.seconds <= point.seconds and one.mse <= point.mse for one in found)
-    for one in found:
-        assert not any(other.seconds < one.seconds and other.mse <= one.mse for other in points)
-
-
 def bench(camera: dict[str, Any]) -> dict[str, Any]:
     def cell(stage: str, seconds: float, mse: float | None, samples: int) -> dict[str, Any]:
         of = {"low": seconds, "median": seconds, "high": seconds}
@@ -489,13 +487,14 @@ def test_a_bench_of_the_same_camera_is_drawn_and_of_another_is_not(drawn: data.R
 # --- words
 
 
-def description(**error: Any) -> dict[str, Any]:
+def described(**error: Any) -> RunReport:
+    """A report with this error and no more than the words speak of."""
     budget = {"null_space": 0.0, "noise": 1.0, "quantisation": 0.0, "rendering": 3.0, "calibration": 0.0}
-    return {
-        "error": {"predicted_mse": 4.0, "budget": budget, **error},
-        "diagnostics": {"pixels_used": 9, "pixels_dead": 0, "pixels_saturated": 0, "resolution": 1.0},
-        "model": {"feigned_information": 0.0},
-    }
+    diagnostics: dict[str, Any] = {"pixels_used": 9, "pixels_dead": 0, "pixels_saturated": 0, "resolution": 1.0}
+    return RunReport.model_construct(
+        error=ErrorReport.model_validate({"predicted_mse": 4.0, "budget": budget, **error}),
+        diagnostics=DiagnosticsReport.model_construct(**diagnostics),
+    )
 
 
 GIVEN = {"mse": 4.0, "low": 2.25, "high": 6.25}
@@ -514,8 +513,8 @@ GIVEN = {"mse": 4.0, "low": 2.25, "high": 6.25}
 def test_the_verdict_compares_what_was_measured_with_what_was_expected(
     error: dict[str, Any], agreement: str, said: str
 ) -> None:
-    told = words.verdict(description(**error))
-    assert words.agreement(description(**error)["error"]) == agreement
+    told = words.verdict(described(**error))
+    assert words.agreement(described(**error).error) == agreement
     assert said in told
     assert "as sharp as the target's grid" in told
     assert "75 % of the expected squared error: more render.samples would help" in told
@@ -523,17 +522,16 @@ def test_the_verdict_compares_what_was_measured_with_what_was_expected(
 
 
 def test_the_verdict_of_no_measurement_is_that_there_is_no_image() -> None:
-    nothing = description()
-    nothing["diagnostics"] |= {"pixels_used": 0, "resolution": None}
-    assert "not an image" in words.verdict(nothing)
-    blurred = description()
-    blurred["diagnostics"]["resolution"] = 2.5
-    assert "resolved to 2.5 pixels" in words.verdict(blurred)
+    report = described()
+    nothing = report.diagnostics.model_copy(update={"pixels_used": 0, "resolution": None})
+    assert "not an image" in words.verdict(report.with_changes(diagnostics=nothing))
+    blurred = report.diagnostics.model_copy(update={"resolution": 2.5})
+    assert "resolved to 2.5 pixels" in words.verdict(report.with_changes(diagnostics=blurred))
 
 
 def test_what_must_not_be_trusted_is_said_first(finished: Path, told: str) -> None:
     run = json.loads((finished / "run.json").read_text(encoding="utf-8"))
-    assert run["model"]["feigned_information"] > 0.05, "one lens type leaves pixels open"
+    assert run["model"]["spurious_information"] > 0.05, "one lens type leaves pixels open"
     assert "Do not trust the predicted error" in told
     assert told.index("Do not trust the predicted error") < told.index("<main")
 
@@ -558,7 +556,7 @@ def test_what_is_no_run_is_refused(finished: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(finished, tmp_path / "run")
     for content in ("{", "[]", "{}"):
         (folder / "run.json").write_text(content, encoding="utf-8")
-        with pytest.raises(InputError, match=r"run\.json: expected what a run says of itself"):
+        with pytest.raises(InputError, match=r"run\.json: expected the results of a run"):
             cached_page(folder, None)
 
 

@@ -20,7 +20,8 @@ from ommatid.bench.table import BenchTable, Cell, Quantiles
 from ommatid.pipeline import bench_curves
 from ommatid.pipeline.time_allocation import NEGLIGIBLE, ErrorCurve, allocate_time, error_curve
 from ommatid.pipeline.time_budget import KEYS, run_within, shared_time
-from ommatid.reconstruct.output.time_spent import spent
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.output.time_spent import time_spent
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Scene, read
@@ -245,7 +246,8 @@ def test_every_run_says_what_more_would_buy(here: Path, ommatid: Command) -> Non
     assert found["noise_alone"] == pytest.approx(
         error["predicted_mse"] - error["budget"]["rendering"] - error["budget"]["calibration"]
     )
-    assert spent(run, calibrated=True) == found
+    report = RunReport.model_validate(run)
+    assert time_spent(report.stages, report.error, calibrated=True) == report.spent
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("30s", 30.0), ("2 min", 120.0), ("0.5 h", 1800.0)])

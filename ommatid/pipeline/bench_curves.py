@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from ommatid.bench.table import BenchTable, Stage, bench_files, read
-from ommatid.runtime.errors import InputError
+from ommatid.bench.table import BenchTable, Stage, bench_tables
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.renderer.variant import choose
 
@@ -19,14 +17,7 @@ def bench_error_curves(folder: Path, setup: Setup) -> tuple[ErrorCurve, ErrorCur
     Returns None if there is none of the same camera, sampler, variant and calibration method.
     """
     sampler, variant = setup.scene.render.sampler, choose(setup.scene.render.variant)
-    camera = json.loads(json.dumps(setup.camera.describe()))
-    for path in bench_files(folder):
-        try:
-            table = read(path)
-        except InputError:
-            continue
-        if table.camera != camera:
-            continue
+    for table in bench_tables(folder, setup.camera.describe()):
         render = _curve(table, "render", sampler, variant)
         calibrate = _curve(table, "calibrate", f"{setup.scene.calibration.method}, {sampler}", variant)
         if render is not None and calibrate is not None:

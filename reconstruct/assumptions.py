@@ -21,7 +21,7 @@ from ommatid.scenes.tables import estimation
 from .fitting.prior_fit import PriorFit, evidence, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import WAYS, MethodChoice, choose_method
-from .methods.method import EstimationTask, Execution, Method, total
+from .methods.method import EstimationTask, Execution, Method, total_variance
 from .noise import (
     UsablePixels,
     check_noise_fit,
@@ -105,7 +105,7 @@ def _first_prior(stack: Stack) -> estimation.PriorTable:
 
 def _expected_noise(stack: Stack, usable: UsablePixels, noise: dict[str, Vector]) -> Vector:
     told = stack.scene.estimator.noise_variance
-    return everywhere(told, int(usable.used.sum())) if isinstance(told, float) else total(noise)
+    return everywhere(told, int(usable.used.sum())) if isinstance(told, float) else total_variance(noise)
 
 
 def _way(
@@ -132,7 +132,7 @@ def _fitted(
     if not usable.used.any() or not (asked or described.kind == "fit"):
         return None
     kept = {name: noise[name] for name in KEPT if name in noise}
-    known = total(kept) if asked else _expected_noise(stack, usable, noise)
+    known = total_variance(kept) if asked else _expected_noise(stack, usable, noise)
     task = EstimationTask(model, stack.values, usable.used, known, prior, stack.scene.estimator, stack.scene.tiles)
     return fit_prior(*evidence(task, prior_known=described.kind != "fit", noise_known=not asked))
 

@@ -83,7 +83,7 @@ def expected_error(
             missing[place] = np.square(u).sum(axis=0)
         else:
             units = _units(problem.unknowns, some)
-            missing[place] = np.square(truth.gather(units + problem.matrix.T @ negative)).sum(axis=0)
+            missing[place] = np.square(truth.apply_root_transposed(units + problem.matrix.T @ negative)).sum(axis=0)
         resolved[place] = -np.asarray(by_column[:, some].multiply(negative).sum(axis=0)).ravel()
         squared = np.square(negative)
         noisy[place] = total @ squared
@@ -139,7 +139,7 @@ def variance_of_sum(form: Form, weights: Vector, noise_variance: Vector) -> floa
 def _noise_of_sum(form: Form, weights: Vector, noise_variance: Vector) -> tuple[float, float]:
     """w^T (I - A H) P0 (I - A H)^T w and w^T A Rvm A^T w."""
     problem = form.problem
-    u, negative = form.solve(problem.prior.gather(weights[:, None]), np.zeros((problem.measurements, 1)))
+    u, negative = form.solve(problem.prior.apply_root_transposed(weights[:, None]), np.zeros((problem.measurements, 1)))
     return float(np.square(u).sum()), float(noise_variance @ np.square(negative[:, 0]))
 
 
@@ -147,7 +147,7 @@ def columns(form: Form, asked: Pixels) -> Iterator[tuple[slice, Pixels, Matrix, 
     """Some of the pixels asked for: u, (K, q), whose squares are the prior's part of Eq. 5, and -A^T e_i, (M, q)."""
     for start in range(0, asked.size, CHUNK):
         place = slice(start, min(start + CHUNK, asked.size))
-        u, negative = form.columns(asked[place])
+        u, negative = form.pixel_solutions(asked[place])
         yield place, asked[place], u, negative
 
 

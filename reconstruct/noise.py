@@ -17,7 +17,7 @@ from ommatid.scenes.optics.negligible import without_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables import estimation
 
-from .methods.method import is_one_number
+from .methods.method import is_uniform
 
 Vector = NDArray[np.float64]
 Noise = dict[str, Vector]
@@ -96,7 +96,7 @@ def of_used(values: Vector, used: NDArray[np.bool_]) -> Vector:
     """Of all pixels' values, (M,), those of the pixels used."""
     if used.all():
         return values
-    return everywhere(float(values[0]), int(used.sum())) if is_one_number(values) else values[used]
+    return everywhere(float(values[0]), int(used.sum())) if is_uniform(values) else values[used]
 
 
 def check_noise_fit(stack: Stack) -> None:

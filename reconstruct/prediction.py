@@ -174,7 +174,7 @@ def _in_the_limit(limit: Svd, noise: Vector) -> Vector:
     """Eq. 5 of an estimator that believes what it sees, (N,); `limit` is of noise 1, `noise` what it really is."""
     if not np.ptp(noise):
         return limit.expected_variance(0.0, float(noise.max(initial=0.0)))
-    spread, rank = limit.problem.prior.spread, limit.rank
+    spread, rank = limit.problem.prior.apply_root, limit.rank
     unseen = np.square(spread(limit.right[:, rank:])).sum(axis=1)
     gain = spread(limit.right[:, :rank] / limit.values[:rank]) @ limit.left.T
     return np.asarray(unseen + np.square(gain) @ noise)

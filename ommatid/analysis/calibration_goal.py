@@ -9,7 +9,7 @@ import numpy as np
 
 from ommatid.reconstruct.expected_error import ExpectedError
 from ommatid.reconstruct.method_choice import WAYS, choose_method
-from ommatid.reconstruct.methods.method import EstimationTask, Execution, total
+from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance
 from ommatid.reconstruct.noise import Noise, everywhere, known_noise, usable_pixels
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
@@ -65,7 +65,7 @@ def for_prior(scene: Scene, camera: Camera) -> StoppingRule:
         seen = model.forward(np.full(model.unknowns, prior.mean))
 
         def expected(noise: Noise) -> ExpectedError:
-            believed = everywhere(told, int(used.sum())) if isinstance(told, float) else total(noise)
+            believed = everywhere(told, int(used.sum())) if isinstance(told, float) else total_variance(noise)
             task = EstimationTask(model, seen, used, believed, prior, scene.estimator, scene.tiles)
             return (
                 WAYS[choose_method(scene, camera, exact=False).method](task, Execution()).result(noise, None).expected
@@ -83,7 +83,7 @@ def _at_most(stack: Stack, model: Model) -> float | None:
     as a bound where it is small everywhere, and where rays beside their pixel spoil a few rows as an average.
     """
     used = usable_pixels(stack, model).used
-    others = total(known_noise(stack))[used]
+    others = total_variance(known_noise(stack))[used]
     relative = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))[used] / np.maximum(others, TINY)
     if not relative.size or float(relative.max()) <= SMALL:
         return float(relative.max(initial=0.0))
@@ -100,7 +100,7 @@ def _added(noise: Noise, expected: ExpectedError, without: Callable[[], float]) 
     part, rest = expected.parts.get("calibration", 0.0), expected.mse - expected.parts.get("calibration", 0.0)
     if "calibration" not in noise or part == 0:
         return 0.0
-    others = total({name: values for name, values in noise.items() if name != "calibration"})
+    others = total_variance({name: values for name, values in noise.items() if name != "calibration"})
     relative = part / max(rest, TINY)
     if float(np.max(noise["calibration"] / np.maximum(others, TINY), initial=0.0)) <= SMALL:
         return relative

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from ..forms.form import Matrix, Vector
-from ..prior import Prior, between_pixels, lag_distances
+from ..prior import Prior, lag_distances, stationary_matrix
 
 WHOLE = 1e-6  # of what a measurement sees: what may lie outside the tile that it counts for
 
@@ -118,7 +118,7 @@ class Evidence:
     def _correlation(self, length: float) -> tuple[Matrix, Matrix]:
         """P1 = exp(-distance / length) and its derivative by the logarithm of the length: (N, N) each."""
         lags = lag_distances(self.shape) / length
-        return between_pixels(np.exp(-lags), self.shape), between_pixels(lags * np.exp(-lags), self.shape)
+        return stationary_matrix(np.exp(-lags), self.shape), stationary_matrix(lags * np.exp(-lags), self.shape)
 
     def _weighted(self, weights: Vector) -> Matrix:
         return np.asarray((self.matrix.T @ sparse.csr_array(self.matrix.multiply(weights[:, None]))).toarray())

@@ -191,9 +191,11 @@ def point_at(recording: MisalignedRecording, scores: Vector) -> LikelihoodPoint:
     inner[np.diag_indices_from(inner)] += 1.0
     factor = np.asarray(linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False))
     residual: Vector = recording.recorded - matrix @ prior.mean
-    u: Vector = np.asarray(linalg.cho_solve((factor, True), prior.gather(weighted.T @ residual), check_finite=False))
-    pull: Vector = (residual - matrix @ prior.spread(u)) / noise
+    u: Vector = np.asarray(
+        linalg.cho_solve((factor, True), prior.apply_root_transposed(weighted.T @ residual), check_finite=False)
+    )
+    pull: Vector = (residual - matrix @ prior.apply_root(u)) / noise
     squares = float(noise @ pull**2 + u @ u + scores @ scores)
     determinant = float(np.log(noise).sum() + 2 * np.log(np.diagonal(factor)).sum())
-    image = prior.mean + prior.spread(u)
+    image = prior.mean + prior.apply_root(u)
     return LikelihoodPoint(recording, scores, matrix, factor, 0.5 * (squares + determinant), pull, image)

@@ -35,7 +35,7 @@ class RobustMethod(Method):
         recorded = white.vector(task.recorded[task.used])
         return white, estimate(problem, recorded, task.settings.method, task.settings.tolerance)
 
-    def estimated(self) -> Vector:
+    def estimate_image(self) -> Vector:
         """f^ alone: (N,)."""
         return self._solved[1].image
 
@@ -70,11 +70,11 @@ class AlignedMethod(Method):
 
     @cached_property
     def _dense(self) -> DenseMethod:
-        return DenseMethod(replace(self.task, model=_with(self.task.model, self.alignment)), self.hands)
+        return DenseMethod(replace(self.task, model=_with(self.task.model, self.alignment)), self.execution)
 
-    def estimated(self) -> Vector:
+    def estimate_image(self) -> Vector:
         """f^ alone: (N,)."""
-        return self._dense.estimated()
+        return self._dense.estimate_image()
 
     def result(self, noise: dict[str, Vector], truth: Vector | None) -> MethodResult:
         """The estimate and its error where the noise is as given; what is left unknown of misalignment adds to it."""

@@ -193,7 +193,7 @@ def robust_error(form: Form, white: Whitening, noise: dict[str, Vector], cause: 
     weights = np.zeros(form.problem.measurements)
     for start in range(0, count, CHUNK):
         some = np.arange(start, min(start + CHUNK, count))
-        u, negative = form.columns(some)
+        u, negative = form.pixel_solutions(some)
         prior, noisy = np.square(u).sum(axis=0), np.square(negative).sum(axis=0)
         variance[some] = prior + noisy
         missing, brought = missing + float(prior.sum()) / count, brought + float(noisy.sum()) / count

@@ -36,7 +36,7 @@ def cost(form: Form, telling: NDArray[np.bool_], camera: Camera, prior: Prior) -
     found = np.empty(form.problem.unknowns)
     for place, _, u, negative in columns(form, np.arange(form.problem.unknowns)):
         moved = shift.T @ negative
-        on_average = prior.gather(moved)
+        on_average = prior.apply_root_transposed(moved)
         about_it = np.zeros(negative.shape[1])
         for rows, block in zip(places, blocks, strict=True):
             about_it += np.sum(negative[rows] * (block @ negative[rows]), axis=0)

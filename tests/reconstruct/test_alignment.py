@@ -48,7 +48,7 @@ def recorded(camera: Camera, image: Vector, rng: np.random.Generator, table: NDA
 
 
 def drawn(prior: Prior, rng: np.random.Generator) -> Vector:
-    return prior.mean + prior.spread(rng.standard_normal(prior.freedoms))
+    return prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
 
 
 def fitted(camera: Camera, values: Vector, prior: Prior) -> Alignment:

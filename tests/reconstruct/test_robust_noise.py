@@ -56,7 +56,7 @@ def priors(side: int = SIDE) -> dict[str, Prior]:
 
 
 def drawn(prior: Prior, rng: np.random.Generator) -> Vector:
-    return prior.mean + prior.spread(rng.standard_normal(prior.freedoms))
+    return prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
 
 
 def drawn_matrix(camera: Camera, rng: np.random.Generator) -> Any:

@@ -14,22 +14,26 @@ from .scene import Scene, resolved
 from .skipped import skipped_effects
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Setup:
-    """A scene, its camera and the picture on its target, (rows, columns), None where no stage needs the picture.
+    """A scene and its camera; derived quantities are computed when they are first used, and once.
 
-    Derived quantities are computed when they are first asked for, and once.
+    given_image : (rows, columns), used instead of the picture that the scene names; None: load that one
     """
 
     scene: Scene
     camera: Camera
-    image: FloatArray | None = None
+    given_image: FloatArray | None = None
 
     @classmethod
-    def from_scene(cls, scene: Scene, *, with_image: bool = True) -> Setup:
-        """Derive the camera and load the picture. Raises InputError, which names the scene file."""
-        camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
-        return cls(scene, camera, picture.load(scene) if with_image else None)
+    def from_scene(cls, scene: Scene) -> Setup:
+        """Derive the camera of a scene. Raises InputError, which names the scene file."""
+        return cls(scene, derive(scene))
+
+    @cached_property
+    def image(self) -> FloatArray:
+        """Image on the target, (rows, columns). Raises InputError if the scene's picture cannot be loaded."""
+        return picture.load(self.scene) if self.given_image is None else self.given_image
 
     @cached_property
     def _reduced(self) -> tuple[Camera, tuple[SkippedEffect, ...]]:
@@ -52,12 +56,12 @@ class Setup:
 
     @property
     def has_structured_matrix(self) -> bool:
-        """Whether the estimator's H is ideal with box footprints, so that no matrix needs to be stored."""
+        """True if the estimator's H is ideal with box footprints, so that no matrix needs to be stored."""
         return self.scene.calibration.method == "ideal" and self.camera.has_box_footprints
 
-    @cached_property
+    @property
     def has_closed_form(self) -> bool:
-        """Whether the H of the simulated camera, misaligned as it is, has a closed form."""
+        """True if H of the simulated camera, misaligned as it is, has a closed form."""
         camera = self.simulated
         for lens_type in camera.types:
             if lens_type.optics.surfaces is not None:

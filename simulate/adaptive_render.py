@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.optics.negligible import without_negligible_effects
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
 from .noise_target import Allowed, allowed_variance
@@ -139,9 +138,7 @@ def _mean(variance: Vector) -> float:
 
 
 def render_until(
-    scene: Scene,
-    camera: Camera,
-    image: Vector,
+    setup: Setup,
     progress: Progress = no_progress,
     partial: Checkpoint | None = None,
     clock: Callable[[], float] = perf_counter,
@@ -151,15 +148,16 @@ def render_until(
     The first round is rendered whatever the time, so that every pixel has a value. Raises InputError where the scene
     has no noise to aim at, or if the variant asked for does not work here.
     """
-    allowed, variant = allowed_variance(scene, camera), choose(scene.render.variant)
+    scene = setup.scene
+    allowed, variant = allowed_variance(setup), choose(scene.render.variant)
     rig = Renderer(
-        without_negligible_effects(scene, camera)[0],
+        setup.simulated,
         variant,
         scene.render.sampler,
         around=None if scene.world is None else scene,
     )
-    rig.set_target(image)
-    rounds = AdaptiveRounds(scene, camera, rig, allowed)
+    rig.set_target(setup.image)
+    rounds = AdaptiveRounds(setup, rig, allowed)
     state = State() if partial is None else partial.state()
     rounds.resume(state)
     start = clock() - float(state.get("seconds", 0.0))
@@ -179,8 +177,9 @@ def render_until(
 class AdaptiveRounds:
     """The rounds of all sub-imagers: (M,) `mean` and `variance` of the last of each."""
 
-    def __init__(self, scene: Scene, camera: Camera, rig: Renderer, allowed: Allowed) -> None:
+    def __init__(self, setup: Setup, rig: Renderer, allowed: Allowed) -> None:
         """Before the first."""
+        scene, camera = setup.scene, setup.camera
         self._scene, self._camera, self._rig, self._allowed = scene, camera, rig, allowed
         self._places = camera.slices()
         self.mean, self.variance = np.zeros(camera.measurements), np.zeros(camera.measurements)

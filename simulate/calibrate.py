@@ -9,10 +9,9 @@ from typing import Any
 from ommatid.runtime.files import fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import without_negligible_effects
-from ommatid.scenes.scene import Scene, resolved
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 from .calibration.entries import rendered_model
 from .calibration.stopping_rule import StoppingRule
@@ -20,13 +19,14 @@ from .ideal import ideal_model
 from .sampling.checkpoint import Checkpoint
 
 
-def made_from(scene: Scene, camera: Camera, judge: StoppingRule | None = None) -> str:
+def made_from(setup: Setup, judge: StoppingRule | None = None) -> str:
     """Fingerprint of everything that H depends on; `judge` where it says when to stop."""
-    description: dict[str, Any] = {"camera": camera.describe(), "calibration": scene.calibration.model_dump()}
+    scene = setup.scene
+    description: dict[str, Any] = {"camera": setup.camera.describe(), "calibration": scene.calibration.model_dump()}
     if judge is not None and is_adaptive(scene):
         description["judged"] = judge.fingerprint
     if scene.calibration.method != "ideal":
-        description["simulated"] = without_negligible_effects(scene, camera)[0].describe()
+        description["simulated"] = setup.simulated.describe()
         description["versions"] = versions("mitsuba")
         render = scene.render
         description["render"] = {"seed": render.seed, "variant": render.variant, "sampler": render.sampler}
@@ -34,8 +34,7 @@ def made_from(scene: Scene, camera: Camera, judge: StoppingRule | None = None) -
 
 
 def calibrate(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     progress: Progress = no_progress,
     partial: Checkpoint | None = None,
     judge: StoppingRule | None = None,
@@ -45,18 +44,18 @@ def calibrate(
     judge : says when to stop where the scene leaves the number of samples open
     Raises InputError if the variant asked for does not work here, DeniedError if a row fails its check.
     """
-    start = perf_counter()
-    record: dict[str, Any] = {"fingerprint": made_from(scene, camera, judge), "method": scene.calibration.method}
+    scene, start = setup.scene, perf_counter()
+    record: dict[str, Any] = {"fingerprint": made_from(setup, judge), "method": scene.calibration.method}
     if scene.calibration.method == "ideal":
-        model = ideal_model(resolved(scene, camera.shape), camera)
+        model = ideal_model(setup.resolved, setup.camera)
         record |= {"seconds": perf_counter() - start, "versions": versions("scipy")}
         return replace(model, record=record)
     if is_adaptive(scene):
         from .calibration.adaptive_rounds import calibrate_until
 
-        model = calibrate_until(scene, camera, judge, progress, partial)
+        model = calibrate_until(setup, judge, progress, partial)
         return replace(model, record=model.record | record | {"seconds": perf_counter() - start})
-    model = rendered_model(scene, camera, progress, partial)
+    model = rendered_model(setup, progress, partial)
     return replace(model, record=record | model.record)
 
 

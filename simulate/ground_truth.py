@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.formats.picture import write_truth
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 from .renderer.variant import choose
 from .renderer.world import describe
@@ -56,18 +56,17 @@ def ideal_camera(camera: Camera, finer: int = 1) -> Camera:
     return replace(camera, types=(whole,), wavelength=None, tolerance=None, lens_columns=None)
 
 
-def truth(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Truth:
+def truth(setup: Setup) -> Truth:
     """Render what the estimate is compared with; its seeds are neither those of data nor of calibration.
 
-    image : on the target, if there is one
     Raises InputError for a world that cannot be built, or a variant that does not work here.
     """
     from .renderer.renderer import Renderer
 
-    variant = choose(scene.render.variant)
-    work = _plan(scene, camera)
+    scene, camera = setup.scene, setup.camera
+    variant, work = choose(scene.render.variant), _plan(scene, camera)
     rig = Renderer(ideal_camera(camera), variant, scene.render.sampler, around=scene)
-    rig.set_target(image)
+    rig.set_target(setup.image)
     start = int(np.random.SeedSequence(scene.render.seed, spawn_key=(zlib.crc32(b"truth"),)).generate_state(1)[0])
     tally = Tally(camera.unknowns)
     for number in range(work.passes):
@@ -86,7 +85,7 @@ def truth(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> Truth:
 
 def _plan(scene: Scene, camera: Camera) -> Plan:
     """TRUER times the samples of a sensor pixel, in passes of a size that memory holds."""
-    work = plan(TRUER * scene.render.counted, scene.render.sampler)
+    work = plan(TRUER * scene.render.sample_count, scene.render.sampler)
     most = max(1, MOST_RAYS // camera.unknowns)
     if work.samples <= most:
         return work
@@ -94,31 +93,32 @@ def _plan(scene: Scene, camera: Camera) -> Plan:
     return Plan(ceil(work.total / each), each)
 
 
-def truth_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
+def truth_from(setup: Setup) -> str:
     """Fingerprint of everything that the truth depends on. Raises InputError."""
-    described = camera.describe()
+    described = setup.camera.describe()
     kept = {name: described[name] for name in ("target.shape", "target.pixel_pitch", "target.distance")}
     return fingerprint(
         {
             **kept,
-            "picture": digest(image.astype(np.float32)),
-            "world": describe(scene),
-            "render": scene.render.model_dump(exclude_none=True),
+            "picture": digest(setup.image.astype(np.float32)),
+            "world": describe(setup.scene),
+            "render": setup.scene.render.model_dump(exclude_none=True),
             "versions": versions("mitsuba"),
         }
     )
 
 
-def cached_truth(path: Path, scene: Scene, camera: Camera, image: NDArray[np.float64]) -> NDArray[np.float64]:
+def cached_truth(path: Path, setup: Setup) -> NDArray[np.float64]:
     """The truth as `path` holds it, rendered where it is not there or was made from something else."""
-    wanted = truth_from(scene, camera, image)
-    try:
-        (old,) = read(path)
-    except (InputError, ValueError):  # missing, damaged or of another kind: to be made
-        old = None
-    if old is not None and old.record.get("fingerprint") == wanted and "Y" in old.channels:
-        return old.channels["Y"].astype(np.float64)
-    made = truth(scene, camera, image)
-    record = {"fingerprint": wanted, "samples": made.samples, "variance": float(made.variance.mean())}
-    write_truth(path, made.image, made.depth, record)
-    return made.image.astype(np.float32).astype(np.float64)
+    wanted = truth_from(setup)
+
+    def write_made(path: Path, made: Truth) -> None:
+        record = {"fingerprint": wanted, "samples": made.samples, "variance": float(made.variance.mean())}
+        write_truth(path, made.image, made.depth, record)
+
+    return cached(path, wanted, _read_truth, lambda: truth(setup), write_made)[0]
+
+
+def _read_truth(path: Path) -> tuple[NDArray[np.float64], str | None]:
+    (part,) = read(path)
+    return part.channels["Y"].astype(np.float64), part.record.get("fingerprint")

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.recording import expected_recording
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 Vector = NDArray[np.float64]
 Allowed = Callable[[Vector], Vector]
@@ -29,11 +29,12 @@ def check_noise_target(scene: Scene) -> None:
         )
 
 
-def allowed_variance(scene: Scene, camera: Camera) -> Allowed:
+def allowed_variance(setup: Setup) -> Allowed:
     """From the light on all pixels, (M,), what the variance of its rendering may be, (M,); NaN where it is nothing.
 
     Raises InputError where there is no noise.
     """
+    scene, camera = setup.scene, setup.camera
     check_noise_target(scene)
     sensor = scene.sensor
     if sensor is None:
@@ -42,7 +43,7 @@ def allowed_variance(scene: Scene, camera: Camera) -> Allowed:
         return lambda light: np.full(light.shape, SHARE * known)
     from .sensor.response import response
 
-    freed = response(scene, camera)
+    freed = response(setup)
 
     def of_sensor(light: Vector) -> Vector:
         values = np.maximum(np.nan_to_num(light), 0.0)

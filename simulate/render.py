@@ -13,11 +13,11 @@ from ommatid.runtime.files import digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.optics.negligible import without_negligible_effects, without_shot_noise
+from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.recording import Recording
-from ommatid.scenes.scene import Scene, resolved
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
-from ommatid.scenes.stack import STRAIGHT, Stack, recorded
+from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.variant import choose
@@ -43,9 +43,9 @@ class Rendering(OverPasses):
         return np.maximum(settled, rounding_variance(self.mean, self.samples))
 
 
-def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
+def made_from(setup: Setup) -> str:
     """Fingerprint of everything that the values of a stack depend on."""
-    world: dict[str, Any] = {}
+    scene, world = setup.scene, dict[str, Any]()
     if scene.world is not None:
         from .renderer.world import describe
 
@@ -53,9 +53,9 @@ def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
     return fingerprint(
         {
             **world,
-            "camera": camera.describe(),
-            "simulated": without_negligible_effects(scene, camera)[0].describe(),
-            "target": digest(image.astype(np.float32)),
+            "camera": setup.camera.describe(),
+            "simulated": setup.simulated.describe(),
+            "target": digest(setup.image.astype(np.float32)),
             "noise": scene.noise.model_dump() if scene.noise else None,
             "sensor": scene.sensor.model_dump() if scene.sensor else None,
             "render": scene.render.model_dump(exclude_none=True),
@@ -65,9 +65,7 @@ def made_from(scene: Scene, camera: Camera, image: NDArray[np.float64]) -> str:
 
 
 def light(
-    scene: Scene,
-    camera: Camera,
-    image: NDArray[np.float64],
+    setup: Setup,
     progress: Progress = no_progress,
     partial: Checkpoint | None = None,
     work: Plan | None = None,
@@ -79,13 +77,14 @@ def light(
     """
     from .renderer.renderer import Renderer
 
+    scene, camera = setup.scene, setup.camera
     if scene.render.samples == "auto":
         raise ValueError("expected a number of samples, got 'auto', which `light_until` renders")
     variant = choose(scene.render.variant)
     work = plan(scene.render.samples, scene.render.sampler) if work is None else work
     around = None if scene.world is None else scene
-    rig = Renderer(without_negligible_effects(scene, camera)[0], variant, scene.render.sampler, around=around)
-    rig.set_target(image)
+    rig = Renderer(setup.simulated, variant, scene.render.sampler, around=around)
+    rig.set_target(setup.image)
     tally = Tally(camera.measurements)
     if partial is not None:
         tally.resume("light", partial.state())
@@ -110,29 +109,27 @@ def light(
 
 
 def render(
-    scene: Scene,
-    camera: Camera,
-    image: NDArray[np.float64],
+    setup: Setup,
     progress: Progress = no_progress,
     partial: Checkpoint | None = None,
     truth: NDArray[np.float64] | None = None,
 ) -> Stack:
-    """Render and record the sub-images of `image`, (rows, columns), on the target.
+    """Render and record the sub-images of the setup's image on its target.
 
     truth : what the estimate is compared with; absent: the image
     The variance of each pixel's mean is drawn towards its sub-image's and never below float32's rounding.
     Raises InputError if the variant asked for does not work here.
     """
-    start = perf_counter()
+    scene, start = setup.scene, perf_counter()
     if scene.render.samples == "auto":
         from .adaptive_render import render_until
 
-        rendering = render_until(scene, camera, image, progress, partial)
+        rendering = render_until(setup, progress, partial)
     else:
-        rendering = light(scene, camera, image, progress, partial)
+        rendering = light(setup, progress, partial)
     record: dict[str, Any] = {
-        "fingerprint": made_from(scene, camera, image),
-        "truth": digest((image if truth is None else truth).astype(np.float32)),
+        "fingerprint": made_from(setup),
+        "truth": digest((setup.image if truth is None else truth).astype(np.float32)),
         "seconds": perf_counter() - start,
         "seed": scene.render.seed,
         "sampler": scene.render.sampler,
@@ -140,28 +137,26 @@ def render(
         **({STRAIGHT: True} if rendering.straight else {}),
         "versions": versions("mitsuba", "drjit", "OpenEXR"),
     }
-    return exposed(scene, camera, rendering.mean, rendering.stated(camera), record)
+    return exposed(setup, rendering.mean, rendering.stated(setup.camera), record)
 
 
-def exposed(
-    scene: Scene, camera: Camera, light: NDArray[np.float64], variance: NDArray[np.float64], record: dict[str, Any]
-) -> Stack:
+def exposed(setup: Setup, light: NDArray[np.float64], variance: NDArray[np.float64], record: dict[str, Any]) -> Stack:
     """What the scene's sensor records of light, (M,), whose variances are known; noise by the scene's seed."""
-    kept, values = resolved(scene, camera.shape), light
+    scene, camera, values = setup.scene, setup.camera, light
     if scene.sensor is not None:
-        return recorded(kept, camera, _exposed(scene, scene.sensor, camera, light), variance, record)
+        return stack_from_recording(setup.resolved, camera, _exposed(setup, scene.sensor, light), variance, record)
     if scene.noise is not None:
         from .sensor.gaussian import expose, generators
 
         values = expose(values, scene.noise, generators(camera, scene.render.seed), camera.slices())
-    return Stack(kept, camera, values, variance, record)
+    return Stack(setup.resolved, camera, values, variance, record)
 
 
-def _exposed(scene: Scene, sensor: SensorTable, camera: Camera, light: NDArray[np.float64]) -> Recording:
+def _exposed(setup: Setup, sensor: SensorTable, light: NDArray[np.float64]) -> Recording:
     from .sensor.emva1288 import record
     from .sensor.response import response
 
     dark = np.isnan(light)  # no light can reach these pixels; so they are dead, and known by their flat
-    freed = np.where(dark, 0.0, response(scene, camera))
-    shot = without_shot_noise(scene, camera) is None
-    return record(np.where(dark, 0.0, light), freed, sensor, camera, scene.render.seed, shot)
+    freed = np.where(dark, 0.0, response(setup))
+    shot = negligible_shot_noise(setup.scene, setup.camera) is None
+    return record(np.where(dark, 0.0, light), freed, sensor, setup.camera, setup.scene.render.seed, shot)

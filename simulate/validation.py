@@ -8,8 +8,7 @@ from ommatid.runtime.errors import naming_source
 from ommatid.runtime.memory import check_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.negligible import without_negligible_effects
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 from .noise_target import check_noise_target
 from .renderer.variant import check_fast_variant, check_transport_variant, choose
@@ -20,27 +19,29 @@ SWEPT = 3 * 8 + 8 * 4 + 10 * 8  # bytes a reading of a sensor pixel: tallies, ba
 BESIDE = 2  # pixels of f around a footprint
 
 
-def check_scene(scene: Scene, camera: Camera, calibrates: bool = True) -> None:
+def check_scene(setup: Setup, calibrates: bool = True) -> None:
     """Raise InputError, which names the scene file, for what would fail only after some work.
 
     calibrates : whether H is to be found, not the light alone
     """
+    scene = setup.scene
     with naming_source(scene.source):
-        check_scene_memory(scene, camera, calibrates)
+        check_scene_memory(setup, calibrates)
         variant = choose(scene.render.variant)
-        check_lenses(camera)
-        check_fast_variant(without_negligible_effects(scene, camera)[0], variant)
+        check_lenses(setup.camera)
+        check_fast_variant(setup.simulated, variant)
         if scene.render.samples == "auto":
             check_noise_target(scene)
         if calibrates and scene.calibration.method == "transport":
             check_transport_variant(variant)
 
 
-def check_scene_memory(scene: Scene, camera: Camera, calibrates: bool = True) -> None:
+def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
     """Raise InputError where memory does not hold a rendering or, if it `calibrates`, H with its uncertainty."""
+    scene, camera = setup.scene, setup.camera
     rendering = SENSOR * camera.measurements + TARGET * camera.unknowns
     check_memory(rendering, "rendering", "make target.shape or the lens arrays smaller")
-    if not calibrates or (scene.calibration.method == "ideal" and camera.has_box_footprints):
+    if not calibrates or setup.has_structured_matrix:
         return
     seen = [kind.measurements * min(_seen(camera, kind), camera.unknowns) for kind in camera.types]
     needed = ENTRY * sum(seen) + (SWEPT * max(seen) if scene.calibration.method == "points" else 0)

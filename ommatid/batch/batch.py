@@ -16,14 +16,13 @@ from ommatid.runtime.files import check_output, clear_abandoned, make_folder
 from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.processors import processors
 from ommatid.runtime.workers import Completed
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.formats.picture import Image, write_truth
-from ommatid.scenes.scene import TRUTH, Scene, resolved, write
+from ommatid.scenes.formats.picture import write_truth
+from ommatid.scenes.scene import TRUTH, Scene, write
+from ommatid.scenes.setup import Setup
 
 from .remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, done_of, packed, unpack
 
 Description = dict[str, Any]
-Opened = tuple[Scene, Camera, Image]
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Batch:
         left to them;  fitting : how many memory holds side by side
     """
 
-    opened: Callable[[Member], Opened]
+    opened: Callable[[Member], Setup]
     stages: Stages
     watch: Callable[[Path], RunObserver]
     tell: Callable[[Member, Description], Description]
@@ -80,7 +79,7 @@ class Batch:
             yield member, partial(self._work, member)
 
     def _work(self, member: Member) -> Description:
-        description = self.stages(*self.opened(member), member.folder, self.watch(member.folder))
+        description = self.stages(self.opened(member), member.folder, self.watch(member.folder))
         return self.tell(member, description)
 
     def _beside(self, members: Sequence[Member], count: int) -> Works:
@@ -95,12 +94,13 @@ class Batch:
         scenes: dict[Member, Scene] = {}
         for member in members:
             try:
-                scene, _, image = self.opened(member)
+                setup = self.opened(member)
+                scene = setup.scene
                 if scene.world is not None:
                     raise InputError(
                         f"{member.scene}: the files of a [world] do not travel to other machines; leave out --scheduler"
                     )
-                prepare(scene, image, member.folder)
+                prepare(setup, member.folder)
                 scenes[member] = scene
             except Exception as error:
                 yield member, partial(_raise, error)
@@ -135,9 +135,9 @@ class Batch:
         return self.tell(member, outcome.description)
 
 
-def _in_process(opened: Callable[[Member], Opened], stages: Stages, member: Member) -> SceneOutcome:
+def _in_process(opened: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:
     """What becomes of a scene in a process on this machine, which finds the scene's files and writes its folder."""
-    return done_of(lambda watch: stages(*opened(member), member.folder, watch))
+    return done_of(lambda watch: stages(opened(member), member.folder, watch))
 
 
 class _ScenePackages:
@@ -152,7 +152,7 @@ class _ScenePackages:
     def __iter__(self) -> Iterator[ScenePackage]:
         for member in self._members:
             try:
-                parcel = packed(*self._batch.opened(member), member.folder)
+                parcel = packed(self._batch.opened(member), member.folder)
             except Exception as error:  # removed meanwhile
                 self.failed[member] = error
                 continue
@@ -160,19 +160,19 @@ class _ScenePackages:
             yield parcel
 
 
-def prepare(scene: Scene, image: Image, folder: Path) -> None:
+def prepare(setup: Setup, folder: Path) -> None:
     """Make the folder of a scene, with the scene and its target in it. Raises InputError or DeniedError.
 
     What a world truly looks like is rendered later.
     """
+    scene = setup.scene
     make_folder(folder)
     clear_abandoned(folder)
     for name in ("scene.toml", TRUTH):
         check_output(folder / name, scene.source, *([Path(scene.target.image)] if scene.target.image else []))
-    rows, columns = image.shape
-    write(folder / "scene.toml", resolved(scene, (rows, columns)))
+    write(folder / "scene.toml", setup.resolved)
     if scene.world is None:
-        write_truth(folder / TRUTH, image)
+        write_truth(folder / TRUTH, setup.image)
 
 
 def _raise(error: Exception) -> Description:

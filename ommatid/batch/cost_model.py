@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 
-from ommatid.reconstruct.method_choice import BASE, allowed_memory, choose_method
+from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, choose_method
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import IN_PLACE_OF_AUTO, Scene, read
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.point_sources import RENDERINGS
 
 from .batch import Member
@@ -32,18 +33,20 @@ class CostEstimate:
 def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str]) -> CostEstimate:
     """Of a scene of a batch; none of one that is refused, which will be told in its turn."""
     try:
-        scene = read(member.scene, (*changes, *member.changes), lenses)
-        camera = derive(scene)
-        choice = choose_method(scene, camera, scene.calibration.method == "ideal" and camera.has_box_footprints)
+        setup = Setup.from_scene(read(member.scene, (*changes, *member.changes), lenses))
+        choice = choose_method(setup.scene, setup.camera, setup.has_structured_matrix)
     except InputError:
         return CostEstimate(0.0, 0)
-    return CostEstimate(LEAST + _rays(scene, camera) / RAYS + choice.seconds, BASE + choice.memory)
+    rays = _rays(setup.scene, setup.camera) / RAYS
+    return CostEstimate(LEAST + rays + choice.seconds, PROGRAM_MEMORY + choice.memory)
 
 
 def _rays(scene: Scene, camera: Camera) -> float:
     method, asked = scene.calibration.method, scene.calibration.samples
     several = {"points": RENDERINGS, "transport": 1.0, "ideal": 0.0}[method]
-    return camera.measurements * (scene.render.counted + several * (IN_PLACE_OF_AUTO if asked == "auto" else asked))
+    return camera.measurements * (
+        scene.render.sample_count + several * (IN_PLACE_OF_AUTO if asked == "auto" else asked)
+    )
 
 
 def concurrent_by_memory(memory: Sequence[int]) -> int:

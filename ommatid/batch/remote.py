@@ -17,9 +17,10 @@ from ommatid.runtime.dask_cluster import scratch_folder
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import write_whole
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import Image
-from ommatid.scenes.scene import Scene, parse, resolved
+from ommatid.scenes.scene import parse
+from ommatid.scenes.setup import Setup
 
 LAST = "run.json"  # stands for all the others
 
@@ -32,7 +33,7 @@ class RunObserver:
     done: Callable[[str, bool], None]
 
 
-Stages = Callable[[Scene, Camera, Image, Path, RunObserver], dict[str, Any]]
+Stages = Callable[[Setup, Path, RunObserver], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,9 @@ class SceneOutcome:
     error: Exception | None = None
 
 
-def packed(scene: Scene, camera: Camera, image: Image, folder: Path) -> ScenePackage:
+def packed(setup: Setup, folder: Path) -> ScenePackage:
     """A scene and what stands in its folder."""
-    tables = resolved(scene, camera.shape).plain()
-    return ScenePackage(tables, str(scene.source), image, str(folder), _contents(folder))
+    return ScenePackage(setup.resolved.plain(), str(setup.scene.source), setup.image, str(folder), _contents(folder))
 
 
 def carry_out(stages: Stages, parcel: ScenePackage) -> SceneOutcome:
@@ -71,7 +71,7 @@ def carry_out(stages: Stages, parcel: ScenePackage) -> SceneOutcome:
 
         def work(watch: RunObserver) -> dict[str, Any]:
             scene = parse(parcel.tables, Path(parcel.source))
-            return stages(scene, derive(scene), parcel.image, folder, watch)
+            return stages(Setup(scene, derive(scene), parcel.image), folder, watch)
 
         outcome, failure = done_of(work), None
         if isinstance(outcome.error, InputError | MachineError):

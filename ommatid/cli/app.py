@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
     from ommatid.scenes.hardware.frames import AcquisitionSettings
     from ommatid.scenes.model import Model
-    from ommatid.scenes.scene import Scene
+    from ommatid.scenes.setup import Setup
     from ommatid.scenes.tables.sensor import NoiseTable
 
 app = typer.Typer(
@@ -149,13 +149,15 @@ def run(
 
     def tell(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         from ommatid.analysis import depth_error, run_table, study
+        from ommatid.reconstruct.output.run_json import RunReport
 
         if not as_json:
-            _table(f"{description['title'] or member.scene.stem}: {member.folder}", run_table.rows(description))
-            if "depth" in description:
-                _table("Error against distance", depth_error.rows(description["depth"]))
-            if "study" in description:
-                _table("The same stack with other ideas of H", study.rows(description["study"]))
+            report = RunReport.model_validate(description)
+            _table(f"{report.title or member.scene.stem}: {member.folder}", run_table.rows(report))
+            if report.depth:
+                _table("Error against distance", depth_error.rows(report.depth))
+            if report.study:
+                _table("The same stack with other models of H", study.rows(report.study))
         return description
 
     sets = _complete(sets, complete)
@@ -214,22 +216,21 @@ def calibrate(
     sets = _complete(sets, complete)
     from ommatid.pipeline.stages import calibrated
     from ommatid.runtime.files import check_output
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
 
     check_output(output, scene)
-    described = read(scene, sets or (), _names(lens))
-    camera = derive(described)
+    setup = Setup.from_scene(read(scene, sets or (), _names(lens)))
     if points:
         if lens:
             raise InputError("--lens: recorded frames are of the whole camera; choose lens types in `reconstruct`")
         bench = _bench(dark, flat, flat_value, origin, upright)
-        model, made = _told_by_points(described, camera, output, [*points, *(more or [])], bench, places, point_value)
+        model, made = _told_by_points(setup, output, [*points, *(more or [])], bench, places, point_value)
     elif more or places or dark or flat or origin:
         raise InputError("calibrate: images, --places, --dark, --flat and --origin belong to --points; name its images")
     else:
         with naming_source(scene), _progress("calibrate") as progress:
-            model, made = calibrated(described, camera, output, progress)
+            model, made = calibrated(setup, output, progress)
     _say(f"calibrate: {_done(made)}, {output}")
     if as_json:
         facts = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
@@ -257,8 +258,9 @@ def reconstruct(
 ) -> None:
     """Reconstruct from files alone."""
     from ommatid.analysis import run_table
-    from ommatid.reconstruct.output import figures, run_json
+    from ommatid.reconstruct.output import figures
     from ommatid.reconstruct.output import result_files as results
+    from ommatid.reconstruct.output.run_json import RegionReport
     from ommatid.reconstruct.restore import check_region
     from ommatid.runtime.files import check_output
     from ommatid.runtime.pool import check_options
@@ -275,19 +277,20 @@ def reconstruct(
     if lens:
         recorded, calibrated = recorded.restrict(_names(lens)), calibrated.restrict(_names(lens))
     check_region(corner, size, recorded.camera.shape)
-    recorded = results.changed(recorded, sets or [], stack)
+    recorded = results.with_estimator_changes(recorded, sets or [], stack)
     truth = results.truth_beside(stack, recorded)
     with _crew(scheduler, workers) as crew, _progress("reconstruct") as progress:
-        restoration, description = results.reconstruct(recorded, calibrated, truth, (stack, model), crew, progress)
+        restoration, report = results.reconstruct(recorded, calibrated, truth, (stack, model), crew, progress)
     if region:
         mean, deviation = restoration.region(corner, size)
-        description["region"] = {"corner": corner, "size": size, "mean": mean, "deviation": deviation}
-    run_json.write_estimate(output, restoration, {"title": recorded.scene.title})
+        region_mean = RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
+        report = report.with_changes(region=region_mean)
+    results.write_estimate(output, restoration, {"title": recorded.scene.title})
     figures.write_estimate(output.with_suffix(".png"), restoration.estimate.reshape(restoration.shape))
     if as_json:
-        _print_json({"file": str(output), **description})
+        _print_json({"file": str(output), **report.plain()})
     else:
-        _table(str(output), run_table.rows(description))
+        _table(str(output), run_table.rows(report))
 
 
 @app.command("import")
@@ -314,23 +317,25 @@ def import_(
 
     A mosaic is the sensor seen from behind the camera, rows downwards; its numbers are taken as they are.
     """
+    from ommatid.analysis.recording_warnings import import_warnings
     from ommatid.runtime.files import check_output
     from ommatid.scenes import stack
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.hardware.frames import files_in
-    from ommatid.scenes.hardware.stack_import import import_stack, warnings
+    from ommatid.scenes.hardware.stack_import import import_stack
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
 
     bench = _bench(dark, flat, flat_value, origin, upright)
     check_output(output, scene, *(file for path in (*images, *bench.dark, *bench.flat) for file in files_in(path)))
-    described = read(scene, sets or ())
-    camera = derive(described)  # all of it: lens types that are left out stand on the sensor nevertheless
-    if lens and not camera.is_ideal_pinhole:
+    setup = Setup.from_scene(
+        read(scene, sets or ())
+    )  # all of it: lens types that are left out stand on the sensor nevertheless
+    if lens and not setup.camera.is_ideal_pinhole:
         raise InputError(f"--lens {lens}: lenses that are more than pinholes are imported all; choose in `reconstruct`")
-    made, frames = import_stack(described, camera, images, bench)
+    made, frames = import_stack(setup, images, bench)
     made = made.restrict(_names(lens)) if lens else made
     stack.write(output, made)
-    for warning in warnings(frames):
+    for warning in import_warnings(frames):
         _say(f"import: {warning}")
     _say(f"import: done, {output}")
     if as_json:
@@ -353,11 +358,11 @@ def predict(
 
     From Eq. 5 and the ideal model: nothing is rendered.
     """
+    from ommatid.analysis import prediction_table
     from ommatid.analysis.predict import electrons, predict_scene
     from ommatid.pipeline import stages
-    from ommatid.reconstruct import prediction as accuracy
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
 
     if sweep:
         members = _members([scene], Path(), sweep, sets, lens)
@@ -368,11 +373,11 @@ def predict(
         raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
     described = read(scene, sets or (), _names(lens))
     with naming_source(scene):
-        prediction, light = predict_scene(described), electrons(described, derive(described))
+        prediction, light = predict_scene(described), electrons(Setup.from_scene(described))
     if as_json:
-        _print_json(prediction.describe() | ({} if light is None else {"light": light}))
+        _print_json(prediction_table.json_of(prediction) | ({} if light is None else {"light": light}))
         return
-    lines, tolerance = accuracy.rows(prediction), described.camera.tolerance
+    lines, tolerance = prediction_table.rows(prediction), described.camera.tolerance
     if tolerance is not None and prediction.misalignment is None and described.estimator.misalignment == "trust":
         lines.append(("misalignment", "not in these numbers: what it adds is known for small targets and no blur"))
     _table(described.title or scene.stem, lines)
@@ -394,9 +399,9 @@ def design(
 
     Ranks magnifications by the expected error (Eq. 5) with each.
     """
-    from ommatid.analysis.candidates import magnifications, with_lens
-    from ommatid.analysis.design import DesignCandidate, ranked, rows
+    from ommatid.analysis.design import DesignCandidate, magnifications, ranked, rows, with_lens
     from ommatid.analysis.predict import predict_scene
+    from ommatid.analysis.prediction_table import json_of
     from ommatid.scenes.scene import read
 
     wanted = magnifications(candidates)
@@ -412,7 +417,7 @@ def design(
             progress((place + 1) / len(wanted))
     choices = ranked(choices)
     if as_json:
-        _print_json({"before": before.describe(), "candidates": [choice.describe() for choice in choices]})
+        _print_json({"before": json_of(before), "candidates": [choice.describe() for choice in choices]})
     else:
         _table(f"{described.title or scene.stem}: what one more lens type would bring", rows(before, choices))
 
@@ -480,9 +485,9 @@ def bench(
     from ommatid.bench.bench import rows
     from ommatid.pipeline.stages import opened
 
-    described, camera, image = opened(scene, sets or (), _names(lens))
+    setup = opened(scene, sets or (), _names(lens))
     with _progress("bench") as progress:
-        table, made = measured(described, camera, image, output, seconds, progress)
+        table, made = measured(setup, output, seconds, progress)
     _say(f"bench: {_done(made)}, {output / 'bench.json'}")
     if as_json:
         _print_json(table.describe())
@@ -499,16 +504,16 @@ def show(
     from ommatid.analysis.predict import optics as optics_of
     from ommatid.analysis.summary import describe, sections
     from ommatid.reconstruct.method_choice import choose_method as choose_way
-    from ommatid.scenes.camera import derive
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
     from ommatid.simulate.renderer.variant import choose
 
-    described = read(scene, _complete(sets, complete), _names(lens))
-    camera = derive(described)
-    choice = choose_way(described, camera, described.calibration.method == "ideal" and camera.has_box_footprints)
+    setup = Setup.from_scene(read(scene, _complete(sets, complete), _names(lens)))
+    described, camera = setup.scene, setup.camera
+    choice = choose_way(described, camera, setup.has_structured_matrix)
     with naming_source(scene):
-        optics, light = optics_of(camera), electrons(described, camera)
-    description = describe(described, camera, choose(described.render.variant), choice.plan(), optics, light)
+        optics, light = optics_of(camera), electrons(setup)
+    description = describe(setup, choose(described.render.variant), choice, optics, light)
     if as_json:
         _print_json(description)
         return
@@ -525,11 +530,11 @@ def export(scene: SceneFile, output: Output, sets: Sets = None, lens: Lenses = "
     from ommatid.simulate.renderer.export import export as write
 
     check_output(output, scene)
-    described, camera, image = opened(scene, sets or (), _names(lens))
-    if described.world is not None:
+    setup = opened(scene, sets or (), _names(lens))
+    if setup.scene.world is not None:
         raise InputError(f"{scene}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
-    picture = write(described, camera, image, output)
-    sensors = [sub.name for sub in camera.sub_imagers]
+    picture = write(setup, output)
+    sensors = [sub.name for sub in setup.camera.sub_imagers]
     _say(f"{output} and {picture}: {len(sensors)} sensors; render one with: mitsuba -m scalar_rgb -s 0 {output}")
     if as_json:
         _print_json({"file": str(output), "picture": str(picture), "sensors": sensors})
@@ -718,7 +723,8 @@ def _each(
 
 
 def _tell_sweep(documents: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
-    from ommatid.batch.sweep_table import lines, summary, write_sweep
+    from ommatid.batch.sweep_row import summary
+    from ommatid.batch.sweep_table import lines, write_sweep
 
     rows = [summary(document) for document in documents]
     if output is not None:
@@ -750,7 +756,7 @@ def _optics_sections(
 
         found.append(("Optics", [(f"lens type {one['lens']}", words(one)) for one in optics]))
     if light is not None:
-        from ommatid.scenes.optics.radiometry import rows
+        from ommatid.analysis.light_table import rows
 
         found.append(("Electrons", rows(light)))
     return found
@@ -784,8 +790,7 @@ def _refuse_no_value(option: str, value: float) -> None:
 
 
 def _told_by_points(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     output: Path,
     points: list[Path],
     bench: AcquisitionSettings,
@@ -793,17 +798,18 @@ def _told_by_points(
     value: float,
 ) -> tuple[Model, bool]:
     """H told from recorded frames, written, with what the user should know of it."""
+    from ommatid.analysis.recording_warnings import calibration_warnings
     from ommatid.runtime.files import check_output
     from ommatid.scenes import model_file
-    from ommatid.scenes.hardware import point_sources, stack_import
     from ommatid.scenes.hardware.frames import files_in
+    from ommatid.scenes.hardware.point_sources import from_recorded_points
 
     _refuse_no_value("--point-value", value)
     read = [file for path in (*points, *bench.dark, *bench.flat) for file in files_in(path)]
     check_output(output, *read, *([] if places is None else [places]))
-    told = point_sources.from_recorded_points(scene, camera, points, bench, places, value)
+    told = from_recorded_points(setup, points, bench, places, value)
     model_file.write(output, told.model)
-    for warning in (*stack_import.dead(told.frames), *point_sources.warnings(told)):
+    for warning in calibration_warnings(told):
         _say(f"calibrate: {warning}")
     return told.model, True
 

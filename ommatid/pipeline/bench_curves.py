@@ -1,12 +1,10 @@
-"""Curves that `ommatid bench` has measured of the same camera, where its results stand beside a run's."""
+"""Error curves from the results of `ommatid bench` for the same camera, if they are beside a run's results."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from ommatid.bench.table import BenchTable, Stage, bench_files, read
-from ommatid.runtime.errors import InputError
+from ommatid.bench.table import BenchTable, Stage, bench_tables
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.renderer.variant import choose
@@ -15,25 +13,18 @@ from .time_allocation import ErrorCurve
 
 
 def bench_error_curves(folder: Path, scene: Scene, camera: Camera) -> tuple[ErrorCurve, ErrorCurve] | None:
-    """Of rendering and of calibration, from the file in the run's folder or the one above; None where none serves."""
-    for path in bench_files(folder):
-        try:
-            table = read(path)
-        except InputError:
-            continue
-        sampler, variant = scene.render.sampler, choose(scene.render.variant)
-        found = (
-            _curve(table, "render", sampler, variant),
-            _curve(table, "calibrate", f"{scene.calibration.method}, {sampler}", variant),
-        )
-        same = table.camera == json.loads(json.dumps(camera.describe()))
-        if same and found[0] is not None and found[1] is not None:
-            return found[0], found[1]
+    """Return the curves of rendering and calibration from the run's folder or its parent, None if there are none."""
+    sampler, variant = scene.render.sampler, choose(scene.render.variant)
+    for table in bench_tables(folder, camera.describe()):
+        render = _curve(table, "render", sampler, variant)
+        calibrate = _curve(table, "calibrate", f"{scene.calibration.method}, {sampler}", variant)
+        if render is not None and calibrate is not None:
+            return render, calibrate
     return None
 
 
 def _curve(table: BenchTable, stage: Stage, way: str, variant: str) -> ErrorCurve | None:
-    """None where the stage was not measured in that way."""
+    """Return the error curve of one method of a stage, None if fewer than two of its cells were measured."""
     counted = [one for one in table.cells if one.counted]
     cells = sorted(
         (one.samples, one.seconds.median, one.mse.median)

@@ -9,14 +9,16 @@ from typing import Any
 
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
+from ommatid.reconstruct.output.run_json import RunReport, StudyCase
 from ommatid.runtime.errors import naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.formats.picture import Image, load
+from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.scene import read
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.cache import cached_model, cached_stack
 from ommatid.simulate.calibrate import is_adaptive
@@ -25,7 +27,7 @@ from ommatid.simulate.renderer.variant import choose as choose_variant
 from ommatid.simulate.validation import check_scene, check_scene_memory
 
 
-def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> tuple[Scene, Camera, Image]:
+def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
     """A scene, its camera and its target, all checked before anything is written."""
     scene = read(path, changes, lenses)
     camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
@@ -33,10 +35,10 @@ def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) 
         from ommatid.simulate.renderer.world import files
 
         files(scene)
-    return scene, camera, load(scene)
+    return Setup(scene, camera, load(scene))
 
 
-def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member) -> tuple[Scene, Camera, Image]:
+def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:
     """A scene of a batch, with its own changes after those of all."""
     return opened(member.scene, (*changes, *member.changes), lenses)
 
@@ -50,46 +52,46 @@ def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Mem
     return fastest_process_count([one.seconds for one in efforts], most, processors())
 
 
-def run(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
-    description = results(scene, camera, image, folder, watch)
-    write_page(camera, folder, watch)
-    return description
+    report = results(setup, folder, watch)
+    write_page(setup.camera, folder, watch)
+    return report.plain()
 
 
 @one_thread()
-def results(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
     """All of a run but its page, and what run.json says of it."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.method_choice import choose_method
-    from ommatid.reconstruct.output.result_files import RUN, cached_results
-    from ommatid.reconstruct.output.run_json import write_run
+    from ommatid.reconstruct.output import run_json
+    from ommatid.reconstruct.output.result_files import cached_results
 
-    exact = scene.calibration.method == "ideal" and camera.has_box_footprints
-    check_scene(scene, camera)
+    scene, camera = setup.scene, setup.camera
+    check_scene(setup)
     if scene.study is not None and "transport" in scene.study.models:
         with naming_source(scene.source):
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
-    choose_method(scene, camera, exact)  # what memory does not hold is refused before any work
+    choose_method(scene, camera, setup.has_structured_matrix)  # what memory does not hold is refused before any work
     study.check_study(scene, camera)
-    stack = _rendered(scene, camera, image, folder, watch)
+    stack = _rendered(setup, folder, watch)
     with watch.progress("calibrate") as progress:
-        model, made = cached_model(folder / "model.npz", scene, camera, progress, for_stack(stack))
+        model, made = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
     watch.done("calibrate", made)
     with watch.progress("reconstruct") as progress:
-        description, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
+        report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     watch.done("reconstruct", made)
-    more: dict[str, Any] = {}
+    complete = report
     if scene.world is not None:
-        from ommatid.analysis.depth_error import of_run
+        from ommatid.analysis.depth_error import depth_error_of_run
 
-        more["depth"] = of_run(folder, camera)
+        complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        more["study"] = _studied(scene, camera, stack, folder, watch)
-    if any(description.get(key) != value for key, value in more.items()):
-        write_run(folder / RUN, {**description, **more})
-    return {**description, **more}
+        complete = complete.with_changes(study=_studied(setup, stack, folder, watch))
+    if complete.plain() != report.plain():
+        run_json.write(folder, complete)
+    return complete
 
 
 def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
@@ -102,32 +104,33 @@ def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
     watch.done("report", made)
 
 
-def render(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def render(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `render` does of a scene, here or on a worker, and says of it."""
-    stack = _rendered(scene, camera, image, folder, watch)
-    return {"sub_images": len(camera.sub_imagers), **stack.record}
+    stack = _rendered(setup, folder, watch)
+    return {"sub_images": len(setup.camera.sub_imagers), **stack.record}
 
 
-def predict_scene(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def predict_scene(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
     from ommatid.analysis.predict import predict_scene
+    from ommatid.analysis.prediction_table import json_of
 
-    del camera, image, folder, watch
-    with naming_source(scene.source):
-        return predict_scene(scene).describe()
+    del folder, watch
+    with naming_source(setup.scene.source):
+        return json_of(predict_scene(setup.scene))
 
 
-def calibrated(scene: Scene, camera: Camera, path: Path, progress: Progress) -> tuple[Model, bool]:
+def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
     """H alone, kept at `path`, and whether it had to be made; its samples are judged by images of the prior."""
-    if scene.calibration.method != "ideal":
-        check_scene(scene, camera)
-    check_scene_memory(scene, camera)
+    if setup.scene.calibration.method != "ideal":
+        check_scene(setup)
+    check_scene_memory(setup)
     judge = None
-    if is_adaptive(scene):
+    if is_adaptive(setup.scene):
         from ommatid.analysis.calibration_goal import for_prior
 
-        judge = for_prior(scene, camera)
-    return cached_model(path, scene, camera, progress, judge)
+        judge = for_prior(setup)
+    return cached_model(path, setup, progress, judge)
 
 
 def facts(chosen: bool) -> dict[str, str]:
@@ -138,16 +141,16 @@ def facts(chosen: bool) -> dict[str, str]:
     return found
 
 
-def _rendered(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> Stack:
-    check_scene(scene, camera, calibrates=False)
-    prepare(scene, image, folder)
+def _rendered(setup: Setup, folder: Path, watch: RunObserver) -> Stack:
+    check_scene(setup, calibrates=False)
+    prepare(setup, folder)
     with watch.progress("render") as progress:
-        stack, made = cached_stack(folder / "stack.exr", scene, camera, image, progress)
+        stack, made = cached_stack(folder / "stack.exr", setup, progress)
     watch.done("render", made)
     return stack
 
 
-def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: RunObserver) -> list[dict[str, Any]]:
+def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> tuple[StudyCase, ...]:
     """The same stack with every idea of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models
@@ -155,7 +158,7 @@ def _studied(scene: Scene, camera: Camera, stack: Stack, folder: Path, watch: Ru
     from ommatid.reconstruct.output.result_files import truth_beside
 
     with watch.progress("study") as progress:
-        known = study_models(scene, camera, folder, no_progress, for_stack(stack))
+        known = study_models(setup, folder, no_progress, for_stack(stack))
         cases, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
     watch.done("study", made)
     return cases

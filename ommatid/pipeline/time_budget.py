@@ -5,10 +5,9 @@ All of them are ordinary runs in the scene's own folder, so that a whole result 
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -16,13 +15,14 @@ from typing import Any, Literal
 import numpy as np
 
 from ommatid.batch.remote import RunObserver, Stages
-from ommatid.reconstruct.output.result_files import RUN
-from ommatid.reconstruct.output.run_json import write_run
+from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.run_json import ErrorReport, RequestedTime, RunReport, TimeReport
 from ommatid.reconstruct.output.time_spent import STAGES
+from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.formats.picture import Image
-from ommatid.scenes.scene import Scene, resolved, with_tables
+from ommatid.scenes.scene import Scene, with_tables
+from ommatid.scenes.setup import Setup
 
 from . import bench_curves, stages, time_allocation
 
@@ -54,18 +54,16 @@ def shared_time(
     """
     asked = TimeRequest(seconds, len(folders))
 
-    def does(scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver) -> dict[str, Any]:
+    def does(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
         begun = started if asked.scenes == 1 else clock()
         rest = (seconds - (begun - started)) / (asked.scenes - folders.index(folder))
-        return run_within(scene, camera, image, folder, watch, rest, say, clock, begun, asked)
+        return run_within(setup, folder, watch, rest, say, clock, begun, asked)
 
     return does
 
 
 def run_within(
-    scene: Scene,
-    camera: Camera,
-    image: Image,
+    setup: Setup,
     folder: Path,
     watch: RunObserver,
     seconds: float,
@@ -79,15 +77,16 @@ def run_within(
     say : hears where even the least did not fit;  begun : when the time began to count, absent: now
     asked : what these seconds are a share of, which differs from run to run; absent: of nothing else
     """
+    scene, camera = setup.scene, setup.camera
     begun = clock() if begun is None else begun
     told = asdict(TimeRequest(seconds) if asked is None else asked)
-    again = _again(folder, scene, camera, told)
+    again = _again(folder, setup, told)
     if again is not None:
-        description = stages.results(
-            with_samples(scene, *(again["chosen"][key] for key in KEYS)), camera, image, folder, watch
-        )
-        return _told(camera, folder, watch, description, again)
-    few = _measured(with_samples(scene, FEW[0], FEW[0]), camera, image, folder, watch, clock)
+        repeated = with_samples(setup, again.chosen[KEYS[0]], again.chosen[KEYS[1]])
+        description = stages.results(repeated, folder, watch)
+        same = again.model_dump(include={"within", "asked", "seconds", "chosen"})
+        return _told(camera, folder, watch, description, same)
+    few = _measured(with_samples(setup, FEW[0], FEW[0]), folder, watch, clock)
     chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
     page = _page(camera, folder, watch, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
     description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun)) - page
@@ -96,16 +95,16 @@ def run_within(
     if _needs_little(scene, camera):
         if left > ROUND * sampled + few.seconds("reconstruct") + rest:
             chosen = "auto", "auto"
-            description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
+            description = stages.results(with_samples(setup, *chosen), folder, watch)
     elif (curves := _of_bench(folder, scene, camera)) is not None or left > 2 * few.wall:
         if curves is None:
-            more = _measured(with_samples(scene, FEW[1], FEW[1]), camera, image, folder, watch, clock)
+            more = _measured(with_samples(setup, FEW[1], FEW[1]), folder, watch, clock)
             chosen, description, curves = (FEW[1], FEW[1]), more.description, _curves(scene, few, more)
             left = (1 - SPARE) * (seconds - (clock() - begun)) - page
-        division = _better(description["error"], curves, left - rest - COMPILED)
+        division = _better(description.error, curves, left - rest - COMPILED)
         if division is not None:
             chosen = division.render, division.calibrate
-            description = stages.results(with_samples(scene, *chosen), camera, image, folder, watch)
+            description = stages.results(with_samples(setup, *chosen), folder, watch)
     total = clock() - begun + page  # the last one is still to come
     if total > seconds:
         what = "even the least" if chosen[0] == FEW[0] else "this"
@@ -114,11 +113,12 @@ def run_within(
     return _told(camera, folder, watch, description, spent)
 
 
-def with_samples(scene: Scene, rendering: Samples, calibration: Samples) -> Scene:
-    """The scene with these numbers of samples, and no time that would end a stage."""
+def with_samples(setup: Setup, rendering: Samples, calibration: Samples) -> Setup:
+    """The setup with these numbers of samples, and no time that would end a stage."""
+    scene = setup.scene
     render = scene.render.model_copy(update={"samples": rendering, "time": None})
     calibrate = scene.calibration.model_copy(update={"samples": calibration})
-    return with_tables(scene, render=render, calibration=calibrate)
+    return replace(setup, scene=with_tables(scene, render=render, calibration=calibrate))
 
 
 def _needs_little(scene: Scene, camera: Camera) -> bool:
@@ -132,13 +132,13 @@ def _needs_little(scene: Scene, camera: Camera) -> bool:
 class MeasuredRun:
     """A run: what it says of itself, what it took, and variances that the stages' parts of the error go with."""
 
-    description: dict[str, Any]
+    description: RunReport
     wall: float
     variance: dict[str, float]
 
     def seconds(self, stage: str) -> float:
         """What a stage took, when it was done."""
-        return float(self.description["stages"][stage]["seconds"])
+        return self.description.stages[stage].seconds
 
     @property
     def beside(self) -> float:
@@ -146,11 +146,9 @@ class MeasuredRun:
         return max(self.wall - sum(self.seconds(stage) for stage in (*STAGES, "reconstruct")), 0.0)
 
 
-def _measured(
-    scene: Scene, camera: Camera, image: Image, folder: Path, watch: RunObserver, clock: Clock
-) -> MeasuredRun:
+def _measured(setup: Setup, folder: Path, watch: RunObserver, clock: Clock) -> MeasuredRun:
     start = clock()
-    description = stages.results(scene, camera, image, folder, watch)
+    description = stages.results(setup, folder, watch)
     wall = clock() - start
     found = model_file.read(folder / "model.npz")
     spread = found.prior_variance_from_model(np.ones(found.unknowns)) if found.variance.any() else np.zeros(1)
@@ -159,12 +157,12 @@ def _measured(
 
 
 def _better(
-    error: dict[str, Any], curves: tuple[time_allocation.ErrorCurve, time_allocation.ErrorCurve], seconds: float
+    error: ErrorReport, curves: tuple[time_allocation.ErrorCurve, time_allocation.ErrorCurve], seconds: float
 ) -> time_allocation.TimeAllocation | None:
     """The best division of these seconds, if it promises less than this error."""
-    floor = error["predicted_mse"] - sum(error["budget"][part] for part in STAGES.values())
+    floor = error.predicted_mse - sum(error.budget[part] for part in STAGES.values())
     found = time_allocation.allocate_time(*curves, floor, seconds, (MOST, MOST))
-    return found if found is not None and found.predicted_mse < error["predicted_mse"] else None
+    return found if found is not None and found.predicted_mse < error.predicted_mse else None
 
 
 def _page(camera: Camera, folder: Path, watch: RunObserver, clock: Clock) -> float:
@@ -194,27 +192,26 @@ def _curves(
         truth = stage == "render" and scene.world is not None
         taken = [one.seconds(stage) + (one.beside if truth else 0.0) for one in (few, more)]
         ends = [(n, s, one.variance[stage]) for n, s, one in zip(FEW, taken, (few, more), strict=True)]
-        found.append(time_allocation.error_curve(ends[0], ends[1], more.description["error"]["budget"][part]))
+        found.append(time_allocation.error_curve(ends[0], ends[1], more.description.error.budget[part]))
     return found[0], found[1]
 
 
-def _again(folder: Path, scene: Scene, camera: Camera, asked: dict[str, Any]) -> dict[str, Any] | None:
+def _again(folder: Path, setup: Setup, asked: dict[str, Any]) -> TimeReport | None:
     """What an earlier run within the same time spent, if it was of the same scene among as many."""
     try:
-        old = json.loads((folder / RUN).read_text(encoding="utf-8"))["spent"]
-        rendering, calibration = (old["chosen"][key] for key in KEYS)
-        now = resolved(with_samples(scene, rendering, calibration), camera.shape).plain()
-        same = old["asked"] == asked and tomllib.loads((folder / "scene.toml").read_text("utf-8")) == now
-    except (OSError, ValueError, KeyError, TypeError):
+        old = run_json.read(folder).spent
+        now = with_samples(setup, old.chosen[KEYS[0]], old.chosen[KEYS[1]]).resolved.plain()
+        same = old.asked == RequestedTime(**asked) and tomllib.loads((folder / "scene.toml").read_text("utf-8")) == now
+    except (InputError, OSError, ValueError, KeyError):
         return None
-    return {key: old[key] for key in ("within", "asked", "seconds", "chosen")} if same else None
+    return old if same else None
 
 
 def _told(
-    camera: Camera, folder: Path, watch: RunObserver, description: dict[str, Any], within: dict[str, Any]
+    camera: Camera, folder: Path, watch: RunObserver, report: RunReport, within: dict[str, Any]
 ) -> dict[str, Any]:
     """The description with what was spent, in run.json and on the run's page as well."""
-    description = {**description, "spent": {**description["spent"], **within}}
-    write_run(folder / RUN, description)
+    report = report.with_changes(spent=TimeReport.model_validate({**report.spent.plain(), **within}))
+    run_json.write(folder, report)
     stages.write_page(camera, folder, watch)
-    return description
+    return report.plain()

@@ -6,10 +6,8 @@ state a large enough error bound; an answer with an error beyond its bound is a 
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, fields
-from io import StringIO
+from dataclasses import asdict, astuple, fields
 from math import log10
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import make_folder, write_text
+from ommatid.runtime.files import make_folder, write_csv, write_text
 
 from .cases import Matrices, StabilityCase, extreme_cases, noise_sweep
 from .exact_answer import ExactAnswer, exact_answer
@@ -121,7 +119,8 @@ def write_stability(folder: Path, matrices: Matrices, progress: Callable[[float]
     outcomes = [point.outcome for point in curves] + table
     automatic = [outcome for outcome in outcomes if outcome.asked == AUTO]
     verdicts = [outcome.verdict for outcome in automatic]
-    write_text(folder / "stability.csv", _csv(outcomes))
+    columns = [field.name for field in fields(StabilityOutcome)]
+    write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
     write_text(folder / "stability.md", markdown(automatic))
     write_figure(folder / "stability.png", curves)
     return {
@@ -163,11 +162,3 @@ def markdown(outcomes: Iterable[StabilityOutcome]) -> str:
             figures = f"{outcome.refined:.1f} | {outcome.variance:.1f} | {outcome.bound:.0e}"
             lines.append(f"{start} | {outcome.ran} | {figures} | {outcome.verdict} |")
     return "\n".join(lines) + "\n"
-
-
-def _csv(outcomes: list[StabilityOutcome]) -> str:
-    stream = StringIO()
-    writer = csv.DictWriter(stream, [field.name for field in fields(StabilityOutcome)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(outcome) for outcome in outcomes)
-    return stream.getvalue()

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 from ..adaptive_render import EXPONENTS, STEEPEST, STRATIFIED
 from ..renderer.variant import choose
@@ -35,8 +35,7 @@ LEAPS = (2.0, 64.0)  # from the samples of a round to those of the next
 
 
 def calibrate_until(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     judge: StoppingRule | None,
     progress: Progress = no_progress,
     partial: Checkpoint | None = None,
@@ -47,15 +46,17 @@ def calibrate_until(
     """
     if judge is None:
         raise ValueError("calibration.samples 'auto' needs somebody to say when it is enough")
+    scene = setup.scene
     exact = not choose(scene.render.variant).startswith("scalar")
     most = MOST if exact else MOST_FLOAT32
     state = {} if partial is None else partial.state()
     tried: list[dict[str, Any]] = json.loads(str(state["tried"])) if "tried" in state else []
     while True:
         samples = _next(tried, EXPONENTS.get(scene.render.sampler, STRATIFIED), most)
-        plans = plans_of(scene, camera, samples, exact)
+        plans = plans_of(setup, samples, exact)
         number = scene.calibration.model_copy(update={"samples": samples})
-        model = rendered_model(scene.model_copy(update={"calibration": number}), camera, progress, None, plans, exact)
+        told = replace(setup, scene=scene.model_copy(update={"calibration": number}))
+        model = rendered_model(told, progress, None, plans, exact)
         spent = {name: plan.total for name, plan in plans.items()}
         tried.append({"asked": max(spent.values()), "samples": spent, "adds": judge.added_error(model)})
         if tried[-1]["adds"] <= DONE or samples >= most:
@@ -74,11 +75,14 @@ def calibrate_until(
     return replace(model, scene=_open(model.scene), record=model.record | counted)
 
 
-def plans_of(scene: Scene, camera: Camera, samples: int, exact: bool) -> Plans:
+def plans_of(setup: Setup, samples: int, exact: bool) -> Plans:
     """Of each lens type, about so many samples a pixel on a grid that fits the edges of its pixels of f."""
+    scene = setup.scene
     alike = scene.calibration.fit is not None  # which counts on equal numbers
     most, sampler = MOST_EXACT if exact else MOST_SAMPLES, scene.render.sampler
-    return {kind.name: on_grid(samples, sampler, 1 if alike else cells_of(kind.ratio), most) for kind in camera.types}
+    return {
+        kind.name: on_grid(samples, sampler, 1 if alike else cells_of(kind.ratio), most) for kind in setup.camera.types
+    }
 
 
 def _next(tried: list[dict[str, Any]], exponent: float, most: int) -> int:

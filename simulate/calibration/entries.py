@@ -14,8 +14,7 @@ from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import without_negligible_effects
-from ommatid.scenes.scene import Scene, resolved
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
 from ..ideal import ideal_matrix
@@ -25,8 +24,7 @@ from .point_sources import Plans, Responses, responses_from_points
 
 
 def rendered_model(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     progress: Progress = no_progress,
     partial: Checkpoint | None = None,
     plans: Plans | None = None,
@@ -36,21 +34,21 @@ def rendered_model(
 
     exact : that sums are taken for float64, where they are
     """
-    start, record = perf_counter(), dict[str, Any](method=scene.calibration.method)
-    simulated = without_negligible_effects(scene, camera)[0]
+    scene, camera, start = setup.scene, setup.camera, perf_counter()
+    record = dict[str, Any](method=scene.calibration.method)
     if scene.calibration.method == "transport":
         from .ray_transport import responses_from_rays
 
-        responses = responses_from_rays(scene, simulated, progress, plans)
+        responses = responses_from_rays(setup, progress, plans)
     else:
-        responses = responses_from_points(scene, simulated, progress, partial, plans)
+        responses = responses_from_points(setup, progress, partial, plans)
     if exact:
         responses = replace(responses, summed=1)
     variance = entry_variances(responses, camera)
     if scene.calibration.fit == "geometry":
         from .geometry_fit import fit_geometry
 
-        responses, variance, record["fit"] = fit_geometry(responses, variance, simulated)
+        responses, variance, record["fit"] = fit_geometry(responses, variance, setup.simulated)
     record |= {
         "seconds": perf_counter() - start,
         "seed": scene.render.seed,
@@ -58,8 +56,7 @@ def rendered_model(
         **_compared(responses, variance, camera),
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
-    kept = resolved(scene, camera.shape)
-    return Model(kept, camera, responses.matrix, variance, responses.batches, record)
+    return Model(setup.resolved, camera, responses.matrix, variance, responses.batches, record)
 
 
 def _compared(responses: Responses, variance: NDArray[np.float64], camera: Camera) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from scipy import sparse
 from ommatid.runtime.errors import MachineError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint, State
@@ -65,8 +65,7 @@ def grid(camera: Camera, apart: int, row: int, column: int) -> NDArray[np.float6
 
 
 def responses_from_points(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     progress: Progress = no_progress,
     partial: Checkpoint | None = None,
     plans: Plans | None = None,
@@ -77,10 +76,10 @@ def responses_from_points(
     """
     from ..renderer.renderer import Renderer
 
-    variant = choose(scene.render.variant)
+    scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
     rig = Renderer(camera, variant, scene.render.sampler, together=False)  # each type its own spacing
     if plans is None:
-        plans = dict.fromkeys(rig.groups, plan(scene.calibration.counted, scene.render.sampler))
+        plans = dict.fromkeys(rig.groups, plan(scene.calibration.sample_count, scene.render.sampler))
     sweeps = {group: SourceSweep(rig, group) for group in rig.groups}
     shares = {group: sweep.reach.apart**2 for group, sweep in sweeps.items()}
     rows: list[sparse.csr_array] = []

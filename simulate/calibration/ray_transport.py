@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import check_transport_variant, choose
 from ..sampling.passes import BATCHES, Plan, plan
@@ -34,21 +33,19 @@ class TracedEntries(NamedTuple):
     dark: NDArray[np.bool_]
 
 
-def responses_from_rays(
-    scene: Scene, camera: Camera, progress: Progress = no_progress, plans: Plans | None = None
-) -> Responses:
+def responses_from_rays(setup: Setup, progress: Progress = no_progress, plans: Plans | None = None) -> Responses:
     """Trace all rays of all passes. Raises InputError where only Mitsuba's slow backend works.
 
     plans : of each group, absent: all as the scene says
     """
     from ..renderer.renderer import Renderer
 
-    variant = choose(scene.render.variant)
+    scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
     check_transport_variant(variant)
     rig = Renderer(camera, variant, scene.render.sampler, together=False)
     parts: list[Part] = []
     if plans is None:
-        plans = dict.fromkeys(rig.groups, plan(scene.calibration.counted, scene.render.sampler))
+        plans = dict.fromkeys(rig.groups, plan(scene.calibration.sample_count, scene.render.sampler))
     blocks = [(group, block) for group in rig.groups for block in rig.blocks(group, plans[group].samples)]
     for place, (group, block) in enumerate(blocks):
         passes: list[TracedEntries] = []

@@ -5,24 +5,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_whole
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import write_truth
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 
 from .plugins import scene_of, stock_sensor, target_of, texture_of
 from .variant import activate
 
 
-def export(scene: Scene, camera: Camera, image: NDArray[np.float64], path: Path) -> Path:
+def export(setup: Setup, path: Path) -> Path:
     """Write FILE.xml, a sensor a sub-imager in the order of the stack, and the target's picture beside it.
 
     Returns the picture's path. Raises InputError unless `path` ends in .xml, DeniedError for a full disk.
     """
+    scene, camera = setup.scene, setup.camera
     if not camera.is_ideal_pinhole:
         raise InputError(
             f"{scene.source}: stock sensors of Mitsuba are pinholes where they should be, so lenses that are more, or a"
@@ -34,11 +31,11 @@ def export(scene: Scene, camera: Camera, image: NDArray[np.float64], path: Path)
     import mitsuba as mi
 
     picture = path.with_name(f"{path.stem}.target.exr")
-    write_truth(picture, image)
+    write_truth(picture, setup.image)
     described = scene_of(target_of(camera, texture_of({"filename": picture.name})))
     for sub in camera.sub_imagers:
         name = sub.name.replace(".", "_")  # a dot would be a path into the scene
-        described[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.counted)
+        described[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.sample_count)
     state = mi.parser.parse_dict(mi.parser.ParserConfig("scalar_rgb"), described)
     write_whole(path, lambda beside: mi.parser.write_file(state, str(beside)))
     return picture

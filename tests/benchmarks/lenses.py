@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse, read
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.point_sources import responses_from_points
 from ommatid.simulate.calibration.ray_transport import responses_from_rays
 from ommatid.simulate.renderer.plugins import film, scene_of, target_of, texture_of
@@ -86,9 +87,8 @@ def transport_rows(scene_file: Path) -> list[Row]:
     rows: list[Row] = []
     for what, keys in (("pinholes", ()), ("lenses out of focus", ('aperture="0.4 mm"', 'focus="800 mm"'))):
         changes = [f"camera.lens.{name}.{key}" for name in ("I", "II", "III") for key in keys]
-        scene = read(scene_file, ["calibration.samples=1024", "render.complete=true", *changes])
-        camera = derive(scene)
-        ways = [partial(_by, way, scene, camera) for way in (responses_from_rays, responses_from_points)]
+        setup = Setup.from_scene(read(scene_file, ["calibration.samples=1024", "render.complete=true", *changes]))
+        ways = [partial(_by, way, setup) for way in (responses_from_rays, responses_from_points)]
         matrices = [way(0).matrix for way in ways]
         apart = abs(matrices[0] - matrices[1]).max() / matrices[1].max()
         seconds = alternate(ways, 3)
@@ -98,9 +98,9 @@ def transport_rows(scene_file: Path) -> list[Row]:
     return rows
 
 
-def _by(way: Callable[[Scene, Camera], Any], scene: Scene, camera: Camera, seed: int) -> Any:
+def _by(way: Callable[[Setup], Any], setup: Setup, seed: int) -> Any:
     del seed  # the scene's own: both ways are to give the same H
-    return way(scene, camera)
+    return way(setup)
 
 
 def _ours(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ommatid.reconstruct.frame_prediction import predict_frame
-from ommatid.reconstruct.method_choice import WAYS, choose_method
+from ommatid.reconstruct.method_choice import METHODS, choose_method
+from ommatid.reconstruct.prediction import predict_frame
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -232,7 +232,7 @@ def test_which_method_is_chosen(shape: tuple[int, int], lenses: Any, tables: dic
     scene = wide(shape, lenses, **tables)
     choice = choose_method(scene, derive(scene), exact=True)
     assert choice.method == method
-    assert choice.method in WAYS
+    assert choice.method in METHODS
     assert choice.memory <= 650e6 or scene.estimator.memory is None
 
 

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from ommatid.analysis import run_table
-from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.result_files import changed
+from ommatid.reconstruct.output.report import report_of
+from ommatid.reconstruct.output.result_files import with_estimator_changes
 from ommatid.reconstruct.restore import Reconstruction, check_match, restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import ideal_model
@@ -26,7 +27,7 @@ from ..examples import GALLERY, THREE, scene
 
 def chain(described: Scene) -> tuple[Stack, Model, Reconstruction]:
     camera, image = derive(described), load(described)
-    stack, model = render(described, camera, image), calibrate(described, camera)
+    stack, model = render(Setup(described, camera, image)), calibrate(Setup(described, camera))
     return stack, model, restore(stack, model, image.ravel())
 
 
@@ -64,7 +65,7 @@ def test_noise_of_h_that_feigns_information_is_told() -> None:
     for lenses in ((), ("I", "II")):
         stack, model, restoration = chain(read(GALLERY / "tile19.toml", ["calibration.samples=1024"], lenses))
         told.append(restoration.spurious_information)
-        lines = run_table.rows(run_json.describe(stack, model, restoration))
+        lines = run_table.rows(report_of(stack, model, restoration))
         warned = any(line.startswith("do not trust") for line, _ in lines)
         assert warned == bool(lenses)
     assert told[1] > 10 * told[0]
@@ -86,7 +87,7 @@ def test_the_budget_says_what_is_there_and_adds_up() -> None:
 def test_more_noise_than_expected_is_in_the_variance_whatever_the_estimator_was_told() -> None:
     described = scene(lenses=THREE, noise={"variance": 4.0}, calibration={"method": "ideal"})
     stack, model, honest = chain(described)
-    told = restore(changed(stack, ["estimator.noise_variance=1e-4"], GALLERY), model)
+    told = restore(with_estimator_changes(stack, ["estimator.noise_variance=1e-4"], GALLERY), model)
     assert told.expected.mse > honest.expected.mse
     assert told.budget()["noise"] > 100 * 4.0 / 361
 
@@ -96,7 +97,7 @@ def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
     camera = derive(described)
     model = ideal_model(described, camera)
     other = scene(lenses=THREE, render={"seed": 9, "samples": 64}, noise={"variance": 2.0})
-    stack = render(other, camera, np.full((19, 19), 50.0))
+    stack = render(Setup(other, camera, np.full((19, 19), 50.0)))
     check_match(stack, model, ("a", "b"))
     restoration = restore(stack, model, np.full(361, 50.0))
     assert restoration.interval is not None
@@ -115,7 +116,7 @@ def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
 def test_strangers_are_refused_with_the_first_difference(other: Scene, key: str) -> None:
     described = scene(lenses=THREE, render={"samples": 16})
     camera = derive(described)
-    stack = render(described, camera, load(described))
+    stack = render(Setup(described, camera))
     with pytest.raises(InputError, match=key):
         check_match(stack, ideal_model(other, derive(other)), ("stack.exr", "model.npz"))
 
@@ -123,7 +124,7 @@ def test_strangers_are_refused_with_the_first_difference(other: Scene, key: str)
 def test_pitches_are_compared_too() -> None:
     described = scene(lenses=THREE, render={"samples": 16})
     camera = derive(described)
-    stack = render(described, camera, load(described))
+    stack = render(Setup(described, camera))
     model = replace(ideal_model(described, camera), camera=replace(camera, pixel_pitch=0.007))
     with pytest.raises(InputError, match=r"camera\.pixel_pitch is 0\.006 in the stack and 0\.007"):
         check_match(stack, model, ("stack.exr", "model.npz"))
@@ -133,7 +134,7 @@ def test_without_the_truth_nothing_is_claimed_of_the_error() -> None:
     described = scene(lenses=THREE, calibration={"method": "ideal"}, render={"samples": 16})
     stack, model, _ = chain(described)
     blind = restore(stack, model)
-    description = run_json.describe(stack, model, blind)
-    assert "mse" not in description["error"]
-    assert run_table.rows(description)
-    assert description["error"]["predicted_mse"] > 0
+    report = report_of(stack, model, blind)
+    assert "mse" not in report.plain()["error"]
+    assert run_table.rows(report)
+    assert report.error.predicted_mse > 0

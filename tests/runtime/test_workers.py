@@ -29,8 +29,9 @@ from ommatid.runtime import pool, workers
 from ommatid.runtime.dask_cluster import NEVER
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.pool import worker_pool as open_pool
-from ommatid.scenes import camera, model_file, scene
-from ommatid.scenes.formats import exr, picture
+from ommatid.scenes import model_file, scene
+from ommatid.scenes.formats import exr
+from ommatid.scenes.setup import Setup
 
 from ..cli.test_commands import FILES, numbers, without
 from ..conftest import TINY, Command, Ended, shell
@@ -545,7 +546,7 @@ def test_what_was_made_before_a_failure_comes_back_and_the_failure_names_the_use
     (here / "out").mkdir()
     (here / "out" / "kept.txt").write_text("mine", encoding="utf-8")
     described = scene.read(here / "tiny.toml")
-    sent = parcel.packed(described, camera.derive(described), picture.load(described), here / "out")
+    sent = parcel.packed(Setup.from_scene(described), here / "out")
     outcome = parcel.carry_out(stops_after_one_file, sent)
     assert outcome.files == {"stack.exr": b"light"}
     assert outcome.done == {"render": True}

@@ -17,6 +17,7 @@ from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.adaptive_render import (
     FLOAT32,
     LEAST,
@@ -48,7 +49,7 @@ def auto(shape: tuple[int, int] = (19, 19), lenses: Any = THREE, **render: Any) 
 
 
 def lit(described: Scene, **more: Any) -> AdaptiveRendering:
-    return render_until(described, derive(described), load(described), **more)
+    return render_until(Setup.from_scene(described), **more)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -61,7 +62,7 @@ def test_the_goal_is_reached_in_every_pixel(variant: str, sampler: str) -> None:
         render={"samples": "auto", "variant": variant, "sampler": sampler},
         noise={"variance": 1.0, "bits": 8},
     )
-    stack = render(described, derive(described), load(described))
+    stack = render(Setup.from_scene(described))
     assert described.noise is not None
     assert stack.record["reached"]
     assert not stack.record["not_reached"]
@@ -74,7 +75,7 @@ def test_a_grid_that_fits_the_pixels_of_f_leaves_no_error(variant: str) -> None:
     needs(variant)
     described = auto(variant=variant)
     camera, image = derive(described), load(described)
-    found = render_until(described, camera, image)
+    found = render_until(Setup(described, camera, image))
     assert found.how["samples"] < 1024, "where a fixed number takes ten thousand"
     away = np.abs(found.mean - ideal_matrix(camera) @ image.ravel())
     assert np.median(away) < 1e-4
@@ -89,7 +90,7 @@ def test_stated_variance_is_that_of_the_error() -> None:
         described = described.model_copy(update={"noise": described.noise and described.noise.model_copy(
             update={"variance": 2.0})})  # fmt: skip
         camera, image = derive(described), load(described)
-        found = render_until(described, camera, image)
+        found = render_until(Setup(described, camera, image))
         error = found.mean - ideal_matrix(camera) @ image.ravel()
         ratios.append(float(np.sum(error**2) / np.sum(found.variance)))
     mean, deviation = np.mean(ratios), np.std(ratios, ddof=1) / len(ratios) ** 0.5
@@ -186,10 +187,10 @@ def test_a_broken_off_rendering_goes_on(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        cached_stack(tmp_path / "stack.exr", described, camera, image, patience)
+        cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), patience)
     assert [path.name for path in tmp_path.iterdir()] == [".stack.exr.partial.npz"]
-    found, _ = cached_stack(tmp_path / "stack.exr", described, camera, image, no_progress)
-    whole, _ = cached_stack(tmp_path / "whole.exr", described, camera, image, no_progress)
+    found, _ = cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), no_progress)
+    whole, _ = cached_stack(tmp_path / "whole.exr", Setup(described, camera, image), no_progress)
     np.testing.assert_array_equal(found.values, whole.values)
     np.testing.assert_array_equal(found.variance, whole.variance)
     assert found.record["spent"] == whole.record["spent"]
@@ -233,18 +234,18 @@ def test_calibration_goes_on_until_h_adds_little(tmp_path: Path, variant: str, m
         noise={"variance": 4.0},
     )
     camera, image = derive(described), load(described)
-    stack = render(described, camera, image)
+    stack = render(Setup(described, camera, image))
     judge = for_stack(stack)
-    model, made = cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)
+    model, made = cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)
     assert made
     assert model.record["auto"]["reached"]
     assert judge.added_error(model) == pytest.approx(model.record["auto"]["adds"])
     budget = restore(stack, model).budget()
     assert budget["calibration"] <= GOAL * (sum(budget.values()) - budget["calibration"])
     assert model.scene.calibration.samples == "auto"
-    assert not cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)[1], "up to date"
+    assert not cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)[1], "up to date"
     fixed = described.model_copy(update={"calibration": described.calibration.model_copy(update={"samples": 256})})
-    assert cached_model(tmp_path / "model.npz", fixed, camera, no_progress, judge)[1], "another model"
+    assert cached_model(tmp_path / "model.npz", Setup(fixed, camera), no_progress, judge)[1], "another model"
 
 
 def endless() -> tuple[Scene, Camera]:
@@ -270,9 +271,9 @@ def test_a_calibration_whose_writing_failed_comes_out_the_same(tmp_path: Path, m
     with monkeypatch.context() as patched:
         patched.setattr("ommatid.scenes.model_file.write", full)
         with pytest.raises(MachineError):
-            cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)
-    found, _ = cached_model(tmp_path / "model.npz", described, camera, no_progress, judge)
-    whole, _ = cached_model(tmp_path / "whole.npz", described, camera, no_progress, judge)
+            cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)
+    found, _ = cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)
+    whole, _ = cached_model(tmp_path / "whole.npz", Setup(described, camera), no_progress, judge)
     assert len(whole.record["auto"]["tried"]) > 1
     assert found.record["auto"] == whole.record["auto"]
     np.testing.assert_array_equal(found.matrix.data, whole.matrix.data)
@@ -284,7 +285,7 @@ def test_jumps_are_few_and_what_cannot_be_reached_is_said() -> None:
 
     def judged(first: float) -> dict[str, Any]:
         judge = StoppingRule(lambda model: first * (model.record["samples"] / 256) ** -1.5, "law", "a law")
-        return calibrate(described, camera, judge=judge).record
+        return calibrate(Setup(described, camera), judge=judge).record
 
     record = judged(1.0)
     assert record["auto"]["reached"]
@@ -298,10 +299,10 @@ def test_without_a_stack_it_is_judged_by_the_prior() -> None:
     """What H adds to Eq. 5 falls as H is known better, though its part of the error alone may rise at first."""
     described = auto((12, 12), (("1/3", [3, 3], [3, 3]),), sampler="independent")
     camera = derive(described)
-    judge, found = for_prior(described, camera), list[float]()
+    judge, found = for_prior(Setup(described, camera)), list[float]()
     for samples in (64, 256, 1024):
         told = described.calibration.model_copy(update={"samples": samples})
-        found.append(judge.added_error(calibrate(described.model_copy(update={"calibration": told}), camera)))
+        found.append(judge.added_error(calibrate(Setup(described.model_copy(update={"calibration": told}), camera))))
     assert found[0] > found[1] > found[2] > 0
 
 

@@ -15,6 +15,7 @@ from ommatid.scenes import model_file
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.simulate import calibrate
 from ommatid.simulate.calibration import entries, point_sources
 from ommatid.simulate.calibration.visible_pixels import VisiblePixels, of_pinholes
@@ -49,7 +50,7 @@ def test_no_two_sources_of_a_grid_reach_one_sensor_pixel() -> None:
 
 def test_rows_sum_to_what_a_uniform_target_reads() -> None:
     described = small()
-    found = point_sources.responses_from_points(described, derive(described))
+    found = point_sources.responses_from_points(Setup.from_scene(described))
     np.testing.assert_allclose(found.matrix.sum(axis=1), 1, atol=2e-6)
 
 
@@ -64,7 +65,7 @@ def test_a_source_given_to_the_wrong_pixel_is_noticed(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(point_sources, "visible_pixels", wrong)
     with pytest.raises(MachineError, match="uniform"):
-        point_sources.responses_from_points(described, camera)
+        point_sources.responses_from_points(Setup(described, camera))
 
 
 def test_the_stated_uncertainty_of_h_is_its_real_error() -> None:
@@ -75,7 +76,7 @@ def test_the_stated_uncertainty_of_h_is_its_real_error() -> None:
     measured: list[float] = []
     for seed in range(30):
         described = small(seed)
-        found = calibrate.calibrate(described, derive(described))
+        found = calibrate.calibrate(Setup.from_scene(described))
         difference = sparse.csr_array(found.matrix - ideal)
         entries.append(float((difference.data**2).sum() / found.variance.sum()))
         error = found.forward(image) - ideal @ image.ravel()
@@ -87,7 +88,7 @@ def test_the_stated_uncertainty_of_h_is_its_real_error() -> None:
 def test_agreement_with_the_ideal_model_is_tested_and_can_fail() -> None:
     described = small(samples=1024)
     camera = derive(described)
-    found = calibrate.calibrate(described, camera)
+    found = calibrate.calibrate(Setup(described, camera))
     assert found.record["agreement"]["p_value"] > 0.01
     wrong = found.matrix.copy()
     wrong.data[40] += 0.05
@@ -102,14 +103,14 @@ def test_agreement_with_the_ideal_model_is_tested_and_can_fail() -> None:
 
 def test_ideal_calibration_has_no_uncertainty() -> None:
     described = scene(calibration={"method": "ideal"})
-    found = calibrate.calibrate(described, derive(described))
+    found = calibrate.calibrate(Setup.from_scene(described))
     assert not found.variance.any()
     assert not found.variance_from_model(load(described)).any()
 
 
 def test_model_files(tmp_path: Path) -> None:
     described = small()
-    found = calibrate.calibrate(described, derive(described))
+    found = calibrate.calibrate(Setup.from_scene(described))
     model_file.write(tmp_path / "model.npz", found)
     again = model_file.read(tmp_path / "model.npz")
     assert (again.matrix != found.matrix).nnz == 0
@@ -137,7 +138,7 @@ def test_restrict_keeps_rows_and_their_uncertainty() -> None:
         render={"variant": "scalar_rgb"},
         calibration={"samples": 16},
     )
-    found = calibrate.calibrate(described, derive(described))
+    found = calibrate.calibrate(Setup.from_scene(described))
     second = found.restrict(("B",))
     assert second.measurements == 16
     image = load(described)

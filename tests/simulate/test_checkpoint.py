@@ -11,6 +11,7 @@ from ommatid.scenes import model_file, stack
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.cache import cached_model, cached_stack
 from ommatid.simulate.sampling import checkpoint
 from ommatid.simulate.sampling.checkpoint import Checkpoint, open_checkpoint
@@ -51,12 +52,12 @@ def test_a_rendering_goes_on(tmp_path: Path, fraction: float) -> None:
     one = tiny()
     camera, image = derive(one), load(one)
     with pytest.raises(KeyboardInterrupt):
-        cached_stack(tmp_path / "stack.exr", one, camera, image, after(fraction))  # type: ignore[arg-type]
+        cached_stack(tmp_path / "stack.exr", Setup(one, camera, image), after(fraction))  # type: ignore[arg-type]
     assert [path.name for path in tmp_path.iterdir()] == [".stack.exr.partial.npz"]
     heard: list[float] = []
-    found, _ = cached_stack(tmp_path / "stack.exr", one, camera, image, heard.append)
+    found, _ = cached_stack(tmp_path / "stack.exr", Setup(one, camera, image), heard.append)
     assert all(done > fraction for done in heard), "passes that were done are not done again"
-    whole, _ = cached_stack(tmp_path / "whole.exr", one, camera, image, nothing)
+    whole, _ = cached_stack(tmp_path / "whole.exr", Setup(one, camera, image), nothing)
     np.testing.assert_array_equal(found.values, whole.values)
     np.testing.assert_array_equal(found.variance, whole.variance)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["stack.exr", "whole.exr"]
@@ -69,12 +70,12 @@ def test_a_calibration_goes_on(tmp_path: Path, fraction: float) -> None:
     one = tiny()
     camera = derive(one)
     with pytest.raises(KeyboardInterrupt):
-        cached_model(tmp_path / "model.npz", one, camera, after(fraction))  # type: ignore[arg-type]
+        cached_model(tmp_path / "model.npz", Setup(one, camera), after(fraction))  # type: ignore[arg-type]
     heard: list[float] = []
-    found, made = cached_model(tmp_path / "model.npz", one, camera, heard.append)
+    found, made = cached_model(tmp_path / "model.npz", Setup(one, camera), heard.append)
     assert made
     assert min(heard) > fraction - 0.05
-    whole, _ = cached_model(tmp_path / "whole.npz", one, camera, nothing)
+    whole, _ = cached_model(tmp_path / "whole.npz", Setup(one, camera), nothing)
     np.testing.assert_array_equal(found.matrix.toarray(), whole.matrix.toarray())
     np.testing.assert_array_equal(found.variance, whole.variance)
     np.testing.assert_array_equal(found.batches, whole.batches)
@@ -86,10 +87,10 @@ def test_another_scene_does_not_go_on_with_it(tmp_path: Path) -> None:
     one = tiny()
     camera, image = derive(one), load(one)
     with pytest.raises(KeyboardInterrupt):
-        cached_stack(tmp_path / "stack.exr", one, camera, image, after(0.5))  # type: ignore[arg-type]
+        cached_stack(tmp_path / "stack.exr", Setup(one, camera, image), after(0.5))  # type: ignore[arg-type]
     other = one.model_copy(update={"render": one.render.model_copy(update={"seed": 1})})
     heard: list[float] = []
-    cached_stack(tmp_path / "stack.exr", other, camera, image, heard.append)
+    cached_stack(tmp_path / "stack.exr", Setup(other, camera, image), heard.append)
     assert len(heard) == 16
 
 

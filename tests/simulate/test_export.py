@@ -13,6 +13,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.exr import read_channels
 from ommatid.scenes.formats.picture import load
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.export import export
 
@@ -27,7 +28,7 @@ def test_mitsubas_own_command_renders_the_same(tmp_path: Path) -> None:
     camera = derive(described)
     image = load(described)
     (tmp_path / "scene").mkdir()
-    picture = export(described, camera, image, tmp_path / "scene" / "camera.xml")
+    picture = export(Setup(described, camera, image), tmp_path / "scene" / "camera.xml")
     assert sorted(path.name for path in picture.parent.iterdir()) == ["camera.target.exr", "camera.xml"]
     ideal = ideal_matrix(camera) @ image.ravel()
     slices = camera.slices()
@@ -54,5 +55,5 @@ def test_mitsubas_own_command_renders_the_same(tmp_path: Path) -> None:
 def test_the_name_must_be_a_scenes(tmp_path: Path) -> None:
     described = scene()
     with pytest.raises(InputError, match=r"\.xml"):
-        export(described, derive(described), load(described), tmp_path / "camera.json")
+        export(Setup.from_scene(described), tmp_path / "camera.json")
     assert not list(tmp_path.iterdir())

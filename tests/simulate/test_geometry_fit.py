@@ -23,6 +23,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.optics import blur
 from ommatid.scenes.optics.footprints import sub_matrix
 from ommatid.scenes.pose import Misalignment, misalignments, pose_of
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.calibration.entries import entry_variances
 from ommatid.simulate.calibration.geometry_fit import GeometryFit, fit_all, fit_geometry
@@ -156,7 +157,7 @@ def test_the_chance_of_a_right_model_is_uniform() -> None:
 def test_pinholes_as_designed(sampler: str) -> None:
     needs("llvm_ad_mono")
     described, pinholes = built({}, {}, FEW, calibration={"samples": 256}, render={"sampler": sampler})
-    responses = responses_from_rays(described, pinholes)
+    responses = responses_from_rays(Setup(described, pinholes))
     found, variance, record = fit_geometry(responses, entry_variances(responses, pinholes), pinholes)
     assert (record["accepted"], record["refused"]) == (len(pinholes.sub_imagers), [])
     assert np.abs(scores(fit_all(responses, pinholes), put_together(pinholes))).max() < FARTHEST
@@ -172,7 +173,7 @@ def test_a_misaligned_camera_is_recovered(sampler: str) -> None:
     """Of a scene that knows of no tolerance."""
     needs("llvm_ad_mono")
     described, wrong = built({}, WRONG, FEW, calibration={"samples": 1024}, render={"sampler": sampler})
-    fits = fit_all(responses_from_rays(described, wrong), replace(wrong, tolerance=None))
+    fits = fit_all(responses_from_rays(Setup(described, wrong)), replace(wrong, tolerance=None))
     expected = put_together(wrong)
     assert all(fit.accepted for fit in fits)
     found = scores(fits, expected)
@@ -187,7 +188,7 @@ def test_distortion_is_recovered() -> None:
     needs("llvm_ad_mono")
     described, bent = built({"distortion": [0.05, 0.0]}, {}, FEW, calibration={"samples": 1024})
     _, straight = built({}, {}, FEW)
-    fits = fit_all(responses_from_rays(described, bent), straight)
+    fits = fit_all(responses_from_rays(Setup(described, bent)), straight)
     expected = np.zeros(6)
     expected[K1] = 0.05
     assert all(fit.accepted for fit in fits)
@@ -203,7 +204,7 @@ def test_defocus_is_recovered() -> None:
         {"aperture": "0.4 mm", "focus": "700 mm"}, {}, few, calibration={"samples": 2048}, render=complete
     )
     _, sharper = built({"aperture": "0.4 mm", "focus": "900 mm"}, {}, few)
-    fits = fit_all(responses_from_rays(described, blurred), sharper)
+    fits = fit_all(responses_from_rays(Setup(described, blurred)), sharper)
     expected = [designed(blurred, sub) for sub in blurred.sub_imagers]
     assert expected[0][BLUR] == pytest.approx(0.4 * 3 / 7)
     assert all(fit.accepted and fit.free[BLUR] and fit.deviation[BLUR] < 0.02 for fit in fits)
@@ -262,7 +263,7 @@ def test_the_scene_file_asks_for_it(tmp_path: Path) -> None:
     few: Any = (("1/3", [1, 2], [2, 2]),)
     calibration = {"samples": 64, "method": "transport", "fit": "geometry"}
     described, camera = built({}, WRONG, few, (9, 9), calibration=calibration)
-    found = calibrate(described, camera)
+    found = calibrate(Setup(described, camera))
     told = found.record["fit"]
     assert (told["kind"], told["accepted"]) == ("geometry", 2)
     assert set(told["parameters"]["A"]) == set(told["units"])

@@ -15,6 +15,7 @@ from ommatid.scenes import stack as stacks
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses import sharpness
@@ -56,10 +57,10 @@ def test_the_measured_error_is_the_promised_one(lens: dict[str, Any], tables: di
     needs("llvm_ad_mono")
     described = built(lens, **tables)
     camera, truth = derive(described), load(described)
-    stacks.write(tmp_path / "stack.exr", render(described, camera, truth))
+    stacks.write(tmp_path / "stack.exr", render(Setup(described, camera, truth)))
     stack = stacks.read(tmp_path / "stack.exr")
     assert (stack.recording is not None) == ("sensor" in tables)
-    found = restore(stack, calibrate(described, camera), truth.ravel())
+    found = restore(stack, calibrate(Setup(described, camera)), truth.ravel())
     assert found.error is not None
     assert found.interval is not None
     assert found.interval.low < found.error.mse < found.interval.high
@@ -70,7 +71,7 @@ def test_pixels_that_no_light_can_reach_are_dead() -> None:
     needs("llvm_ad_mono")
     described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
     camera, truth = derive(described), load(described)
-    stack, model = render(described, camera, truth), calibrate(described, camera)
+    stack, model = render(Setup(described, camera, truth)), calibrate(Setup(described, camera))
     dark = np.isnan(stack.values)
     picture = dark.reshape(25, 25)
     assert picture[0, 0]
@@ -84,8 +85,8 @@ def test_pixels_that_no_light_can_reach_are_dead() -> None:
     assert usable_pixels(stack, model).dead >= dark.sum()
     with_sensor = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), sensor=SENSOR)
     # Dark is where one of 16 passes of 64 rays brought nothing: a fifth of the light makes that a chance of 1e-5.
-    assert (response(with_sensor, camera)[dark] < 0.2 * response(with_sensor, camera).max()).all()
-    counted = render(with_sensor, camera, truth)
+    assert (response(Setup(with_sensor, camera))[dark] < 0.2 * response(Setup(with_sensor, camera)).max()).all()
+    counted = render(Setup(with_sensor, camera, truth))
     assert np.isnan(counted.values[dark]).all()
 
 
@@ -97,7 +98,7 @@ def test_what_a_lens_type_collects_is_what_the_rendering_shows() -> None:
 
     described = built({"surfaces": BIPLANE[1:]}, sensor=SENSOR)
     camera = derive(described)
-    freed = response(described, camera)
+    freed = response(Setup(described, camera))
     rig = Renderer(camera, "llvm_ad_mono", together=False)
     for group in rig.groups:
         light = rig.gathered(group, 2**14, sampler_seeds(0, "data", 0, 1))
@@ -114,7 +115,7 @@ def test_what_has_no_closed_form_is_calibrated_all_the_same() -> None:
     needs("llvm_ad_mono")
     lens = {"aperture": "0.4 mm", "focus": "700 mm", "distortion": [0.05, 0.0]}
     described = built(lens, (("1/3", [2, 2], [3, 3]),), (12, 12), noise={"variance": 1e-2})
-    model = calibrate(described, derive(described))
+    model = calibrate(Setup.from_scene(described))
     assert "agreement" not in model.record
     assert model.matrix.sum(axis=1).max() == pytest.approx(1)
 
@@ -139,7 +140,7 @@ def test_lens_types_that_are_left_out_leave_the_others_where_they_are() -> None:
 def test_more_than_pinholes_cannot_be_exported(tmp_path: Path) -> None:
     described = built({"aperture": "0.4 mm"})
     with pytest.raises(InputError, match="cannot be exported"):
-        export(described, derive(described), load(described), tmp_path / "lens.xml")
+        export(Setup.from_scene(described), tmp_path / "lens.xml")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import pytest
 from scipy import sparse, stats
 
 from ommatid.scenes.formats.picture import load
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.ray_transport import responses_from_rays
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.render import light
@@ -47,7 +48,7 @@ def test_h_is_that_of_the_closed_form(kind: str) -> None:
     needs("llvm_ad_mono")
     render = {"sampler": "independent", "complete": True}
     described, camera = built(*CLOSED[kind], calibration={"samples": SAMPLES}, render=render)
-    traced = responses_from_rays(described, camera)
+    traced = responses_from_rays(Setup(described, camera))
     found = scores(traced.matrix, true_matrix(camera), traced.passes * traced.samples)
     assert found.size > 5000
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
@@ -72,6 +73,6 @@ def test_rendered_sub_images_of_a_photograph(kind: str) -> None:
     tables: dict[str, Any] = {"render": {"samples": 4096, "complete": True}}
     described, camera = built(*CLOSED[kind], TWO, **tables)
     image = load(described)
-    rendered = light(described, camera, image)
+    rendered = light(Setup(described, camera, image))
     difference = rendered.mean - true_matrix(camera) @ image.ravel()
     assert_student(difference, rendered.variance, rendered.passes)

@@ -12,6 +12,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.calibration.point_sources import responses_from_points
 from ommatid.simulate.calibration.ray_transport import responses_from_rays
@@ -52,7 +53,7 @@ def test_it_gives_the_h_of_point_sources(kind: str) -> None:
     needs("llvm_ad_mono")
     tables = {"calibration": {"samples": 32}, "render": {"complete": True, "variant": "llvm_ad_mono"}}
     described, camera = built(*KINDS[kind], SMALL, (7, 7), **tables)
-    by_rays, by_points = responses_from_rays(described, camera), responses_from_points(described, camera)
+    by_rays, by_points = responses_from_rays(Setup(described, camera)), responses_from_points(Setup(described, camera))
     assert abs(by_rays.matrix - by_points.matrix).max() < 1e-6 * by_points.matrix.max()
     np.testing.assert_allclose(by_rays.variance, by_points.variance, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(by_rays.batches, by_points.batches, atol=1e-7)
@@ -64,7 +65,7 @@ def test_its_h_renders_the_photograph(kind: str) -> None:
     needs("llvm_ad_mono")
     samples = {"samples": 4096}
     described, camera = built(*KINDS[kind], calibration={**samples, "method": "transport"}, render=samples)
-    model, rendered = calibrate(described, camera), light(described, camera, load(described))
+    model, rendered = calibrate(Setup(described, camera)), light(Setup(described, camera))
     spread = rendered.variance + model.variance_from_model(load(described))
     assert_student(model.forward(load(described)) - rendered.mean, spread, rendered.passes)
 
@@ -72,18 +73,18 @@ def test_its_h_renders_the_photograph(kind: str) -> None:
 def test_without_the_fast_backend_one_sentence_says_what_to_do() -> None:
     described, camera = built({}, {}, calibration={"method": "transport"}, render={"variant": "scalar_rgb"})
     with pytest.raises(InputError, match="needs Mitsuba's fast backend, got scalar_rgb; run: "):
-        calibrate(described, camera)
+        calibrate(Setup(described, camera))
     for lens, more in list(KINDS.values())[1:]:
         described, camera = built(lens, more, render={"variant": "scalar_rgb", "samples": 16})
         with pytest.raises(InputError, match="more than pinholes need Mitsuba's fast backend"):
-            light(described, camera, load(described))
+            light(Setup(described, camera))
 
 
 def test_progress_ends_at_one() -> None:
     needs("llvm_ad_mono")
     described, camera = built({}, {}, calibration={"samples": 16})
     told: list[float] = []
-    responses_from_rays(described, camera, told.append)
+    responses_from_rays(Setup(described, camera), told.append)
     assert told == sorted(told)
     assert told[-1] == pytest.approx(1.0)
 
@@ -98,14 +99,14 @@ def test_pixels_in_blocks_give_the_same_picture_with_other_noise(monkeypatch: py
     described, camera = built({}, {}, one, (12, 12), **tables)
     flat = load(described)
     flat[:, :6] = flat[:, 6:] = np.arange(12.0)[:, None] * np.ones(6)
-    whole = light(described, camera, flat)
+    whole = light(Setup(described, camera, flat))
     monkeypatch.setattr(rays, "MOST_RAYS", 4 * 256)
-    pieces = light(described, camera, flat)
+    pieces = light(Setup(described, camera, flat))
     assert_student(pieces.mean - whole.mean, pieces.variance + whole.variance, whole.passes)
     assert (pieces.mean[:4] == whole.mean[:4]).all(), "the first block has the seed itself"
     assert (pieces.mean[4:] != whole.mean[4:]).any()
-    assert (light(described, camera, flat).mean == pieces.mean).all(), "and all of them always the same"
+    assert (light(Setup(described, camera, flat)).mean == pieces.mean).all(), "and all of them always the same"
     monkeypatch.setattr(rays, "MOST_RAYS", 4 * 4)
-    by_rays, by_points = responses_from_rays(described, camera), responses_from_points(described, camera)
+    by_rays, by_points = responses_from_rays(Setup(described, camera)), responses_from_points(Setup(described, camera))
     assert abs(by_rays.matrix - by_points.matrix).max() < 1e-12
     np.testing.assert_allclose(by_rays.variance, by_points.variance, rtol=1e-9, atol=1e-15)

@@ -11,6 +11,7 @@ import pytest
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.render import made_from, render
 
@@ -19,7 +20,7 @@ from ..modules import existing
 
 
 def recorded(described: Scene) -> Stack:
-    return render(described, derive(described), load(described))
+    return render(Setup.from_scene(described))
 
 
 @pytest.fixture
@@ -52,7 +53,7 @@ def test_another_seed_gives_other_noise() -> None:
 def test_progress_ends_at_one_and_never_falls() -> None:
     described = scene(render={"variant": "scalar_rgb", "samples": 16})
     seen: list[float] = []
-    render(described, derive(described), load(described), seen.append)
+    render(Setup.from_scene(described), seen.append)
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
 
@@ -75,8 +76,8 @@ def test_a_scene_without_noise_runs_no_noise_code(monkeypatch: pytest.MonkeyPatc
 def test_fingerprint_changes_with_what_the_values_depend_on_and_only_with_that() -> None:
     plain = scene()
     camera, image = derive(plain), load(plain)
-    first = made_from(plain, camera, image)
-    assert made_from(scene(prior={"mean": 100.0}), camera, image) == first
-    assert made_from(scene(noise={"variance": 1.0}), camera, image) != first
-    assert made_from(scene(render={"seed": 3}), camera, image) != first
-    assert made_from(plain, camera, image + 1) != first
+    first = made_from(Setup(plain, camera, image))
+    assert made_from(Setup(scene(prior={"mean": 100.0}), camera, image)) == first
+    assert made_from(Setup(scene(noise={"variance": 1.0}), camera, image)) != first
+    assert made_from(Setup(scene(render={"seed": 3}), camera, image)) != first
+    assert made_from(Setup(plain, camera, image + 1)) != first

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.point_sources import responses_from_points
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, light
@@ -41,7 +42,7 @@ def test_sub_images_of_a_photograph(variant: str, sampler: str) -> None:
     needs(variant)
     described, camera = three_types(variant, 4096, sampler)
     image = load(described)
-    rendering = light(described, camera, image)
+    rendering = light(Setup(described, camera, image))
     difference = rendering.mean - ideal_matrix(camera) @ image.ravel()
     assert {sub.type.name for sub in camera.sub_imagers} == {"A", "B", "C"}
     assert_student(difference, floored(rendering), rendering.passes)
@@ -51,7 +52,7 @@ def test_sub_images_of_a_photograph(variant: str, sampler: str) -> None:
 def test_calibrated_h(variant: str) -> None:
     needs(variant)
     described, camera = three_types(variant, 4096)
-    found = responses_from_points(described, camera)
+    found = responses_from_points(Setup(described, camera))
     dense, ideal = found.matrix.toarray(), ideal_matrix(camera).toarray()
     assert (dense[ideal > 0] > 0).all(), "light comes from everywhere where the closed form says"
     assert dense[ideal == 0].sum() < 1e-5 * dense.sum(), "but for rays rounded over an edge, only from there"
@@ -70,7 +71,7 @@ def test_calibrated_h_of_ratios_that_are_no_whole_numbers(variant: str) -> None:
     data["camera"]["lens"][0]["step"] = "1/3"
     described = parse(data, Path("test.toml"))
     camera = derive(described)
-    found = responses_from_points(described, camera)
+    found = responses_from_points(Setup(described, camera))
     dense, ideal = found.matrix.toarray(), ideal_matrix(camera).toarray()
     rows = np.repeat(np.arange(camera.measurements), np.diff(found.matrix.indptr))
     # Slivers thinner than one ray in a hundred passes are no matter of Student's t.
@@ -90,7 +91,7 @@ def test_ratios_that_are_no_whole_numbers(variant: str) -> None:
     described = scene((13, 15), UNUSUAL, render=render)
     camera = derive(described)
     image = load(described)
-    rendering = light(described, camera, image)
+    rendering = light(Setup(described, camera, image))
     assert_student(rendering.mean - ideal_matrix(camera) @ image.ravel(), floored(rendering), rendering.passes)
 
 
@@ -103,7 +104,7 @@ def test_a_letter_f_comes_out_upright(variant: str) -> None:
     described = scene((12, 12), ((1, [2, 2], [9, 9]),), render={"variant": variant, "samples": 16})
     camera = derive(described)
     assert camera.types[0].origin == (1, 1)
-    rendering = light(described, camera, letter)
+    rendering = light(Setup(described, camera, letter))
     pictures = [rendering.mean[place].reshape(9, 9) for place in camera.slices()]
     for sub, picture in zip(camera.sub_imagers, pictures, strict=True):
         window = letter[1 + sub.k : 10 + sub.k, 1 + sub.l : 10 + sub.l]
@@ -115,7 +116,7 @@ def test_a_uniform_target_reads_its_own_value(variant: str) -> None:
     """To the rounding of a float32 film; a pinhole of finite depth does not darken towards the edge."""
     needs(variant)
     described, camera = three_types(variant, 256)
-    rendering = light(described, camera, np.full((19, 19), 100.0))
+    rendering = light(Setup(described, camera, np.full((19, 19), 100.0)))
     np.testing.assert_allclose(rendering.mean, 100.0, rtol=2e-6)
 
 
@@ -128,7 +129,7 @@ def test_the_error_falls_as_the_sampler_promises(variant: str, sampler: str, pow
     for samples in (256, 256 * 16):
         described, camera = three_types(variant, samples, sampler)
         image = load(described)
-        rendering = light(described, camera, image)
+        rendering = light(Setup(described, camera, image))
         difference = (rendering.mean - ideal_matrix(camera) @ image.ravel())[:450]  # 1/4 fills its strata exactly
         error[samples] = float(np.sqrt(np.mean(difference**2)))
     fell = error[256] / error[4096]
@@ -141,7 +142,7 @@ def test_the_variance_of_the_mean_is_the_real_one(variant: str, sampler: str) ->
     needs(variant)
     described, camera = three_types(variant, 1024, sampler)
     image = load(described)
-    rendering = light(described, camera, image)
+    rendering = light(Setup(described, camera, image))
     difference = (rendering.mean - ideal_matrix(camera) @ image.ravel())[:450]
     # The mean of 450 squares over their variances, weighted by what both have in common.
     assert np.sum(difference**2) / np.sum(rendering.variance[:450]) == pytest.approx(1, abs=0.4)
@@ -155,9 +156,9 @@ def test_noise_of_data_calibration_and_seeds_is_uncorrelated(variant: str) -> No
     ideal = ideal_matrix(camera) @ image.ravel()
     other, _ = three_types(variant, 64, seed=12)
     errors = [
-        light(described, camera, image).mean - ideal,
-        light(other, camera, image).mean - ideal,
-        responses_from_points(described, camera).matrix @ image.ravel() - ideal,
+        light(Setup(described, camera, image)).mean - ideal,
+        light(Setup(other, camera, image)).mean - ideal,
+        responses_from_points(Setup(described, camera)).matrix @ image.ravel() - ideal,
     ]
     for one, another in ((0, 1), (0, 2), (1, 2)):
         pair = np.array([errors[one][:450], errors[another][:450]])
@@ -180,7 +181,7 @@ def test_no_ray_slips_into_another_sub_imager(variant: str) -> None:
     assert camera.types[0].origin == (2, 2)
     blocks = np.random.default_rng(0).uniform(50.0, 250.0, (16, 16)).astype(np.float32).astype(np.float64)
     image = np.pad(np.kron(blocks, np.ones((6, 6))), 1, mode="edge").astype(np.float64)
-    rendering = light(described, camera, image)
+    rendering = light(Setup(described, camera, image))
     np.testing.assert_allclose(
         rendering.mean.reshape(256, 16), np.repeat(blocks.reshape(256, 1), 16, axis=1), rtol=1e-5
     )

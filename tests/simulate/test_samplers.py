@@ -15,6 +15,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.optics.boxes import overlap
 from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import light
 from ommatid.simulate.renderer.renderer import Renderer
@@ -59,7 +60,7 @@ def test_rendered_against_ideal(variant: str, sampler: Sampler) -> None:
     needs(variant)
     described, seen = three_types(variant, 16 * 64, sampler)
     image = load(described)
-    rendering = light(described, seen, image)
+    rendering = light(Setup(described, seen, image))
     assert rendering.passes == 16
     assert rendering.record()["samples"] == 16 * fitting(sampler, 64)
     assert_student(rendering.mean - ideal_matrix(seen) @ image.ravel(), floored(rendering), rendering.passes)

@@ -15,6 +15,7 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import TRUTH, Scene, parse
+from ommatid.scenes.setup import Setup
 from ommatid.simulate.cache import cached_stack
 from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.ideal import ideal_matrix
@@ -81,11 +82,11 @@ def test_a_glowing_checkerboard_is_the_flat_target_with_that_picture(tmp_path: P
     described, camera = world(tmp_path, board, variant=variant, white=2.0)
     row, column = np.indices((12, 12)) // 3
     picture = np.where((row + column) % 2 == 1, 1.6, 0.4) / 2 * 255  # color0 in the corner where u = v = 0, lower left
-    seen = light(described, camera, load(described))
-    shown = light(flat_scene((12, 12), THIRDS, render=described.render.model_dump()), camera, picture)
+    seen = light(Setup(described, camera))
+    shown = light(Setup(flat_scene((12, 12), THIRDS, render=described.render.model_dump()), camera, picture))
     assert_student(seen.mean - ideal_matrix(camera) @ picture.ravel(), floored(seen), seen.passes)
     assert_student(seen.mean - shown.mean, floored(seen) + floored(shown), seen.passes)
-    exact = truth(described, camera, load(described))
+    exact = truth(Setup(described, camera))
     np.testing.assert_allclose(exact.image, picture, atol=0.5)
     np.testing.assert_allclose(exact.depth, Z, rtol=1e-6)
 
@@ -95,7 +96,7 @@ def test_the_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: str) -> 
     """A glowing rectangle whose edges cut pixels at three quarters and at a half: what shines is the covered share."""
     needs(variant)
     described, camera = world(tmp_path, rectangle(5.5, 7, 0.25, 0, Z, glow(0.5)), variant=variant)
-    found = truth(described, camera, load(described))
+    found = truth(Setup(described, camera))
     across, along = np.zeros(12), np.zeros(12)
     across[3:9] = 1, 1, 1, 1, 1, 0.5  # x from 3 to -2.5 mm, which is to the right
     along[2:10] = 0.5, 1, 1, 1, 1, 1, 1, 0.5
@@ -113,7 +114,7 @@ def test_a_ball_hides_what_is_behind_it(tmp_path: Path, variant: str) -> None:
     ball = f'<shape type="sphere"><point name="center" x="{x}" y="{y}" z="{z}"/>'
     ball += f'<float name="radius" value="{radius}"/>{glow(0.8)}</shape>'
     described, camera = world(tmp_path, rectangle(40, 40, 0, 0, 1500, glow(0.2)) + ball, variant=variant)
-    found = truth(described, camera, load(described))
+    found = truth(Setup(described, camera))
     corners = np.arange(13)
     at_x, at_y = 6.0 - corners[None, :], 6.0 - corners[:, None]
     along = (at_x * x + at_y * y + Z * z) / np.sqrt(at_x**2 + at_y**2 + Z**2)
@@ -138,8 +139,8 @@ def test_a_letter_f_of_cubes_is_upright_and_not_mirrored(tmp_path: Path, variant
     needs(variant)
     cubes = "".join(cube(5.5 - column, 5.5 - row, Z + 0.05, 0.5, glow(0.8)) for row, column in np.argwhere(LETTER))
     described, camera = world(tmp_path, cubes, ((1, [1, 1], [12, 12]),), variant=variant)
-    np.testing.assert_allclose(truth(described, camera, load(described)).image, LETTER * 204.0, atol=0.5)
-    rendering = light(described, camera, load(described))
+    np.testing.assert_allclose(truth(Setup(described, camera)).image, LETTER * 204.0, atol=0.5)
+    rendering = light(Setup(described, camera))
     np.testing.assert_allclose(rendering.mean.reshape(12, 12), LETTER * 204.0, atol=0.5)
 
 
@@ -150,7 +151,7 @@ def test_disparity_is_how_far_a_near_square_moves(tmp_path: Path, variant: str) 
     square = rectangle(2, 2, 0, 0, Z / 2, glow(1))
     lens_pitch = {"camera": {"lens_pitch": "3 mm"}}
     described, camera = world(tmp_path, square, ((1, [2, 2], [11, 11]),), variant=variant, **lens_pitch)
-    rendering = light(described, camera, load(described))
+    rendering = light(Setup(described, camera))
     moved: list[float] = []
     for sub, place in zip(camera.sub_imagers, camera.slices(), strict=True):
         share = rendering.mean[place].reshape(11, 11)
@@ -172,7 +173,7 @@ def test_a_picture_stands_before_its_world(tmp_path: Path) -> None:
     picture = {"image": "photo:camera", "origin": [96, 224]}
     described, camera = world(tmp_path, content, target=picture, white=3.0)
     image = load(described)
-    found = truth(described, camera, image)
+    found = truth(Setup(described, camera, image))
     hidden = np.zeros((12, 12), dtype=bool)
     hidden[4:8, 4:8] = True
     np.testing.assert_allclose(found.image[~hidden], image[~hidden], rtol=1e-4, atol=0.5)
@@ -187,8 +188,8 @@ def test_every_lens_reads_a_uniform_world_as_it_is(tmp_path: Path) -> None:
     data["camera"]["lens"][1] |= {"aperture": "0.1 mm", "focus": "700 mm"}
     blurred = parse(data, Path("test.toml"))
     camera = derive(blurred)
-    np.testing.assert_allclose(light(blurred, camera, load(blurred)).mean, 0.4 * 255, rtol=2e-6)
-    assert np.isnan(truth(blurred, camera, load(blurred)).depth).all()
+    np.testing.assert_allclose(light(Setup(blurred, camera)).mean, 0.4 * 255, rtol=2e-6)
+    assert np.isnan(truth(Setup(blurred, camera)).depth).all()
 
 
 def test_an_aperture_blurs_what_is_not_in_focus(tmp_path: Path) -> None:
@@ -203,7 +204,7 @@ def test_an_aperture_blurs_what_is_not_in_focus(tmp_path: Path) -> None:
     data = described.plain()
     data["camera"]["lens"][0]["aperture"] = "4 mm"
     blurred = parse(data, Path("test.toml"))
-    seen = light(blurred, derive(blurred), load(blurred)).mean.reshape(12, 12)
+    seen = light(Setup.from_scene(blurred)).mean.reshape(12, 12)
     away = (np.arange(12) - 5.5) ** 2
     spread = [float((seen.sum(axis=axis) * away).sum() / seen.sum()) for axis in (0, 1)]
     steepest = (2.0 / camera.depth(camera.types[0])) ** 2
@@ -226,7 +227,7 @@ def test_light_that_bounces_is_the_same_on_both_backends(tmp_path: Path) -> None
     found: list[Rendering] = []
     for variant in VARIANTS:
         described, camera = world(tmp_path, LIT, variant=variant)
-        found.append(light(described, camera, load(described)))
+        found.append(light(Setup(described, camera)))
     assert found[0].mean.std() > 5 < found[0].mean.mean()
     assert_student(found[0].mean - found[1].mean, floored(found[0]) + floored(found[1]), found[0].passes)
 
@@ -255,7 +256,7 @@ def test_light_that_cannot_bounce_is_left_out_to_the_last_digit(tmp_path: Path) 
     found: list[Rendering] = []
     for inside, render in ((content, {}), (content, {"complete": True}), (LIT, {})):
         described, camera = world(tmp_path, inside, render=render)
-        found.append(light(described, camera, load(described)))
+        found.append(light(Setup(described, camera)))
     assert [one.straight for one in found] == [True, False, False]
     np.testing.assert_allclose(found[0].mean, found[1].mean, rtol=1e-6)
 
@@ -280,7 +281,7 @@ def test_a_world_is_rendered_again_where_it_or_what_it_names_has_changed(tmp_pat
     image, path = load(described), tmp_path / "stack.exr"
 
     def keep() -> tuple[float, bool]:
-        stack, made = cached_stack(path, described, camera, image, lambda _: None)
+        stack, made = cached_stack(path, Setup(described, camera, image), lambda _: None)
         known = read(tmp_path / TRUTH)[0].channels
         assert stack.record["truth"] == digest(known["Y"])
         assert known["Y"].mean() == pytest.approx(float(stack.values.mean()), rel=1e-5)
@@ -309,7 +310,7 @@ def test_a_world_is_rendered_again_where_it_or_what_it_names_has_changed(tmp_pat
 def test_a_world_that_cannot_be_built_is_refused_in_a_sentence(tmp_path: Path, content: str, complaint: str) -> None:
     described, camera = world(tmp_path, content, variant="scalar_rgb")
     with pytest.raises(InputError, match=complaint) as told:
-        truth(described, camera, load(described))
+        truth(Setup(described, camera))
     text = str(told.value)
     assert text.startswith("test.toml: world.file: ")
     assert "\n" not in text

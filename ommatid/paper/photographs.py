@@ -18,10 +18,11 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import scene
 from ommatid.scenes.formats import picture
+from ommatid.scenes.tables.gallery import GALLERY
 from ommatid.scenes.tables.sensor import NoiseTable
 from ommatid.simulate.sensor.gaussian import expose, generators
 
-from .tile_errors import GALLERY, PaperTile
+from .tile_errors import PaperTile
 
 PHOTOGRAPH = "photo:camera"
 TILES = 6
@@ -140,7 +141,7 @@ def measure(
     rows: list[tuple[FloatArray, float, FloatArray, float, float]] = []
     for level, noise in enumerate(noises):
         variance = noise.variance + noise.quantisation_variance
-        form = tile.form.at(variance)
+        form = tile.form.with_noise_scaled(variance)
         values = np.stack([recorded(image, level) for image in range(len(images))], 1)
         error = mean[:, None] + form.gain(values - before) - images.T
         from_noise = form.gain(values - light)

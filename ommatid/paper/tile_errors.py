@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -22,9 +21,9 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes import scene
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.tables.estimation import PriorTable
+from ommatid.scenes.tables.gallery import GALLERY
 from ommatid.simulate.ideal import ideal_matrix
 
-GALLERY = Path(str(scene.__file__)).parent
 SIDES = (19, 35, 41)
 COMPLETE_SIDES = (19, 35)  # of tiles that are computed with every combination of lens types
 TWICE, TWO, THREE = ("I", "I"), ("I", "II"), ("I", "II", "III")

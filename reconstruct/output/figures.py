@@ -23,7 +23,7 @@ RESOLUTION = 110
 
 
 @dataclass(frozen=True)
-class Panel:
+class OverviewPanel:
     """A map of the overview, and the colour scale that suits its content."""
 
     title: str
@@ -47,13 +47,13 @@ def write_overview(path: Path, title: str, stack: Stack, restoration: Reconstruc
 
     shape = restoration.shape
     estimate = restoration.estimate.reshape(shape)
-    above, below = _sub_images(stack), [Panel("Estimate", estimate, "values")]
+    above, below = _sub_images(stack), [OverviewPanel("Estimate", estimate, "values")]
     if restoration.truth is not None:
         truth = restoration.truth.reshape(shape)
-        above.insert(0, Panel("Truth", truth, "values"))
-        below.append(Panel("Error: estimate minus truth", estimate - truth, "error"))
+        above.insert(0, OverviewPanel("Truth", truth, "values"))
+        below.append(OverviewPanel("Error: estimate minus truth", estimate - truth, "error"))
     deviation = np.sqrt(restoration.expected.variance).reshape(shape)
-    below.append(Panel("Expected standard deviation", deviation, "deviation"))
+    below.append(OverviewPanel("Expected standard deviation", deviation, "deviation"))
     across = max(len(above), len(below) + 1)
     figure: Any = Figure(figsize=(COLUMN_INCHES * across, 7.2), dpi=RESOLUTION, layout="constrained")
     FigureCanvasAgg(figure)
@@ -85,20 +85,20 @@ def _grey_range(restoration: Reconstruction) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 
-def _sub_images(stack: Stack) -> list[Panel]:
+def _sub_images(stack: Stack) -> list[OverviewPanel]:
     """Return the middle sub-image of each lens type."""
-    panels: list[Panel] = []
+    panels: list[OverviewPanel] = []
     subs = list(zip(stack.camera.sub_imagers, stack.images(), strict=True))
     for lens_type in stack.camera.types:
         members = [(sub, image) for sub, image in subs if sub.type == lens_type]
         sub, image = members[len(members) // 2]
         rows, columns = lens_type.array
         name = f"Type {lens_type.name}, sub-image {sub.k}, {sub.l} of {rows} x {columns}"
-        panels.append(Panel(f"{name}\nmagnification {1 / lens_type.ratio}", image, "recorded"))
+        panels.append(OverviewPanel(f"{name}\nmagnification {1 / lens_type.ratio}", image, "recorded"))
     return panels
 
 
-def _draw_panel(figure: Any, axes: Any, panel: Panel, grey: tuple[float, float]) -> None:
+def _draw_panel(figure: Any, axes: Any, panel: OverviewPanel, grey: tuple[float, float]) -> None:
     low, high, colours, label = *grey, "gray", "value (0 to 255)"
     if panel.content == "error":
         high = float(np.abs(panel.image).max()) or 1.0

@@ -18,7 +18,6 @@ from scipy import sparse, stats
 from ommatid.runtime.arrays import FloatArray
 
 from .forms.form import Form
-from .prior import Prior
 
 Pixels = NDArray[np.intp]
 
@@ -67,13 +66,10 @@ class Interval:
     high: float
 
 
-def expected_error(
-    form: Form, noise: dict[str, FloatArray], truth: Prior | None = None, pixels: Pixels | None = None
-) -> ExpectedError:
-    """Return Eq. 5 for the actual noise and, if given, the actual prior.
+def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | None = None) -> ExpectedError:
+    """Return Eq. 5 for the actual noise.
 
-    noise : named (M,) variances, the diagonal of Rvm in parts;  truth : the actual prior, absent: the expected one
-    pixels : the pixels whose error is returned, absent: all
+    noise : named (M,) variances, the diagonal of Rvm in parts;  pixels : whose error is returned, absent: all
     """
     problem = form.problem
     pixels = np.arange(problem.unknowns) if pixels is None else pixels
@@ -82,16 +78,12 @@ def expected_error(
     total = np.sum(list(noise.values()), axis=0) if noise else np.zeros(measurements)
     missing, noisy, resolved, weights = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(measurements)
     for chunk, chosen, u, negative in solved_columns(form, pixels):
-        if truth is None:
-            missing[chunk] = np.square(u).sum(axis=0)
-        else:
-            units = np.eye(problem.unknowns)[:, chosen]
-            missing[chunk] = np.square(truth.gather(units + problem.matrix.T @ negative)).sum(axis=0)
+        missing[chunk] = np.square(u).sum(axis=0)
         resolved[chunk] = -np.asarray(by_column[:, chosen].multiply(negative).sum(axis=0)).ravel()
         squared = np.square(negative)
         noisy[chunk] = total @ squared
         weights += squared.sum(axis=1) / count
-    as_expected = truth is None and np.array_equal(total, problem.noise_variance)
+    as_expected = np.array_equal(total, problem.noise_variance)
     variance = form.variance()[pixels] if as_expected else missing + noisy
     parts = {name: float(weights @ values) for name, values in noise.items()}
     return ExpectedError(variance, float(missing.mean()), parts, resolved)

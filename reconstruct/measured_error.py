@@ -8,9 +8,10 @@ from typing import Any, cast
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.constants import WHITE
 
 TRIM = 2  # pixels of the border that trimmed errors leave out
-PEAK = 255.0
+
 SMALLEST_SSIM = 7  # pixels, the window of structural similarity
 
 
@@ -34,11 +35,11 @@ def measure_error(estimate: FloatArray, truth: FloatArray, shape: tuple[int, int
     """Return mean squared error, PSNR (peak 255) and structural similarity of an estimate, (N,), to the truth, (N,)."""
     squared = (estimate - truth) ** 2
     mse = float(squared.mean())
-    psnr = 10 * float(np.log10(PEAK**2 / mse)) if mse > 0 else None
+    psnr = 10 * float(np.log10(WHITE**2 / mse)) if mse > 0 else None
     ssim: float | None = None
     if min(shape) >= SMALLEST_SSIM:
         from skimage import metrics
 
         similarity = cast(Any, metrics).structural_similarity
-        ssim = float(similarity(truth.reshape(shape), estimate.reshape(shape), data_range=PEAK))
+        ssim = float(similarity(truth.reshape(shape), estimate.reshape(shape), data_range=WHITE))
     return MeasuredError(mse, trimmed_mean(squared, shape), psnr, ssim)

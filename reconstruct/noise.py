@@ -13,7 +13,7 @@ import numpy as np
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import without_shot_noise
+from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
@@ -52,7 +52,7 @@ def known_noise(stack: Stack) -> Noise:
     """Return the variances, (M,), known before anything is estimated; absent effects have no entry."""
     noise = {"rendering": stack.variance}
     if stack.recording is not None:
-        return noise | stack.recording.noise(stack.recording.light_nearby(stack.camera))
+        return noise | stack.recording.noise(stack.recording.smoothed_light(stack.camera))
     table = stack.scene.noise
     if table is not None and table.variance > 0:
         noise["noise"] = uniform(table.variance, stack.values.size)
@@ -82,7 +82,7 @@ def noise_for_image(image: FloatArray, stack: Stack, model: Model, usable: Usabl
 
 def depends_on_light(stack: Stack, model: Model) -> bool:
     """Return True if some of the noise is only known once there is an estimate."""
-    counted = stack.recording is not None and without_shot_noise(stack.scene, stack.camera) is None
+    counted = stack.recording is not None and negligible_shot_noise(stack.scene, stack.camera) is None
     return counted or bool(model.variance.any())
 
 

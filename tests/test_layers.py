@@ -76,6 +76,15 @@ def test_no_module_is_long(module: str) -> None:
     assert len(modules()[module].read_text(encoding="utf-8").splitlines()) <= TOO_LONG.get(module, LONGEST)
 
 
+def test_no_class_name_stands_for_two_things() -> None:
+    defined: dict[str, list[str]] = {}
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                defined.setdefault(node.name, []).append(module)
+    assert {name: where for name, where in defined.items() if len(where) > 1} == {}
+
+
 def test_no_folder_is_crowded() -> None:
     inside = Counter(path.parent for path in modules().values() if path.stem != "__init__")
     assert {folder: count for folder, count in inside.items() if count > LARGEST} == {}
@@ -109,5 +118,5 @@ def test_the_command_line_imports_nothing_heavy() -> None:
     """`ommatid --help` in under 0.3 s: what it loads decides, and that can be tested on any machine."""
     script = "import sys, ommatid.__main__; print(*sys.modules)"
     ended = subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, capture_output=True, text=True)
-    heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR"}
+    heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR", "psutil"}
     assert not heavy & set(ended.stdout.split())

@@ -14,6 +14,7 @@ from ommatid.reconstruct.noise import Noise, known_noise, uniform, usable_pixels
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -22,7 +23,6 @@ from ommatid.simulate.calibration.stopping_rule import StoppingRule
 
 from .predict import expected_noise
 
-WHITE = 255.0
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
 TINY = float(np.finfo(np.float64).tiny)
 TABLES = ("prior", "estimator", "tiles", "noise", "sensor")  # on which the expected error depends

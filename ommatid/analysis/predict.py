@@ -49,7 +49,7 @@ def expected_noise(setup: Setup) -> float | FloatArray:
 
 def optics(camera: Camera) -> list[dict[str, Any]]:
     """Return the sharpness of the lens types in JSON's types; empty where all are pinholes."""
-    if all(lens_type.optics.pinhole for lens_type in camera.types):
+    if all(lens_type.optics.is_pinhole for lens_type in camera.types):
         return []
     from ommatid.simulate.lenses.sharpness import describe
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-
-from pydantic import ValidationError
 
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.output.run_json import Record, StudyCase
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.runtime.files import cached, fingerprint, write_csv, write_text
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -88,30 +84,26 @@ def cached_study(
     models : by name, made only where they are needed
     """
     current = fingerprint([list(models), stack.record, stack.scene.plain(), truth is not None])
-    existing = _existing(folder)
-    if existing is not None and existing.fingerprint == current:
-        return existing.cases, False
-    cases: list[StudyCase] = []
-    for name, make in models.items():
-        cases.append(study_case(stack, name, make(), truth))
-        progress(len(cases) / len(models))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(StudyCase.model_fields), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(case.plain() for case in cases)
-    write_text(folder / TABLE, text.getvalue())
-    study = StudyFile(fingerprint=current, cases=tuple(cases))
-    write_text(folder / NUMBERS, json.dumps(study.plain(), indent=2) + "\n")
-    return study.cases, True
+
+    def make() -> StudyFile:
+        cases: list[StudyCase] = []
+        for name, model in models.items():
+            cases.append(study_case(stack, name, model(), truth))
+            progress(len(cases) / len(models))
+        return StudyFile(fingerprint=current, cases=tuple(cases))
+
+    def write(folder: Path, study: StudyFile) -> None:
+        columns = list(StudyCase.model_fields)
+        write_csv(folder / TABLE, columns, (case.plain().values() for case in study.cases))
+        write_text(folder / NUMBERS, json.dumps(study.plain(), indent=2) + "\n")
+
+    return cached(folder, current, _read_study, make, write)
 
 
-def _existing(folder: Path) -> StudyFile | None:
-    """Read study.json of a folder that holds both files of a study; None where one is missing or damaged."""
-    try:
-        study = StudyFile.model_validate_json((folder / NUMBERS).read_bytes())
-        return study if (folder / TABLE).is_file() else None
-    except (OSError, ValidationError):
-        return None
+def _read_study(folder: Path) -> tuple[tuple[StudyCase, ...], str | None]:
+    """Return the cases in study.json, and its fingerprint if study.csv is there too."""
+    study = StudyFile.model_validate_json((folder / NUMBERS).read_bytes())
+    return study.cases, study.fingerprint if (folder / TABLE).is_file() else None
 
 
 def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:

@@ -44,7 +44,9 @@ def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str])
 def _rays(scene: Scene, camera: Camera) -> float:
     method, asked = scene.calibration.method, scene.calibration.samples
     several = {"points": RENDERINGS, "transport": 1.0, "ideal": 0.0}[method]
-    return camera.measurements * (scene.render.counted + several * (IN_PLACE_OF_AUTO if asked == "auto" else asked))
+    return camera.measurements * (
+        scene.render.sample_count + several * (IN_PLACE_OF_AUTO if asked == "auto" else asked)
+    )
 
 
 def concurrent_by_memory(memory: Sequence[int]) -> int:

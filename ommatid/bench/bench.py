@@ -18,6 +18,7 @@ from ommatid.runtime.files import digest, fingerprint, make_folder
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.scene import Sampler, Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
@@ -33,7 +34,7 @@ from .slopes import recommend, slope
 from .table import AUTO, JSON, STAGES, BenchTable, Cell, ConvergenceCurve, SkippedJob, Stage
 
 PARTIAL = ".bench.partial.jsonl"
-ROUNDING: dict[Stage, float] = {"render": 1e-5 * 255, "calibrate": 1e-5}  # errors below these are float32 rounding
+ROUNDING: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below these are float32 rounding
 FLOOR_SHARE = 0.1  # of the time limit, for the noise floor
 SETUP_SHARE = 0.02  # of the progress, for the reference and the noise floor
 

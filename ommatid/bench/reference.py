@@ -111,7 +111,7 @@ def render_light(setup: Setup) -> Rendering | AdaptiveRendering:
     render = setup.scene.render
     if render.samples == "auto":
         return render_until(setup)
-    return light(setup, work=sample_plan(render.counted, render.sampler))
+    return light(setup, work=sample_plan(render.sample_count, render.sampler))
 
 
 def light_error(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:

@@ -7,10 +7,8 @@ of H; `reconstruct`, over the pixels of f in units of each pixel's posterior sta
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterator, Mapping
-from io import StringIO
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import write_text
+from ommatid.runtime.files import write_csv, write_text
 
 JSON, CSV = "bench.json", "bench.csv"
 ALONE = "alone"  # the setting of a dense form without refinement, which a scene cannot ask for
@@ -187,7 +185,9 @@ def write(folder: Path, table: BenchTable) -> None:
 
     Raises InputError or MachineError.
     """
-    write_text(folder / CSV, csv_text(table.cells))
+    rows = [row_of(cell) for cell in table.cells]
+    columns = list(rows[0]) if rows else list(Cell.model_fields)
+    write_csv(folder / CSV, columns, (row.values() for row in rows))
     write_text(folder / JSON, json.dumps(table.describe(), indent=2, allow_nan=False) + "\n")
 
 
@@ -220,17 +220,8 @@ def bench_tables(folder: Path, camera: Mapping[str, Any]) -> Iterator[BenchTable
             yield table
 
 
-def csv_text(cells: tuple[Cell, ...]) -> str:
-    """Return one row per cell as CSV; quantities with quantiles take three columns, absent values are empty."""
-    stream = StringIO()
-    rows = [_row(cell) for cell in cells]
-    writer = csv.DictWriter(stream, list(rows[0]) if rows else list(Cell.model_fields), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
-
-
-def _row(cell: Cell) -> dict[str, Any]:
+def row_of(cell: Cell) -> dict[str, Any]:
+    """Return a cell as a row of bench.csv by column; quantities with quantiles take three columns."""
     row: dict[str, Any] = {}
     for name, value in cell:
         if name not in ("error", "seconds", "mse"):

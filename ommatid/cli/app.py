@@ -317,10 +317,11 @@ def import_(
 
     A mosaic is the sensor seen from behind the camera, rows downwards; its numbers are taken as they are.
     """
+    from ommatid.analysis.recording_warnings import import_warnings
     from ommatid.runtime.files import check_output
     from ommatid.scenes import stack
     from ommatid.scenes.hardware.frames import files_in
-    from ommatid.scenes.hardware.stack_import import import_stack, warnings
+    from ommatid.scenes.hardware.stack_import import import_stack
     from ommatid.scenes.scene import read
     from ommatid.scenes.setup import Setup
 
@@ -334,7 +335,7 @@ def import_(
     made, frames = import_stack(setup, images, bench)
     made = made.restrict(_names(lens)) if lens else made
     stack.write(output, made)
-    for warning in warnings(frames):
+    for warning in import_warnings(frames):
         _say(f"import: {warning}")
     _say(f"import: done, {output}")
     if as_json:
@@ -398,8 +399,7 @@ def design(
 
     Ranks magnifications by the expected error (Eq. 5) with each.
     """
-    from ommatid.analysis.candidates import magnifications, with_lens
-    from ommatid.analysis.design import DesignCandidate, ranked, rows
+    from ommatid.analysis.design import DesignCandidate, magnifications, ranked, rows, with_lens
     from ommatid.analysis.predict import predict_scene
     from ommatid.analysis.prediction_table import json_of
     from ommatid.scenes.scene import read
@@ -723,7 +723,8 @@ def _each(
 
 
 def _tell_sweep(documents: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
-    from ommatid.batch.sweep_table import lines, summary, write_sweep
+    from ommatid.batch.sweep_row import summary
+    from ommatid.batch.sweep_table import lines, write_sweep
 
     rows = [summary(document) for document in documents]
     if output is not None:
@@ -755,7 +756,7 @@ def _optics_sections(
 
         found.append(("Optics", [(f"lens type {one['lens']}", words(one)) for one in optics]))
     if light is not None:
-        from ommatid.scenes.optics.radiometry import rows
+        from ommatid.analysis.light_table import rows
 
         found.append(("Electrons", rows(light)))
     return found
@@ -797,17 +798,18 @@ def _told_by_points(
     value: float,
 ) -> tuple[Model, bool]:
     """H told from recorded frames, written, with what the user should know of it."""
+    from ommatid.analysis.recording_warnings import calibration_warnings
     from ommatid.runtime.files import check_output
     from ommatid.scenes import model_file
-    from ommatid.scenes.hardware import point_sources, stack_import
     from ommatid.scenes.hardware.frames import files_in
+    from ommatid.scenes.hardware.point_sources import from_recorded_points
 
     _refuse_no_value("--point-value", value)
     read = [file for path in (*points, *bench.dark, *bench.flat) for file in files_in(path)]
     check_output(output, *read, *([] if places is None else [places]))
-    told = point_sources.from_recorded_points(setup, points, bench, places, value)
+    told = from_recorded_points(setup, points, bench, places, value)
     model_file.write(output, told.model)
-    for warning in (*stack_import.dead(told.frames), *point_sources.warnings(told)):
+    for warning in calibration_warnings(told):
         _say(f"calibrate: {warning}")
     return told.model, True
 

@@ -5,7 +5,6 @@ A sweep is a batch with `sweep.json`, which lists its folders with the `values` 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -14,15 +13,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from ommatid.batch.sweep_row import NUMBERS, read_rows
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 
 from .cached import REPORT, read_stamp, sources_digest
 
-INDEX, NUMBERS = "index.html", "sweep.json"
+INDEX = "index.html"
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,8 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     sweep = read_sweep(output / NUMBERS)
     content = [[asdict(entry) for entry in entries], None if sweep is None else asdict(sweep)]
     stamp = fingerprint([content, versions("bokeh"), sources_digest()])
-    if read_stamp(output / INDEX) == stamp:
-        return False
-    write_text(output / INDEX, page(entries, sweep, output.resolve().name, stamp))
-    return True
+    name = output.resolve().name
+    return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
 
 
 def _entry(folder: Path, failure: str) -> BatchEntry:
@@ -106,19 +104,19 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
 def read_sweep(path: Path) -> SweepTable | None:
     """Return the content of sweep.json, None if the file is missing or damaged."""
     try:
-        scenes: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-        keys = tuple(dict.fromkeys(key for scene in scenes for key in scene["values"]))
-        rows = [
-            (
-                "" if "failed" in scene else quote(f"{Path(scene['folder']).name}/{REPORT}"),
-                tuple(str(scene["values"].get(key, "")) for key in keys),
-                scene.get("mse"),
-                scene.get("predicted_mse"),
-            )
-            for scene in scenes
-        ]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        scenes = read_rows(path)
+    except InputError:
         return None
+    keys = tuple(dict.fromkeys(key for scene in scenes for key in scene.values))
+    rows = [
+        (
+            "" if scene.failed is not None or scene.folder is None else quote(f"{Path(scene.folder).name}/{REPORT}"),
+            tuple(str(scene.values.get(key, "")) for key in keys),
+            scene.mse,
+            scene.predicted_mse,
+        )
+        for scene in scenes
+    ]
     return SweepTable(keys, rows) if keys and rows else None
 
 

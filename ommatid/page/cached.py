@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output import run_json
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
 from ommatid.scenes.model import Model
@@ -34,22 +34,20 @@ def cached_page(
     bench = next(bench_tables(folder, recorded.camera.describe()), None)
     described = None if bench is None else bench.describe()
     stamp = fingerprint([run_json.read(folder).plain(), described, versions("bokeh"), sources_digest()])
-    if read_stamp(folder / REPORT) == stamp:
-        return False
-    from .document import page  # imports Bokeh
 
-    write_text(folder / REPORT, page(read_run(folder, recorded, calibrated), ideal, bench, stamp))
-    return True
+    def make() -> str:
+        from .document import page  # imports Bokeh
+
+        return page(read_run(folder, recorded, calibrated), ideal, bench, stamp)
+
+    return cached(folder / REPORT, stamp, read_stamp, make, write_text)[1]
 
 
-def read_stamp(path: Path) -> str | None:
-    """Return the fingerprint of a page on disk; None for a missing, foreign or truncated file."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return None
+def read_stamp(path: Path) -> tuple[None, str | None]:
+    """Return the fingerprint of a page on disk; None for a foreign or truncated file."""
+    text = path.read_text(encoding="utf-8")
     match = re.search(r'<meta name="ommatid" content="([0-9a-f]+)">', text[:HEAD])
-    return match[1] if match and text.rstrip().endswith("</html>") else None
+    return None, match[1] if match and text.rstrip().endswith("</html>") else None
 
 
 def sources_digest() -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import Float32Array
+from ommatid.scenes.constants import WHITE
 
 from . import plots
 from .data import ResultMaps
@@ -89,7 +90,7 @@ def _range(image: Float32Array, aside: float) -> tuple[float, float]:
     """Return the range of an image without `aside` per cent of the values at either end."""
     known = image[np.isfinite(image)]
     if not known.size:
-        return 0.0, 255.0
+        return 0.0, WHITE
     low, high = (float(end) for end in np.percentile(known, [aside, 100 - aside]))
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 

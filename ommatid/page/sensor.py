@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.hardware.frames import patches
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.stack import Stack
@@ -65,7 +66,7 @@ class Mosaic:
     def ends(self) -> tuple[float, float]:
         """Smallest and largest value."""
         known = np.concatenate([patch.image[np.isfinite(patch.image)] for patch in self.patches])
-        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 255.0)
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, WHITE)
         return (low, high) if high > low else (low - 0.5, high + 0.5)
 
     def extent(self, name: str) -> tuple[float, float, float, float]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
 from ommatid.scenes.formats import exr
@@ -97,15 +97,12 @@ def fingerprint_of(stack: Stack, model: Model) -> str:
     return fingerprint([digest(*arrays), [stack.record, model.record], stack.scene.plain()])
 
 
-def _existing_report(folder: Path) -> RunReport | None:
-    """Return run.json of a folder that holds all results of one reconstruction; else None."""
-    if not all((folder / name).is_file() for name in (ESTIMATE, PICTURE, OVERVIEW)):
-        return None
-    try:
-        report = run_json.read(folder)
-        return report if exr.read(folder / ESTIMATE)[0].record["fingerprint"] == report.fingerprint else None
-    except (InputError, KeyError):
-        return None
+def _read_results(folder: Path) -> tuple[RunReport, str | None]:
+    """Return run.json, and its fingerprint if all results are there, whole and of one reconstruction."""
+    report = run_json.read(folder)
+    made_from = exr.read(folder / ESTIMATE)[0].record["fingerprint"]
+    whole = report.fingerprint == made_from and all((folder / name).is_file() for name in (PICTURE, OVERVIEW))
+    return report, made_from if whole else None
 
 
 def cached_results(
@@ -113,10 +110,9 @@ def cached_results(
 ) -> tuple[RunReport, bool]:
     """Return run.json of a folder, and True if the reconstruction had to be made for it."""
     current = fingerprint_of(stack, model)
-    existing = _existing_report(folder)
-    if existing is not None and existing.fingerprint == current:
-        return existing, False
-    restoration, report = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
-    report = report.with_changes(fingerprint=current)
-    write_results(folder, stack, restoration, report)
-    return report, True
+
+    def make() -> tuple[Reconstruction, RunReport]:
+        restoration, report = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
+        return restoration, report.with_changes(fingerprint=current)
+
+    return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made))

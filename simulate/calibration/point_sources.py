@@ -79,7 +79,7 @@ def responses_from_points(
     scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
     rig = Renderer(camera, variant, scene.render.sampler, together=False)  # each type its own spacing
     if plans is None:
-        plans = dict.fromkeys(rig.groups, plan(scene.calibration.counted, scene.render.sampler))
+        plans = dict.fromkeys(rig.groups, plan(scene.calibration.sample_count, scene.render.sampler))
     sweeps = {group: SourceSweep(rig, group) for group in rig.groups}
     shares = {group: sweep.reach.apart**2 for group, sweep in sweeps.items()}
     rows: list[sparse.csr_array] = []

@@ -45,7 +45,7 @@ def responses_from_rays(setup: Setup, progress: Progress = no_progress, plans: P
     rig = Renderer(camera, variant, scene.render.sampler, together=False)
     parts: list[Part] = []
     if plans is None:
-        plans = dict.fromkeys(rig.groups, plan(scene.calibration.counted, scene.render.sampler))
+        plans = dict.fromkeys(rig.groups, plan(scene.calibration.sample_count, scene.render.sampler))
     blocks = [(group, block) for group in rig.groups for block in rig.blocks(group, plans[group].samples)]
     for place, (group, block) in enumerate(blocks):
         passes: list[TracedEntries] = []

@@ -35,7 +35,7 @@ def export(setup: Setup, path: Path) -> Path:
     described = scene_of(target_of(camera, texture_of({"filename": picture.name})))
     for sub in camera.sub_imagers:
         name = sub.name.replace(".", "_")  # a dot would be a path into the scene
-        described[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.counted)
+        described[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.sample_count)
     state = mi.parser.parse_dict(mi.parser.ParserConfig("scalar_rgb"), described)
     write_whole(path, lambda beside: mi.parser.write_file(state, str(beside)))
     return picture

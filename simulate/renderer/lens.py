@@ -27,7 +27,7 @@ class LensModel:
     def __init__(self, camera: Camera, kind: LensType) -> None:
         """Of a lens type."""
         self._distortion = kind.optics.distortion
-        self._corner = camera.distance / camera.corner
+        self._corner = camera.distance / camera.half_diagonal
         if self._distortion is not None:
             from ommatid.scenes.optics.distortion import field
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Sampler, Scene
 
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 EXACT_SUMS = 2**22, 2**50  # whole numbers below come out of float32 sums, and of float64 ones, with less than 1/4 lost
 MOST_TEXELS = 2**24  # that float32 can number
 FAR = 1e4  # in target's distances: how far a world is looked into by stock sensors
-WHITE = 255.0  # the value that the radiance called white is shown as
 
 
 class Renderer:
@@ -64,7 +64,7 @@ class Renderer:
         self.camera = camera
         fast = not variant.startswith("scalar")
         self.groups: dict[str, tuple[LensType, ...]] = {kind.name: (kind,) for kind in camera.types}
-        if fast and together and all(kind.optics.pinhole for kind in camera.types):
+        if fast and together and all(kind.optics.is_pinhole for kind in camera.types):
             self.groups = {"camera": camera.types}
         self.channels = 3 if variant.endswith("rgb") and around is None else 1
         self.exact = EXACT_SUMS[fast]

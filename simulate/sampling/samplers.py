@@ -63,7 +63,7 @@ def law(sampler: Sampler, camera: Camera) -> ConvergenceLaw:
     """Of a sampler in front of the lenses of a camera and a flat target, which is constant over each of its pixels."""
     if sampler == "independent":
         return ConvergenceLaw(-0.5, "independent samples: the variance of a mean of n is 1/n of one's")
-    if not all(kind.optics.pinhole for kind in camera.types):
+    if not all(kind.optics.is_pinhole for kind in camera.types):
         why = "rays differ in four or six numbers, and the sampler stratifies them only two by two"
         return ConvergenceLaw(None, why, IN_THE_LIMIT)
     if sampler == "ldsampler":

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
-from ommatid.scenes.recording import ROUNDING, Recording, dark_level, flat_values
+from ommatid.scenes.recording import ROUNDING, Recording, dark_electrons, flat_values
 from ommatid.scenes.tables.sensor import SensorTable
 
 Vector = NDArray[np.float64]
@@ -99,7 +99,7 @@ class _Pixels:
         return rng.poisson(expected, shape) if self.shot else np.broadcast_to(expected, shape)
 
     def _expected(self, light: Vector) -> Vector:
-        electrons = np.maximum(light, 0.0) * self.response + dark_level(self.sensor)
+        electrons = np.maximum(light, 0.0) * self.response + dark_electrons(self.sensor)
         return np.minimum(electrons, 2 * self.sensor.full_well + 1e6)  # certainly full; NumPy's Poisson ends somewhere
 
     def _digital(self, electrons: Vector) -> Vector:

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from ommatid.analysis.candidates import magnifications, with_lens
+from ommatid.analysis.design import magnifications, with_lens
 from ommatid.reconstruct.prediction import predict
 from ommatid.reconstruct.prior import independent
 from ommatid.runtime.errors import InputError

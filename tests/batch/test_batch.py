@@ -206,24 +206,6 @@ def test_a_batch_that_is_killed_at_any_moment_is_resumed(
 # --- what killed processes leave
 
 
-def test_what_a_dead_process_was_writing_is_removed_and_what_a_living_one_writes_is_not(tmp_path: Path) -> None:
-    path = tmp_path / "a[1].npz"
-    dead = tmp_path / f".0123abcd{files.PART}{path.name}"
-    mine = tmp_path / ".0123abcd.party"
-    for left in (dead, mine):
-        left.write_bytes(b"half")
-
-    def write(beside: Path) -> None:
-        assert not dead.exists()
-        files.clear_abandoned(tmp_path)
-        files.clear_abandoned(tmp_path, path.name)
-        assert beside.exists(), "it is being written"
-        beside.write_bytes(b"whole")
-
-    files.write_whole(path, write)
-    assert {left.name: left.read_bytes() for left in tmp_path.iterdir()} == {path.name: b"whole", mine.name: b"half"}
-
-
 def test_a_run_clears_what_one_that_was_killed_has_left(kept: Path, ommatid: Command) -> None:
     for name in (f".0123abcd{files.PART}estimate.png", ".stack.exr.partial.npz", ".model.npz.partial.npz"):
         (kept / name).write_bytes(b"half")

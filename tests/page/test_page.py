@@ -580,12 +580,14 @@ def test_an_index_of_a_sweep_shows_its_values_and_errors(finished: Path, tmp_pat
         {"folder": "a", "values": {"noise.variance": "1e-4", "lens": "1/2"}, "mse": 2.0, "predicted_mse": 2.5},
         {"folder": "b", "values": {"noise.variance": "1e-2", "lens": "1/2"}, "mse": 3.0, "predicted_mse": 3.5},
     ]
+    listed = [{"scene": "a.toml", **row} for row in listed]
     (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")
     assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": ""})
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "noise.variance" in parsed(text).text["th"]
     assert 'id="plot-sweep"' in text
-    listed.append({"folder": "c", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"})
+    failed = {"scene": "a.toml", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"}
+    listed.append({"folder": "c", **failed})
     (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")
     assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": "", tmp_path / "c": "below 0"})
     text = (tmp_path / "index.html").read_text(encoding="utf-8")

@@ -14,15 +14,15 @@ from ommatid.reconstruct.noise import depends_on_light
 from ommatid.scenes.camera import derive
 from ommatid.scenes.optics.negligible import (
     SkippedEffect,
+    negligible_shot_noise,
     noise_variance,
     without_negligible_effects,
-    without_shot_noise,
 )
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.skipped import skipped_effects
-from ommatid.scenes.stack import recorded
+from ommatid.scenes.stack import stack_from_recording
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light
 from ommatid.simulate.sensor.emva1288 import record
@@ -123,7 +123,7 @@ def test_an_aperture_of_one_type_alone_is_left_out() -> None:
     data["camera"]["lens"][1] |= {"aperture": "0.4 mm", "focus": "500 mm"}
     described = parse(data, Path("test.toml"))
     reduced, found = without_negligible_effects(described, derive(described))
-    assert [kind.optics.pinhole for kind in reduced.types] == [True, False]
+    assert [kind.optics.is_pinhole for kind in reduced.types] == [True, False]
     assert [left.what for left in found] == ["samples of the aperture of lens type A"]
 
 
@@ -134,7 +134,7 @@ def test_the_plan_says_what_why_and_how_much() -> None:
     assert len(apertures) == 2
     assert all(0 < one["bound"] < 1 for one in apertures)
     assert "pixels of f wide" in apertures[0]["why"]
-    assert "bound" not in next(one for one in told if one["what"] == "light that bounces")
+    assert "bound" not in next(one for one in told if one["what"] == "interreflection")
 
 
 def test_noise_of_a_real_sensor_counts_too() -> None:
@@ -184,10 +184,10 @@ def dim(**more: Any) -> tuple[Any, Any]:
 def test_shot_noise_that_hides_below_the_read_noise_is_left_out() -> None:
     """The short recording is the complete one to the bound, on average over many exposures, and draws no photons."""
     described, camera = dim()
-    left = without_shot_noise(described, camera)
+    left = negligible_shot_noise(described, camera)
     assert left is not None
     assert left.describe() in [one.describe() for one in skipped_effects(described, camera)]
-    assert without_shot_noise(*dim(render={"complete": True})) is None
+    assert negligible_shot_noise(*dim(render={"complete": True})) is None
     assert described.sensor is not None
     response, light = electrons(described, camera), np.full(camera.measurements, 255.0)
     values: dict[bool, list[Any]] = {True: [], False: []}
@@ -218,6 +218,6 @@ def test_without_shot_noise_no_photon_is_drawn_and_nothing_is_estimated_twice(mo
     record(light, response, described.sensor, camera, 0)
     assert asked[0] > 0
     model = ideal_model(described, camera)
-    assert not depends_on_light(recorded(described, camera, short, np.zeros(light.size), {}), model)
+    assert not depends_on_light(stack_from_recording(described, camera, short, np.zeros(light.size), {}), model)
     bright, same = dim(sensor={**described.sensor.model_dump(mode="json"), "illuminance": "5000 lux"})
-    assert depends_on_light(recorded(bright, same, short, np.zeros(light.size), {}), model)
+    assert depends_on_light(stack_from_recording(bright, same, short, np.zeros(light.size), {}), model)

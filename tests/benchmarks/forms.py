@@ -85,10 +85,10 @@ def _case(path: Path, lenses: tuple[str, ...], label: str) -> list[FormRow]:
         start = perf_counter()
         refined = refine(built[name], exactly, shift, exactly.recorded(recorded))
         certified = perf_counter() - start
-        size = float(np.linalg.norm(exact.freedoms))
+        size = float(np.linalg.norm(exact.coefficients))
         digits = (
-            _digits(float(np.linalg.norm(alone - exact.freedoms)) / size),
-            _digits(float(np.linalg.norm(refined.freedoms - exact.freedoms)) / size),
+            _digits(float(np.linalg.norm(alone - exact.coefficients)) / size),
+            _digits(float(np.linalg.norm(refined.coefficients - exact.coefficients)) / size),
             np.nan if name == REFERENCE else _digits(float(np.max(np.abs(built[name].variance() / variance - 1)))),
         )
         seconds = (float(np.median(times[name])), solved, certified)

@@ -32,9 +32,9 @@ def frames_table() -> Table:
     table.caption = (
         f"Medians (minimum to maximum) of {REPEATS} repeats in alternation. The lower part is relative to its own first"
         " line. The other solvers take the fewest steps that suffice. Storing H beforehand is neither timed nor"
-        " counted; memory is the peak of a separate interpreter above that with H and g. Errors are in posterior standard"
-        f" deviations, against our solver's solution to 1e-6, which differs by {difference:.1g} from that of Cholesky."
-        f" Total time: {perf_counter() - start:.0f} s."
+        " counted; memory is the peak of a separate interpreter above that with H and g. Errors are in posterior"
+        " standard deviations, against our solver's solution to 1e-6, which differs by"
+        f" {difference:.1g} from that of Cholesky. Total time: {perf_counter() - start:.0f} s."
     )
     return table
 

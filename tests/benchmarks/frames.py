@@ -60,7 +60,7 @@ def frame_rows() -> tuple[list[FrameRow], float]:
     errors.reference = whole.estimate(REFERENCE).image
     counts = _counts(whole, matrix, errors)
     frame, factor = whole.frame(), factorised(matrix)
-    right = frame.collected(whole.residual)
+    right = frame.right_hand_side(whole.residual)
     difference = errors.of(factor(right))
     direct = frame.solve(right).steps
     solvers = [

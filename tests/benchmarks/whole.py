@@ -56,7 +56,7 @@ class Whole:
     def estimate(self, accuracy: float = ACCURACY) -> Solution:
         """Return f^ - f0, computed without preparation."""
         frame = self.frame()
-        return frame.solve(frame.collected(self.residual), accuracy)
+        return frame.solve(frame.right_hand_side(self.residual), accuracy)
 
 
 def whole_camera(size: int) -> Camera:

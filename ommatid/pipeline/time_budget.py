@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ommatid.batch.batch import Member
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.run_json import ErrorReport, RequestedTime, RunReport, TimeReport
@@ -22,6 +23,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.units import duration
 
 from . import stages
 from .bench_curves import bench_error_curves
@@ -37,6 +39,29 @@ KEYS = ("render.samples", "calibration.samples")
 Clock = Callable[[], float]
 Samples = int | Literal["auto"]
 Curves = tuple[ErrorCurve, ErrorCurve]
+
+
+def stages_within(
+    time: str,
+    members: Sequence[Member],
+    started: float,
+    say: Callable[[str], None],
+    scheduler: str = "",
+    workers: int | None = None,
+) -> tuple[Stages, int | None]:
+    """Choose the stages of `run` and the number of processes for scenes that have a `time` together, such as "30 s".
+
+    Without a time these are the ordinary stages and `workers`. Raises InputError if `time` is no duration, or if
+    `scheduler` or `workers` are given with it.
+    """
+    if not time:
+        return stages.run, workers
+    if scheduler or workers is not None:
+        raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
+    try:
+        return shared_time(duration(time), [member.folder for member in members], started, say), 1
+    except ValueError as error:
+        raise InputError(f"--within: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest
+from ommatid.runtime.files import cached, digest
 from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file, stack
@@ -19,7 +18,7 @@ from ommatid.scenes.stack import Stack
 
 from . import calibrate, render
 from .calibration.stopping_rule import StoppingRule
-from .sampling.checkpoint import clear, open_checkpoint
+from .sampling.checkpoint import open_checkpoint
 
 
 def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:
@@ -32,21 +31,32 @@ def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, b
         from .ground_truth import cached_truth
 
         truth = cached_truth(path.with_name(TRUTH), setup)
-    try:
-        old = stack.read(path)
-    except InputError:  # missing, damaged or of another kind: to be made
-        old = None
-    if old is not None and old.record.get("fingerprint") == render.made_from(setup):
-        now = setup.resolved
-        record = {**old.record, "truth": digest(truth.astype(np.float32))}
-        if old.scene.plain() != now.plain() or old.record != record:
-            # What the estimator is told, or what it is compared with, may have changed; the values have not.
-            stack.write(path, replace(old, scene=now, record=record))
-        clear(path)
-        return stack.read(path), False
-    with open_checkpoint(path, render.made_from(setup)) as partial:
-        stack.write(path, render.render(setup, progress, partial, truth))
-    return stack.read(path), True
+    wanted = render.made_from(setup)
+    with open_checkpoint(path, wanted) as partial:
+        current, made = cached(
+            path,
+            wanted,
+            _read_stack,
+            lambda: render.render(setup, progress, partial, truth),
+            stack.write,
+        )
+    now = setup.resolved
+    record = {**current.record, "truth": digest(truth.astype(np.float32))}
+    if current.scene.plain() != now.plain() or current.record != record:
+        # What the estimator assumes, or what it is compared with, may have changed; the values have not.
+        stack.write(path, replace(current, scene=now, record=record))
+        current = stack.read(path)
+    return current, made
+
+
+def _read_stack(path: Path) -> tuple[Stack, str | None]:
+    found = stack.read(path)
+    return found, found.record.get("fingerprint")
+
+
+def _read_model(path: Path) -> tuple[Model, str | None]:
+    found = model_file.read(path)
+    return found, found.record.get("fingerprint")
 
 
 @one_thread()
@@ -56,13 +66,11 @@ def cached_model(path: Path, setup: Setup, progress: Progress, judge: StoppingRu
     judge : says when to stop where the scene leaves the number of samples open
     """
     wanted = calibrate.made_from(setup, judge)
-    try:
-        old = model_file.read(path)
-    except InputError:
-        old = None
-    if old is not None and old.record.get("fingerprint") == wanted:
-        clear(path)
-        return old, False
     with open_checkpoint(path, wanted) as partial:
-        model_file.write(path, calibrate.calibrate(setup, progress, partial, judge))
-    return model_file.read(path), True
+        return cached(
+            path,
+            wanted,
+            _read_model,
+            lambda: calibrate.calibrate(setup, progress, partial, judge),
+            model_file.write,
+        )

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.exr import read
@@ -112,13 +111,14 @@ def truth_from(setup: Setup) -> str:
 def cached_truth(path: Path, setup: Setup) -> NDArray[np.float64]:
     """The truth as `path` holds it, rendered where it is not there or was made from something else."""
     wanted = truth_from(setup)
-    try:
-        (old,) = read(path)
-    except (InputError, ValueError):  # missing, damaged or of another kind: to be made
-        old = None
-    if old is not None and old.record.get("fingerprint") == wanted and "Y" in old.channels:
-        return old.channels["Y"].astype(np.float64)
-    made = truth(setup)
-    record = {"fingerprint": wanted, "samples": made.samples, "variance": float(made.variance.mean())}
-    write_truth(path, made.image, made.depth, record)
-    return made.image.astype(np.float32).astype(np.float64)
+
+    def write_made(path: Path, made: Truth) -> None:
+        record = {"fingerprint": wanted, "samples": made.samples, "variance": float(made.variance.mean())}
+        write_truth(path, made.image, made.depth, record)
+
+    return cached(path, wanted, _read_truth, lambda: truth(setup), write_made)[0]
+
+
+def _read_truth(path: Path) -> tuple[NDArray[np.float64], str | None]:
+    (part,) = read(path)
+    return part.channels["Y"].astype(np.float64), part.record.get("fingerprint")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ommatid.reconstruct.forms.form import Vector
-from ommatid.reconstruct.prediction import TRIM
+from ommatid.reconstruct.measured_error import TRIM
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.constants import WHITE
 

@@ -62,11 +62,6 @@ class Checkpoint:
         self._path.unlink(missing_ok=True)
 
 
-def clear(path: Path) -> None:
-    """Remove what was left of the result at `path` by a run that was killed just after it was written."""
-    _beside(path).unlink(missing_ok=True)
-
-
 def _beside(path: Path) -> Path:
     return path.with_name(f".{path.name}.partial.npz")
 

@@ -11,9 +11,8 @@ import pytest
 from scipy import constants, integrate
 
 from ommatid.analysis.light_table import rows
-from ommatid.reconstruct.frame_prediction import predict_frame
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.prediction import predict
+from ommatid.reconstruct.prediction import predict, predict_frame
 from ommatid.reconstruct.prior import independent
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive

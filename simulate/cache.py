@@ -1,4 +1,4 @@
-"""Stacks and models on disk: kept while what they were made from has not changed, made again when it has."""
+"""Stacks and models on disk, reused while their fingerprint matches the scene and made again otherwise."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from .sampling.checkpoint import clear, open_checkpoint
 
 
 def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:
-    """The stack at `path` as it is on disk, and whether it had to be rendered. Raises what rendering raises.
+    """Return the stack at `path` as it is on disk, and True if it had to be rendered.
 
-    Where there is a world, what it truly looks like is kept beside the stack.
+    The ground truth of a world is stored beside the stack. Raises what `render` raises.
     """
     truth = setup.image
     if setup.scene.world is not None:
@@ -34,35 +34,38 @@ def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, b
         truth = cached_truth(path.with_name(TRUTH), setup)
     try:
         old = stack.read(path)
-    except InputError:  # missing, damaged or of another kind: to be made
+    except InputError:  # missing, damaged or of another format
         old = None
-    if old is not None and old.record.get("fingerprint") == render.made_from(setup):
-        now = setup.resolved
+    made_from = render.made_from(setup)
+    if old is not None and old.record.get("fingerprint") == made_from:
         record = {**old.record, "truth": digest(truth.astype(np.float32))}
-        if old.scene.plain() != now.plain() or old.record != record:
-            # What the estimator is told, or what it is compared with, may have changed; the values have not.
-            stack.write(path, replace(old, scene=now, record=record))
+        if old.scene.plain() != setup.resolved.plain() or old.record != record:
+            # The estimator's tables or the ground truth may have changed; the values have not.
+            stack.write(path, replace(old, scene=setup.resolved, record=record))
         clear(path)
         return stack.read(path), False
-    with open_checkpoint(path, render.made_from(setup)) as partial:
-        stack.write(path, render.render(setup, progress, partial, truth))
+    with open_checkpoint(path, made_from) as checkpoint:
+        stack.write(path, render.render(setup, progress, checkpoint, truth))
     return stack.read(path), True
 
 
 @one_thread()
-def cached_model(path: Path, setup: Setup, progress: Progress, judge: StoppingRule | None = None) -> tuple[Model, bool]:
-    """The model at `path` as it is on disk, and whether it had to be calibrated. Raises what calibration raises.
+def cached_model(
+    path: Path, setup: Setup, progress: Progress, stopping_rule: StoppingRule | None = None
+) -> tuple[Model, bool]:
+    """Return the model at `path` as it is on disk, and True if it had to be calibrated.
 
-    judge : says when to stop where the scene leaves the number of samples open
+    stopping_rule : needed where the scene leaves the number of samples open
+    Raises what `calibrate` raises.
     """
-    wanted = calibrate.made_from(setup, judge)
+    made_from = calibrate.made_from(setup, stopping_rule)
     try:
         old = model_file.read(path)
     except InputError:
         old = None
-    if old is not None and old.record.get("fingerprint") == wanted:
+    if old is not None and old.record.get("fingerprint") == made_from:
         clear(path)
         return old, False
-    with open_checkpoint(path, wanted) as partial:
-        model_file.write(path, calibrate.calibrate(setup, progress, partial, judge))
+    with open_checkpoint(path, made_from) as checkpoint:
+        model_file.write(path, calibrate.calibrate(setup, progress, checkpoint, stopping_rule))
     return model_file.read(path), True

@@ -244,8 +244,8 @@ def _calibration(
     def one(repeat: int) -> Repeat:
         seed = subject.seed(name, repeat)
         scene = reference.with_calibration(subject.scene, method, sampler, variant, asked, seed)
-        judge = for_stack(subject.stack(repeat)) if asked == AUTO else None
-        model, cost = _costed(lambda: calibrate(replace(subject.setup, scene=scene), judge=judge))
+        rule = for_stack(subject.stack(repeat)) if asked == AUTO else None
+        model, cost = _costed(lambda: calibrate(replace(subject.setup, scene=scene), stopping_rule=rule))
         error = reference.error_of_model(model, subject.reference)
         mse = subject.of_model(model, repeat) if repeat < FEWER else None
         return Repeat(error, cost, mse, int(model.record["samples"]))

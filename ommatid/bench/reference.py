@@ -125,7 +125,7 @@ def error_of_light(rendering: Rendering | AdaptiveRendering, right: Reference) -
 
 def stack_of(setup: Setup, rendering: Rendering | AdaptiveRendering) -> Stack:
     """A rendering of several passes as the scene's sensor records it, with noise by the scene's seed."""
-    return exposed(setup, rendering.mean, rendering.stated(setup.camera), {})
+    return exposed(setup, rendering.mean, rendering.stated_variance(setup.camera), {})
 
 
 def stack_of_light(setup: Setup, light: Vector, right: Reference) -> Stack:

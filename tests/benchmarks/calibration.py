@@ -31,14 +31,14 @@ OVERRIDES = ("target.shape=[119,119]", "target.origin=[98,196]")
 
 
 def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
-    """One row for sources that the same rig renders, and one for the whole camera in one sensor where that can be."""
+    """Return a row for single sources in the same renderer, and one for the camera in one sensor, where possible."""
     camera = derive(read(scene_file, OVERRIDES))
-    rig = Renderer(camera, variant, together=False)
+    renderer = Renderer(camera, variant, together=False)
     sources = np.random.default_rng(1).choice(camera.unknowns, SOURCES, replace=False)
-    matrix = by_grids(rig, 0)
-    singly = by_sources(rig, sources, 0)
+    matrix = by_grids(renderer, 0)
+    singly = by_sources(renderer, sources, 0)
     apart = float(np.abs(matrix[:, sources].toarray() - singly).max())
-    ways = [lambda seed: by_grids(rig, seed), lambda seed: by_sources(rig, sources, seed)]
+    ways = [lambda seed: by_grids(renderer, seed), lambda seed: by_sources(renderer, sources, seed)]
     names = ["one source a rendering, a sensor a lens type"]
     checks = [f"H of {SOURCES} sources differs by {apart:.2g} at most, {np.count_nonzero(singly)} entries not 0"]
     if not variant.startswith("scalar"):
@@ -62,26 +62,26 @@ def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
     ]
 
 
-def by_grids(rig: Renderer, seed: int) -> sparse.csr_array:
+def by_grids(renderer: Renderer, seed: int) -> sparse.csr_array:
     """H, (M, N), by one pass of grids, the uniform target for its check included."""
     rows: list[sparse.csr_array] = []
-    for group in rig.groups:
-        swept = SourceSweep(rig, group)
-        swept.one_more(PASS, seed, no_progress)
+    for group in renderer.groups:
+        swept = SourceSweep(renderer, group)
+        swept.add_pass(PASS, seed, no_progress)
         tally = swept.tally
-        rows.append(entries_of(rig.camera, swept.reach, tally.mean)[0])
+        rows.append(entries_of(renderer.camera, swept.visible, tally.mean)[0])
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 
 
-def by_sources(rig: Renderer, sources: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
+def by_sources(renderer: Renderer, sources: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
     """Columns of H, (M, sources), by a rendering of the whole camera for each source."""
-    camera = rig.camera
+    camera = renderer.camera
     columns = np.empty((camera.measurements, sources.size))
     for place, source in enumerate(sources):
         image = np.zeros(camera.shape)
         image.flat[source] = 1.0
-        rig.set_target(image)
-        for group in rig.groups:
+        renderer.set_target(image)
+        for group in renderer.groups:
             own = sampler_seeds(seed, "calibration", 0, PASS.passes)
-            columns[rig.places(group), place] = rig.expose(group, PASS.samples, own)[0]
+            columns[renderer.rows(group), place] = renderer.expose(group, PASS.samples, own)[0]
     return columns

@@ -34,7 +34,7 @@ def camera_rows(scene_file: Path, variant: str, samples: int) -> list[Row]:
     loop, batches = _loop(camera, picture, samples), _batches(camera, picture, samples)
     stock = f"{len(camera.sub_imagers)} `perspective` sensors, one by one"
     if variant.startswith("scalar"):
-        # There our rig is a loop of stock sensors itself.
+        # There our renderer is a loop of stock sensors itself.
         ways = {"Rig: as many stock sensors": ours, stock: loop}
     else:
         ways = {"Rig: all rays at once": ours, stock: loop, f"{len(camera.types)} `batch` sensors": batches}
@@ -61,13 +61,13 @@ def _difference(one: NDArray[np.float64], other: NDArray[np.float64]) -> str:
 
 
 def _ours(camera: Camera, picture: NDArray[np.float64], variant: str, samples: int) -> Reader:
-    rig = Renderer(camera, variant, SAMPLER)
-    rig.set_target(*[picture] * rig.channels)
+    renderer = Renderer(camera, variant, SAMPLER)
+    renderer.set_target(*[picture] * renderer.channels)
 
     def expose(seed: int) -> NDArray[np.float64]:
         # Each sensor a seed of its own, else their noise would be alike.
         return np.concatenate(
-            [rig.expose(group, samples, lambda place: 1000 * seed + place)[0] for group in rig.groups]
+            [renderer.expose(group, samples, lambda place: 1000 * seed + place)[0] for group in renderer.groups]
         )
 
     return expose

@@ -66,11 +66,11 @@ def _light(kind: str) -> Row:
 
 
 def _exposure(camera: Camera, picture: NDArray[np.float64], samples: int) -> Callable[[int], NDArray[np.float64]]:
-    rig = Renderer(camera, VARIANT, SAMPLER)
-    rig.set_target(picture)
+    renderer = Renderer(camera, VARIANT, SAMPLER)
+    renderer.set_target(picture)
 
     def expose(seed: int) -> NDArray[np.float64]:
-        found = [rig.expose(group, samples, lambda place: 100 * seed + place)[0] for group in rig.groups]
+        found = [renderer.expose(group, samples, lambda place: 100 * seed + place)[0] for group in renderer.groups]
         return np.concatenate(found)
 
     return expose

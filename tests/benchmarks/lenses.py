@@ -104,9 +104,9 @@ def _by(way: Callable[[Setup], Any], setup: Setup, seed: int) -> Any:
 
 
 def _ours(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
-    rig = Renderer(camera, VARIANT, SAMPLER)
-    rig.set_target(picture)
-    return lambda seed: rig.expose("I", SAMPLES, lambda _: seed)[0].reshape(SIDE, SIDE)
+    renderer = Renderer(camera, VARIANT, SAMPLER)
+    renderer.set_target(picture)
+    return lambda seed: renderer.expose("I", SAMPLES, lambda _: seed)[0].reshape(SIDE, SIDE)
 
 
 def _thinlens(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:

@@ -1,9 +1,9 @@
-"""How large the error of an estimate is expected to be (Wood et al., Eq. 5), over all images and for a given one.
+"""The expected error of an estimate (Wood et al., Eq. 5), on average over all images and for a given one.
 
     error covariance = (I - A H) P0 (I - A H)^T + A Rvm A^T                       (Eq. 5)
 
-Rvm is what the noise really is, whatever the estimator expects. Everything is summed from squares, pixel by pixel, so
-that no variance can come out negative.
+Rvm is the actual noise, whatever the estimator expects. Every pixel's variance is a sum of squares, so that none can
+come out negative.
 """
 
 from __future__ import annotations
@@ -15,26 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse, stats
 
-from .forms.form import Form, Matrix, Vector
-from .prior import Prior
+from ommatid.runtime.arrays import FloatArray
+
+from .forms.form import Form
 
 Pixels = NDArray[np.intp]
 
-CHUNK = 512
+CHUNK = 512  # pixels solved for at once
+COVERAGE = (0.005, 0.995)  # quantiles of the interval
 
 
 @dataclass(frozen=True)
 class ExpectedError:
     """Eq. 5: (N,) `variance` of every pixel, and the parts of its mean that the prior and each noise bring.
 
-    missing : the prior's part, "null space": what no measurement tells, or what the noise forbids to believe
-    resolved : (N,), the diagonal of A H: how much of a pixel's value comes from the measurements, 0 to 1
+    missing : the prior's part, in run.json "null_space": unseen by the measurements, or hidden by their noise
+    resolved : (N,), the diagonal of A H: the share of a pixel's value that comes from the measurements, 0 to 1
     """
 
-    variance: Vector
+    variance: FloatArray
     missing: float
     parts: dict[str, float]
-    resolved: Vector
+    resolved: FloatArray
 
     @property
     def mse(self) -> float:
@@ -43,113 +45,102 @@ class ExpectedError:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Trace of A H: how many independent numbers the measurements tell of the image (Rodgers 2000, section 2.4)."""
+        """Trace of A H: the number of independent values that the measurements determine (Rodgers 2000, 2.4)."""
         return float(self.resolved.sum())
 
     @property
-    def resolution(self) -> Vector:
+    def resolution(self) -> FloatArray:
         """Width of the averaging kernel in pixels of f, (N,): 1 / sqrt((A H)_ii), infinite where nothing is seen.
 
         The side of the square of pixels that share one degree of freedom (after Purser and Huang 1993).
         """
-        return widths(self.resolved)
+        return kernel_widths(self.resolved)
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Expectation of the mean squared error given the image, and where it falls 99 times in 100."""
+    """Expectation of the mean squared error given the image, and the interval that holds it in 99 of 100 cases."""
 
     mse: float
     low: float
     high: float
 
 
-def expected_error(
-    form: Form, noise: dict[str, Vector], truth: Prior | None = None, pixels: Pixels | None = None
-) -> ExpectedError:
-    """Eq. 5 with the noises, and the prior, as they really are.
+def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | None = None) -> ExpectedError:
+    """Return Eq. 5 for the actual noise.
 
-    noise : named (M,) variances that together are Rvm;  truth : the real prior, where it is not the expected one
-    pixels : of which alone the error is asked, absent: of all
+    noise : named (M,) variances, the diagonal of Rvm in parts;  pixels : whose error is returned, absent: all
     """
     problem = form.problem
-    asked = np.arange(problem.unknowns) if pixels is None else pixels
-    count, measurements = asked.size, problem.measurements
+    pixels = np.arange(problem.unknowns) if pixels is None else pixels
+    count, measurements = pixels.size, problem.measurements
     by_column = sparse.csc_array(problem.matrix)
     total = np.sum(list(noise.values()), axis=0) if noise else np.zeros(measurements)
     missing, noisy, resolved, weights = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(measurements)
-    for place, some, u, negative in columns(form, asked):
-        if truth is None:
-            missing[place] = np.square(u).sum(axis=0)
-        else:
-            units = _units(problem.unknowns, some)
-            missing[place] = np.square(truth.gather(units + problem.matrix.T @ negative)).sum(axis=0)
-        resolved[place] = -np.asarray(by_column[:, some].multiply(negative).sum(axis=0)).ravel()
+    for chunk, chosen, u, negative in solved_columns(form, pixels):
+        missing[chunk] = np.square(u).sum(axis=0)
+        resolved[chunk] = -np.asarray(by_column[:, chosen].multiply(negative).sum(axis=0)).ravel()
         squared = np.square(negative)
-        noisy[place] = total @ squared
+        noisy[chunk] = total @ squared
         weights += squared.sum(axis=1) / count
-    as_expected = truth is None and np.array_equal(total, problem.noise_variance)
-    variance = form.variance()[asked] if as_expected else missing + noisy
+    as_expected = np.array_equal(total, problem.noise_variance)
+    variance = form.variance()[pixels] if as_expected else missing + noisy
     parts = {name: float(weights @ values) for name, values in noise.items()}
     return ExpectedError(variance, float(missing.mean()), parts, resolved)
 
 
-def expected_given(form: Form, truth: Vector, noise_variance: Vector) -> Interval:
-    """What the mean squared error of this very image should be: |(I - A H)(f - f0)|^2 + trace(A Rvm A^T), over N.
+def expected_given(form: Form, truth: FloatArray, noise_variance: FloatArray) -> Interval:
+    """Return the expected mean squared error for one image: |(I - A H)(f - f0)|^2 + trace(A Rvm A^T), over N.
 
-    A photograph is no draw from the prior, so Eq. 5 does not answer for it. The interval takes the error as a gamma
-    variate of the same mean and variance, the quadratic form's own: with K = A Rvm A^T, 4 b^T K b + 2 trace(K^2).
+    Use it for a photograph, which is no draw from the prior of Eq. 5. The interval takes the error as a gamma variate
+    with mean and variance of the quadratic form: with K = A Rvm A^T, the latter is 4 b^T K b + 2 trace(K^2).
     """
     problem = form.problem
-    away = truth - problem.prior.mean
-    bias = away - form.gain(problem.matrix @ away)
+    difference = truth - problem.prior.mean
+    bias = difference - form.gain(problem.matrix @ difference)
     trace = squares = 0.0
-    for _, _, _, negative in columns(form, np.arange(problem.unknowns)):
+    for _, _, _, negative in solved_columns(form, np.arange(problem.unknowns)):
         weighted = noise_variance[:, None] * negative
         trace += float(np.sum(weighted * negative))
         squares += float(np.square(form.gain(weighted)).sum())
-    variance = 4 * _noise_of_sum(form, bias, noise_variance)[1] + 2 * squares
+    variance = 4 * _parts_of_sum(form, bias, noise_variance)[1] + 2 * squares
     return interval(float(bias @ bias) + trace, variance, truth.size)
 
 
 def interval(mean: float, variance: float, count: int) -> Interval:
-    """Of the mean of `count` squares whose sum has this mean and variance, taken as a gamma variate."""
+    """Return the interval of the mean of `count` squares, whose sum is a gamma variate of this mean and variance."""
     if variance <= 0:
         return Interval(mean / count, mean / count, mean / count)
     shape, scale = mean**2 / variance, variance / mean
-    low, high = (float(stats.gamma.ppf(level, shape, scale=scale)) for level in (0.005, 0.995))
+    low, high = (float(stats.gamma.ppf(level, shape, scale=scale)) for level in COVERAGE)
     return Interval(mean / count, low / count, high / count)
 
 
-def widths(resolved: Vector) -> Vector:
-    """1 / sqrt((A H)_ii), infinite where nothing is seen: (N,)."""
+def kernel_widths(resolved: FloatArray) -> FloatArray:
+    """Return 1 / sqrt((A H)_ii), infinite where nothing is seen: (N,)."""
     root = np.sqrt(np.maximum(resolved, 0.0))
     return np.divide(1.0, root, out=np.full_like(root, np.inf), where=root > 0)
 
 
-def variance_of_sum(form: Form, weights: Vector, noise_variance: Vector) -> float:
-    """Expected squared error (Eq. 5) of the weighted sum w^T f^ of pixels: `weights`, (N,), such as 1/n in a region.
+def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> float:
+    """Return the expected squared error (Eq. 5) of a weighted sum of pixels; weights : (N,), such as 1/n in a region.
 
-    Neighbours' errors go together or cancel, so this is not the sum of their variances.
+    Errors of neighbours are correlated, so this is not the sum of their variances.
     """
-    missing, noisy = _noise_of_sum(form, weights, noise_variance)
+    missing, noisy = _parts_of_sum(form, weights, noise_variance)
     return missing + noisy
 
 
-def _noise_of_sum(form: Form, weights: Vector, noise_variance: Vector) -> tuple[float, float]:
-    """w^T (I - A H) P0 (I - A H)^T w and w^T A Rvm A^T w."""
+def _parts_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> tuple[float, float]:
+    """Return w^T (I - A H) P0 (I - A H)^T w and w^T A Rvm A^T w."""
     problem = form.problem
     u, negative = form.solve(problem.prior.gather(weights[:, None]), np.zeros((problem.measurements, 1)))
     return float(np.square(u).sum()), float(noise_variance @ np.square(negative[:, 0]))
 
 
-def columns(form: Form, asked: Pixels) -> Iterator[tuple[slice, Pixels, Matrix, Matrix]]:
-    """Some of the pixels asked for: u, (K, q), whose squares are the prior's part of Eq. 5, and -A^T e_i, (M, q)."""
-    for start in range(0, asked.size, CHUNK):
-        place = slice(start, min(start + CHUNK, asked.size))
-        u, negative = form.columns(asked[place])
-        yield place, asked[place], u, negative
-
-
-def _units(count: int, some: Pixels) -> Matrix:
-    return np.eye(count)[:, some]
+def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, FloatArray, FloatArray]]:
+    """Yield for chunks of pixels their range, indices, u, (K, q), whose squares are the prior's part, and -A^T e_i."""
+    for start in range(0, pixels.size, CHUNK):
+        chunk = slice(start, min(start + CHUNK, pixels.size))
+        u, negative = form.columns(pixels[chunk])
+        yield chunk, pixels[chunk], u, negative

@@ -1,4 +1,4 @@
-"""Which way to the estimate: one dense problem, tiles, or the whole frame; what each needs of memory and time."""
+"""The choice among one dense problem, tiles and the whole frame, from the memory and time that each needs."""
 
 from __future__ import annotations
 
@@ -19,152 +19,136 @@ from .methods.method import Method
 from .methods.tile_method import TileMethod
 from .misalignment.misaligned_methods import AlignedMethod, RobustMethod
 
-BASE = 300_000_000  # bytes, of the program itself and its libraries
-DENSE = 4000  # pixels, up to which the dense problem, exact and with every form, takes seconds
-TILES_ARE_WITHIN = 0.3  # posterior standard deviations of the exact answer, on average; 0.17 where types see all edges
+PROGRAM_MEMORY = 300_000_000  # bytes, of the program itself and its libraries
+MAX_DENSE_PIXELS = 4000  # up to which the dense problem, exact and with every form, takes seconds
+TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on average; 0.17 where types see all edges
 
-WAYS: dict[str, type[Method]] = {
+METHODS: dict[str, type[Method]] = {
     "dense": DenseMethod,
     "robust": RobustMethod,
     "fit": AlignedMethod,
     "tiles": TileMethod,
     "frame": FrameMethod,
 }
-WORDS = {
-    "dense": "one dense problem",
-    "robust": "one dense problem, misalignment as more noise",
-    "fit": "one dense problem, H found from the stack",
-    "tiles": "tile by tile",
-    "frame": "the whole frame at once",
-}
 
 
 @dataclass(frozen=True)
 class MethodChoice:
-    """A way, why this one, and about how much memory and time it takes on two cores of 2026."""
+    """A method, the reason for it, and about how much memory (bytes) and time (s) it takes on two cores of 2026."""
 
     method: str
     why: str
     memory: int
     seconds: float
 
-    def plan(self) -> dict[str, str]:
-        """For people: what will run, and what it takes."""
-        return {
-            "method": WORDS[self.method],
-            "why": self.why,
-            "about": f"{max(self.seconds, 0.1):.2g} s and {max(self.memory, 10**8) / 1e9:.1f} GB",
-        }
-
 
 def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
-    """The cheapest way that is as right as `estimator` asks. Raises InputError where none fits into memory.
+    """Choose the cheapest method with the accuracy that `estimator` asks for.
 
-    exact : whether H is that of a perfect camera
+    exact : whether H is that of an ideal camera
+    Raises InputError where no method fits into memory.
     """
-    told, allowed = scene.estimator, allowed_memory(scene.estimator.memory)
-    if told.misalignment != "trust":
+    allowed = allowed_memory(scene.estimator.memory)
+    if scene.estimator.misalignment != "trust":
         return _misaligned(scene, camera, exact, allowed)
-    sliding = all(is_sliding(kind) for kind in camera.types)
-    silent = told.noise_variance == 0 or (told.noise_variance is None and exact and not _noise(scene))
-    if told.method == "tiles":
-        names, why = ["tiles"], "asked for"
-    elif told.method == "frame":
-        names, why = ["frame"], "asked for"
-    elif told.method != "auto":
-        names, why = ["dense"], f"the {told.method} form was asked for"
-    elif camera.unknowns <= DENSE:
-        names, why = ["dense", "tiles"], f"{camera.unknowns} pixels are few"
-    elif silent:
-        names, why = ["tiles"], "measurements without noise need a dense form"
-    elif told.accuracy >= TILES_ARE_WITHIN:
-        names, why = ["tiles"], f"an accuracy of {told.accuracy:g} posterior standard deviations is what tiles reach"
-    elif sliding:
-        names, why = ["frame", "tiles"], f"{camera.unknowns} pixels, and every lens type sees the same everywhere"
-    else:
-        names, why = ["tiles"], "the lens types do not see the same everywhere: not all are m x m one pixel apart"
-    needs = {name: _needed(name, scene, camera, exact) for name in names}
-    for place, name in enumerate(names):
-        if needs[name] <= allowed:
-            reason = why if place == 0 else f"{names[0]} would need {needs[names[0]] / 1e9:.1f} GB"
-            return MethodChoice(name, reason, needs[name], _seconds(name, scene, camera, exact))
+    names, why = _candidates(scene, camera, exact)
+    memory = {name: _memory(name, scene, camera, exact) for name in names}
+    for name in names:
+        if memory[name] <= allowed:
+            reason = why if name == names[0] else f"{names[0]} would need {memory[names[0]] / 1e9:.1f} GB"
+            return MethodChoice(name, reason, memory[name], _seconds(name, scene, camera, exact))
     raise InputError(
-        f"the {' or '.join(names)} estimator needs {min(needs.values()) / 1e9:.1f} GB for {camera.unknowns} pixels,"
+        f"the {' or '.join(names)} estimator needs {min(memory.values()) / 1e9:.1f} GB for {camera.unknowns} pixels,"
         f" {allowed / 1e9:.1f} GB are allowed; raise estimator.memory, or crop the target with target.origin and"
         " target.shape"
     )
 
 
+def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], str]:
+    """Return methods in the order of preference, and why the first one is."""
+    estimator = scene.estimator
+    noiseless = estimator.noise_variance == 0 or (estimator.noise_variance is None and exact and not _has_noise(scene))
+    if estimator.method in ("tiles", "frame"):
+        return [estimator.method], "asked for"
+    if estimator.method != "auto":
+        return ["dense"], f"the {estimator.method} form was asked for"
+    if camera.unknowns <= MAX_DENSE_PIXELS:
+        return ["dense", "tiles"], f"{camera.unknowns} pixels are few"
+    if noiseless:
+        return ["tiles"], "measurements without noise need a dense form"
+    if estimator.accuracy >= TILE_ACCURACY:
+        return ["tiles"], f"tiles reach an accuracy of {estimator.accuracy:g} posterior standard deviations"
+    if all(is_sliding(lens_type) for lens_type in camera.types):
+        return ["frame", "tiles"], f"{camera.unknowns} pixels, and every lens type sees the same everywhere"
+    return ["tiles"], "the lens types do not see the same everywhere: not all are m x m one pixel apart"
+
+
 def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> MethodChoice:
-    """The way of an estimator that expects a misaligned camera, and begins with H as designed."""
-    how, form = scene.estimator.misalignment, scene.estimator.method
-    key = f"{scene.source}: estimator.misalignment '{how}'"
+    """Choose the method of an estimator that expects a misaligned camera and starts from H as designed."""
+    method, form = scene.estimator.misalignment, scene.estimator.method
+    key = f"{scene.source}: estimator.misalignment '{method}'"
     if camera.tolerance is None:
         raise InputError(f"{key} needs to know what may be misaligned, got no [camera.tolerance]; add one")
-    if camera.unknowns > DENSE:
-        raise InputError(f"{key} serves up to {DENSE} pixels of f, got {camera.unknowns}; crop the target")
+    if camera.unknowns > MAX_DENSE_PIXELS:
+        raise InputError(f"{key} serves up to {MAX_DENSE_PIXELS} pixels of f, got {camera.unknowns}; crop the target")
     if not (camera.has_box_footprints and camera.has_sharp_footprints):
         raise InputError(f"{key} serves pinholes and thin lenses in focus, got blurred or distorted ones; calibrate")
     if form in ("tiles", "frame"):
         raise InputError(f"{key} takes a dense form, got estimator.method '{form}'; set that to 'auto'")
     if not exact:
-        raise InputError(f"{key} begins with H as designed, got a calibrated one; set calibration.method to 'ideal'")
-    largest = max(kind.pixels[0] * kind.pixels[1] for kind in camera.types)
+        raise InputError(f"{key} starts from H as designed, got a calibrated one; set calibration.method to 'ideal'")
+    largest = max(lens_type.pixels[0] * lens_type.pixels[1] for lens_type in camera.types)
     blocks = 3 * 8 * camera.measurements * (largest + camera.unknowns)  # of Rv, and H whitened by them
-    memory = _needed("dense", scene, camera, exact=False) + blocks
+    memory = _memory("dense", scene, camera, exact=False) + blocks
     if memory > allowed:
         raise InputError(
             f"{key} needs {memory / 1e9:.1f} GB, {allowed / 1e9:.1f} GB are allowed; raise estimator.memory"
         )
-    return MethodChoice(
-        how, f"estimator.misalignment is '{how}'", memory, _seconds("dense", scene, camera, exact=False)
-    )
+    seconds = _seconds("dense", scene, camera, exact=False)
+    return MethodChoice(method, f"estimator.misalignment is '{method}'", memory, seconds)
 
 
-def allowed_memory(told: int | None) -> int:
-    """Bytes that may be used: what the scene says, else half of what is free; never more than that."""
+def allowed_memory(limit: int | None) -> int:
+    """Return the bytes that may be used: the limit, at most what is free; without a limit half of what is free."""
     free = free_memory()
-    return free // 2 if told is None else min(told, free)
+    return free // 2 if limit is None else min(limit, free)
 
 
-def _noise(scene: Scene) -> bool:
+def _has_noise(scene: Scene) -> bool:
     if scene.sensor is not None:
         return True
     return scene.noise is not None and scene.noise.variance + scene.noise.quantisation_variance > 0
 
 
-def _needed(way: str, scene: Scene, camera: Camera, exact: bool) -> int:
-    entries = 0 if exact else 12 * 10 * camera.measurements * _footprint(camera)
-    if way == "dense":
+def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
+    """Return an upper estimate of the bytes that a method needs."""
+    widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
+    entries = 0 if exact else 12 * 10 * camera.measurements * widest**2
+    if method == "dense":
+        form = scene.estimator.method
+        if form == "auto":
+            form = "covariance" if camera.measurements < camera.unknowns else "information"
         correlated = scene.prior.kind != "independent"
-        method = scene.estimator.method
-        form = (
-            ("covariance" if camera.measurements < camera.unknowns else "information") if method == "auto" else method
-        )
         return needed_memory(form, camera.measurements, camera.unknowns, correlated=correlated) + entries
     images = 8 * (5 * camera.measurements + 16 * camera.unknowns)
-    if way == "tiles":
+    if method == "tiles":
         side = scene.tiles.size**2
-        return BASE + images + entries + 2 * processors() * needed_memory("information", 3 * side, side)
-    widest = max(ceil(kind.ratio) for kind in camera.types)
+        return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory("information", 3 * side, side)
     longest = max(camera.shape)
     strips = 8 * 4 * longest * (5 * widest) * (5 * widest * (widest - 1) + widest)
     if exact:
-        return BASE + images + strips + 8 * 2 * longest * 81 * widest**2 * (widest - 1)
-    together = 12 * 3 * (2 * widest + 1) ** 2 * camera.unknowns  # K, stored
-    return BASE + images + entries + strips + together + 2 * 8 * 2 * longest * widest * (40 + 10 * widest) ** 2
+        return PROGRAM_MEMORY + images + strips + 8 * 2 * longest * 81 * widest**2 * (widest - 1)
+    normal_matrix = 12 * 3 * (2 * widest + 1) ** 2 * camera.unknowns  # K, stored
+    edges = 2 * 8 * 2 * longest * widest * (40 + 10 * widest) ** 2
+    return PROGRAM_MEMORY + images + entries + strips + normal_matrix + edges
 
 
-def _footprint(camera: Camera) -> int:
-    return max(ceil(kind.ratio) for kind in camera.types) ** 2
-
-
-def _seconds(way: str, scene: Scene, camera: Camera, exact: bool) -> float:
-    """Measured on two cores, to within a factor of two or so."""
+def _seconds(method: str, scene: Scene, camera: Camera, exact: bool) -> float:
+    """Return the time that a method takes on two cores, measured to within a factor of two or so."""
     count = camera.unknowns
-    if way == "dense":
+    if method == "dense":
         return max(0.1, 7e-11 * count**3 * (10 if scene.prior.kind != "independent" else 1))
-    each = 0.15 * (scene.tiles.size / 35) ** 6 / (scene.tiles.size - 2 * scene.tiles.overlap) ** 2
-    if way == "tiles":
-        return 1.0 + count * (each if not exact else 2e-6)
-    return 1.5 + count * (1.2e-5 if exact else 1.5e-4 + each / 2)
+    per_pixel = 0.15 * (scene.tiles.size / 35) ** 6 / (scene.tiles.size - 2 * scene.tiles.overlap) ** 2
+    if method == "tiles":
+        return 1.0 + count * (per_pixel if not exact else 2e-6)
+    return 1.5 + count * (1.2e-5 if exact else 1.5e-4 + per_pixel / 2)

@@ -1,4 +1,4 @@
-"""From a recorded stack and a model to the image, its error bars, and where its error comes from."""
+"""Reconstruct the image of a recorded stack, with error bars and the causes of its error."""
 
 from __future__ import annotations
 
@@ -7,36 +7,34 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
-from ommatid.scenes.tables import estimation
+from ommatid.scenes.tables.estimation import PriorTable
 
 from .assumptions import assumptions_for, with_fallback
 from .estimator.estimate import Solver
 from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
+from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import Execution, MethodResult
-from .noise import UsablePixels
-from .prediction import MeasuredError, compare, trimmed
+from .noise import Noise, UsablePixels
 
-Vector = NDArray[np.float64]
-
-MOST_FEIGNED = 0.05  # of what is believed of a pixel on average: above it the expected error is not to be trusted
+MAX_SPURIOUS_INFORMATION = 0.05  # share above which the expected error is not to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Squares of what the estimate leaves of the measurements, in units of the expected noise, against expectation.
+    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation.
 
-    expected : M - trace(A H) for images drawn from the prior;  deviation : of the sum by chance, at most
+    expected : M - trace(A H) for images drawn from the prior;  deviation : upper bound of the standard deviation
     """
 
     chi_squared: float
@@ -46,29 +44,28 @@ class Residual:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """An estimate with its expected error (Eq. 5), and how it compares where the truth is known.
+    """An estimate with its expected error (Eq. 5), and its measured error where the truth is known.
 
-    choice : which way to it;  prior : what was believed of the image, found or told
-    noise : what is known of it by name, (pixels used,) each
-    feigned : the share of what is believed of a pixel, on average, that the noise of H may have feigned
+    prior : as assumed, fitted or described;  noise : variances by cause, (pixels used,) each
+    spurious_information : mean share of a pixel's apparent information that the noise of H may have produced
     """
 
     result: MethodResult
     choice: MethodChoice
-    prior: estimation.PriorTable
+    prior: PriorTable
     trimmed_mse: float | None
     residual: Residual | None
     shape: tuple[int, int]
     usable: UsablePixels
-    noise: dict[str, Vector]
+    noise: Noise
     fit: PriorFit | None
     spurious_information: float
     seconds: float
-    truth: Vector | None
+    truth: FloatArray | None
     error: MeasuredError | None
 
     @property
-    def estimate(self) -> Vector:
+    def estimate(self) -> FloatArray:
         """f^, (N,)."""
         return self.result.image
 
@@ -79,21 +76,24 @@ class Reconstruction:
 
     @property
     def interval(self) -> Interval | None:
-        """What the error of this very image should be."""
+        """Expected error of this image, None where the truth is not known."""
         return self.result.interval
 
     @property
     def solver(self) -> Solver:
-        """What computed it, why, and how right it is."""
+        """The form that ran, with the bounds on its numerical error."""
         return self.result.solver
 
     def budget(self) -> dict[str, float]:
-        """Parts of the expected squared error by their cause; they add up to it, an absent effect brings 0."""
+        """Return the parts of the expected squared error by cause; they add up to it, an absent effect has 0."""
         parts = {"null_space": self.expected.missing, **self.expected.parts}
         return {name: parts.get(name, 0.0) for name in BUDGET} | parts
 
     def region(self, corner: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
-        """Mean of the estimate in a region and its expected deviation (Eq. 5). Raises InputError if it lies outside."""
+        """Return the mean of the estimate in a region and its standard deviation (Eq. 5).
+
+        Raises InputError if the region lies outside the image.
+        """
         check_region(corner, size, self.shape)
         weights = np.zeros(self.shape)
         weights[corner[0] : corner[0] + size[0], corner[1] : corner[1] + size[1]] = 1 / (size[0] * size[1])
@@ -126,58 +126,58 @@ def check_match(stack: Stack, model: Model, names: tuple[Path | str, Path | str]
 def restore(
     stack: Stack,
     model: Model,
-    truth: Vector | None = None,
+    truth: FloatArray | None = None,
     workers: Workers | None = None,
     progress: Progress = no_progress,
 ) -> Reconstruction:
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 
-    truth : (N,) or None;  workers : who does tiles, absent: threads of this process
-    Raises InputError if memory does not suffice, if no way is right to what the scene asks, or if the noise of a
+    truth : (N,) or None;  workers : for tiles, absent: threads of this process
+    Raises InputError if memory does not suffice, if no method reaches the tolerance of the scene, or if the noise of a
     [sensor] is to be fitted.
     """
-    return with_fallback(
-        stack, model, lambda choice: _restored(stack, model, truth, choice, Execution(workers, progress))
-    )
+    execution = Execution(workers, progress)
+    return with_fallback(stack, model, lambda choice: _restored(stack, model, truth, choice, execution))
 
 
 def _restored(
-    stack: Stack, model: Model, truth: Vector | None, choice: MethodChoice, hands: Execution
+    stack: Stack, model: Model, truth: FloatArray | None, choice: MethodChoice, execution: Execution
 ) -> Reconstruction:
     start = perf_counter()
-    told = assumptions_for(stack, model, choice, hands)
-    way, usable, noise = told.method, told.usable, told.noise
-    outcome = way.result(noise, truth)
+    assumed = assumptions_for(stack, model, choice, execution)
+    result, expected_noise = assumed.method.result(assumed.noise, truth), assumed.method.task.expected_noise
     shape = model.camera.shape
     return Reconstruction(
-        result=outcome,
+        result=result,
         choice=choice,
-        prior=told.prior,
-        trimmed_mse=trimmed(outcome.expected.variance, shape),
-        residual=_residual(outcome, way.task.expected_noise),
+        prior=assumed.prior,
+        trimmed_mse=trimmed_mean(result.expected.variance, shape),
+        residual=_residual(result, expected_noise),
         shape=shape,
-        usable=usable,
-        noise=noise,
-        fit=told.fit,
-        spurious_information=_feigned(model, usable, way.task.expected_noise, outcome.expected),
+        usable=assumed.usable,
+        noise=assumed.noise,
+        fit=assumed.fit,
+        spurious_information=_spurious_information(model, assumed.usable, expected_noise, result.expected),
         seconds=perf_counter() - start,
         truth=truth,
-        error=None if truth is None else compare(outcome.image, truth, shape),
+        error=None if truth is None else measure_error(result.image, truth, shape),
     )
 
 
-def _feigned(model: Model, usable: UsablePixels, believed: Vector, expected: ExpectedError) -> float:
+def _spurious_information(
+    model: Model, usable: UsablePixels, expected_noise: FloatArray, expected: ExpectedError
+) -> float:
     if not model.variance.any():
         return 0.0
     noise = np.full(model.measurements, np.inf)
-    noise[usable.used] = believed
+    noise[usable.used] = expected_noise
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
         return float(np.nan_to_num(model.spurious_information(noise) * expected.variance).mean())
 
 
-def _residual(outcome: MethodResult, believed: Vector) -> Residual | None:
-    """None where a measurement is said to have no noise: then there is no unit for what is left of it."""
-    if not believed.size or not (believed > 0).all():
+def _residual(result: MethodResult, expected_noise: FloatArray) -> Residual | None:
+    """Return None where a measurement has no expected noise, which is the unit of its residual."""
+    if not expected_noise.size or not (expected_noise > 0).all():
         return None
-    freedoms = max(believed.size - outcome.expected.degrees_of_freedom, 0.0)
-    return Residual(float(believed @ np.square(outcome.multipliers)), freedoms, (2 * freedoms) ** 0.5)
+    freedoms = max(expected_noise.size - result.expected.degrees_of_freedom, 0.0)
+    return Residual(float(expected_noise @ np.square(result.multipliers)), freedoms, (2 * freedoms) ** 0.5)

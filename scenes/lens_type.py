@@ -1,4 +1,4 @@
-"""A lens type, what its lenses are beside a pinhole, and one sub-imager of it.
+"""Lens types, their optics, and single sub-imagers.
 
 Lengths are millimetres; positions on the target are in pixels of f, from its top left corner.
 """
@@ -14,11 +14,11 @@ from .tables.camera import Surface
 
 @dataclass(frozen=True)
 class LensOptics:
-    """What a lens type's lenses are beside a pinhole in focus; absent effects are None.
+    """The optics of a lens type in addition to a pinhole in focus; absent effects are None.
 
-    aperture : diameter of a thin lens;  focus : distance that it shows sharp, absent: the target's
-    distortion : k1, k2, magnification times 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner
-    surfaces : of a real lens, from the target to the sensor;  scale : of them, or "fit"
+    aperture : diameter of a thin lens;  focus : distance in focus, absent: the target's
+    distortion : k1, k2 of the magnification factor 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner
+    surfaces : of a real lens, from the target to the sensor;  scale : factor on the surfaces, or "fit"
     """
 
     aperture: float | None = None
@@ -28,24 +28,26 @@ class LensOptics:
     scale: float | str | None = None
 
     @property
-    def pinhole(self) -> bool:
-        """Whether there is nothing but a pinhole."""
+    def is_pinhole(self) -> bool:
+        """True for a pinhole without distortion."""
         return self == LensOptics()
 
     def describe(self) -> dict[str, Any]:
-        """What is there, in JSON's types."""
+        """The effects present, in JSON's types; part of fingerprints."""
         surfaces = None if self.surfaces is None else [surface.model_dump(mode="json") for surface in self.surfaces]
-        listed: dict[str, Any] = {"aperture": self.aperture, "focus": self.focus, "scale": self.scale}
-        listed["distortion"] = None if self.distortion is None else list(self.distortion)
-        listed["surfaces"] = surfaces
-        return {name: value for name, value in listed.items() if value is not None}
+        effects: dict[str, Any] = {"aperture": self.aperture, "focus": self.focus, "scale": self.scale}
+        effects["distortion"] = None if self.distortion is None else list(self.distortion)
+        effects["surfaces"] = surfaces
+        return {name: value for name, value in effects.items() if value is not None}
 
 
 @dataclass(frozen=True)
 class LensType:
-    """An array of equal sub-imagers; `ratio` is m, the pixels of f that a sensor pixel covers along one axis.
+    """An array of equal sub-imagers.
 
-    left : columns of sub-imagers of other types to its left, absent: of those that are listed before it
+    ratio : m, pixels of f that a sensor pixel covers along one axis
+    origin : row and column of f where the view of sub-imager (0, 0) begins
+    left : columns of sub-imagers of other types to its left; None: those of the types listed before it
     """
 
     name: str
@@ -64,28 +66,29 @@ class LensType:
 
     @property
     def measurements(self) -> int:
-        """Number of sensor pixels of all its sub-imagers."""
+        """Number of sensor pixels of all sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
 
     def middle(self, window: tuple[Fraction, Fraction]) -> tuple[float, float]:
-        """Row and column of f in the middle of a sub-imager's view that begins at `window`."""
+        """Row and column of f in the middle of the view of a sub-imager whose view begins at `window`."""
         row, column = (start + self.ratio * count / 2 for start, count in zip(window, self.pixels, strict=True))
         return float(row), float(column)
 
     @property
     def span(self) -> tuple[Fraction, Fraction]:
-        """Rows and columns of f that the array sees as a whole."""
-        return _span(self.ratio, self.array[0], self.pixels[0], self.step), _span(
-            self.ratio, self.array[1], self.pixels[1], self.step
+        """Rows and columns of f that all sub-imagers together see."""
+        rows, columns = (
+            self.ratio * pixels + (count - 1) * self.step for count, pixels in zip(self.array, self.pixels, strict=True)
         )
+        return rows, columns
 
 
 @dataclass(frozen=True)
 class SubImager:
-    """One lens and the patch of sensor behind it.
+    """One lens and the sensor patch behind it.
 
-    `window` is the row and column of f where its view begins; `lens` and `patch` are the (x, y) centres of the
-    lens and of the patch, `depth` the distance from the lens to the patch.
+    window : row and column of f where its view begins
+    lens, patch : (x, y) of their centres;  depth : distance from the lens to the patch
     """
 
     type: LensType
@@ -98,9 +101,5 @@ class SubImager:
 
     @property
     def name(self) -> str:
-        """Its name in a stack: type, k, l."""
+        """Name of its part in a stack: type.k.l."""
         return f"{self.type.name}.{self.k:02d}.{self.l:02d}"
-
-
-def _span(ratio: Fraction, count: int, pixels: int, step: Fraction) -> Fraction:
-    return ratio * pixels + (count - 1) * step

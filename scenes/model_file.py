@@ -1,7 +1,8 @@
-"""The file of a model: what `scipy.sparse.load_npz` reads, with variances and a description beside it.
+"""The file of a model: a matrix for `scipy.sparse.load_npz`, with its variances and a description.
 
-`variance` is in the order of `data`; a JSON text `ommatid` holds the scene, how H was found, and a SHA-256. The ideal H
-of a large frame is not stored, it follows from the scene: such a file has the format "boxes" and no entries.
+`variance` is in the order of `data`; a JSON text `ommatid` holds the scene, the record of how H was determined, and a
+SHA-256. The ideal H of a large frame is not stored, as it follows from the scene: such a file has the format "boxes"
+and no entries.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ ENTRIES = ("indices", "indptr", "data")
 
 
 def write(path: Path, model: Model) -> None:
-    """Write a model, whole or not at all. Raises InputError or DeniedError."""
+    """Write a model, completely or not at all. Raises InputError or MachineError."""
     arrays: dict[str, NDArray[Any]] = {
         "shape": np.array([model.measurements, model.unknowns], dtype=np.int64),
         "variance": model.variance,
@@ -55,7 +56,7 @@ def write(path: Path, model: Model) -> None:
 
 
 def read(path: Path) -> Model:
-    """Read a model. Raises InputError if it is missing, damaged, pickled or no model."""
+    """Read a model. Raises InputError if the file is missing, damaged, pickled or of another kind."""
     arrays, description = _arrays(path)
     try:
         content = json.loads(description)
@@ -65,7 +66,7 @@ def read(path: Path) -> Model:
         camera = derive(scene)
         matrix, shape = None, tuple(arrays["shape"].tolist())
         if "data" in arrays:
-            matrix = _checked(arrays, shape)
+            matrix = _matrix(arrays, shape)
         elif not (method == "ideal" and camera.has_box_footprints):
             raise ValueError("it has no entries")
     except InputError:
@@ -77,15 +78,15 @@ def read(path: Path) -> Model:
     expected = (camera.measurements, camera.unknowns)
     entries = np.shape(arrays.get("data", ()))
     if shape != expected or not arrays["variance"].shape == entries == arrays["batches"].shape[1:]:
-        raise InputError(f"{path}: its matrix is {shape}, its scene wants {expected}; calibrate again")
+        raise InputError(f"{path}: its matrix is {shape}, its scene needs {expected}; calibrate again")
     return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
 
 
-def _checked(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
-    """H from its parts. Raises ValueError where they are no matrix in rows, or hold what is no number."""
+def _matrix(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
+    """H from its arrays. Raises ValueError if they do not form a CSR matrix, or hold values out of range."""
     for name, kinds in (("data", "f"), ("variance", "f"), ("batches", "f"), ("indices", "i"), ("indptr", "i")):
         if arrays[name].dtype.kind not in kinds or not (np.abs(arrays[name]) <= LARGEST**2).all():
-            raise ValueError(f"{name} of {arrays[name].dtype} holds what is no number of its kind")
+            raise ValueError(f"{name} of {arrays[name].dtype} has values of another type or out of range")
     if (arrays["variance"] < 0).any():
         raise ValueError("a variance is below 0")
     if len(shape) != 2:
@@ -96,13 +97,14 @@ def _checked(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.
 
 
 def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    """The arrays of a file that match their checksum, and the description as JSON. Raises InputError."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        found = npz.read(path)
-        names = ["shape", "variance", "batches", *(ENTRIES if found["format"][()] != b"boxes" else ())]
-        arrays = {name: found[name] for name in names}
-        record = json.loads(str(found["ommatid"][()]))
+        content = npz.read(path)
+        names = ["shape", "variance", "batches", *(ENTRIES if content["format"][()] != b"boxes" else ())]
+        arrays = {name: content[name] for name in names}
+        record = json.loads(str(content["ommatid"][()]))
         description, seal = record["description"], record["sha256"]
     except InputError:
         raise
@@ -116,5 +118,5 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
 
 
 def _seal(arrays: dict[str, NDArray[Any]], description: str) -> str:
-    pixels = digest(*(arrays[name] for name in sorted(arrays)))
-    return hashlib.sha256(f"{pixels}{description}".encode()).hexdigest()
+    content = digest(*(arrays[name] for name in sorted(arrays)))
+    return hashlib.sha256(f"{content}{description}".encode()).hexdigest()

@@ -1,7 +1,7 @@
-"""The scene file: what the camera is, what it looks at, and what is to be computed.
+"""The scene file: the camera, its target and what is to be computed.
 
-TOML in, a frozen and validated `Scene` out. Lengths are written with a unit ("6 um"); a bare number where a length
-belongs and an unknown key are errors.
+TOML in, a frozen and validated `Scene` out. Lengths carry a unit ("6 um"); a bare number where a length is expected
+and an unknown key are errors.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ommatid.runtime.files import write_text
 from .tables import toml
 from .tables.camera import CameraTable
 from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
+from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.overrides import apply_overrides, keep_lenses
 from .tables.sensor import NoiseTable, SensorTable
@@ -27,11 +28,11 @@ from .tables.units import Corner, FileName, Length, Pair, Samples, Time
 
 TRUTH = "truth.exr"
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
-IN_PLACE_OF_AUTO = 1024  # samples, for what is no rendering of sub-images
+IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where render.samples is "auto"
 
 
 class TargetTable(Table):
-    """The flat picture that the camera looks at, and the grid on which the image is to be recovered."""
+    """The flat picture that the camera looks at, and the grid on which the image is reconstructed."""
 
     image: FileName | None = Field(
         default=None,
@@ -46,12 +47,12 @@ class TargetTable(Table):
 
 
 class WorldTable(Table):
-    """A Mitsuba scene behind the target or, where that has no picture, instead of it."""
+    """A Mitsuba scene behind the target or, where the target has no picture, in its place."""
 
     file: FileName = Field(
         description="a Mitsuba scene file: millimetres, the camera at the origin looking along +z, +y up"
     )
-    white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that counts as a value of 255")
+    white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that becomes a value of 255")
 
 
 class RenderTable(Table):
@@ -62,29 +63,29 @@ class RenderTable(Table):
         description='per sensor pixel, in 16 passes or more; "auto": until their variance is a tenth of the sensor\'s',
     )
     time: Time | None = Field(
-        default=None, description='after which samples = "auto" stops, wherever it is; absent: it takes its time'
+        default=None, description='time limit of samples = "auto", at whatever variance; absent: no limit'
     )
     seed: int = Field(default=0, ge=0, lt=2**63)
     variant: Literal["auto", "scalar_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
     sampler: Sampler = Field(
-        default="multijitter", description="how rays are spread; stratified ones round samples up to what fits them"
+        default="multijitter", description="how rays are distributed; stratified ones round samples up to a valid count"
     )
-    complete: bool = Field(default=False, description="leave nothing out, however small its effect")
+    complete: bool = Field(default=False, description="simulate every effect, however small")
 
     @property
-    def counted(self) -> int:
-        """Samples where their number has to be known beforehand."""
+    def sample_count(self) -> int:
+        """Number of samples for computations that need it in advance."""
         return IN_PLACE_OF_AUTO if self.samples == "auto" else self.samples
 
     @model_validator(mode="after")
-    def _time_to_spend(self) -> RenderTable:
+    def _check_time(self) -> RenderTable:
         if self.time is not None and self.samples != "auto":
             raise ValueError(f'time ends samples = "auto", got samples = {self.samples}; remove one of the two keys')
         return self
 
 
 class CalibrationTable(Table):
-    """How the observation matrix H is found."""
+    """How the observation matrix H is determined."""
 
     method: Literal["points", "transport", "ideal"] = "points"
     samples: Samples = Field(
@@ -92,18 +93,18 @@ class CalibrationTable(Table):
         description='per sensor pixel, in 16 passes or more; "auto": until H adds under a tenth to the expected error',
     )
     fit: Literal["geometry"] | None = Field(
-        default=None, description='"geometry": a few numbers a sub-imager instead of the noise of its every entry'
+        default=None, description='"geometry": fit a few parameters per sub-imager in place of noisy entries'
     )
 
     @property
-    def counted(self) -> int:
-        """Samples where they are a number. Raises ValueError where they are not."""
+    def sample_count(self) -> int:
+        """Number of samples. Raises ValueError for "auto"."""
         if self.samples == "auto":
             raise ValueError("expected a number of samples, got 'auto'")
         return self.samples
 
     @model_validator(mode="after")
-    def _something_to_fit(self) -> CalibrationTable:
+    def _check_fit(self) -> CalibrationTable:
         if self.fit is not None and self.method == "ideal":
             raise ValueError("fit belongs to a calibrated H, got method 'ideal'; take 'points' or 'transport'")
         return self
@@ -128,13 +129,13 @@ class Scene(Table):
     _source: Path = PrivateAttr(default=Path("scene"))
 
     @model_validator(mode="after")
-    def _tables_go_together(self) -> Scene:
+    def _check_combination(self) -> Scene:
         if self.noise is not None and self.sensor is not None:
             raise ValueError("expected [noise], an ideal sensor's, or [sensor], a real one's, got both; remove one")
         if self.target.image is None and self.world is None:
             raise ValueError("expected a picture to look at, target.image, or a Mitsuba scene, world.file, got neither")
         if self.target.image is None and self.target.shape is None:
-            raise ValueError("a target without a picture needs target.shape, what is to be recovered, got none")
+            raise ValueError("a target without a picture needs target.shape, the grid to reconstruct, got none")
         if self.sensor is not None:
             for lens in self.camera.lens:
                 if lens.aperture is None and lens.surfaces is None:
@@ -150,25 +151,24 @@ class Scene(Table):
         return self._source
 
     def plain(self) -> dict[str, Any]:
-        """The scene as TOML and JSON hold it; absent keys stay absent."""
+        """The scene in types of TOML and JSON, without absent keys."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
 def resolved(scene: Scene, shape: tuple[int, int]) -> Scene:
-    """The scene as a run's folder holds it: its target is the picture `truth.exr` beside it, whole.
+    """The scene as a run's folder stores it: the target is the whole picture `truth.exr` beside the scene file.
 
-    With a world, `truth.exr` shows that as well, so the target keeps its own picture, if it has one.
+    With a world, `truth.exr` shows the world too, so the target keeps its own picture, if it has one.
     """
     update: dict[str, Any] = {"image": TRUTH, "origin": None, "shape": shape}
     if scene.world is not None:
         update = {"shape": shape}
-    target = scene.target.model_copy(update=update)
-    return _moved(scene.model_copy(update={"target": target}), scene.source)
+    return with_tables(scene, target=scene.target.model_copy(update=update))
 
 
 def with_tables(scene: Scene, **tables: Any) -> Scene:
-    """The scene with some of its tables exchanged; its errors name the same file."""
-    return _moved(scene.model_copy(update=tables), scene.source)
+    """A copy with some tables exchanged; its errors name the same file."""
+    return _with_source(scene.model_copy(update=tables), scene.source)
 
 
 def parse(data: dict[str, Any], source: Path) -> Scene:
@@ -177,10 +177,10 @@ def parse(data: dict[str, Any], source: Path) -> Scene:
         scene = Scene.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{source}: {explain(error, data, Scene)}") from error
-    return _moved(scene, source)
+    return _with_source(scene, source)
 
 
-def _moved(scene: Scene, source: Path) -> Scene:
+def _with_source(scene: Scene, source: Path) -> Scene:
     scene._source = source  # pyright: ignore[reportPrivateUsage]
     return scene
 
@@ -188,13 +188,15 @@ def _moved(scene: Scene, source: Path) -> Scene:
 def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) -> Scene:
     """Read a scene file, apply `--set` overrides and keep only the named lens types, if any are named.
 
-    The target's picture, where it is a file, is looked for beside the scene file.
+    `path` may be the name of a gallery scene. Relative paths of the target's picture and of the world start at the
+    scene file's folder.
     Raises InputError that names the file, the key, what was expected and what came.
     """
+    path = find_scene(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such scene file; `ommatid init {path.name}` writes one to start from") from error
+        raise InputError(missing_scene(path)) from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: could not be read as a scene file ({error})") from error
     try:
@@ -205,7 +207,7 @@ def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) 
 
 
 def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], lenses: Iterable[str]) -> Scene:
-    """The scene in `data` after `--set` overrides and `--lens`. Raises InputError."""
+    """The scene in `data` after `--set` overrides and `--lens`, with absolute paths. Raises InputError."""
     try:
         data = keep_lenses(apply_overrides(data, overrides), lenses)
     except InputError as error:
@@ -217,16 +219,16 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
 
         update["camera"] = with_surfaces(scene.camera, source)
     image, world = scene.target.image, scene.world
-    if image is not None and not re.match(r"^photo:", image):
+    if image is not None and not image.startswith("photo:"):
         update["target"] = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
     if world is not None:
         update["world"] = world.model_copy(update={"file": str((source.parent / world.file).resolve())})
-    return _moved(scene.model_copy(update=update), source)
+    return with_tables(scene, **update)
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write a scene as TOML, defaults included. Raises InputError or DeniedError."""
+    """Write a scene as TOML, defaults included. Raises InputError or MachineError."""
     import tomli_w
 
-    pair = re.compile(r"\[\s+(\d+),\s+(\d+),\s+\]")  # which the library spreads over four lines
+    pair = re.compile(r"\[\s+(\d+),\s+(\d+),\s+\]")  # tomli_w spreads pairs over four lines
     write_text(path, pair.sub(r"[\1, \2]", tomli_w.dumps(scene.plain())))

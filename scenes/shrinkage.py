@@ -1,24 +1,23 @@
-"""Variances from few repeats, moderated: each alone is a poor weight, all together say how far each can be trusted."""
+"""Shrinkage of sample variances from few repeats, each of which alone would be a poor weight."""
 
 from __future__ import annotations
 
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize, special
 
-Vector = NDArray[np.float64]
+from ommatid.runtime.arrays import FloatArray
 
 
-def shrink_variances(variance: Vector, repeats: int) -> Vector:
-    """The expected true variances, given the sample variances of `repeats` values each, of things of one kind.
+def shrink_variances(variance: FloatArray, repeats: int) -> FloatArray:
+    """Posterior means of true variances, given the sample variances of `repeats` values of each of similar quantities.
 
     The true variances are taken as draws from a scaled inverse chi-squared distribution whose two parameters are
-    fitted to the logarithms (Smyth 2004, Statistical Applications in Genetics and Molecular Biology 3, article 3):
-    what these scatter more than so few repeats make them is real. Each variance is drawn towards a typical one, not
-    towards the arithmetic mean, which would give flat parts of a picture the variance of its edges. The mean of what
-    remains possible is taken, so that sums of variances come out right even when they were used as weights.
+    fitted to the logarithms (Smyth 2004, Statistical Applications in Genetics and Molecular Biology 3, article 3): the
+    scatter of the logarithms in excess of that of so few repeats is real. Each variance shrinks towards a typical one,
+    not towards the arithmetic mean, which would give flat parts of a picture the variance of its edges. Posterior means
+    keep sums of variances unbiased even when the variances were used as weights.
     """
     freedom = repeats - 1
     known = variance > 0
@@ -27,7 +26,7 @@ def shrink_variances(variance: Vector, repeats: int) -> Vector:
     logarithms = np.log(variance[known])
     excess = float(logarithms.var(ddof=1)) - _trigamma(freedom / 2)
     centre = float(logarithms.mean() - special.digamma(freedom / 2)) + np.log(freedom / 2)
-    if excess <= 0:  # all alike
+    if excess <= 0:  # no sign of unequal variances
         return np.full_like(variance, np.exp(centre))
     weight = 2 * _inverse_trigamma(excess)
     typical = np.exp(centre + special.digamma(weight / 2) - np.log(weight / 2))
@@ -39,8 +38,8 @@ def _trigamma(x: float) -> float:
 
 
 def _inverse_trigamma(value: float) -> float:
-    # It falls from infinity to 0; in the logarithm of x a bracket that holds every float is short.
-    def away(logarithm: float) -> float:
+    # Trigamma falls from infinity to 0; in the logarithm of x this bracket holds the root of every float.
+    def difference(logarithm: float) -> float:
         return _trigamma(float(np.exp(logarithm))) - value
 
-    return float(np.exp(cast(Any, optimize).brentq(away, -30.0, 30.0)))
+    return float(np.exp(cast(Any, optimize).brentq(difference, -30.0, 30.0)))

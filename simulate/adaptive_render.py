@@ -81,7 +81,8 @@ class SubImagerProgress:
     @staticmethod
     def from_json(values: dict[str, Any]) -> SubImagerProgress:
         """Create the progress from its fields in JSON's types."""
-        return SubImagerProgress(**{**values, **{name: Plan(**values[name]) for name in ("next", "last")}})
+        fields: dict[str, Any] = {**values, **{name: Plan(**values[name]) for name in ("next", "last")}}
+        return SubImagerProgress(**fields)
 
     def add_round(self, work: Plan, variance: FloatArray) -> None:
         """Account for a round, from its plan and the variances of its pixels' means."""

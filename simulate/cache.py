@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest
+from ommatid.runtime.files import cached, digest
 from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file, stack
@@ -19,7 +18,7 @@ from ommatid.scenes.stack import Stack
 
 from . import calibrate, render
 from .calibration.stopping_rule import StoppingRule
-from .sampling.checkpoint import clear, open_checkpoint
+from .sampling.checkpoint import open_checkpoint
 
 
 def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:
@@ -32,21 +31,22 @@ def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, b
         from .ground_truth import cached_truth
 
         truth = cached_truth(path.with_name(TRUTH), setup)
-    try:
-        old = stack.read(path)
-    except InputError:  # missing, damaged or of another format
-        old = None
     made_from = render.made_from(setup)
-    if old is not None and old.record.get("fingerprint") == made_from:
-        record = {**old.record, "truth": digest(truth.astype(np.float32))}
-        if old.scene.plain() != setup.resolved.plain() or old.record != record:
-            # The estimator's tables or the ground truth may have changed; the values have not.
-            stack.write(path, replace(old, scene=setup.resolved, record=record))
-        clear(path)
-        return stack.read(path), False
     with open_checkpoint(path, made_from) as checkpoint:
-        stack.write(path, render.render(setup, progress, checkpoint, truth))
-    return stack.read(path), True
+        result, made = cached(
+            path, made_from, _read_stack, lambda: render.render(setup, progress, checkpoint, truth), stack.write
+        )
+    record = {**result.record, "truth": digest(truth.astype(np.float32))}
+    if result.scene.plain() != setup.resolved.plain() or result.record != record:
+        # The estimator's tables or the ground truth may have changed; the values have not.
+        stack.write(path, replace(result, scene=setup.resolved, record=record))
+        result = stack.read(path)
+    return result, made
+
+
+def _read_stack(path: Path) -> tuple[Stack, str | None]:
+    result = stack.read(path)
+    return result, result.record.get("fingerprint")
 
 
 @one_thread()
@@ -59,13 +59,16 @@ def cached_model(
     Raises what `calibrate` raises.
     """
     made_from = calibrate.made_from(setup, stopping_rule)
-    try:
-        old = model_file.read(path)
-    except InputError:
-        old = None
-    if old is not None and old.record.get("fingerprint") == made_from:
-        clear(path)
-        return old, False
     with open_checkpoint(path, made_from) as checkpoint:
-        model_file.write(path, calibrate.calibrate(setup, progress, checkpoint, stopping_rule))
-    return model_file.read(path), True
+        return cached(
+            path,
+            made_from,
+            _read_model,
+            lambda: calibrate.calibrate(setup, progress, checkpoint, stopping_rule),
+            model_file.write,
+        )
+
+
+def _read_model(path: Path) -> tuple[Model, str | None]:
+    model = model_file.read(path)
+    return model, model.record.get("fingerprint")

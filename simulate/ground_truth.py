@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.exr import read
@@ -85,7 +84,7 @@ def truth(setup: Setup) -> Truth:
 def _plan(setup: Setup) -> Plan:
     """TRUER times the samples of a sensor pixel, in passes of a size that memory holds."""
     render = setup.scene.render
-    work = plan(TRUER * render.counted, render.sampler)
+    work = plan(TRUER * render.sample_count, render.sampler)
     most = max(1, MOST_RAYS // setup.camera.unknowns)
     if work.samples <= most:
         return work
@@ -110,13 +109,14 @@ def truth_from(setup: Setup) -> str:
 def cached_truth(path: Path, setup: Setup) -> FloatArray:
     """Return the truth at `path`, rendered if it is missing or its fingerprint differs."""
     made_from = truth_from(setup)
-    try:
-        (old,) = read(path)
-    except (InputError, ValueError):  # missing, damaged or of another format
-        old = None
-    if old is not None and old.record.get("fingerprint") == made_from and "Y" in old.channels:
-        return old.channels["Y"].astype(np.float64)
-    new = truth(setup)
-    record = {"fingerprint": made_from, "samples": new.samples, "variance": float(new.variance.mean())}
-    write_truth(path, new.image, new.depth, record)
-    return new.image.astype(np.float32).astype(np.float64)
+
+    def write(path: Path, new: Truth) -> None:
+        record = {"fingerprint": made_from, "samples": new.samples, "variance": float(new.variance.mean())}
+        write_truth(path, new.image, new.depth, record)
+
+    return cached(path, made_from, _read_truth, lambda: truth(setup), write)[0]
+
+
+def _read_truth(path: Path) -> tuple[FloatArray, str | None]:
+    (part,) = read(path)
+    return part.channels["Y"].astype(np.float64), part.record.get("fingerprint")

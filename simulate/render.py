@@ -13,11 +13,11 @@ from ommatid.runtime.files import digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.optics.negligible import without_shot_noise
+from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.recording import Recording
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
-from ommatid.scenes.stack import STRAIGHT, Stack, recorded
+from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.variant import choose
@@ -143,7 +143,8 @@ def exposed(setup: Setup, light: FloatArray, variance: FloatArray, record: dict[
     """Record light, (M,), of known variance by the scene's sensor; its noise follows from the scene's seed."""
     scene, camera, values = setup.scene, setup.camera, light
     if scene.sensor is not None:
-        return recorded(setup.resolved, camera, _recording(setup, scene.sensor, light), variance, record)
+        recording = _recording(setup, scene.sensor, light)
+        return stack_from_recording(setup.resolved, camera, recording, variance, record)
     if scene.noise is not None:
         from .sensor.gaussian import expose, generators
 
@@ -157,5 +158,5 @@ def _recording(setup: Setup, sensor: SensorTable, light: FloatArray) -> Recordin
 
     dark = np.isnan(light)  # no light can reach these pixels, so their flat frame marks them as dead
     electrons = np.where(dark, 0.0, response(setup))
-    shot = without_shot_noise(setup.scene, setup.camera) is None
+    shot = negligible_shot_noise(setup.scene, setup.camera) is None
     return record(np.where(dark, 0.0, light), electrons, sensor, setup.camera, setup.scene.render.seed, shot)

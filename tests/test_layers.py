@@ -23,7 +23,6 @@ BELOW = {
     "simulate": {"runtime", "scenes"},
     "reconstruct": {"runtime", "scenes"},
 }
-TOO_LONG = {"ommatid.cli.app": 860}
 
 
 def room(module: str) -> str:
@@ -73,7 +72,16 @@ def test_nothing_is_imported_by_the_bare_name_of_a_folder(path: Path) -> None:
 
 @pytest.mark.parametrize("module", modules())
 def test_no_module_is_long(module: str) -> None:
-    assert len(modules()[module].read_text(encoding="utf-8").splitlines()) <= TOO_LONG.get(module, LONGEST)
+    assert len(modules()[module].read_text(encoding="utf-8").splitlines()) <= LONGEST
+
+
+def test_no_class_name_stands_for_two_things() -> None:
+    defined: dict[str, list[str]] = {}
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                defined.setdefault(node.name, []).append(module)
+    assert {name: where for name, where in defined.items() if len(where) > 1} == {}
 
 
 def test_no_folder_is_crowded() -> None:
@@ -91,7 +99,7 @@ def test_packages_export_nothing(name: str) -> None:
     module = importlib.import_module(name)
     assert Path(str(module.__file__)).resolve() == modules()[name], "another package of this name is in the way"
     body = ast.parse(modules()[name].read_text(encoding="utf-8")).body
-    assert len(body) == 1, "a docstring and nothing else"
+    assert len(body) == 1 or name == "ommatid", "a docstring and nothing else"
 
 
 def test_reconstruct_works_where_mitsuba_does_not_exist() -> None:
@@ -109,5 +117,5 @@ def test_the_command_line_imports_nothing_heavy() -> None:
     """`ommatid --help` in under 0.3 s: what it loads decides, and that can be tested on any machine."""
     script = "import sys, ommatid.__main__; print(*sys.modules)"
     ended = subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, capture_output=True, text=True)
-    heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR"}
+    heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR", "psutil"}
     assert not heavy & set(ended.stdout.split())

@@ -1,4 +1,4 @@
-"""What the uncertainty of H adds to the error of a reconstruction: of a stack at hand, or of images of the prior."""
+"""Stopping rules of an adaptive calibration: by how much the uncertainty of H may raise the expected error."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from ommatid.reconstruct.expected_error import ExpectedError
-from ommatid.reconstruct.method_choice import WAYS, choose_method
+from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, total
-from ommatid.reconstruct.noise import Noise, everywhere, known_noise, usable_pixels
+from ommatid.reconstruct.noise import Noise, known_noise, uniform, usable_pixels
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -22,35 +23,35 @@ from ommatid.simulate.calibration.stopping_rule import StoppingRule
 
 from .predict import expected_noise
 
-WHITE = 255.0
-SMALL = 0.03  # beside the other noise of a measurement
+NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
 TINY = float(np.finfo(np.float64).tiny)
-TOLD = ("prior", "estimator", "tiles", "noise", "sensor")  # what the expected error depends on
+TABLES = ("prior", "estimator", "tiles", "noise", "sensor")  # on which the expected error depends
 
 
 def for_stack(stack: Stack) -> StoppingRule:
-    """By the error budget of the very stack that the model is for."""
+    """Return the rule by the error budget of the stack for which H is calibrated."""
 
-    def adds(model: Model) -> float:
-        at_most = _at_most(stack, model)
-        if at_most is not None:
-            return at_most
-        found = restore(stack, model)
-        known = replace(model, variance=np.zeros_like(model.variance), batches=model.batches[:0])
-        return _added(found.noise, found.expected, lambda: restore(stack, known).expected.mse)
+    def added_error(model: Model) -> float:
+        bound = _negligible_bound(stack, model)
+        if bound is not None:
+            return bound
+        restoration = restore(stack, model)
+        certain = replace(model, variance=np.zeros_like(model.variance), batches=model.batches[:0])
+        return _added(restoration.noise, restoration.expected, lambda: restore(stack, certain).expected.mse)
 
-    known = digest(stack.values, stack.variance)
-    return StoppingRule(adds, fingerprint(["stack", known, _told(stack.scene)]), "the error budget of this stack")
+    made_from = ["stack", digest(stack.values, stack.variance), _tables(stack.scene)]
+    return StoppingRule(added_error, fingerprint(made_from), "the error budget of this stack")
 
 
 def for_prior(setup: Setup) -> StoppingRule:
-    """By Eq. 5 for images drawn from the prior, where there is no stack. Raises InputError without noise.
+    """Return the rule by Eq. 5 for images drawn from the prior, for a calibration without a stack.
 
-    A prior that is to be found in a stack counts as one of independent pixels, and light as the prior's mean.
+    A prior that is to be fitted counts as one of independent pixels, and light as the prior's mean.
+    Raises InputError without noise.
     """
     scene, camera = setup.scene, setup.camera
-    found = expected_noise(setup)
-    noise = found if isinstance(found, np.ndarray) else everywhere(found, camera.measurements)
+    actual = expected_noise(setup)
+    noise = actual if isinstance(actual, np.ndarray) else uniform(actual, camera.measurements)
     if not (noise[np.isfinite(noise)] > 0).all():
         raise InputError(
             f"{scene.source}: calibration.samples 'auto' takes as many as are needed beside the sensor's noise, and"
@@ -58,55 +59,56 @@ def for_prior(setup: Setup) -> StoppingRule:
         )
     prior = scene.prior.model_copy(update={"kind": "independent"}) if scene.prior.kind == "fit" else scene.prior
 
-    def adds(model: Model) -> float:
+    def added_error(model: Model) -> float:
         used = np.isfinite(noise) & (np.diff(model.matrix.indptr) > 0)
-        spread = model.prior_variance_from_model(np.full(model.unknowns, prior.variance))
-        causes = {"noise": noise[used], "calibration": spread[used]}
-        told = scene.estimator.noise_variance
-        seen = model.forward(np.full(model.unknowns, prior.mean))
+        from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance))
+        causes = {"noise": noise[used], "calibration": from_model[used]}
+        setting = scene.estimator.noise_variance
+        recorded = model.forward(np.full(model.unknowns, prior.mean))
+        method = METHODS[choose_method(scene, camera, exact=False).method]
 
         def expected(noise: Noise) -> ExpectedError:
-            believed = everywhere(told, int(used.sum())) if isinstance(told, float) else total(noise)
-            task = EstimationTask(model, seen, used, believed, prior, scene.estimator, scene.tiles)
-            return (
-                WAYS[choose_method(scene, camera, exact=False).method](task, Execution()).result(noise, None).expected
-            )
+            assumed = uniform(setting, int(used.sum())) if isinstance(setting, float) else total(noise)
+            task = EstimationTask(model, recorded, used, assumed, prior, scene.estimator, scene.tiles)
+            return method(task, Execution()).result(noise, None).expected
 
         return _added(causes, expected(causes), lambda: expected({"noise": causes["noise"]}).mse)
 
-    return StoppingRule(adds, fingerprint(["prior", _told(scene)]), "Eq. 5 for images drawn from the prior")
+    return StoppingRule(added_error, fingerprint(["prior", _tables(scene)]), "Eq. 5 for images drawn from the prior")
 
 
-def _at_most(stack: Stack, model: Model) -> float | None:
-    """What the uncertainty of H adds where that is so little that no reconstruction has to tell; else None.
+def _negligible_bound(stack: Stack, model: Model) -> float | None:
+    """Return a bound on what the uncertainty of H adds where it is negligible beside the other noise; else None.
 
-    It is compared with the other noise, measurement by measurement, for values from 0 to 255 that go from end to end:
-    as a bound where it is small everywhere, and where rays beside their pixel spoil a few rows as an average.
+    It saves a reconstruction. Both are compared measurement by measurement, for images of white noise from 0 to 255: by
+    the maximum where it is negligible everywhere, by the mean where a few rows are spoilt by stray rays.
     """
     used = usable_pixels(stack, model).used
     others = total(known_noise(stack))[used]
     relative = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))[used] / np.maximum(others, TINY)
-    if not relative.size or float(relative.max()) <= SMALL:
+    if not relative.size or float(relative.max()) <= NEGLIGIBLE:
         return float(relative.max(initial=0.0))
-    return float(relative.mean()) if float(relative.mean()) <= SMALL / 10 else None
+    return float(relative.mean()) if float(relative.mean()) <= NEGLIGIBLE / 10 else None
 
 
-def _added(noise: Noise, expected: ExpectedError, without: Callable[[], float]) -> float:
-    """What the uncertainty of H adds to the expected error, relative to the rest of it.
+def _added(noise: Noise, expected: ExpectedError, mse_without: Callable[[], float]) -> float:
+    """Return the error that the uncertainty of H adds, relative to the expected error without it.
 
-    Its part of the budget alone would say too little where it is large: it also makes the estimator believe less of the
-    measurements, so that other parts grow. The expected error without it tells; but where it is small beside the other
-    noise of every measurement, by a factor r at most, the error is no more than 1 + r times that without it.
+    Its part of the budget is too small a measure where it is large, since the estimator then also gives the
+    measurements less weight, and other parts grow: the error without it is computed. Where it is negligible beside the
+    other noise of every measurement, by a factor r at most, the error is no more than 1 + r times that without it, and
+    the part is measure enough.
     """
-    part, rest = expected.parts.get("calibration", 0.0), expected.mse - expected.parts.get("calibration", 0.0)
+    part = expected.parts.get("calibration", 0.0)
+    rest = expected.mse - part
     if "calibration" not in noise or part == 0:
         return 0.0
     others = total({name: values for name, values in noise.items() if name != "calibration"})
     relative = part / max(rest, TINY)
-    if float(np.max(noise["calibration"] / np.maximum(others, TINY), initial=0.0)) <= SMALL:
+    if float(np.max(noise["calibration"] / np.maximum(others, TINY), initial=0.0)) <= NEGLIGIBLE:
         return relative
-    return max(relative, expected.mse / max(without(), TINY) - 1)
+    return max(relative, expected.mse / max(mse_without(), TINY) - 1)
 
 
-def _told(scene: Scene) -> dict[str, object]:
-    return {name: value for name, value in scene.plain().items() if name in TOLD}
+def _tables(scene: Scene) -> dict[str, object]:
+    return {name: value for name, value in scene.plain().items() if name in TABLES}

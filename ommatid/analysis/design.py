@@ -1,48 +1,114 @@
-"""Which lens type to add: the expected error after each (Wood et al., section 6), from Eq. 5 alone."""
+"""Candidate lens types for a camera: read their magnifications, add one to a scene, rank them by expected error.
+
+The error with each is that of Eq. 5 (Wood et al., section 6).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
+from math import ceil
 from typing import Any
 
 import numpy as np
 
 from ommatid.reconstruct.prediction import Prediction
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.scene import Scene, parse
+
+from .prediction_table import json_of
+
+ADDED = "added"  # name of the lens type
+MAX_CANDIDATES = 1000
+OPTICS = ("aperture", "focus", "distortion", "surfaces", "scale")  # keys copied from the camera's last lens type
 
 
 @dataclass(frozen=True)
 class DesignCandidate:
-    """A magnification, and what is expected once it is there; None and `reason` where it cannot be had."""
+    """A magnification and the prediction with it; None and `reason` where it is impossible."""
 
     magnification: str
     expected: Prediction | None
     reason: str = ""
 
     def describe(self) -> dict[str, Any]:
-        """In JSON's types."""
-        expected = None if self.expected is None else self.expected.describe()
+        """Return the candidate in JSON's types."""
+        expected = None if self.expected is None else json_of(self.expected)
         return {"magnification": self.magnification, "expected": expected, "reason": self.reason}
 
 
-def ranked(choices: list[DesignCandidate]) -> list[DesignCandidate]:
-    """The least expected error first; what cannot be had last."""
-    return sorted(choices, key=lambda choice: np.inf if choice.expected is None else choice.expected.mse)
+def ranked(candidates: list[DesignCandidate]) -> list[DesignCandidate]:
+    """Sort by expected error, the least first; impossible candidates come last."""
+    return sorted(candidates, key=lambda candidate: np.inf if candidate.expected is None else candidate.expected.mse)
 
 
-def rows(before: Prediction, choices: list[DesignCandidate]) -> list[tuple[str, str]]:
-    """The lines of the printed table: magnification, expected error, and what it is worth."""
-    lines = [("as it is", f"{before.mse:.6g} a pixel, {before.null_space} dimensions unseen")]
-    for choice in choices:
-        found = choice.expected
-        if found is None:
-            lines.append((f"+ {choice.magnification}", choice.reason))
+def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[str, str]]:
+    """Return magnification and expected error, one row per candidate after that of the camera itself."""
+    lines = [("unchanged", f"{before.mse:.6g} per pixel, {before.null_space} dimensions unseen")]
+    for candidate in candidates:
+        after, name = candidate.expected, f"+ {candidate.magnification}"
+        if after is None:
+            lines.append((name, candidate.reason))
             continue
-        gain = f"{before.mse / found.mse:.3g} times less" if found.mse > 0 else "nothing is left"
-        more = found.measurements - before.measurements
-        lines.append(
-            (
-                f"+ {choice.magnification}",
-                f"{found.mse:.6g} a pixel, {gain}; {found.null_space} dimensions unseen, {more} measurements more",
-            )
-        )
+        gain = f"{before.mse / after.mse:.3g} times less" if after.mse > 0 else "no error is left"
+        added = after.measurements - before.measurements
+        unseen = f"{after.null_space} dimensions unseen, {added} measurements more"
+        lines.append((name, f"{after.mse:.6g} per pixel, {gain}; {unseen}"))
     return lines
+
+
+def magnifications(text: str) -> list[Fraction]:
+    """Read "1/2,1/3,...,1/9": ratios above 0 and up to 1; dots continue the step of the two 1/magnifications before.
+
+    Raises InputError that names what cannot be read.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    ratios: list[Fraction] = []
+    for index, part in enumerate(parts):
+        if part != "...":
+            ratios.append(_magnification(part))
+            continue
+        if len(ratios) < 2 or index + 1 == len(parts):
+            raise InputError('--candidates: "..." needs two ratios before it and one after it, as in 1/2,1/3,...,1/9')
+        ratios += _between(ratios[-2], ratios[-1], _magnification(parts[index + 1]))
+    return list(dict.fromkeys(ratios))
+
+
+def with_lens(scene: Scene, magnification: Fraction) -> Scene:
+    """Return the scene with one more lens type: 1/magnification sub-imagers along each axis, as large as fits.
+
+    Aperture, focus, distortion and surfaces are those of the last type, so that like is compared with like.
+    Raises InputError where not one pixel fits the target.
+    """
+    data = scene.plain()
+    count = ceil(1 / magnification)
+    taken = {lens["name"] for lens in data["camera"]["lens"]}
+    names = [ADDED, *(f"{ADDED}-{number}" for number in range(2, MAX_CANDIDATES))]
+    name = next(name for name in names if name not in taken)
+    last = data["camera"]["lens"][-1]
+    optics = {key: last[key] for key in OPTICS if key in last}
+    added = {**optics, "name": name, "magnification": str(magnification), "array": [count, count], "pixels": "fit"}
+    camera = {**data["camera"], "lens": [*data["camera"]["lens"], added]}
+    return parse({**data, "camera": camera}, scene.source)
+
+
+def _between(before: Fraction, last: Fraction, end: Fraction) -> list[Fraction]:
+    step = 1 / last - 1 / before
+    steps = (1 / end - 1 / last) / step if step else Fraction(-1)
+    if steps > MAX_CANDIDATES:
+        raise InputError(
+            f"--candidates: expected at most {MAX_CANDIDATES} magnifications, got {int(steps)} up to {end}"
+        )
+    if steps <= 0 or steps.denominator != 1:
+        raise InputError(f"--candidates: steps of {step} in 1/magnification never reach {end} after {last}")
+    return [1 / (1 / last + step * number) for number in range(1, int(steps))]
+
+
+def _magnification(text: str) -> Fraction:
+    try:
+        ratio = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        ratio = Fraction(0)
+    if not 0 < ratio <= 1:
+        raise InputError(f"--candidates: expected magnifications above 0 and at most 1, such as 1/6, got '{text}'")
+    return ratio

@@ -1,4 +1,4 @@
-"""Several ideas of one camera's H, for a study: each is made only where it is asked for."""
+"""The models of H that a study compares; each is made only when it is asked for."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
 
 def study_models(
-    setup: Setup, folder: Path, progress: Progress, judge: StoppingRule | None = None
+    setup: Setup, folder: Path, progress: Progress, stopping_rule: StoppingRule | None = None
 ) -> dict[str, Callable[[], Model]]:
-    """What makes each model that the scene's study names; calibrated ones are kept in `folder`."""
-    names = () if setup.scene.study is None else setup.scene.study.models
-    return {name: partial(_made, name, setup, folder, progress, judge) for name in names}
+    """Return by name the functions that make the models of a scene's study; calibrated ones are cached in `folder`."""
 
-
-def _made(name: str, setup: Setup, folder: Path, progress: Progress, judge: StoppingRule | None) -> Model:
     scene, camera = setup.scene, setup.camera
-    if name in ("points", "transport"):
-        told = scene.calibration.model_copy(update={"method": name})
-        alone = "model.npz" if name == scene.calibration.method else f"model.{name}.npz"
-        changed = replace(setup, scene=scene.model_copy(update={"calibration": told}))
-        return cached_model(folder / alone, changed, progress, judge)[0]
-    if name == "true":
-        return exact_model(setup.resolved, camera, true_matrix(camera), "true")
-    return ideal_model(setup.resolved, camera)
+
+    def make(name: str) -> Model:
+        if name == "true":
+            return exact_model(setup.resolved, camera, true_matrix(camera), "true")
+        if name not in ("points", "transport"):
+            return ideal_model(setup.resolved, camera)
+        calibration = scene.calibration.model_copy(update={"method": name})
+        path = folder / ("model.npz" if name == scene.calibration.method else f"model.{name}.npz")
+        changed = replace(setup, scene=scene.model_copy(update={"calibration": calibration}))
+        return cached_model(path, changed, progress, stopping_rule)[0]
+
+    return {name: partial(make, name) for name in (() if scene.study is None else scene.study.models)}

@@ -1,17 +1,15 @@
-"""What theory promises of a scene before anything is rendered: its error (Eq. 5), its sharpness, its light."""
+"""Predict the error (Eq. 5), the sharpness and the light of a scene from theory; nothing is rendered."""
 
 from __future__ import annotations
 
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ommatid.reconstruct.frame_prediction import predict_frame
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.prediction import Prediction, predict
+from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
+from ommatid.reconstruct.prediction import Prediction, predict, predict_frame
 from ommatid.reconstruct.prior import prior_of
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
 from ommatid.scenes.camera import Camera
@@ -22,26 +20,24 @@ from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 @one_thread()
 def predict_scene(scene: Scene) -> Prediction:
-    """What Eq. 5 and the ideal model promise of a scene."""
+    """Predict the error of a scene with the ideal H. Raises InputError where the estimator takes a recorded stack."""
     setup = Setup.from_scene(scene)
     camera = setup.camera
     choice = choose_method(scene, camera, exact=camera.has_box_footprints)
-    actual, shape = expected_noise(setup), camera.shape
+    actual = expected_noise(setup)
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.method != "dense":
         return predict_frame(choice, ideal_model(scene, camera), actual)
-    prior = prior_of(scene.prior, shape, camera.target_pitch)
-    tolerated = None
+    prior = prior_of(scene.prior, camera.shape, camera.target_pitch)
+    added = None
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":
-        from ommatid.reconstruct.misalignment.tolerance_cost import cost
-
-        tolerated = partial(cost, camera=camera, prior=prior)
-    return predict(ideal_matrix(camera), prior, actual, scene.estimator, shape, tolerated)
+        added = partial(misalignment_variance, camera=camera, prior=prior)
+    return predict(ideal_matrix(camera), prior, actual, scene.estimator, camera.shape, added)
 
 
-def expected_noise(setup: Setup) -> float | NDArray[np.float64]:
-    """Variance of every measurement, one number or an array: with a [sensor] that of light of the prior's mean."""
+def expected_noise(setup: Setup) -> float | FloatArray:
+    """Return the variance of all measurements, or of each, (M,): with a [sensor] that of light of the prior's mean."""
     scene = setup.scene
     if scene.sensor is not None:
         from ommatid.scenes.optics.radiometry import predicted_noise
@@ -52,8 +48,8 @@ def expected_noise(setup: Setup) -> float | NDArray[np.float64]:
 
 
 def optics(camera: Camera) -> list[dict[str, Any]]:
-    """What lenses that are more than pinholes do to sharpness."""
-    if all(kind.optics.pinhole for kind in camera.types):
+    """Return the sharpness of the lens types in JSON's types; empty where all are pinholes."""
+    if all(lens_type.optics.is_pinhole for lens_type in camera.types):
         return []
     from ommatid.simulate.lenses.sharpness import describe
 
@@ -61,7 +57,7 @@ def optics(camera: Camera) -> list[dict[str, Any]]:
 
 
 def electrons(setup: Setup) -> dict[str, Any] | None:
-    """The electrons that each lens type's pixels collect, where they are counted."""
+    """Return the electrons that the pixels of each lens type collect; None without a [sensor]."""
     if setup.scene.sensor is None:
         return None
     from ommatid.scenes.optics.radiometry import summary

@@ -1,147 +1,172 @@
-"""run.json as the rows of the table that is printed."""
+"""The rows of the table that `run` and `reconstruct` print, from the content of run.json."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import exp
-from typing import Any
 
-from ommatid.reconstruct.restore import MOST_FEIGNED
+from ommatid.reconstruct.output.run_json import (
+    DiagnosticsReport,
+    ErrorReport,
+    ModelReport,
+    RegionReport,
+    RunReport,
+    SolverReport,
+    StageReport,
+    TimeReport,
+)
+from ommatid.reconstruct.restore import MAX_SPURIOUS_INFORMATION
 
 from .summary import skipped_words
 
-MOST_NAMED = 5  # sub-imagers, in a line of the table
-WARNING = (
-    "the lens types leave pixels open on which the noise of H feigns information:"
+Row = tuple[str, str]
+
+MAX_NAMES = 5  # sub-imagers named in one row
+SPURIOUS = (
+    "the lens types leave pixels open, and noise of H looks like information on them:"
     " raise calibration.samples, or take calibration.method = 'ideal' if the camera is"
 )
 
 
-def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of the printed table: what, and how much."""
-    error, stages = description["error"], description["stages"]
-    lines: list[tuple[str, str]] = []
-    for name, stage in stages.items():
-        made = [samples_of(stage)] if "samples" in stage else []
-        made += [stage["variant"]] if "variant" in stage else []
-        if name == "reconstruct":
-            made.append(f"{_way(description['solver'])}, {description['unknowns']} unknowns")
-        done = "import" if stage.get("method") == "imported" else name
-        lines.append((f"{done}, seconds", ", ".join([f"{stage['seconds']:.2f}", *made])))
-    if "mse" in error:
-        lines.append(("mean squared error, measured", f"{error['mse']:.4g}"))
-    if "expected_given_truth" in error:
-        given = error["expected_given_truth"]
-        lines.append(
-            ("  expected for this picture", f"{given['mse']:.4g} (99 %: {given['low']:.4g} to {given['high']:.4g})")
-        )
-    lines.append(("  predicted (Eq. 5)", f"{error['predicted_mse']:.4g}"))
-    total = error["predicted_mse"]
-    for name, part in error["budget"].items():
-        if part > 0:
-            lines.append((f"    from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / total:.1f} %)"))
-    if "region" in description:
-        lines.append(_region_row(description["region"]))
-    if "mse" in error:
-        psnr = "exact" if error["psnr"] is None else f"{error['psnr']:.2f} dB"
-        ssim = "picture too small" if error["ssim"] is None else f"{error['ssim']:.4f}"
-        lines += [("PSNR (peak 255)", psnr), ("structural similarity", ssim)]
-    lines += _solver_rows(description["solver"]) + _diagnostic_rows(description["diagnostics"], description["unknowns"])
-    agreement = description["model"]
-    if agreement["max_z"] is not None:
-        difference = f"{agreement['rms_difference_from_ideal']:.2g} rms"
-        lines.append(
-            (
-                "H against the ideal one",
-                f"{difference}, largest z {agreement['max_z']:.1f}, p {agreement['p_value']:.2g}",
-            )
-        )
-    if "fit" in agreement:
-        lines.append(("H by a fit of its geometry", _fitted(agreement["fit"])))
-    if agreement["feigned_information"] > MOST_FEIGNED:
-        lines.append(("do not trust the predicted error", WARNING))
-    lines += [(f"left out: {skip['what']}", skipped_words(skip)) for skip in description["skipped"]]
-    return lines + _time_rows(description["spent"])
-
-
-def samples_of(stage: dict[str, Any]) -> str:
-    """How many samples a stage took, in words."""
-    if "fewest_samples" not in stage:
-        return f"{stage['samples']} samples a pixel in {stage['passes']} passes"
-    said = f"{stage['fewest_samples']} to {stage['samples']} samples a pixel, as many as were needed"
-    missed = list(stage.get("not_reached", {}))
-    if missed:
-        return f"{said}; too few for {_named(missed)}: {stage['not_reached'][missed[0]]}"
-    return said if stage.get("auto", {}).get("reached", True) else f"{said}; too few, no more are taken"
-
-
-def _named(names: list[str]) -> str:
-    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if names[MOST_NAMED:] else "")
-
-
-def _fitted(fit: dict[str, Any]) -> str:
-    refused = fit["refused"]
-    told = f"{fit['accepted']} sub-imagers"
-    if not refused:
-        return told
-    return f"{told}; as measured, since the fit is no good there: {_named(refused)}"
-
-
-def _way(solver: dict[str, Any]) -> str:
-    if solver["way"] == "frame":
-        return f"whole frame, {solver['refinements']} steps of conjugate gradients"
-    return f"{solver['method']} form"
-
-
-def _solver_rows(solver: dict[str, Any]) -> list[tuple[str, str]]:
-    if solver["way"] == "frame":
-        lines = [
-            ("computation, error", f"below {solver['bound']:.1g} posterior standard deviations in every pixel"),
-            ("  of variances", f"{solver['variance_bound']:.1g}, relative, by exact solutions for some pixels"),
-        ]
-    else:
-        bounds = f"error below {solver['bound']:.0e}, of variances {solver['variance_bound']:.0e} (relative)"
-        lines = [("right digits", f"{solver['digits']:.1f}: {bounds}")]
-    return lines + [(f"  not by the {failed['method']} form", failed["why_not"]) for failed in solver["tried"]]
-
-
-def _diagnostic_rows(found: dict[str, Any], unknowns: int) -> list[tuple[str, str]]:
-    lines: list[tuple[str, str]] = []
-    if found["pixels_dead"] or found["pixels_saturated"]:
-        lines.append(("sensor pixels left out", f"{found['pixels_dead']} dead, {found['pixels_saturated']} saturated"))
-    if not found["pixels_used"]:
-        lines.append(("do not look for the image here", "no sensor pixel is left, so this is the prior"))
-    width = "nothing is resolved" if found["resolution"] is None else f"{found['resolution']:.3g} pixels of f"
-    residual = found["chi_squared"]
-    lines += [
-        ("degrees of freedom", f"{found['degrees_of_freedom']:.1f} of {unknowns}"),
-        ("resolution, median", width),
+def rows(report: RunReport) -> list[Row]:
+    """Return names and values, in the order in which they are printed."""
+    return [
+        *_stage_rows(report),
+        *_error_rows(report.error),
+        *([] if report.region is None else [_region_row(report.region)]),
+        *_image_quality_rows(report.error),
+        *_solver_rows(report.solver),
+        *_diagnostic_rows(report.diagnostics, report.unknowns),
+        *_model_rows(report.model),
+        *((f"left out: {skipped.what}", skipped_words(skipped.why, skipped.bound)) for skipped in report.skipped),
+        *_time_rows(report.spent),
     ]
-    if residual is not None:
-        expected = f"{residual['expected']:.4g}, give or take {residual['deviation']:.2g}"
-        lines.append(("chi-squared of the residual", f"{residual['chi_squared']:.4g}, expected {expected}"))
-    for name, one in found.get("fit", {}).items():
-        spread = one["log_deviation"]
-        doubt = "how well is not known" if spread is None else f"within a factor of {exp(spread):.3g}"
-        unit = " pixels of f" if name == "correlation_length" else ""
-        lines.append((f"found: {name.replace('_', ' ')}", f"{one['value']:.4g}{unit}, {doubt}"))
-    if found.get("fit_doubtful"):
-        lines.append(("do not trust what was found", "the stack does not tell it: it lies where the search ended"))
+
+
+def samples_of(stage: StageReport) -> str:
+    """Return the number of samples of a stage in words."""
+    if stage.fewest_samples is None:
+        return f"{stage.samples} samples per pixel in {stage.passes} passes"
+    words = f"{stage.fewest_samples} to {stage.samples} samples per pixel, as many as were needed"
+    missed = list(stage.not_reached)
+    if missed:
+        return f"{words}; too few for {_named(missed)}: {stage.not_reached[missed[0]]}"
+    return words if stage.auto.get("reached", True) else f"{words}; too few, no more are taken"
+
+
+def _named(names: Sequence[str]) -> str:
+    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if names[MAX_NAMES:] else "")
+
+
+def _stage_rows(report: RunReport) -> list[Row]:
+    lines: list[Row] = []
+    for name, stage in report.stages.items():
+        details = [] if stage.samples is None else [samples_of(stage)]
+        details += [] if stage.variant is None else [stage.variant]
+        if name == "reconstruct":
+            details.append(f"{_method(report.solver)}, {report.unknowns} unknowns")
+        label = "import" if stage.method == "imported" else name
+        lines.append((f"{label}, seconds", ", ".join([f"{stage.seconds:.2f}", *details])))
     return lines
 
 
-def _region_row(region: dict[str, Any]) -> tuple[str, str]:
-    (row, column), (rows, columns) = region["corner"], region["size"]
-    where = f"mean of {rows} x {columns} pixels at {row}, {column}"
-    return where, f"{region['mean']:.4f}, give or take {region['deviation']:.2g}"
+def _method(solver: SolverReport) -> str:
+    if solver.way == "frame":
+        return f"whole frame, {solver.refinements} steps of conjugate gradients"
+    return f"{solver.method} form"
 
 
-def _time_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
-    stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found["stages"].items())
-    lines: list[tuple[str, str]] = []
-    if "within" in found:
-        chosen = ", ".join(f"{key} {value}" for key, value in found["chosen"].items())
-        lines.append(("time", f"{found['seconds']:.1f} s of {found['within']:g} s: {stages}; chosen: {chosen}"))
-    if found.get("more"):
-        more = [f"{one['seconds']:.3g} s: {one['predicted_mse']:.4g}" for one in found["more"][:2]]
-        lines.append(("error at most, in more time", f"{', '.join(more)}; by noise alone: {found['noise_alone']:.4g}"))
+def _error_rows(error: ErrorReport) -> list[Row]:
+    lines: list[Row] = []
+    if error.mse is not None:
+        lines.append(("mean squared error, measured", f"{error.mse:.4g}"))
+    given = error.expected_given_truth
+    if given is not None:
+        lines.append(("  expected for this picture", f"{given.mse:.4g} (99 %: {given.low:.4g} to {given.high:.4g})"))
+    total = error.predicted_mse
+    lines.append(("  predicted (Eq. 5)", f"{total:.4g}"))
+    return lines + [
+        (f"    from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / total:.1f} %)")
+        for name, part in error.budget.items()
+        if part > 0
+    ]
+
+
+def _region_row(region: RegionReport) -> Row:
+    (row, column), (rows, columns) = region.corner, region.size
+    return f"mean of {rows} x {columns} pixels at {row}, {column}", f"{region.mean:.4f} ± {region.deviation:.2g}"
+
+
+def _image_quality_rows(error: ErrorReport) -> list[Row]:
+    if error.mse is None:
+        return []
+    psnr = "exact" if error.psnr is None else f"{error.psnr:.2f} dB"
+    ssim = "image too small" if error.ssim is None else f"{error.ssim:.4f}"
+    return [("PSNR (peak 255)", psnr), ("structural similarity", ssim)]
+
+
+def _solver_rows(solver: SolverReport) -> list[Row]:
+    if solver.way == "frame":
+        lines = [
+            ("computation, error", f"below {solver.bound:.1g} posterior standard deviations in every pixel"),
+            ("  of variances", f"{solver.variance_bound:.1g}, relative, by exact solutions for some pixels"),
+        ]
+    else:
+        bounds = f"error below {solver.bound:.0e}, of variances {solver.variance_bound:.0e} (relative)"
+        lines = [("right digits", f"{solver.digits:.1f}: {bounds}")]
+    return lines + [(f"  not by the {form.method} form", form.why_not) for form in solver.tried]
+
+
+def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]:
+    lines: list[Row] = []
+    if diagnostics.pixels_dead or diagnostics.pixels_saturated:
+        counts = f"{diagnostics.pixels_dead} dead, {diagnostics.pixels_saturated} saturated"
+        lines.append(("sensor pixels left out", counts))
+    if not diagnostics.pixels_used:
+        lines.append(("this is the prior, not an image", "no sensor pixel is left"))
+    width = "nothing is resolved" if diagnostics.resolution is None else f"{diagnostics.resolution:.3g} pixels of f"
+    lines += [
+        ("degrees of freedom", f"{diagnostics.degrees_of_freedom:.1f} of {unknowns}"),
+        ("resolution, median", width),
+    ]
+    residual = diagnostics.chi_squared
+    if residual is not None:
+        expected = f"expected {residual.expected:.4g} ± {residual.deviation:.2g}"
+        lines.append(("chi-squared of the residual", f"{residual.chi_squared:.4g}, {expected}"))
+    for name, number in diagnostics.fit.items():
+        unit = " pixels of f" if name == "correlation_length" else ""
+        precision = "of unknown precision"
+        if number.log_deviation is not None:
+            precision = f"within a factor of {exp(number.log_deviation):.3g}"
+        lines.append((f"fitted {name.replace('_', ' ')}", f"{number.value:.4g}{unit}, {precision}"))
+    if diagnostics.fit_doubtful:
+        lines.append(
+            ("do not trust the fit", "a fitted value lies on the bound of its range: the stack does not tell it")
+        )
+    return lines
+
+
+def _model_rows(model: ModelReport) -> list[Row]:
+    lines: list[Row] = []
+    if model.max_z is not None:
+        difference = f"{model.rms_difference_from_ideal:.2g} rms, largest z {model.max_z:.1f}, p {model.p_value:.2g}"
+        lines.append(("H against the ideal one", difference))
+    if model.fit is not None:
+        refused = model.fit["refused"]
+        rest = f"; as measured, since the fit is not good there: {_named(refused)}" if refused else ""
+        lines.append(("H by a fit of its geometry", f"{model.fit['accepted']} sub-imagers{rest}"))
+    if model.spurious_information > MAX_SPURIOUS_INFORMATION:
+        lines.append(("do not trust the predicted error", SPURIOUS))
+    return lines
+
+
+def _time_rows(spent: TimeReport) -> list[Row]:
+    lines: list[Row] = []
+    if spent.within is not None:
+        stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.stages.items())
+        chosen = ", ".join(f"{key} {value}" for key, value in spent.chosen.items())
+        lines.append(("time", f"{spent.seconds:.1f} s of {spent.within:g} s: {stages}; chosen: {chosen}"))
+    if spent.more:
+        more = ", ".join(f"{more.seconds:.3g} s: {more.predicted_mse:.4g}" for more in spent.more[:2])
+        lines.append(("error at most, in more time", f"{more}; by noise alone: {spent.noise_alone:.4g}"))
     return lines

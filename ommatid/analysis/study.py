@@ -1,22 +1,18 @@
-"""One stack reconstructed several times, each time with another idea of H: what each costs, and what it promises."""
+"""Reconstruct one stack with several models of H, and compare the measured with the expected errors."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ommatid.reconstruct.method_choice import choose_method
+from ommatid.reconstruct.output.run_json import Record, StudyCase
 from ommatid.reconstruct.restore import restore
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.runtime.files import cached, fingerprint, write_csv, write_text
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -24,40 +20,28 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 
 NUMBERS, TABLE = "study.json", "study.csv"
-MISALIGNMENT = {"robust": "robust", "fitted": "fit"}  # of the estimator; of every other model "trust"
-WORDS = {
-    "ideal": "the ideal H on trust",
-    "robust": "the ideal H, misalignment as more noise",
+MISALIGNMENT = {"robust": "robust", "fitted": "fit"}  # estimator.misalignment by model; "trust" for all others
+LABELS = {
+    "ideal": "the ideal H",
+    "robust": "the ideal H, misalignment as noise",
     "points": "H of rendered point sources",
-    "transport": "H by transport",
-    "fitted": "H found from the stack itself",
+    "transport": "H by ray transport",
+    "fitted": "H fitted to the stack itself",
     "true": "the true H",
 }
 
 
-@dataclass(frozen=True)
-class StudyCase:
-    """What one idea of H gave: mean squared errors.
+class StudyFile(Record):
+    """The content of study.json."""
 
-    predicted : Eq. 5;  expected : of this picture, which `low` and `high` hold 99 times in 100
-    What is measured or for this picture is None without the truth, the latter also where it is not known.
-    """
-
-    model: str
-    mse: float | None
-    predicted: float
-    expected: float | None
-    low: float | None
-    high: float | None
-    seconds: float
+    fingerprint: str
+    cases: tuple[StudyCase, ...]
 
 
 def check_study(scene: Scene, camera: Camera) -> None:
-    """Raise InputError where a study names what this camera cannot be reconstructed with, before any work."""
+    """Raise InputError where a study names a model with which this camera cannot be reconstructed."""
     for name in () if scene.study is None else scene.study.models:
-        how = MISALIGNMENT.get(name, "trust")
-        told = scene.estimator.model_copy(update={"misalignment": how})
-        choose_method(scene.model_copy(update={"estimator": told}), camera, camera.has_box_footprints)
+        choose_method(_with_misalignment(scene, name), camera, camera.has_box_footprints)
         if name == "true" and camera.tolerance is not None and not camera.has_sharp_footprints:
             raise InputError(
                 f"{scene.source}: study.models: the 'true' H of misaligned lenses with surfaces or blur has no closed"
@@ -65,22 +49,26 @@ def check_study(scene: Scene, camera: Camera) -> None:
             )
 
 
+def _with_misalignment(scene: Scene, name: str) -> Scene:
+    estimator = scene.estimator.model_copy(update={"misalignment": MISALIGNMENT.get(name, "trust")})
+    return scene.model_copy(update={"estimator": estimator})
+
+
 def study_case(
-    stack: Stack, name: str, model: Model, truth: NDArray[np.float64] | None, progress: Progress = no_progress
+    stack: Stack, name: str, model: Model, truth: FloatArray | None, progress: Progress = no_progress
 ) -> StudyCase:
-    """Reconstruct a stack with one idea of H. Raises what reconstruction raises."""
-    told = stack.scene.estimator.model_copy(update={"misalignment": MISALIGNMENT.get(name, "trust")})
-    stack = replace(stack, scene=stack.scene.model_copy(update={"estimator": told}))
-    found = restore(stack, model, truth, None, progress)
-    given = found.interval
+    """Reconstruct a stack with one model of H. Raises what `restore` raises."""
+    stack = replace(stack, scene=_with_misalignment(stack.scene, name))
+    restoration = restore(stack, model, truth, None, progress)
+    given = restoration.interval
     return StudyCase(
         model=name,
-        mse=None if found.error is None else found.error.mse,
-        predicted=found.expected.mse,
+        mse=None if restoration.error is None else restoration.error.mse,
+        predicted=restoration.expected.mse,
         expected=None if given is None else given.mse,
         low=None if given is None else given.low,
         high=None if given is None else given.high,
-        seconds=found.seconds,
+        seconds=restoration.seconds,
     )
 
 
@@ -88,48 +76,45 @@ def cached_study(
     folder: Path,
     stack: Stack,
     models: Mapping[str, Callable[[], Model]],
-    truth: NDArray[np.float64] | None,
+    truth: FloatArray | None,
     progress: Progress = no_progress,
-) -> tuple[list[dict[str, Any]], bool]:
-    """The cases of a study in JSON's types, and whether they had to be made; study.json and study.csv hold them.
+) -> tuple[tuple[StudyCase, ...], bool]:
+    """Return the cases of a study, and True if they had to be computed; writes study.json and study.csv.
 
     models : by name, made only where they are needed
     """
-    wanted = fingerprint([list(models), stack.record, stack.scene.plain(), truth is not None])
-    old = _standing(folder)
-    if old is not None and old["fingerprint"] == wanted:
-        return list(old["cases"]), False
-    cases: list[dict[str, Any]] = []
-    for name, make in models.items():
-        cases.append(asdict(study_case(stack, name, make(), truth)))
-        progress(len(cases) / len(models))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(cases[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(cases)
-    write_text(folder / TABLE, text.getvalue())
-    write_text(folder / NUMBERS, json.dumps({"fingerprint": wanted, "cases": cases}, indent=2) + "\n")
-    return cases, True
+    current = fingerprint([list(models), stack.record, stack.scene.plain(), truth is not None])
+
+    def make() -> StudyFile:
+        cases: list[StudyCase] = []
+        for name, model in models.items():
+            cases.append(study_case(stack, name, model(), truth))
+            progress(len(cases) / len(models))
+        return StudyFile(fingerprint=current, cases=tuple(cases))
+
+    def write(folder: Path, study: StudyFile) -> None:
+        columns = list(StudyCase.model_fields)
+        write_csv(folder / TABLE, columns, (case.plain().values() for case in study.cases))
+        write_text(folder / NUMBERS, json.dumps(study.plain(), indent=2) + "\n")
+
+    return cached(folder, current, _read_study, make, write)
 
 
-def _standing(folder: Path) -> dict[str, Any] | None:
-    """study.json of a folder that has both files of a study, whole; else None."""
-    try:
-        old: dict[str, Any] = json.loads((folder / NUMBERS).read_text(encoding="utf-8"))
-        return old if (folder / TABLE).is_file() and {"fingerprint", "cases"} <= old.keys() else None
-    except (OSError, ValueError, AttributeError):
-        return None
+def _read_study(folder: Path) -> tuple[tuple[StudyCase, ...], str | None]:
+    """Return the cases in study.json, and its fingerprint if study.csv is there too."""
+    study = StudyFile.model_validate_json((folder / NUMBERS).read_bytes())
+    return study.cases, study.fingerprint if (folder / TABLE).is_file() else None
 
 
-def rows(cases: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """The lines of the printed table."""
+def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:
+    """Return the model and its errors, one row per case."""
     lines: list[tuple[str, str]] = []
     for case in cases:
-        told = f"predicted {case['predicted']:.4g}"
-        if case["mse"] is not None:
-            told = f"mean squared error {case['mse']:.4g}, {told}"
-        if case["mse"] is not None and case["low"] is not None:
-            within = "inside" if case["low"] <= case["mse"] <= case["high"] else "OUTSIDE"
-            told += f"; for this picture {case['expected']:.4g}, {within} {case['low']:.4g} to {case['high']:.4g}"
-        lines.append((WORDS[case["model"]], told))
+        words = f"predicted {case.predicted:.4g}"
+        if case.mse is not None:
+            words = f"mean squared error {case.mse:.4g}, {words}"
+        if case.mse is not None and case.low is not None and case.high is not None:
+            place = "inside" if case.low <= case.mse <= case.high else "OUTSIDE"
+            words += f"; for this picture {case.expected:.4g}, {place} {case.low:.4g} to {case.high:.4g}"
+        lines.append((LABELS[case.model], words))
     return lines

@@ -1,4 +1,4 @@
-"""What follows from a scene, for people: the geometry of every lens type, what it sees, and the plan of a run."""
+"""The geometry of a scene's lens types, what they see, and the plan of a run, as JSON and as tables."""
 
 from __future__ import annotations
 
@@ -6,28 +6,36 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.reconstruct.method_choice import MethodChoice
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
-from ommatid.scenes.skipped import skipped_effects
+from ommatid.scenes.setup import Setup
+
+METHODS = {
+    "dense": "one dense problem",
+    "robust": "one dense problem, misalignment as noise",
+    "fit": "one dense problem, H fitted to the stack",
+    "tiles": "tile by tile",
+    "frame": "the whole frame at once",
+}
 
 
 def describe(
-    scene: Scene,
-    camera: Camera,
+    setup: Setup,
     variant: str,
-    reconstruction: dict[str, Any],
+    choice: MethodChoice | None,
     optics: list[dict[str, Any]] | None = None,
     light: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Geometry and plan in JSON's types; lengths are millimetres.
+    """Return geometry and plan in JSON's types; lengths are millimetres.
 
-    reconstruction : the plan of the last stage;  optics : what each lens type with an aperture does to sharpness
-    light : electrons that are collected, of a scene with a [sensor]
+    choice : of the estimator's method;  optics : the sharpness of lens types with an aperture
+    light : collected electrons, of a scene with a [sensor]
     """
+    scene, camera = setup.scene, setup.camera
     seen = camera.types_seeing()
-    fewer = {
-        str(count): int(np.sum(seen == count)) for count in range(len(camera.types)) if bool(np.any(seen == count))
-    }
+    counts = range(len(camera.types))
     return {
         "title": scene.title,
         "target": {
@@ -37,68 +45,71 @@ def describe(
             "height": camera.rows * camera.target_pitch,
             "distance": camera.distance,
         },
-        "lens_types": [_lens_type(camera, place) for place in range(len(camera.types))],
+        "lens_types": [_lens_type(camera, lens_type) for lens_type in camera.types],
         "measurements": camera.measurements,
         "unknowns": camera.unknowns,
-        "pixels_seen_by_fewer_types": fewer,
-        "where": _where(camera),
+        "pixels_seen_by_fewer_types": {
+            str(count): int(np.sum(seen == count)) for count in counts if bool(np.any(seen == count))
+        },
+        "where": _unseen_edges(camera),
         **({"optics": optics} if optics else {}),
         **({"light": light} if light is not None else {}),
-        "plan": _plan(scene, camera, variant, reconstruction),
-        "skipped": [left.describe() for left in skipped_effects(scene, camera)],
+        "plan": _plan(scene, camera, variant, choice),
+        "skipped": [skipped.describe() for skipped in setup.skipped],
     }
 
 
-def _lens_type(camera: Camera, place: int) -> dict[str, Any]:
-    kind = camera.types[place]
+def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
     return {
-        "name": kind.name,
-        "magnification": str(1 / kind.ratio),
-        "array": list(kind.array),
-        "pixels": list(kind.pixels),
-        "step": str(kind.step),
-        "sees_rows": [kind.origin[0], float(kind.origin[0] + kind.span[0])],
-        "sees_columns": [kind.origin[1], float(kind.origin[1] + kind.span[1])],
-        "sensor_depth": camera.depth(kind),
-        "focal_length": camera.focal_length(kind),
-        "sub_image_width": kind.pixels[1] * camera.pixel_pitch,
-        "measurements": kind.measurements,
+        "name": lens_type.name,
+        "magnification": str(1 / lens_type.ratio),
+        "array": list(lens_type.array),
+        "pixels": list(lens_type.pixels),
+        "step": str(lens_type.step),
+        "sees_rows": [lens_type.origin[0], float(lens_type.origin[0] + lens_type.span[0])],
+        "sees_columns": [lens_type.origin[1], float(lens_type.origin[1] + lens_type.span[1])],
+        "sensor_depth": camera.depth(lens_type),
+        "focal_length": camera.focal_length(lens_type),
+        "sub_image_width": lens_type.pixels[1] * camera.pixel_pitch,
+        "measurements": lens_type.measurements,
     }
 
 
-def _where(camera: Camera) -> list[str]:
-    """In words, which edges of the target each lens type does not see."""
-    found: list[str] = []
-    for kind in camera.types:
-        top, left = kind.origin
-        bottom, right = camera.rows - top - kind.span[0], camera.columns - left - kind.span[1]
+def _unseen_edges(camera: Camera) -> list[str]:
+    """Return one sentence per lens type that does not see all edges of the target."""
+    sentences: list[str] = []
+    for lens_type in camera.types:
+        top, left = lens_type.origin
+        bottom, right = camera.rows - top - lens_type.span[0], camera.columns - left - lens_type.span[1]
         edges = (("top", top), ("bottom", bottom), ("left", left), ("right", right))
         missed = [f"{float(width):g} at the {edge}" for edge, width in edges if width > 0]
         if missed:
-            found.append(f"type {kind.name} does not see the pixels {', '.join(missed)}")
-    return found
+            sentences.append(f"type {lens_type.name} does not see the pixels {', '.join(missed)}")
+    return sentences
 
 
-def _plan(scene: Scene, camera: Camera, variant: str, reconstruction: dict[str, Any]) -> dict[str, Any]:
-    plan: dict[str, Any] = {
-        "render": {"variant": variant, "samples": _samples(scene), "sensors": len(camera.sub_imagers)},
-        "calibrate": {"method": scene.calibration.method},
-        "reconstruct": reconstruction,
+def _plan(scene: Scene, camera: Camera, variant: str, choice: MethodChoice | None) -> dict[str, Any]:
+    render, calibration = scene.render, scene.calibration
+    limit = "" if render.time is None else f" for {render.time:g} s at most"
+    samples = f"{render.samples}{limit}" if limit else render.samples
+    calibrate: dict[str, Any] = {"method": calibration.method}
+    if calibration.method in ("points", "transport"):
+        calibrate |= {"variant": variant, "samples": calibration.samples}
+    if calibration.method == "points":
+        calibrate["sources"] = camera.unknowns
+    reconstruct: dict[str, str] = {}
+    if choice is not None:
+        needs = f"{max(choice.seconds, 0.1):.2g} s and {max(choice.memory, 10**8) / 1e9:.1f} GB"
+        reconstruct = {"method": METHODS[choice.method], "why": choice.why, "about": needs}
+    return {
+        "render": {"variant": variant, "samples": samples, "sensors": len(camera.sub_imagers)},
+        "calibrate": calibrate,
+        "reconstruct": reconstruct,
     }
-    if scene.calibration.method == "points":
-        plan["calibrate"] |= {"variant": variant, "samples": scene.calibration.samples, "sources": camera.unknowns}
-    if scene.calibration.method == "transport":
-        plan["calibrate"] |= {"variant": variant, "samples": scene.calibration.samples}
-    return plan
-
-
-def _samples(scene: Scene) -> int | str:
-    ends = "" if scene.render.time is None else f" for {scene.render.time:g} s at most"
-    return f"{scene.render.samples}{ends}" if ends else scene.render.samples
 
 
 def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """The same as titled tables of two columns."""
+    """Return the description as titled tables of two columns."""
     target = description["target"]
     geometry = [
         ("target", f"{target['rows']} x {target['columns']} pixels, {target['height']:g} x {target['width']:g} mm"),
@@ -112,33 +123,31 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
     else:
         geometry.append(("edges", "every pixel is seen by every lens type"))
     lenses = [
-        (f"lens type {kind['name']}, {kind['magnification']}", _lens_words(kind)) for kind in description["lens_types"]
+        (f"lens type {lens['name']}, {lens['magnification']}", _lens_words(lens)) for lens in description["lens_types"]
     ]
     stages = [
-        (stage, ", ".join(f"{key} {value}" for key, value in does.items()))
-        for stage, does in description["plan"].items()
+        (stage, ", ".join(f"{key} {value}" for key, value in plan.items()))
+        for stage, plan in description["plan"].items()
     ]
-    skipped = [(skip["what"], skipped_words(skip)) for skip in description["skipped"]]
-    title = description["title"] or "Camera"
+    skipped = [(skip["what"], skipped_words(skip["why"], skip.get("bound"))) for skip in description["skipped"]]
     return [
-        (title, geometry),
+        (description["title"] or "Camera", geometry),
         ("Lens types", lenses),
         ("What will run", stages),
         ("What is left out, and why", skipped),
     ]
 
 
-def skipped_words(skip: dict[str, Any]) -> str:
-    """In words, with the bound on what it changes."""
-    bound = f"; no measurement changes by more than {skip['bound']:.2g}" if "bound" in skip else ""
-    return f"{skip['why']}{bound}"
+def skipped_words(why: str, bound: float | None) -> str:
+    """Return the reason for skipping an effect, with the bound on what it changes."""
+    return why if bound is None else f"{why}; no measurement changes by more than {bound:.2g}"
 
 
-def _lens_words(kind: dict[str, Any]) -> str:
-    array, pixels = kind["array"], kind["pixels"]
+def _lens_words(lens: dict[str, Any]) -> str:
+    array, pixels = lens["array"], lens["pixels"]
     return (
         f"{array[0]} x {array[1]} sub-imagers of {pixels[0]} x {pixels[1]} pixels,"
-        f" {kind['sub_image_width']:.3g} mm wide,"
-        f" focal length {kind['focal_length']:.4g} mm, sensor {kind['sensor_depth']:.4g} mm behind the lens,"
-        f" rows {kind['sees_rows'][0]:g} to {kind['sees_rows'][1]:g}"
+        f" {lens['sub_image_width']:.3g} mm wide,"
+        f" focal length {lens['focal_length']:.4g} mm, sensor {lens['sensor_depth']:.4g} mm behind the lens,"
+        f" rows {lens['sees_rows'][0]:g} to {lens['sees_rows'][1]:g}"
     )

@@ -1,4 +1,4 @@
-"""Error against run time of every stage of a scene: what `bench` measures, writes, draws and recommends."""
+"""Measure error against run time of every stage of a scene, for `ommatid bench`: table, figures and recommendation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import platform
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from time import perf_counter
 from typing import cast
@@ -17,6 +18,7 @@ from ommatid.runtime.files import digest, fingerprint, make_folder
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.scene import Sampler, Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
@@ -27,69 +29,91 @@ from . import table as bench_file
 from .figure import write_figures
 from .jobs import Subject, jobs
 from .reference import REFERENCE, reference
-from .scheduler import Job, Journal, measure, name_of
+from .scheduler import Journal, measure, name_of
 from .slopes import recommend, slope
-from .table import JSON, BenchTable, Cell, ConvergenceCurve, SkippedJob, Stage
+from .table import AUTO, JSON, STAGES, BenchTable, Cell, ConvergenceCurve, SkippedJob, Stage
 
 PARTIAL = ".bench.partial.jsonl"
-FLAT: dict[Stage, float] = {"render": 1e-5 * 255, "calibrate": 1e-5}  # errors below which float32 shows, and no slope
-PATIENCE = 0.1  # of the time: how long the noise alone may take
-SETTING_UP = 0.02  # of the progress: the reference, and what the noise alone leaves
+ROUNDING: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below these are float32 rounding
+FLOOR_SHARE = 0.1  # of the time limit, for the noise floor
+SETUP_SHARE = 0.02  # of the progress, for the reference and the noise floor
 
 
 def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
-    """The table of a scene, and whether anything had to be measured for it; what stands in `folder` is not repeated.
+    """Return the bench table of a scene, and True if anything had to be measured for it.
 
-    seconds : that it may take; cells that do not fit are left out
-    Raises InputError for a scene that cannot be measured, and where `folder` holds the table of another scene.
+    Cells that are already in `folder` are not measured again; those that do not fit into the time limit are left out.
+
+    seconds : time limit
+    Raises InputError for a scene that cannot be measured, and if `folder` holds the table of another scene.
     """
     start = perf_counter()
-    setup = replace(setup, scene=_as_measured(setup.scene))
-    _refuse(setup)
-    what = _described(setup)
-    made = fingerprint([what, versions("mitsuba", "drjit", "scipy")])
-    old = _standing(folder, what)
-    if old is not None and old.fingerprint == made and not (old.budget < seconds and any(o.late for o in old.left_out)):
-        return old, False
+    if setup.scene.world is not None:
+        raise InputError(
+            f"{setup.scene.source}: bench measures flat targets, got a [world]; remove it, or choose another scene"
+        )
+    setup = replace(setup, scene=_with_exact_assumptions(setup.scene), given_image=setup.image)
+    scene, camera = setup.scene, setup.camera
+    check_scene(setup, calibrates=False)
+    subject_print = _fingerprint(setup)
+    made_from = fingerprint([subject_print, versions("mitsuba", "drjit", "scipy")])
+    previous = _previous(folder, subject_print)
+    if previous is not None and previous.fingerprint == made_from:
+        if previous.budget >= seconds or not any(job.late for job in previous.left_out):
+            return previous, False
+    else:
+        previous = None
     make_folder(folder)
-    finished = Journal(folder / PARTIAL, made)
-    if old is not None and old.fingerprint == made:
-        for cell in old.cells:
-            finished.cells.setdefault(name_of(cell), cell)
-        finished.seconds = max(finished.seconds, old.seconds)
-    before = finished.seconds
-    with naming_source(setup.scene.source):
-        found = reference(setup, folder, lambda done: progress(SETTING_UP * done))
-        subject = Subject(setup, found, PATIENCE * seconds)
-        told, left_out = jobs(subject)
-    spent = perf_counter() - start
-    late = measure(told, seconds, finished, lambda done: progress(SETTING_UP + (1 - SETTING_UP) * done), spent)
-    left_out += [SkippedJob(name, why) for name, why in finished.refused.items()]
-    total = before + perf_counter() - start
-    table = _table(subject, told, finished, [*left_out, *late], (what, made, seconds, total))
+    journal = Journal(folder / PARTIAL, made_from)
+    if previous is not None:
+        for cell in previous.cells:
+            journal.cells.setdefault(name_of(cell), cell)
+        journal.seconds = max(journal.seconds, previous.seconds)
+    seconds_before = journal.seconds
+    with naming_source(scene.source):
+        right = reference(setup, folder, lambda share: progress(SETUP_SHARE * share))
+        subject = Subject(setup, right, FLOOR_SHARE * seconds)
+        listed, left_out = jobs(subject)
+    late = measure(
+        listed,
+        seconds,
+        journal,
+        lambda share: progress(SETUP_SHARE + (1 - SETUP_SHARE) * share),
+        perf_counter() - start,
+    )
+    left_out += [SkippedJob(what=name, why=why) for name, why in journal.refused.items()]
+    cells = tuple(journal.cells[job.name] for job in listed if job.name in journal.cells)
+    table = BenchTable(
+        title=scene.title or scene.source.stem,
+        scene=subject_print,
+        fingerprint=made_from,
+        camera=camera.describe(),
+        machine={"cores": os.cpu_count(), "system": platform.platform(), "load": os.getloadavg()[0]},
+        versions=versions("mitsuba", "drjit", "scipy"),
+        against=right.description,
+        noise_deviation=_noise_deviation(subject),
+        budget=seconds,
+        seconds=seconds_before + perf_counter() - start,
+        cells=cells,
+        curves=tuple(curves(cells, camera)),
+        recommended=recommend(cells, subject.noise_floor),
+        left_out=(*left_out, *late),
+    )
     write_figures(folder, table)
     bench_file.write(folder, table)
-    finished.remove()
+    journal.remove()
     (folder / REFERENCE).unlink(missing_ok=True)
     return table, True
 
 
-def _as_measured(scene: Scene) -> Scene:
-    """Without what the cells set themselves; a misaligned camera is one whose H was calibrated."""
+def _with_exact_assumptions(scene: Scene) -> Scene:
+    """Return the scene without misalignment of its estimator and without a study, which the cells replace."""
     estimator = scene.estimator.model_copy(update={"misalignment": "trust"})
     return scene.model_copy(update={"estimator": estimator, "study": None})
 
 
-def _refuse(setup: Setup) -> None:
-    if setup.scene.world is not None:
-        raise InputError(
-            f"{setup.scene.source}: bench measures flat targets, got a [world]; remove it, or take another scene"
-        )
-    check_scene(setup, calibrates=False)
-
-
-def _described(setup: Setup) -> str:
-    """Fingerprint of what is measured, whatever samples and methods the scene itself asks for."""
+def _fingerprint(setup: Setup) -> str:
+    """Return the fingerprint of camera, image and scene without the keys that the cells set."""
     tables = setup.scene.plain()
     for table, keys in {"render": ("samples", "variant"), "calibration": ("samples", "method", "fit")}.items():
         tables[table] = {key: value for key, value in tables[table].items() if key not in keys}
@@ -98,105 +122,87 @@ def _described(setup: Setup) -> str:
     return fingerprint([setup.camera.describe(), tables, digest(setup.image.astype("float32"))])
 
 
-def _standing(folder: Path, what: str) -> BenchTable | None:
+def _previous(folder: Path, subject_print: str) -> BenchTable | None:
     path = folder / JSON
     if not path.exists():
         return None
     try:
-        old = bench_file.read(path)
-    except InputError:  # damaged: to be made again
+        previous = bench_file.read(path)
+    except InputError:  # damaged: measure again
         return None
-    if old.scene != what:
+    if previous.scene != subject_print:
         raise InputError(
-            f"{path}: is of another scene, '{old.title}', or of other values of its keys; choose another folder with -o"
+            f"{path}: is of another scene, '{previous.title}', or of other values of its keys; choose another folder"
+            " with -o"
         )
-    return old
-
-
-def _table(
-    subject: Subject,
-    told: Sequence[Job],
-    finished: Journal,
-    left_out: list[SkippedJob],
-    numbers: tuple[str, str, float, float],
-) -> BenchTable:
-    cells = [finished.cells[job.name] for job in told if job.name in finished.cells]
-    what, made, budget, total = numbers
-    return BenchTable(
-        title=subject.scene.title or subject.scene.source.stem,
-        scene=what,
-        fingerprint=made,
-        camera=subject.camera.describe(),
-        machine={"cores": os.cpu_count(), "system": platform.platform(), "load": os.getloadavg()[0]},
-        versions=versions("mitsuba", "drjit", "scipy"),
-        against=subject.reference.words,
-        noise_deviation=_noise_deviation(subject),
-        budget=budget,
-        seconds=total,
-        cells=tuple(cells),
-        curves=tuple(curves(cells, subject.camera)),
-        recommended=recommend(cells, subject.floor),
-        left_out=tuple(left_out),
-    )
+    return previous
 
 
 def _noise_deviation(subject: Subject) -> float:
-    """Root mean square of what the sensor adds to exact light, in values of f."""
-    away = subject.stack(0).values - subject.reference.light
-    return float(np.sqrt(np.nanmean(np.square(away))))
+    """Return the root mean square of the sensor's noise on exact light, in pixel values of f."""
+    noise = subject.stack(0).values - subject.reference.light
+    return float(np.sqrt(np.nanmean(np.square(noise))))
 
 
 def curves(cells: Sequence[Cell], camera: Camera) -> list[ConvergenceCurve]:
-    """The slope of each way of rendering and calibrating, beside what theory says."""
+    """Return the slope of each method of rendering and calibration, and its theoretical slope."""
     found: list[ConvergenceCurve] = []
-    for stage, limit in FLAT.items():
-        some = [cell for cell in cells if cell.stage == stage and cell.counted]
-        for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in some):
-            alike = [cell for cell in some if (cell.way, cell.variant) == (way, variant) and cell.error.median > limit]
-            found.append(_curve(alike, camera, (stage, way, variant)))
+    for stage, limit in ROUNDING.items():
+        counted = [cell for cell in cells if cell.stage == stage and cell.counted]
+        for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in counted):
+            used = [cell for cell in counted if (cell.way, cell.variant) == (way, variant)]
+            found.append(_curve([cell for cell in used if cell.error.median > limit], camera, stage, way, variant))
     return found
 
 
-def _curve(cells: Sequence[Cell], camera: Camera, key: tuple[Stage, str, str | None]) -> ConvergenceCurve:
-    stage, way, variant = key
+def _curve(cells: Sequence[Cell], camera: Camera, stage: Stage, way: str, variant: str | None) -> ConvergenceCurve:
     theory = law(cast(Sampler, way.split(", ")[-1]), camera)
-    limited = theory.least > 1
-    used = [cell for cell in cells if not limited or (cell.samples or 0) >= theory.least * FEWEST_PASSES]
-    fitted, why = slope(used), theory.why
-    if fitted is None:
-        why += "; fewer than three cells to fit, or errors that are rounding alone"
-        return ConvergenceCurve(stage, way, variant, None, None, theory.slope, why, None)
-    counts = [(cell.samples or 1) // FEWEST_PASSES for cell in used]
-    if limited:
+    asymptotic = theory.least > 1
+    used = [cell for cell in cells if not asymptotic or (cell.samples or 0) >= theory.least * FEWEST_PASSES]
+    fit, why, agrees = slope(used), theory.why, None
+    if fit is None:
+        why += "; fewer than three cells to fit, or errors at the level of rounding"
+    elif asymptotic:
         why += f"; fitted from {theory.least * FEWEST_PASSES} samples on"
-    allowed = corners(camera, min(counts), max(counts)) if limited and theory.slope is not None else 0.0
-    if 0 < allowed < float("inf"):
-        why += f", where strata that hold corners may change it by {allowed:.2g}"
-    agrees = None if theory.slope is None or allowed == float("inf") else fitted.agrees(theory.slope, allowed)
-    return ConvergenceCurve(stage, way, variant, fitted.value, fitted.deviation, theory.slope, why, agrees)
+    if fit is not None and theory.slope is not None:
+        counts = [(cell.samples or 1) // FEWEST_PASSES for cell in used]
+        margin = corners(camera, min(counts), max(counts)) if asymptotic else 0.0
+        if 0 < margin < inf:
+            why += f", where strata that contain corners may change it by {margin:.2g}"
+        agrees = None if margin == inf else fit.agrees(theory.slope, margin)
+    return ConvergenceCurve(
+        stage=stage,
+        way=way,
+        variant=variant,
+        slope=None if fit is None else fit.value,
+        slope_deviation=None if fit is None else fit.deviation,
+        theory=theory.slope,
+        why=why,
+        agrees=agrees,
+    )
 
 
 def rows(table: BenchTable) -> list[tuple[str, str]]:
-    """The lines of the printed table: slopes, what is recommended, and what was left out."""
+    """Return the rows of the printed table: slopes, recommended settings, and what was left out."""
     lines: list[tuple[str, str]] = []
     for curve in table.curves:
         if curve.slope is None or curve.slope_deviation is None:
             continue
-        beside = "" if curve.theory is None else f", theory {curve.theory:g}"
-        verdict = "" if curve.agrees is None else (": agrees" if curve.agrees else ": does not agree")
+        theory = "" if curve.theory is None else f", theory {curve.theory:g}"
+        agreement = "" if curve.agrees is None else (": agrees" if curve.agrees else ": does not agree")
         name = f"slope, {curve.stage} {curve.way}, {curve.variant}"
-        lines.append((name, f"{curve.slope:.3f} ± {curve.slope_deviation:.3f}{beside}{verdict}"))
-    for stage in bench_file.STAGES:
-        best = table.recommended.get(stage)
-        if best is not None:
-            words = [str(value) for key, value in best.items() if key not in ("samples", "seconds") and value]
-            if "samples" in best:
-                counted = best["samples"] != bench_file.AUTO
-                words.append(f"{best['samples']} samples" if counted else f'samples = "{bench_file.AUTO}"')
-            lines.append((f"recommended, {stage}", f"{', '.join(words)}, {best['seconds']:.2g} s"))
-    lines.append(("why", str(table.recommended["why"])))
-    lines.append(("cells", f"{len(table.cells)} in {table.seconds:.0f} s, held against {table.against}"))
-    late = sum(one.late for one in table.left_out)
+        lines.append((name, f"{curve.slope:.3f} ± {curve.slope_deviation:.3f}{theory}{agreement}"))
+    for stage in STAGES:
+        best = table.recommended.of(stage)
+        if best is None:
+            continue
+        words = [word for word in (best.method, best.setting, best.sampler, best.variant) if word]
+        if best.samples is not None:
+            words.append(f'samples = "{AUTO}"' if best.samples == AUTO else f"{best.samples} samples")
+        lines.append((f"recommended, {stage}", f"{', '.join(words)}, {best.seconds:.2g} s"))
+    lines.append(("why", table.recommended.why))
+    lines.append(("cells", f"{len(table.cells)} in {table.seconds:.0f} s, compared with {table.against}"))
+    late = sum(job.late for job in table.left_out)
     if late:
         lines.append(("left out", f"{late} cells that did not fit into {table.budget:g} s; raise --seconds"))
     return lines

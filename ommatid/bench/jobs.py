@@ -1,4 +1,4 @@
-"""The cells that `bench` measures of a scene: every sampler, method and way, with what each repeat of one does."""
+"""The cells that `bench` measures for a scene: every sampler, calibration method and solver."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from time import perf_counter
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.assumptions import method_for
-from ommatid.reconstruct.method_choice import DENSE
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.method import EstimationTask
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -30,166 +30,171 @@ from ommatid.simulate.renderer.variant import PREFERENCE, release, unusable_reas
 from ommatid.simulate.sampling.seeds import repeat_seed
 
 from . import reference
-from .precision import ExactSolution, SolverSetting, exact_solution, settings
+from .precision import ExactSolution, SolverSetting, exact_solution, solver_settings
 from .reference import Reference, Samples
 from .resources import Cost, measure_cost
-from .scheduler import FEWER, REPEATS, Job, Repeat
+from .scheduler import FEWER_REPEATS, REPEATS, Job, Repeat
 from .table import AUTO, SkippedJob
 
-Image = NDArray[np.float64]
 Method = Literal["points", "transport"]
 Result = TypeVar("Result")
 
-SAMPLES = tuple(4**power for power in range(1, 8))  # a pixel, 4 to 16384
+SAMPLES = tuple(4**power for power in range(1, 8))  # per pixel, 4 to 16384
 SAMPLERS: tuple[Sampler, ...] = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
-RAYS = {"scalar_rgb": 5e6, "llvm_ad_mono": 3e7, "cuda_ad_mono": 3e8}  # a second, about: only an order to begin with
-READY = {"scalar_rgb": 0.02, "llvm_ad_mono": 0.03, "cuda_ad_mono": 0.05}  # seconds before the first ray, about
-TWICE = 2  # estimates that a calibrated H takes: its uncertainty adds noise that the first one shows
-JUDGING = 2  # more of them, where an H is judged by what its uncertainty adds
-BY_ITSELF = 0.005  # seconds that a sub-imager takes which is rendered by itself, about
+# Orders of magnitude, for a first guess of durations:
+RAYS_PER_SECOND = {"scalar_rgb": 5e6, "llvm_ad_mono": 3e7, "cuda_ad_mono": 3e8}
+STARTUP = {"scalar_rgb": 0.02, "llvm_ad_mono": 0.03, "cuda_ad_mono": 0.05}  # seconds before the first ray
+SUB_IMAGER_STARTUP = 0.005  # seconds per sub-imager that is rendered separately
+ESTIMATES = 2  # per calibrated H: the first shows how much noise the uncertainty of H adds
+STOPPING_ESTIMATES = 2  # in addition, where the calibration stops at a goal for that noise
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The scene that is measured: its camera, its target, and what is right of both.
+    """The scene that is measured, with its image, and the reference.
 
-    patience : seconds after which no more estimates are made of what the noise alone leaves
+    time_limit : seconds after which no more estimates of the noise floor are made
     """
 
     setup: Setup
     reference: Reference
-    patience: float = inf
+    time_limit: float = inf
 
     @property
     def scene(self) -> Scene:
-        """The scene."""
+        """The scene of the setup."""
         return self.setup.scene
 
     @property
     def camera(self) -> Camera:
-        """Its camera."""
+        """The camera of the setup."""
         return self.setup.camera
 
+    def changed(self, scene: Scene) -> Setup:
+        """Return the setup with other settings of its stages."""
+        return replace(self.setup, scene=scene)
+
     def noise(self, repeat: int) -> Setup:
-        """The setup with the sensor's noise of a repeat, which all cells share."""
-        return self._seeded("noise", repeat)
+        """Return the setup with the seed of the sensor's noise of a repeat, which all cells share."""
+        render = self.scene.render.model_copy(update={"seed": self.seed("noise", repeat)})
+        return self.changed(self.scene.model_copy(update={"render": render}))
 
     def seed(self, name: str, repeat: int) -> int:
-        """Of the rays of a cell's repeat."""
+        """Return the seed of the rays of a cell's repeat."""
         return repeat_seed(self.scene.render.seed, name, repeat)
 
     def stack(self, repeat: int) -> Stack:
-        """Exact light, recorded."""
-        return reference.stack_of_light(self.noise(repeat), self.reference.light, self.reference)
+        """Return exact light, recorded with the noise of a repeat."""
+        return reference.record_light(self.noise(repeat), self.reference.light, self.reference)
 
-    def squares(self, image: Image) -> float:
-        """Mean squared error of an estimate, (N,)."""
+    def mean_squared_error(self, image: FloatArray) -> float:
+        """Return the mean squared error of an estimate, (N,)."""
         return float(np.mean(np.square(image - self.setup.image.ravel())))
 
     @property
-    def large(self) -> bool:
-        """Whether the estimate is one of a frame or of tiles, which noise of its own in every pixel would slow down."""
-        return self.camera.unknowns > DENSE
+    def is_large(self) -> bool:
+        """True if the solver is a frame or tiles, which are slow for a different noise variance in every pixel."""
+        return self.camera.unknowns > MAX_DENSE_PIXELS
 
-    def of_rendering(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
-        """Mean squared error of the estimate from a rendering and exact H, freed of this noise's luck."""
+    def rendering_mse(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
+        """Return the mean squared error of the image from a rendering and exact H, normalised."""
         setup = self.noise(repeat)
-        once = isinstance(rendering, Rendering) and rendering.passes == 1  # whose variance nobody knows
-        if self.large or once:
-            return self._brought(reference.stack_of_light(setup, rendering.mean, self.reference), repeat)
-        return self._brought(reference.stack_of(setup, rendering), repeat)
+        single_pass = isinstance(rendering, Rendering) and rendering.passes == 1  # with unknown variance
+        if self.is_large or single_pass:
+            stack = reference.record_light(setup, rendering.mean, self.reference)
+        else:
+            stack = reference.record_rendering(setup, rendering)
+        return self.normalised(self._mse_with_exact_model(stack), repeat)
 
-    def of_model(self, model: Model, repeat: int) -> float:
-        """Mean squared error of the estimate from exact light with a calibrated H, freed of this noise's luck.
+    def model_mse(self, model: Model, repeat: int) -> float:
+        """Return the mean squared error of the image from exact light and a calibrated H, normalised.
 
-        Where that is large the two change places: light through the calibrated H and an estimate with the exact one,
-        which to first order in the error of H are wrong by the same, A dH f.
+        For large cameras the two are exchanged: light computed with the calibrated H, and an estimate with the exact
+        one. To first order in the error dH of H both have the same error, A dH f.
         """
-        if not self.large:
-            return self.freed(self.squares(method_for(self.stack(repeat), model).image), repeat)
+        if not self.is_large:
+            return self.normalised(self.mean_squared_error(method_for(self.stack(repeat), model).image), repeat)
         light = model.forward(self.setup.image.ravel())
-        return self._brought(reference.stack_of_light(self.noise(repeat), light, self.reference), repeat)
+        stack = reference.record_light(self.noise(repeat), light, self.reference)
+        return self.normalised(self._mse_with_exact_model(stack), repeat)
 
-    def _brought(self, stack: Stack, repeat: int) -> float:
-        return self.freed(self.squares(method_for(stack, self.reference.model).image), repeat)
+    def normalised(self, mse: float, repeat: int) -> float:
+        """Return a mean squared error without the random deviation of the sensor's noise in a repeat from its median.
 
-    def freed(self, squares: float, repeat: int) -> float:
-        """A mean squared error with the noise of a repeat as it would be with noise of middling luck.
-
-        It is that of the floor, times what it is more than exact light and exact H make of the same noise.
+        This is the noise floor, times the ratio of `mse` to the error with exact light, exact H and the same noise.
         """
-        own = self._own(repeat)
-        return squares / own * self.floor if own > 0 else squares
+        own = self._exact_mse(repeat)
+        return mse / own * self.noise_floor if own > 0 else mse
 
-    def _own(self, repeat: int) -> float:
-        """Mean squared error with exact light and exact H and the noise of a repeat."""
-        if repeat not in self._known:
-            self._known[repeat] = self.squares(method_for(self.stack(repeat), self.reference.model).image)
-        return self._known[repeat]
+    def _mse_with_exact_model(self, stack: Stack) -> float:
+        return self.mean_squared_error(method_for(stack, self.reference.model).image)
+
+    def _exact_mse(self, repeat: int) -> float:
+        if repeat not in self._exact_mses:
+            self._exact_mses[repeat] = self._mse_with_exact_model(self.stack(repeat))
+        return self._exact_mses[repeat]
 
     @cached_property
-    def _known(self) -> dict[int, float]:
+    def _exact_mses(self) -> dict[int, float]:
         return {}
 
     @cached_property
-    def _alone(self) -> tuple[list[float], float]:
-        start, found = perf_counter(), list[float]()
-        while not found or (len(found) < REPEATS and perf_counter() - start < self.patience):
-            found.append(self._own(len(found)))
-        return found, (perf_counter() - start) / len(found)
+    def _floor_and_duration(self) -> tuple[float, float]:
+        start, errors = perf_counter(), list[float]()
+        while not errors or (len(errors) < REPEATS and perf_counter() - start < self.time_limit):
+            errors.append(self._exact_mse(len(errors)))
+        return float(np.median(errors)), (perf_counter() - start) / len(errors)
 
     @property
-    def solving(self) -> float:
-        """Seconds that each of them took."""
-        return self._alone[1]
+    def noise_floor(self) -> float:
+        """Median of the mean squared error with exact light and exact H over repeats of the noise."""
+        return self._floor_and_duration[0]
 
     @property
-    def floor(self) -> float:
-        """Their median: what the noise alone leaves."""
-        return float(np.median(self._alone[0]))
-
-    def _seeded(self, what: str, repeat: int) -> Setup:
-        render = self.scene.render.model_copy(update={"seed": self.seed(what, repeat)})
-        return replace(self.setup, scene=self.scene.model_copy(update={"render": render}))
+    def estimate_seconds(self) -> float:
+        """Mean duration of an estimate with exact light and exact H."""
+        return self._floor_and_duration[1]
 
 
 def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
-    """All cells, and what cannot be measured here, with the reason."""
-    working = [variant for variant in PREFERENCE if not unusable_reason(variant)]
-    left_out = [SkippedJob(variant, unusable_reason(variant)) for variant in PREFERENCE if variant not in working]
+    """Return all cells, and those that cannot be measured on this machine or for this scene, with the reason."""
+    reasons = {variant: unusable_reason(variant) for variant in PREFERENCE}
+    working = [variant for variant in PREFERENCE if not reasons[variant]]
+    left_out = [SkippedJob(what=variant, why=reason) for variant, reason in reasons.items() if reason]
     if not subject.camera.is_ideal_pinhole and "scalar_rgb" in working:
         working.remove("scalar_rgb")
-        left_out.append(SkippedJob("scalar_rgb", "lenses that are more than pinholes need a fast backend"))
+        left_out.append(SkippedJob(what="scalar_rgb", why="lenses other than pinholes need a fast backend"))
     found = [*_renderings(subject, working), *_calibrations(subject, working)]
     try:
-        found += _as_needed(subject, working)
+        found += _adaptive_jobs(subject, working)
     except InputError as error:
-        left_out.append(SkippedJob("samples 'auto'", str(error)))
-    estimates, refused = _estimates(subject)
-    return [*found, *estimates], [*left_out, *refused]
+        left_out.append(SkippedJob(what="samples 'auto'", why=str(error)))
+    estimates, unsolvable = _estimates(subject)
+    return [*found, *estimates], [*left_out, *unsolvable]
 
 
 @dataclass(frozen=True)
 class JobSettings:
-    """How many samples a pixel a cell takes: `taken`, unless only the cell can tell, and about how many to begin with.
+    """Samples per pixel of a cell: the number, None if it is adaptive, and its expectation.
 
-    setting : the same for people
+    setting : the same in words
     """
 
-    taken: int | None
-    about: int
+    samples: int | None
+    expected: int
     setting: str
 
 
-def _counted(asked: int, sampler: Sampler) -> JobSettings:
-    work = reference.work_of(asked, sampler)
+def _fixed_samples(samples: int, sampler: Sampler) -> JobSettings:
+    work = reference.sample_plan(samples, sampler)
     return JobSettings(work.total, work.total, f"{work.passes} pass{'es' if work.passes > 1 else ''} of {work.samples}")
 
 
-def _as_needed(subject: Subject, variants: list[str]) -> list[Job]:
-    """With samples "auto" and the scene's own sampler. Raises InputError where there is no noise to compare with."""
+def _adaptive_jobs(subject: Subject, variants: list[str]) -> list[Job]:
+    """Return cells with samples "auto" and the scene's own sampler. Raises InputError for a scene without noise."""
     scene = subject.scene
-    work = JobSettings(None, reference.foreseen_samples(subject.setup, subject.reference), AUTO)
+    expected = reference.expected_samples(subject.setup, subject.reference)
+    work = JobSettings(None, expected, AUTO)
     found: list[Job] = []
     for variant in variants:
         found.append(_rendering(subject, variant, scene.render.sampler, AUTO, work))
@@ -202,82 +207,88 @@ def _renderings(subject: Subject, variants: list[str]) -> list[Job]:
     found: dict[str, Job] = {}
     for variant in variants:
         for sampler in SAMPLERS:
-            for asked in SAMPLES:
-                job = _rendering(subject, variant, sampler, asked, _counted(asked, sampler))
-                found.setdefault(job.name, job)  # where several counts are rounded up to one
+            for samples in SAMPLES:
+                job = _rendering(subject, variant, sampler, samples, _fixed_samples(samples, sampler))
+                found.setdefault(job.name, job)  # several numbers may be rounded up to the same
     return list(found.values())
 
 
-def _rendering(subject: Subject, variant: str, sampler: Sampler, asked: Samples, work: JobSettings) -> Job:
-    name = f"render {sampler} {variant} {work.taken or AUTO}"
+def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Samples, work: JobSettings) -> Job:
+    name = f"render {sampler} {variant} {work.samples or AUTO}"
 
-    def one(repeat: int) -> Repeat:
-        scene = reference.with_rendering(subject.scene, sampler, variant, asked, subject.seed(name, repeat))
-        rendering, cost = _costed(lambda: reference.rendered(replace(subject.setup, scene=scene)))
-        error = reference.error_of_light(rendering, subject.reference)
-        mse = subject.of_rendering(rendering, repeat) if repeat < FEWER else None
+    def repeated(repeat: int) -> Repeat:
+        scene = reference.with_rendering(subject.scene, sampler, variant, samples, subject.seed(name, repeat))
+        rendering, cost = _measured(lambda: reference.render_light(subject.changed(scene)))
+        error = reference.light_error(rendering, subject.reference)
+        mse = subject.rendering_mse(rendering, repeat) if repeat < FEWER_REPEATS else None
         return Repeat(error, cost, mse, int(rendering.record()["samples"]))
 
-    ready = READY[variant] + (BY_ITSELF * len(subject.camera.sub_imagers) if asked == AUTO else 0.0)
-    guess = ready + work.about * subject.camera.measurements / RAYS[variant] + subject.solving
-    return Job("render", sampler, variant, work.taken, work.setting, guess, one)
+    startup = STARTUP[variant]
+    if samples == AUTO:
+        startup += SUB_IMAGER_STARTUP * len(subject.camera.sub_imagers)
+    rays = work.expected * subject.camera.measurements
+    guess = startup + rays / RAYS_PER_SECOND[variant] + subject.estimate_seconds
+    return Job("render", sampler, variant, work.samples, work.setting, guess, repeated)
 
 
 def _calibrations(subject: Subject, variants: list[str]) -> list[Job]:
-    own, found = subject.scene.render.sampler, dict[str, Job]()
+    own_sampler, found = subject.scene.render.sampler, dict[str, Job]()
     for variant in variants:
-        rays: tuple[Sampler, ...] = () if variant.startswith("scalar") else SAMPLERS
-        methods: list[tuple[Method, Sampler]] = [("points", own), *(("transport", sampler) for sampler in rays)]
+        transport: tuple[Sampler, ...] = () if variant.startswith("scalar") else SAMPLERS
+        methods: list[tuple[Method, Sampler]] = [
+            ("points", own_sampler),
+            *(("transport", sampler) for sampler in transport),
+        ]
         for method, sampler in methods:
-            for asked in SAMPLES[1:]:  # fewer than there are passes cannot be asked for
-                job = _calibration(subject, variant, method, sampler, asked, _counted(asked, sampler))
+            for samples in SAMPLES[1:]:  # the first is less than the number of passes, which a calibration refuses
+                job = _calibration(subject, variant, method, sampler, samples, _fixed_samples(samples, sampler))
                 found.setdefault(job.name, job)
     return list(found.values())
 
 
 def _calibration(
-    subject: Subject, variant: str, method: Method, sampler: Sampler, asked: Samples, work: JobSettings
+    subject: Subject, variant: str, method: Method, sampler: Sampler, samples: Samples, work: JobSettings
 ) -> Job:
     way = f"{method}, {sampler}"
-    name = f"calibrate {way} {variant} {work.taken or AUTO}"
+    name = f"calibrate {way} {variant} {work.samples or AUTO}"
 
-    def one(repeat: int) -> Repeat:
+    def repeated(repeat: int) -> Repeat:
         seed = subject.seed(name, repeat)
-        scene = reference.with_calibration(subject.scene, method, sampler, variant, asked, seed)
-        rule = for_stack(subject.stack(repeat)) if asked == AUTO else None
-        model, cost = _costed(lambda: calibrate(replace(subject.setup, scene=scene), stopping_rule=rule))
-        error = reference.error_of_model(model, subject.reference)
-        mse = subject.of_model(model, repeat) if repeat < FEWER else None
+        scene = reference.with_calibration(subject.scene, method, sampler, variant, samples, seed)
+        rule = for_stack(subject.stack(repeat)) if samples == AUTO else None
+        model, cost = _measured(lambda: calibrate(subject.changed(scene), stopping_rule=rule))
+        error = reference.model_error(model, subject.reference)
+        mse = subject.model_mse(model, repeat) if repeat < FEWER_REPEATS else None
         return Repeat(error, cost, mse, int(model.record["samples"]))
 
-    each = work.about * subject.camera.measurements / RAYS[variant]
-    solving = subject.solving * (TWICE + JUDGING if asked == AUTO else TWICE)
-    guess = 2 * READY[variant] + each * (RENDERINGS if method == "points" else 1.0) + solving
-    return Job("calibrate", way, variant, work.taken, work.setting, guess, one)
+    rendering = work.expected * subject.camera.measurements / RAYS_PER_SECOND[variant]
+    solving = subject.estimate_seconds * (ESTIMATES + (STOPPING_ESTIMATES if samples == AUTO else 0))
+    guess = 2 * STARTUP[variant] + rendering * (RENDERINGS if method == "points" else 1.0) + solving
+    return Job("calibrate", way, variant, work.samples, work.setting, guess, repeated)
 
 
 def _estimates(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
-    answers: dict[int, tuple[EstimationTask, ExactSolution]] = {}
+    solutions: dict[int, tuple[EstimationTask, ExactSolution]] = {}
 
-    def answer(repeat: int) -> tuple[EstimationTask, ExactSolution]:
-        if repeat not in answers:
+    def solution(repeat: int) -> tuple[EstimationTask, ExactSolution]:
+        if repeat not in solutions:
             task = method_for(subject.stack(repeat), subject.reference.model).task
-            known = answers[0][1].deviation if answers else None
-            answers[repeat] = task, exact_solution(task, known)
-        return answers[repeat]
+            deviation = solutions[0][1].deviation if solutions else None
+            solutions[repeat] = task, exact_solution(task, deviation)
+        return solutions[repeat]
 
     def job(setting: SolverSetting) -> Job:
-        def one(repeat: int) -> Repeat:
-            task, right = answer(repeat)
-            image, cost = _costed(lambda: setting.image(task))
-            return Repeat(right.error(image), cost, subject.freed(subject.squares(image), repeat))
+        def repeated(repeat: int) -> Repeat:
+            task, exact = solution(repeat)
+            image, cost = _measured(lambda: setting.image(task))
+            return Repeat(exact.error(image), cost, subject.normalised(subject.mean_squared_error(image), repeat))
 
-        return Job("reconstruct", setting.method, None, None, setting.setting, setting.guess, one)
+        return Job("reconstruct", setting.method, None, None, setting.setting, setting.guess, repeated)
 
-    found, refused = settings(answer(0)[0])
-    return [job(setting) for setting in found], [SkippedJob(*one) for one in refused]
+    found, unsolvable = solver_settings(solution(0)[0])
+    return [job(setting) for setting in found], [SkippedJob(what=what, why=why) for what, why in unsolvable]
 
 
-def _costed(work: Callable[[], Result]) -> tuple[Result, Cost]:
+def _measured(work: Callable[[], Result]) -> tuple[Result, Cost]:
     release()
     return measure_cost(work)

@@ -1,41 +1,50 @@
-"""Words beside the points of a plot, none on top of another."""
+"""Labels beside the points of a plot that do not overlap."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-LINE = 0.035  # of a panel's height: how far apart labels stand
-Label = tuple[float, float, str, str]  # of a point at x, y: words, colour
+LINE_HEIGHT = 0.035  # distance between labels, as a fraction of the panel's height
 
 
-def spread(panel: Any, labels: Sequence[Label], wider: float) -> None:
-    """Labels right of all points, not on top of one another, each with a thin line to its own.
+class Label(NamedTuple):
+    """The text of a point at (x, y), and its colour."""
 
-    wider : how much the panel's axis is prolonged to make room, as a power of the span it has
+    x: float
+    y: float
+    text: str
+    colour: str
+
+
+def label_points(panel: Any, labels: Sequence[Label], widening: float) -> None:
+    """Write the labels in one column to the right of all points, each with a thin line to its point.
+
+    widening : factor by which the span of the logarithmic x axis is extended to make room
     """
     left, right = panel.get_xlim()
-    panel.set_xlim(left, left * (right / left) ** wider)
+    panel.set_xlim(left, left * (right / left) ** widening)
     low, high = np.log(panel.get_ylim())
-    rising = sorted(labels, key=lambda one: one[1])
-    places = [float((np.log(value) - low) / (high - low)) for _, value, _, _ in rising]
-    apart = [LINE * (1 + words.count("\n")) for _, _, words, _ in rising]
-    for place, (x, y, words, colour) in zip(_moved_apart(places, apart), rising, strict=True):
-        leader = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "alpha": 0.6, "relpos": (0, 0.5)}
-        text = {"textcoords": "axes fraction", "va": "center", "fontsize": 8.5, "color": colour}
-        panel.annotate(words, (x, y), xytext=(1.03 / wider, place), arrowprops=leader, **text)
+    rising = sorted(labels, key=lambda label: label.y)
+    centers = [float((np.log(label.y) - low) / (high - low)) for label in rising]
+    heights = [LINE_HEIGHT * (1 + label.text.count("\n")) for label in rising]
+    for center, label in zip(_separated(centers, heights), rising, strict=True):
+        line = {"arrowstyle": "-", "color": label.colour, "linewidth": 0.5, "alpha": 0.6, "relpos": (0, 0.5)}
+        style = {"textcoords": "axes fraction", "va": "center", "fontsize": 8.5, "color": label.colour}
+        panel.annotate(label.text, (label.x, label.y), xytext=(1.03 / widening, center), arrowprops=line, **style)
 
 
-def _moved_apart(places: Sequence[float], apart: Sequence[float]) -> list[float]:
-    """Rising places between 0 and 1, moved until neighbours stand half their heights' sum from one another."""
-    found: list[float] = []
-    for number, place in enumerate(places):
-        least = found[-1] + (apart[number] + apart[number - 1]) / 2 if found else apart[0] / 2
-        found.append(max(place, least))
-    most = 1.0
-    for number in reversed(range(len(found))):
-        found[number] = min(found[number], most - apart[number] / 2)
-        most = found[number] - apart[number] / 2
-    return found
+def _separated(centers: Sequence[float], heights: Sequence[float]) -> list[float]:
+    """Move rising positions between 0 and 1 apart until labels of these heights do not overlap."""
+    moved: list[float] = []
+    bottom = 0.0
+    for center, height in zip(centers, heights, strict=True):
+        moved.append(max(center, bottom + height / 2))
+        bottom = moved[-1] + height / 2
+    top = 1.0
+    for index in reversed(range(len(moved))):
+        moved[index] = min(moved[index], top - heights[index] / 2)
+        top = moved[index] - heights[index] / 2
+    return moved

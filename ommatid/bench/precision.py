@@ -1,158 +1,153 @@
-"""What each way to the estimate costs and how right it is: dense forms, tiles of several sizes, the frame.
+"""Cost and numerical error of the solvers: dense forms, tiles of several sizes, and the frame.
 
-Errors are held against the exact answer, in posterior standard deviations of each pixel. That answer is a dense form's
-after refinement, known to fifteen digits, or, of a frame, the same frame solved a hundred times more accurately.
+Errors are relative to the exact solution, in posterior standard deviations of each pixel. The exact solution is that of
+a dense form after refinement, to fifteen digits, or, for a frame, the same frame solved to a much higher accuracy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ommatid.reconstruct.estimator.estimate import FORMS, estimate
 from ommatid.reconstruct.estimator.memory import needed_memory
 from ommatid.reconstruct.forms.form import NotSolvableError
 from ommatid.reconstruct.frame.frame_method import FrameMethod
 from ommatid.reconstruct.frame.preconditioner import is_sliding
-from ommatid.reconstruct.method_choice import DENSE
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
 from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import free_memory
 from ommatid.scenes.tables.estimation import TilesTable
 
 from .table import ALONE
 
-Vector = NDArray[np.float64]
-
-SIZES = ((11, 2), (15, 3), (19, 4), (27, 6), (35, 8), (51, 12))  # of tiles, and of the border that is dropped
-ACCURACIES = (1.0, 0.1, 0.01, 1e-3, 1e-4)  # that a frame is asked for
-EXACTLY = 1e-6  # posterior standard deviations: of the answer that these are held against
-EACH = 4e-12  # seconds, times the 3/2th power of the numbers that a form holds: about what it takes
+TILE_SIZES = ((11, 2), (15, 3), (19, 4), (27, 6), (35, 8), (51, 12))  # sides, and widths of the border that is dropped
+ACCURACIES = (1.0, 0.1, 0.01, 1e-3, 1e-4)  # estimator.accuracy of a frame
+EXACT_ACCURACY = 1e-6  # of the exact solution for a frame, in posterior standard deviations
+SECONDS_PER_WORK = 4e-12  # order of magnitude; the work of a form is the 3/2 power of the numbers it stores
 
 
 @dataclass(frozen=True)
 class SolverSetting:
-    """One way with what is set of it; `guess`: about how many seconds it takes; `image`: the estimate, (N,)."""
+    """One setting of a solver.
+
+    guess : expected duration in seconds;  image : computes the estimate, (N,)
+    """
 
     method: str
     setting: str
     guess: float
-    image: Callable[[EstimationTask], Vector]
+    image: Callable[[EstimationTask], FloatArray]
 
 
 @dataclass(frozen=True)
 class ExactSolution:
-    """The right answer to one task, (N,), and the posterior standard deviation of each pixel, (N,)."""
+    """Exact solution of a task, (N,), and the posterior standard deviation of each pixel, (N,)."""
 
-    image: Vector
-    deviation: Vector
+    image: FloatArray
+    deviation: FloatArray
 
-    def error(self, image: Vector) -> float:
-        """Root mean square over pixels, in posterior standard deviations of each; no less than float64 can tell."""
-        told = np.spacing(np.abs(self.image) + np.abs(image)) / self.deviation
-        return float(np.sqrt(np.mean(np.square((image - self.image) / self.deviation) + np.square(told))))
+    def error(self, image: FloatArray) -> float:
+        """Return the RMS difference in posterior standard deviations, at least the resolution of float64."""
+        resolution = np.spacing(np.abs(self.image) + np.abs(image)) / self.deviation
+        return float(np.sqrt(np.mean(np.square((image - self.image) / self.deviation) + np.square(resolution))))
 
 
 def is_dense(task: EstimationTask) -> bool:
-    """Whether one dense problem serves."""
-    return task.model.unknowns <= DENSE
+    """Return True if a single dense problem is small enough."""
+    return task.model.unknowns <= MAX_DENSE_PIXELS
 
 
-def exact_solution(task: EstimationTask, deviation: Vector | None = None) -> ExactSolution:
-    """The right answer; `deviation` where it is known already, since it does not depend on what was recorded.
+def exact_solution(task: EstimationTask, deviation: FloatArray | None = None) -> ExactSolution:
+    """Return the exact solution.
 
-    Raises InputError where there is no way to it.
+    deviation : the posterior standard deviations if already known; they do not depend on the recorded values
+    Raises InputError if no method applies to the task.
     """
-    told = task.settings.model_copy(update={"method": "auto", "accuracy": EXACTLY})
-    way = (DenseMethod if is_dense(task) else FrameMethod)(replace(task, settings=told), Execution())
+    exact = replace(task, settings=task.settings.model_copy(update={"method": "auto", "accuracy": EXACT_ACCURACY}))
+    method = (DenseMethod if is_dense(task) else FrameMethod)(exact, Execution())
     if deviation is None:
-        deviation = np.sqrt(way.result({"noise": task.expected_noise}, None).expected.variance)
-    return ExactSolution(way.image, deviation)
+        deviation = np.sqrt(method.result({"noise": task.expected_noise}, None).expected.variance)
+    return ExactSolution(method.image, deviation)
 
 
-def settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tuple[str, str]]]:
-    """What can be measured of this task, and what cannot, with the reason."""
-    found, left_out = _forms(task), list[tuple[str, str]]()
-    sliding, noisy = all(is_sliding(kind) for kind in task.model.camera.types), bool((task.expected_noise > 0).all())
+def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tuple[str, str]]]:
+    """Return the settings that can be measured for this task, and those that cannot, with the reason."""
+    found, left_out = _form_settings(task), list[tuple[str, str]]()
+    sliding = all(is_sliding(lens_type) for lens_type in task.model.camera.types)
+    has_frame = sliding and bool((task.expected_noise > 0).all())
     if not is_dense(task):
-        left_out.append(("dense forms", f"{task.model.unknowns} pixels, up to {DENSE} are served"))
-        if not (sliding and noisy):
-            why = "too many pixels for a dense form, and no frame: there is no exact answer to hold estimates against"
+        left_out.append(("dense forms", f"{task.model.unknowns} pixels, and the limit is {MAX_DENSE_PIXELS}"))
+        if not has_frame:
+            why = "too many pixels for a dense form, and a frame does not apply: there is no exact solution"
             return [], [("reconstruct", why)]
-    for size, overlap in SIZES:
-        if size < min(task.shape):
-            found.append(_tiles(size, overlap))
-    if sliding and noisy:
-        found += [_frame(task, accuracy) for accuracy in ACCURACIES]
+    found += [_tile_setting(size, overlap) for size, overlap in TILE_SIZES if size < min(task.shape)]
+    if has_frame:
+        found += [_frame_setting(task, accuracy) for accuracy in ACCURACIES]
     else:
-        left_out.append(("frame", "it takes noise in every measurement, and lens types that see the same everywhere"))
+        left_out.append(("frame", "it needs noise in every measurement, and lens types with the same view everywhere"))
     return found, left_out
 
 
-def _forms(task: EstimationTask) -> list[SolverSetting]:
-    """Each dense form by itself, and refined until its bound is below the tolerance."""
+def _form_settings(task: EstimationTask) -> list[SolverSetting]:
+    """Return each dense form without refinement, and refined until its bound is below the tolerance."""
     if not is_dense(task):
         return []
     found: list[SolverSetting] = []
     correlated = task.prior.kind != "independent"
     for name in FORMS:
         needed = needed_memory(name, task.model.measurements, task.model.unknowns, correlated=correlated)
-        guess = EACH * (needed / 8) ** 1.5
-
-        def alone(task: EstimationTask, name: str = name) -> Vector:
-            return _alone(task, name)
-
-        def refined(task: EstimationTask, name: str = name) -> Vector:
-            return _refined(task, name)
-
-        found.append(SolverSetting(name, ALONE, guess, alone))
-        found.append(SolverSetting(name, f"refined, tolerance {task.settings.tolerance:g}", 2 * guess, refined))
+        guess = SECONDS_PER_WORK * (needed / 8) ** 1.5
+        refined = f"refined, tolerance {task.settings.tolerance:g}"
+        found.append(SolverSetting(name, ALONE, guess, partial(_unrefined_image, name=name)))
+        found.append(SolverSetting(name, refined, 2 * guess, partial(_refined_image, name=name)))
     return found
 
 
-def _problem(task: EstimationTask) -> tuple[Problem, Vector]:
+def _problem(task: EstimationTask) -> tuple[Problem, FloatArray]:
     problem = Problem(task.model.matrix[task.used], task.prior_on(task.shape), task.expected_noise)
     return problem, task.recorded[task.used]
 
 
-def _alone(task: EstimationTask, name: str) -> Vector:
-    """Of a form as it is. Raises InputError where it cannot."""
+def _unrefined_image(task: EstimationTask, name: str) -> FloatArray:
+    """Compute the estimate of a form without refinement. Raises InputError if memory or precision do not suffice."""
     problem, recorded = _problem(task)
     needed = needed_memory(name, problem.measurements, problem.unknowns, correlated=not problem.prior.independent)
     if needed > free_memory():
-        raise InputError(f"it needs {needed / 1e9:.1f} GB")
+        raise InputError(f"it needs {needed / 1e9:.1f} GB of memory")
     try:
         with np.errstate(all="ignore"):  # of forms that lose all digits, which their error shows
-            form = FORMS[name](problem)
-            away = form.gain(recorded - problem.matrix @ problem.prior.mean)
+            update = FORMS[name](problem).gain(recorded - problem.matrix @ problem.prior.mean)
     except NotSolvableError as error:
         raise InputError(str(error)) from error
-    return problem.prior.mean + away
+    return problem.prior.mean + update
 
 
-def _refined(task: EstimationTask, name: str) -> Vector:
+def _refined_image(task: EstimationTask, name: str) -> FloatArray:
     problem, recorded = _problem(task)
     return estimate(problem, recorded, name, task.settings.tolerance).image
 
 
-def _tiles(size: int, overlap: int) -> SolverSetting:
-    cut = TilesTable(size=size, overlap=overlap)
+def _tile_setting(size: int, overlap: int) -> SolverSetting:
+    tiles = TilesTable(size=size, overlap=overlap)
 
-    def image(task: EstimationTask) -> Vector:
-        return TileMethod(replace(task, tiles=cut), Execution()).image
+    def image(task: EstimationTask) -> FloatArray:
+        return TileMethod(replace(task, tiles=tiles), Execution()).image
 
     return SolverSetting("tiles", f"{size} less {overlap}", 1.0 + 4 * (size / 51) ** 4, image)
 
 
-def _frame(task: EstimationTask, accuracy: float) -> SolverSetting:
-    def image(task: EstimationTask) -> Vector:
-        told = task.settings.model_copy(update={"accuracy": accuracy})
-        return FrameMethod(replace(task, settings=told), Execution()).image
+def _frame_setting(task: EstimationTask, accuracy: float) -> SolverSetting:
+    def image(task: EstimationTask) -> FloatArray:
+        settings = task.settings.model_copy(update={"accuracy": accuracy})
+        return FrameMethod(replace(task, settings=settings), Execution()).image
 
     return SolverSetting("frame", f"accuracy {accuracy:g}", 0.1 + 1e-5 * task.model.unknowns, image)

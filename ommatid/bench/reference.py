@@ -1,6 +1,6 @@
-"""What rendering and calibration come to with so many samples: against the closed form, else against many more rays.
+"""Errors of renderings and calibrations against a reference: the closed form, or else a run with many more rays.
 
-Every repeat has a seed of its own, and none of these streams is one of the scene's data or calibration.
+Every repeat has its own seed, and none of these random streams is one of the scene's data or calibration.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Sampler, Scene
@@ -27,118 +27,115 @@ from ommatid.simulate.sampling.passes import FEWEST_PASSES, JITTERED, Plan, cell
 from ommatid.simulate.sampling.samplers import fitting
 from ommatid.simulate.sampling.seeds import repeat_seed
 
-Vector = NDArray[np.float64]
 Samples = int | Literal["auto"]
 
-TRUER = 64  # times the samples of what is judged: then the reference brings less than a hundredth of the error
+SAMPLE_RATIO = 64  # reference samples per measured sample: the reference adds less than a hundredth of the error
 REFERENCE = ".bench.reference.npz"
-MOST_SAMPLES = 2**14  # a pixel, of what is judged
-MOST_RAYS = 2**27  # of a reference: some ten seconds where lenses are traced surface by surface
+MOST_SAMPLES = 2**14  # per pixel, of a measured cell
+MOST_RAYS = 2**27  # of a reference: about ten seconds where rays are traced through surfaces
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What renderings and calibrations are held against: H as it truly is, or as very many rays show it.
+    """The reference for renderings and calibrations: the true H, or an estimate of it from very many rays.
 
-    light : (M,) what the sensor pixels truly read of the image;  spread : (M,) its variance, 0 of a closed form
-    words : for people
+    light : (M,) true values of the sensor pixels;  variance : (M,) their variance, 0 for a closed form
+    description : how the reference was obtained
     """
 
     model: Model
-    light: Vector
-    spread: Vector
-    words: str
+    light: FloatArray
+    variance: FloatArray
+    description: str
 
 
 def reference(setup: Setup, folder: Path, progress: Progress = no_progress) -> Reference:
-    """The closed form where there is one; else H from 64 times the rays, or from as many as can be waited for.
+    """Return the closed form where there is one, else H from 64 times the rays, or as many as MOST_RAYS permits.
 
-    Such a reference is kept in `folder`. Raises InputError where it takes a backend that does not work here.
+    Such an estimate is cached in `folder`. Raises InputError if its backend does not work on this machine.
     """
-    scene, camera, flat = setup.scene, setup.camera, setup.image.ravel()
+    scene, camera, image = setup.scene, setup.camera, setup.image.ravel()
     if setup.has_closed_form:
-        kept = setup.resolved
-        perfect = camera.has_box_footprints and camera.tolerance is None
-        model = (
-            ideal_model(kept, camera) if perfect else exact_model(kept, camera, true_matrix(setup.simulated), "true")
-        )
-        return Reference(model, model.forward(flat), np.zeros(camera.measurements), "the closed form")
-    samples = min(TRUER * MOST_SAMPLES, MOST_RAYS // camera.measurements)
-    told = with_calibration(
-        scene, "transport", "multijitter", "auto", samples, repeat_seed(scene.render.seed, "right", 0)
-    )
-    model, _ = cached_model(folder / REFERENCE, replace(setup, scene=told), progress)
-    return Reference(
-        model, model.forward(flat), model.variance_from_model(flat), f"a reference of {model.record['samples']} samples"
-    )
+        if camera.has_box_footprints and camera.tolerance is None:
+            model = ideal_model(setup.resolved, camera)
+        else:
+            model = exact_model(setup.resolved, camera, true_matrix(setup.simulated), "true")
+        return Reference(model, model.forward(image), np.zeros(camera.measurements), "the closed form")
+    samples = min(SAMPLE_RATIO * MOST_SAMPLES, MOST_RAYS // camera.measurements)
+    seed = repeat_seed(scene.render.seed, "right", 0)
+    many = with_calibration(scene, "transport", "multijitter", "auto", samples, seed)
+    model, _ = cached_model(folder / REFERENCE, replace(setup, scene=many), progress)
+    description = f"a reference of {model.record['samples']} samples"
+    return Reference(model, model.forward(image), model.variance_from_model(image), description)
 
 
 def with_rendering(scene: Scene, sampler: Sampler, variant: str, samples: Samples, seed: int) -> Scene:
-    """The scene rendered so."""
+    """Return the scene with these settings of its rendering."""
     return _changed(scene, "render", sampler=sampler, variant=variant, samples=samples, seed=seed)
 
 
 def with_calibration(
     scene: Scene, method: Literal["points", "transport"], sampler: Sampler, variant: str, samples: Samples, seed: int
 ) -> Scene:
-    """The scene calibrated so."""
-    told = _changed(scene, "render", sampler=sampler, variant=variant, seed=seed)
-    return _changed(told, "calibration", method=method, samples=samples, fit=None)
+    """Return the scene with these settings of its calibration."""
+    rendered = _changed(scene, "render", sampler=sampler, variant=variant, seed=seed)
+    return _changed(rendered, "calibration", method=method, samples=samples, fit=None)
 
 
 def _changed(scene: Scene, table: str, **update: Any) -> Scene:
     return scene.model_copy(update={table: getattr(scene, table).model_copy(update=update)})
 
 
-def work_of(samples: int, sampler: Sampler) -> Plan:
-    """As renderings divide them over passes; fewer samples than the fewest passes are those of a single one."""
+def sample_plan(samples: int, sampler: Sampler) -> Plan:
+    """Return passes and samples as renderings use them; too few samples for several passes make a single pass."""
     return plan(samples, sampler) if samples >= FEWEST_PASSES else Plan(1, fitting(sampler, samples))
 
 
-def foreseen_samples(setup: Setup, right: Reference) -> int:
-    """About how many samples a pixel 'auto' will take: those of a first round where grids fit the edges of pixels of f.
+def expected_samples(setup: Setup, right: Reference) -> int:
+    """Estimate the samples per pixel that samples = "auto" will take.
 
-    Elsewhere as many as leave a quarter of the variance that is allowed, if a pixel's rays scatter like the image.
-    Raises InputError where there is no noise, so that 'auto' cannot tell when it is enough.
+    Where a grid of strata fits the edges of the pixels of f this is a first round. Elsewhere it is the number that
+    leaves a quarter of the allowed variance if the rays of a pixel vary as the image does.
+    Raises InputError without noise, to which the variance could be compared.
     """
     camera, sampler = setup.camera, setup.scene.render.sampler
     allowed = float(np.nanmean(allowed_variance(setup)(right.light)))
     if camera.has_box_footprints and sampler in JITTERED:
-        return max(on_grid(LEAST, sampler, cells_of(kind.ratio)).total for kind in camera.types)
+        return max(on_grid(LEAST, sampler, cells_of(lens_type.ratio)).total for lens_type in camera.types)
     ratio = float(setup.image.var()) / (FEWEST_PASSES * AIM * allowed)
     return int(min(max(FEWEST_PASSES * ratio ** (1 / EXPONENTS.get(sampler, STRATIFIED)), LEAST), MOST))
 
 
-def rendered(setup: Setup) -> Rendering | AdaptiveRendering:
-    """The light alone, as `run` renders it."""
+def render_light(setup: Setup) -> Rendering | AdaptiveRendering:
+    """Render the light without the sensor's noise, as `run` does."""
     render = setup.scene.render
     if render.samples == "auto":
         return render_until(setup)
-    return light(setup, work=work_of(render.counted, render.sampler))
+    return light(setup, work=sample_plan(render.sample_count, render.sampler))
 
 
-def error_of_light(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:
-    """Root mean square over sensor pixels, in values of f; what the reference itself errs by is taken out."""
-    squares = np.square(rendering.mean - right.light) - right.spread
+def light_error(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:
+    """Return the root mean square error over sensor pixels, in values of f, without the variance of the reference."""
+    squares = np.square(rendering.mean - right.light) - right.variance
     return float(np.sqrt(max(np.nanmean(squares), 0.0)))
 
 
-def stack_of(setup: Setup, rendering: Rendering | AdaptiveRendering) -> Stack:
-    """A rendering of several passes as the scene's sensor records it, with noise by the scene's seed."""
+def model_error(model: Model, right: Reference) -> float:
+    """Return the root mean square error over the entries of H, without the variance of the reference."""
+    difference = sparse.csr_array(model.matrix - right.model.matrix)
+    squares = float(np.square(difference.data).sum()) - float(right.model.variance.sum())
+    return float(np.sqrt(max(squares, 0.0) / right.model.entries))
+
+
+def record_rendering(setup: Setup, rendering: Rendering | AdaptiveRendering) -> Stack:
+    """Return a rendering of several passes as the scene's sensor records it, with noise from the scene's seed."""
     return exposed(setup, rendering.mean, rendering.stated_variance(setup.camera), {})
 
 
-def stack_of_light(setup: Setup, light: Vector, right: Reference) -> Stack:
-    """Light, (M,), as the scene's sensor records it; every pixel is said to be as far from right as all are on average.
+def record_light(setup: Setup, light: FloatArray, right: Reference) -> Stack:
+    """Return light, (M,), as the scene's sensor records it.
 
-    Of exact light that is not at all.
+    The stated variance of the light is the same for all pixels: its mean squared error, 0 for exact light.
     """
-    away = float(np.nanmean(np.square(light - right.light)))
-    return exposed(setup, light, np.broadcast_to(away, light.shape), {})
-
-
-def error_of_model(model: Model, right: Reference) -> float:
-    """Root mean square over the entries of the right H; what the reference itself errs by is taken out."""
-    away = sparse.csr_array(model.matrix - right.model.matrix)
-    squares = float(np.square(away.data).sum()) - float(right.model.variance.sum())
-    return float(np.sqrt(max(squares, 0.0) / right.model.entries))
+    mse = float(np.nanmean(np.square(light - right.light)))
+    return exposed(setup, light, np.broadcast_to(mse, light.shape), {})

@@ -1,4 +1,4 @@
-"""What work costs: seconds, and the most memory that this process held, where the system tells, as Linux does."""
+"""Cost of a computation: its wall-clock time, and the peak memory of this process where Linux's /proc reports it."""
 
 from __future__ import annotations
 
@@ -10,38 +10,42 @@ from typing import NamedTuple, TypeVar
 
 Result = TypeVar("Result")
 
-STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-PEAK = "VmHWM:"
+STATUS, CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Cost(NamedTuple):
-    """Seconds, and bytes that the process held at its peak, the program itself included; None where nobody tells."""
+    """Wall-clock seconds, and peak resident memory of the whole process in bytes, None where it is not reported."""
 
     seconds: float
     memory: int | None
 
 
 def measure_cost(work: Callable[[], Result]) -> tuple[Result, Cost]:
-    """What some work returns, and what it cost."""
-    told = _forget()
+    """Return the result of `work` and its cost."""
+    is_reset = reset_peak_memory()
     start = perf_counter()
     result = work()
-    return result, Cost(perf_counter() - start, _peak() if told else None)
+    return result, Cost(perf_counter() - start, resident_memory("VmHWM") if is_reset else None)
 
 
-def _forget() -> bool:
-    """Let the peak begin anew; whether the system does."""
+def reset_peak_memory() -> bool:
+    """Reset the peak of the resident memory to its present value; return False where the system cannot.
+
+    The peak comes from /proc and not from getrusage, whose ru_maxrss is inherited from the parent process and cannot
+    be reset.
+    """
     try:
-        ctypes.CDLL(None).malloc_trim(0)  # what was freed goes back, or it would hide as much of what the work takes
-        FORGET.write_text("5", encoding="ascii")
+        ctypes.CDLL(None).malloc_trim(0)  # return freed memory, which would hide as much of the work's memory
+        CLEAR_REFS.write_text("5", encoding="ascii")
     except (OSError, AttributeError, TypeError):
         return False
     return True
 
 
-def _peak() -> int | None:
+def resident_memory(field: str) -> int | None:
+    """Return a field of /proc/self/status in bytes: VmRSS, resident memory, or VmHWM, its peak; None without /proc."""
     try:
         lines = STATUS.read_text(encoding="ascii").splitlines()
-        return next((1024 * int(line.split()[1]) for line in lines if line.startswith(PEAK)), None)
+        return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), None)
     except OSError:
         return None

@@ -1,8 +1,8 @@
-"""Measurements one after the other, the cheapest first, as far as the time goes; each is kept as soon as it is done.
+"""Run measurements one after the other, the cheapest first, within a time limit, and store each as soon as it is done.
 
-A measurement is a job of several repeats. How long a job takes is guessed from the one before it in its series, which
-differs from it in a known ratio; jobs that do not fit into what is left of the time are left out. Short ones of
-AUTO come before all others, since each tells as much as the end of a curve.
+A measurement is a job of several repeats. The duration of a job is predicted from the previous job of its series, since
+the ratio of their work is known; jobs that do not fit into the remaining time are left out. Short jobs with an adaptive
+number of samples precede all others, since each gives as much information as the end of a curve.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
@@ -20,19 +20,19 @@ from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.progress import Progress
 
 from .resources import Cost
-from .table import AUTO, Cell, Quantiles, SkippedJob, Stage, cell_of
+from .table import AUTO, Cell, Quantiles, SkippedJob, Stage
 
-REPEATS, FEWER = 5, 3  # with seeds of their own; odd, so that the median is one of them
-SOON = 0.1  # of the time: what a cell of AUTO may take to be measured before all others
-LONG = 1.0  # seconds of a repeat, from which on there are fewer
+REPEATS, FEWER_REPEATS = 5, 3  # with independent seeds; odd, so that the median is one of the values
+LONG = 1.0  # seconds of a repeat, from which on FEWER_REPEATS are made
+SHORT_SHARE = 0.1  # of the time limit: the longest adaptive job that precedes all others
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """What one repeat found.
+    """Result of one repeat.
 
-    mse : of the image that it brings, None where that was not computed
-    samples : a pixel, where they were not known beforehand
+    mse : mean squared error of the resulting image, None if not computed
+    samples : per pixel, of a job with an adaptive number
     """
 
     error: float
@@ -43,7 +43,7 @@ class Repeat:
 
 @dataclass(frozen=True)
 class Job:
-    """One cell to be measured. `guess`: about how many seconds a repeat takes; `work`: does the repeat of a number."""
+    """A cell to be measured. `guess`: expected seconds per repeat; `work`: runs the repeat of an index."""
 
     stage: Stage
     way: str
@@ -55,27 +55,27 @@ class Job:
 
     @property
     def name(self) -> str:
-        """For people, and what it is kept under."""
+        """Readable name, and key in the journal."""
         return name_of(self)
 
     @property
     def series(self) -> tuple[str, str, str | None, str]:
-        """What it has in common with jobs that differ from it in samples alone."""
+        """Key of the jobs that differ only in their number of samples."""
         return self.stage, self.way, self.variant, "" if self.samples else self.setting
 
 
-def name_of(one: Job | Cell) -> str:
-    """For people, and what it is kept under."""
-    known = one.samples is not None and one.setting != AUTO  # of AUTO only once it is done
-    samples = f"{one.samples} samples" if known else None
-    return ", ".join(part for part in (f"{one.stage} {one.way}", one.variant, samples, one.setting) if part)
+def name_of(item: Job | Cell) -> str:
+    """Return the readable name of a job or its cell, the key in the journal."""
+    known = item.samples is not None and item.setting != AUTO  # adaptive: known only after the measurement
+    samples = f"{item.samples} samples" if known else None
+    return ", ".join(part for part in (f"{item.stage} {item.way}", item.variant, samples, item.setting) if part)
 
 
 class Journal:
-    """What is done, by name, in a file to which a line is added for each: whatever stops the program, it is kept."""
+    """Finished cells by name, stored in a file with one line per job, so that an interrupted bench can continue."""
 
     def __init__(self, path: Path, fingerprint: str) -> None:
-        """Read what an earlier run of the same left."""
+        """Read the cells of an earlier, interrupted bench with the same fingerprint."""
         self._path, self._fingerprint = path, fingerprint
         self.cells: dict[str, Cell] = {}
         self.refused: dict[str, str] = {}
@@ -85,34 +85,34 @@ class Journal:
         except (OSError, UnicodeDecodeError):
             lines = []
         for line in lines:
-            self._take(line)
+            self._load(line)
 
-    def _take(self, line: str) -> None:
+    def _load(self, line: str) -> None:
         try:
-            one = json.loads(line)
-            if one["fingerprint"] != self._fingerprint:
+            entry = json.loads(line)
+            if entry["fingerprint"] != self._fingerprint:
                 return
-            if "cell" in one:
-                self.cells[str(one["name"])] = cell_of(json.dumps(one["cell"]))
+            if "cell" in entry:
+                self.cells[str(entry["name"])] = Cell.model_validate(entry["cell"], strict=True)
             else:
-                self.refused[str(one["name"])] = str(one["why"])
-            self.seconds += float(one["seconds"])
-        except (ValueError, KeyError, TypeError):  # cut short when the program was stopped
+                self.refused[str(entry["name"])] = str(entry["why"])
+            self.seconds += float(entry["seconds"])
+        except (ValueError, KeyError, TypeError):  # truncated when the program was killed
             return
 
     def add(self, name: str, cell: Cell | str, seconds: float) -> None:
-        """Keep a cell, or why there is none. Raises DeniedError."""
+        """Store a cell, or the reason why there is none. Raises MachineError if the file cannot be written."""
+        entry = {"fingerprint": self._fingerprint, "name": name, "seconds": seconds}
         if isinstance(cell, Cell):
             self.cells[name] = cell
-            told = {"cell": asdict(cell)}
+            line = json.dumps({**entry, "cell": cell.model_dump()}, allow_nan=False)
         else:
             self.refused[name] = cell
-            told = {"why": cell}
+            line = json.dumps({**entry, "why": cell}, allow_nan=False)
         self.seconds += seconds
-        line = json.dumps({"fingerprint": self._fingerprint, "name": name, "seconds": seconds, **told}, allow_nan=False)
         try:
             with self._path.open("a", encoding="utf-8") as stream:
-                stream.write(f"\n{line}\n")  # on a line of its own, whatever the last one was cut to
+                stream.write(f"\n{line}\n")  # a new line, even after a truncated one
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
@@ -120,99 +120,95 @@ class Journal:
             raise MachineError(f"{self._path}: could not be written ({reason}); free some space") from error
 
     def remove(self) -> None:
-        """The table stands for it now."""
+        """Delete the file, when the table has replaced it."""
         self._path.unlink(missing_ok=True)
 
 
 def measure(
-    jobs: Sequence[Job], allowed: float, finished: Journal, progress: Progress, spent: float = 0.0
+    jobs: Sequence[Job], limit: float, journal: Journal, progress: Progress, spent: float = 0.0
 ) -> list[SkippedJob]:
-    """Do those jobs that are not finished, short ones of AUTO and then the cheapest first, and say what did not fit.
+    """Run the jobs that are not in the journal, the cheapest first, and return those that did not fit.
 
-    allowed : seconds, of which `spent` and those of what is finished are gone
+    limit : seconds, of which `spent` and those in the journal are already used
     """
-    waiting = [job for job in jobs if job.name not in finished.cells and job.name not in finished.refused]
-    ratios: dict[tuple[str, str, str | None, str], float] = {}
+    waiting = [job for job in jobs if job.name not in journal.cells and job.name not in journal.refused]
+    ratios: dict[tuple[str, str, str | None, str], float] = {}  # measured over guessed seconds, by series
     for job in jobs:
-        if job.name in finished.cells:
-            ratios[job.series] = max(1.0, finished.cells[job.name].seconds.median / job.guess)
-    start, before = perf_counter(), spent + finished.seconds
+        if job.name in journal.cells:
+            ratios[job.series] = max(1.0, journal.cells[job.name].seconds.median / job.guess)
+    start, used = perf_counter(), spent + journal.seconds
 
     def left() -> float:
-        return allowed - before - (perf_counter() - start)
+        return limit - used - (perf_counter() - start)
 
-    def expected(job: Job) -> float:
+    def per_repeat(job: Job) -> float:
         return job.guess * ratios.get(job.series, 1.0)
 
-    def turn(job: Job) -> tuple[bool, float]:
-        each = expected(job)
-        return job.setting != AUTO or each * _repeats(each) > SOON * allowed, each
+    def order(job: Job) -> tuple[bool, float]:
+        seconds = per_repeat(job)
+        return job.setting != AUTO or seconds * _repeats(seconds) > SHORT_SHARE * limit, seconds
 
     left_out: list[SkippedJob] = []
     while waiting:
-        job = min(waiting, key=turn)
+        job = min(waiting, key=order)
         waiting.remove(job)
-        each = expected(job)
-        if each * _repeats(each) > left():
-            left_out.append(_late(job, each * _repeats(each), allowed))
+        total = per_repeat(job) * _repeats(per_repeat(job))
+        if total > left():
+            why = f"its {total:.2g} s did not fit into {limit:g} s; raise --seconds"
+            left_out.append(SkippedJob(what=job.name, why=why, late=True))
             continue
-        begun = perf_counter()
-        found = _repeated(job, left)
-        seconds = perf_counter() - begun
-        if isinstance(found, SkippedJob):
+        job_start = perf_counter()
+        result = _run(job, left)
+        seconds = perf_counter() - job_start
+        if isinstance(result, SkippedJob):
             ratios[job.series] = seconds / job.guess
-            left_out.append(found)
-        elif isinstance(found, str):
-            finished.add(job.name, found, seconds)
+            left_out.append(result)
         else:
-            finished.add(job.name, found, seconds)
-            ratios[job.series] = seconds / found.repeats / job.guess
-        progress(min(1.0, 1 - left() / allowed))
+            journal.add(job.name, result, seconds)
+            if isinstance(result, Cell):
+                ratios[job.series] = seconds / result.repeats / job.guess
+        progress(min(1.0, 1 - left() / limit))
     progress(1.0)
     return left_out
 
 
-def _repeated(job: Job, left: Callable[[], float]) -> Cell | SkippedJob | str:
-    """The cell of a job, or why there is none."""
-    done: list[Repeat] = []
-    begun = perf_counter()
-    while not done or len(done) < _repeats((perf_counter() - begun) / len(done)):
-        each = (perf_counter() - begun) / max(len(done), 1)
-        if done and each > left():
-            return SkippedJob(
-                job.name, f"a repeat took {each:.2g} s, too long for {FEWER} in the seconds left", late=True
-            )
+def _run(job: Job, left: Callable[[], float]) -> Cell | SkippedJob | str:
+    """Return the cell of a job, or the reason why there is none."""
+    repeats: list[Repeat] = []
+    start = perf_counter()
+    seconds = 0.0
+    while not repeats or len(repeats) < _repeats(seconds):
+        if repeats and seconds > left():
+            why = f"a repeat took {seconds:.2g} s, too long for {FEWER_REPEATS} in the remaining time"
+            return SkippedJob(what=job.name, why=why, late=True)
         try:
-            done.append(job.work(len(done)))
+            repeats.append(job.work(len(repeats)))
         except InputError as error:
             return str(error)
-    return cell_from_repeats(job, done)
+        seconds = (perf_counter() - start) / len(repeats)
+    return cell_from_repeats(job, repeats)
 
 
-def _repeats(each: float) -> int:
-    return REPEATS if each < LONG else FEWER
+def _repeats(seconds: float) -> int:
+    return REPEATS if seconds < LONG else FEWER_REPEATS
 
 
-def cell_from_repeats(job: Job, done: Sequence[Repeat]) -> Cell:
-    """What repeats come to."""
-    errors, mse = [one.error for one in done], [one.mse for one in done if one.mse is not None]
-    several = len(errors) > 1 and min(errors) > 0
-    taken = [one.samples for one in done if one.samples is not None]
-    peaks = [one.cost.memory for one in done if one.cost.memory is not None]
+def cell_from_repeats(job: Job, repeats: Sequence[Repeat]) -> Cell:
+    """Return the cell of a job: quantiles over its repeats, and the largest memory and number of samples."""
+    errors = [repeat.error for repeat in repeats]
+    mses = [repeat.mse for repeat in repeats if repeat.mse is not None]
+    samples = [repeat.samples for repeat in repeats if repeat.samples is not None]
+    memory = [repeat.cost.memory for repeat in repeats if repeat.cost.memory is not None]
     return Cell(
         stage=job.stage,
         way=job.way,
         variant=job.variant,
-        samples=max(taken, default=None) if job.samples is None else job.samples,
+        samples=max(samples, default=None) if job.samples is None else job.samples,
         setting=job.setting,
-        repeats=len(done),
+        repeats=len(repeats),
         error=Quantiles.of(errors),
-        seconds=Quantiles.of([one.cost.seconds for one in done]),
-        memory=max(peaks, default=None),
-        mse=Quantiles.of(mse) if mse else None,
-        scatter=float(np.std(np.log(errors), ddof=1)) if several else None,
+        seconds=Quantiles.of([repeat.cost.seconds for repeat in repeats]),
+        memory=max(memory, default=None),
+        mse=Quantiles.of(mses) if mses else None,
+        scatter=float(np.std(np.log(errors), ddof=1)) if len(errors) > 1 and min(errors) > 0 else None,
     )
-
-
-def _late(job: Job, seconds: float, allowed: float) -> SkippedJob:
-    return SkippedJob(job.name, f"its {seconds:.2g} s did not fit into {allowed:g} s; raise --seconds", late=True)

@@ -1,23 +1,26 @@
-"""How fast errors fall with samples, what is worth its seconds, and which setting reaches the noise floor first."""
+"""Convergence rates, Pareto fronts, and the cheapest settings that reach the noise floor."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from math import exp, log
+from math import exp, inf, log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.analysis.pareto import pareto_front
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.shrinkage import shrink_variances
 
-from .table import ALONE, AUTO, Cell
+from .table import ALONE, AUTO, STAGES, Cell, Recommendation, RecommendedSetting
 
-AGREES = 3.0  # standard errors within which a slope is that of theory
-FEWEST = 3  # points of a slope
-WORSE = 0.1  # of the mean squared error: what a recommended setting may add to the noise floor
+CRITICAL_SCORE = 3.0  # standard errors within which a slope agrees with theory
+FEWEST_POINTS = 3  # of a fitted slope
+TOLERANCE = 0.1  # relative excess over the noise floor that recommended settings may add in total
+SAMPLES_KEYS = {"render": "render.samples", "calibrate": "calibration.samples"}
 
 
 @dataclass(frozen=True)
@@ -27,145 +30,163 @@ class Slope:
     value: float
     deviation: float
 
-    def agrees(self, theory: float, allowed: float = 0.0) -> bool:
-        """Whether it lies within 3 standard errors of what theory says, which is known to what is `allowed`."""
-        return abs(self.value - theory) <= AGREES * self.deviation + allowed
+    def agrees(self, theory: float, margin: float = 0.0) -> bool:
+        """Return True if the slope is within 3 standard errors, plus `margin`, of the theoretical slope."""
+        return abs(self.value - theory) <= CRITICAL_SCORE * self.deviation + margin
 
 
 def slope(cells: Sequence[Cell]) -> Slope | None:
-    """Of cells that differ in samples alone: weighted least squares on logarithms; None where they are too few.
+    """Fit the slope of cells that differ only in samples, by weighted least squares on logarithms.
 
-    Each point weighs by the variance of its median logarithm over seeds, these variances drawn towards one another,
-    since few repeats tell little of each. The standard error is what those variances make of the slope, whether or not
-    the points happen to lie on a line.
+    Returns None for fewer than three different numbers of samples. Each point is weighted by the inverse variance of
+    its median logarithm over seeds; these variances are shrunk towards one another, since few repeats determine each of
+    them poorly. The standard error follows from those variances, whether or not the points lie on a line.
     """
     known = [cell for cell in cells if cell.scatter and cell.samples and cell.repeats > 1 and cell.error.median > 0]
-    if len({cell.samples for cell in known}) < FEWEST:
+    if len({cell.samples for cell in known}) < FEWEST_POINTS:
         return None
     x = np.log([float(cell.samples or 1) for cell in known])
     y = np.log([cell.error.median for cell in known])
     repeats = np.array([cell.repeats for cell in known])
     scatter = np.square([cell.scatter or 0.0 for cell in known])
-    variance = shrink_variances(scatter, int(repeats.min())) * of_medians(repeats)
-    weight = 1 / variance
-    middle = float(weight @ x / weight.sum())
-    spread = float(weight @ np.square(x - middle))
-    return Slope(float(weight @ ((x - middle) * y)) / spread, spread**-0.5)
+    weight = 1 / (shrink_variances(scatter, int(repeats.min())) * variance_of_median(repeats))
+    center = float(weight @ x / weight.sum())
+    moment = float(weight @ np.square(x - center))
+    return Slope(float(weight @ ((x - center) * y)) / moment, moment**-0.5)
 
 
-def of_medians(repeats: NDArray[Any]) -> NDArray[Any]:
-    """Variance of the median of so many normal values, in units of the variance of one.
+def variance_of_median(repeats: NDArray[Any]) -> FloatArray:
+    """Return the variance of the median of n normal values, in units of the variance of one value.
 
-    pi / (2 n + pi - 2) is right for one value and for many, within 2 % for odd numbers between, and too large for even
-    ones, by 22 % at most.
+    pi / (2 n + pi - 2) is exact for n = 1 and for large n, within 2 % for odd n between, and up to 22 % too large for
+    even n.
     """
     return np.pi / (2 * repeats + np.pi - 2)
 
 
-def pareto(cells: Sequence[Cell]) -> list[Cell]:
-    """Cells that none is both faster and better than, from the fastest on."""
-    front: list[Cell] = []
-    for cell in sorted(cells, key=lambda one: (one.seconds.median, one.error.median)):
-        if not front or cell.error.median < front[-1].error.median:
-            front.append(cell)
-    return front
+def median_seconds(cell: Cell) -> float:
+    """Return the median duration of a cell, the cost in its Pareto front."""
+    return cell.seconds.median
+
+
+def median_error(cell: Cell) -> float:
+    """Return the median error of a cell."""
+    return cell.error.median
 
 
 def excess(cell: Cell, floor: float) -> float:
-    """What a setting adds to the mean squared error of exact light, exact H and an exact estimate, in units of that.
+    """Return the relative increase of the mean squared error over `floor` that is due to one setting.
 
-    An estimate that is off by e posterior standard deviations adds e^2.
+    An estimate with an error of e posterior standard deviations adds e^2.
     """
     if cell.stage == "reconstruct":
         return cell.error.median**2
     if cell.mse is None or floor <= 0:
-        return float("inf")
+        return inf
     return max(cell.mse.median / floor - 1, 0.0)
 
 
-def recommend(cells: Sequence[Cell], floor: float) -> dict[str, Any]:
-    """The cheapest setting of all stages whose excesses add up to no more than a tenth; else the one of least excess.
+def recommend(cells: Sequence[Cell], floor: float) -> Recommendation:
+    """Return the cheapest setting of each stage whose excesses add up to at most 10 %, else those of least excess.
 
-    floor : mean squared error of exact light and exact H, with the scene's noise
+    floor : mean squared error with exact light and exact H, with the scene's noise
     Rendering and calibration share the scene's sampler and variant.
     """
-    found: dict[str, Any] = {"noise_floor": floor, "mse": None, "reached": False}
     choices = list(_choices([cell for cell in cells if cell.setting != ALONE], floor))
     if floor <= 0 or not choices:
-        why = "there was no time for a cell of every stage; raise --seconds"
+        why = "no cell of some stage was measured within the time limit; raise --seconds"
         if floor <= 0:
-            why = "the scene has no noise, so there is no floor: more samples always bring more"
-        return {**found, "why": why}
-    reaching = [some for some in choices if _excess_of(some, floor) <= WORSE]
-    best = min(reaching, key=_seconds_of) if reaching else min(choices, key=lambda some: _excess_of(some, floor))
-    more = _excess_of(best, floor)
-    found |= {cell.stage: _told(cell) for cell in best} | {"mse": floor * (1 + more), "reached": bool(reaching)}
-    if reaching:
-        above = f"{round(100 * more, 4):.2g} % above it"
-        why = f"the cheapest within {100 * WORSE:g} % of what exact light and exact H give: {above}"
-        return {**found, "why": "; ".join([why, *_as_needed(best)])}
-    words = [word for word in (_needed(cells, cell, floor) for cell in best) if word]
-    why = f"no setting measured comes within {100 * WORSE:g} % of what exact light and exact H give; these come nearest"
-    return {**found, "why": "; ".join([f"{why}, {100 * more:.0f} % above it", *words, *_as_needed(best)])}
+            why = "the scene has no noise, so there is no noise floor: more samples always reduce the error"
+        return Recommendation(noise_floor=floor, mse=None, reached=False, why=why)
+    sufficient = [choice for choice in choices if _total_excess(choice, floor) <= TOLERANCE]
+    if sufficient:
+        best = min(sufficient, key=_total_seconds)
+    else:
+        best = min(choices, key=lambda choice: _total_excess(choice, floor))
+    total = _total_excess(best, floor)
+    limit = f"within {100 * TOLERANCE:g} % of the error with exact light and exact H"
+    if sufficient:
+        reasons = [f"the cheapest {limit}: {round(100 * total, 4):.2g} % above it"]
+    else:
+        reasons = [f"no measured setting is {limit}; these are the nearest, {100 * total:.0f} % above it"]
+        reasons += [words for words in (_more_samples(cells, cell, floor) for cell in best) if words]
+    reasons += [
+        f'{SAMPLES_KEYS[cell.stage]} = "{AUTO}" took up to {cell.samples} samples per pixel'
+        for cell in best
+        if not cell.counted
+    ]
+    render, calibrate, reconstruct = (_recommended(cell) for cell in best)
+    return Recommendation(
+        noise_floor=floor,
+        mse=floor * (1 + total),
+        reached=bool(sufficient),
+        why="; ".join(reasons),
+        render=render,
+        calibrate=calibrate,
+        reconstruct=reconstruct,
+    )
 
 
 def _choices(cells: Sequence[Cell], floor: float) -> Iterator[tuple[Cell, ...]]:
-    """A cell of each stage, those of rendering and calibration of one sampler and variant, as a scene has them."""
-    estimates = _worth([cell for cell in cells if cell.stage == "reconstruct"], floor)
-    for key in dict.fromkeys(_shared(cell) for cell in cells if cell.stage == "render"):
-        alike = [cell for cell in cells if _shared(cell) == key]
-        stages = [_worth([cell for cell in alike if cell.stage == stage], floor) for stage in ("render", "calibrate")]
-        yield from product(*stages, estimates)
+    """Yield a cell of each stage, in the order of STAGES; rendering and calibration share a sampler and variant."""
+    for key in dict.fromkeys(_sampler_and_variant(cell) for cell in cells if cell.stage == "render"):
+        usable = [cell for cell in cells if cell.stage == "reconstruct" or _sampler_and_variant(cell) == key]
+        yield from product(
+            *(
+                pareto_front(
+                    [cell for cell in usable if cell.stage == stage and excess(cell, floor) < inf],
+                    median_seconds,
+                    lambda cell: excess(cell, floor),
+                )
+                for stage in STAGES
+            )
+        )
 
 
-def _shared(cell: Cell) -> tuple[str, str | None]:
+def _sampler_and_variant(cell: Cell) -> tuple[str, str | None]:
     return cell.way.split(", ")[-1], cell.variant
 
 
-def _excess_of(some: Sequence[Cell], floor: float) -> float:
-    return sum(excess(cell, floor) for cell in some)
+def _total_excess(choice: Sequence[Cell], floor: float) -> float:
+    return sum(excess(cell, floor) for cell in choice)
 
 
-def _seconds_of(some: Sequence[Cell]) -> float:
-    return sum(cell.seconds.median for cell in some)
+def _total_seconds(choice: Sequence[Cell]) -> float:
+    return sum(median_seconds(cell) for cell in choice)
 
 
-def _worth(cells: Sequence[Cell], floor: float) -> list[Cell]:
-    """Cells that none is both faster than and brings less excess."""
-    front: list[Cell] = []
-    some = [cell for cell in cells if excess(cell, floor) < float("inf")]
-    for cell in sorted(some, key=lambda one: (one.seconds.median, excess(one, floor))):
-        if not front or excess(cell, floor) < excess(front[-1], floor):
-            front.append(cell)
-    return front
-
-
-def _told(cell: Cell) -> dict[str, Any]:
-    seconds = {"seconds": cell.seconds.median}
+def _recommended(cell: Cell) -> RecommendedSetting:
+    seconds = cell.seconds.median
     if cell.stage == "reconstruct":
-        return {"method": cell.way, "setting": cell.setting, **seconds}
+        return RecommendedSetting(method=cell.way, setting=cell.setting, seconds=seconds)
     *method, sampler = cell.way.split(", ")
-    told = {"method": method[0]} if method else {}
-    samples = cell.samples if cell.counted else AUTO
-    return {**told, "sampler": sampler, "variant": cell.variant, "samples": samples, **seconds}
+    return RecommendedSetting(
+        method=method[0] if method else None,
+        sampler=sampler,
+        variant=cell.variant,
+        samples=cell.samples if cell.counted else AUTO,
+        seconds=seconds,
+    )
 
 
-def _as_needed(some: Sequence[Cell]) -> list[str]:
-    """What "auto" took, where it is recommended."""
-    names = {"render": "render.samples", "calibrate": "calibration.samples"}
-    open_ones = [cell for cell in some if not cell.counted]
-    return [f'{names[cell.stage]} = "{AUTO}" took up to {cell.samples} samples a pixel' for cell in open_ones]
+def _more_samples(cells: Sequence[Cell], cell: Cell, floor: float) -> str:
+    """Return in words how many samples a stage needs, extrapolated from its last two cells, or an empty string.
 
-
-def _needed(cells: Sequence[Cell], cell: Cell, floor: float) -> str:
-    """About how many samples a stage would take, as its last two cells go on: excess falls with the squared error."""
+    The excess decreases with the square of the error; rendering and calibration each get half of the tolerance.
+    """
     if cell.samples is None or not cell.counted:
         return ""
-    share, now = WORSE / 2, excess(cell, floor)  # the other half is for the other of both
-    alike = [one for one in cells if (one.stage, one.way, one.variant) == (cell.stage, cell.way, cell.variant)]
-    last = sorted((one for one in alike if one.samples and one.counted), key=lambda one: one.samples or 0)[-2:]
-    if now <= share or len(last) < 2 or last[0].error.median <= last[1].error.median:
+    share, present = TOLERANCE / 2, excess(cell, floor)
+    curve = [
+        (other.samples, other.error.median)
+        for other in cells
+        if (other.stage, other.way, other.variant) == (cell.stage, cell.way, cell.variant)
+        and other.samples
+        and other.counted
+    ]
+    last = sorted(curve)[-2:]
+    if present <= share or len(last) < 2 or last[0][1] <= last[1][1]:
         return ""
-    fall = log(last[0].error.median / last[1].error.median) / log((last[1].samples or 1) / (last[0].samples or 1))
-    samples = cell.samples * exp(log(now / share) / (2 * fall))
-    return f"{cell.stage}, {cell.way}, would take about {float(f'{samples:.1g}'):.0f} samples"
+    rate = log(last[0][1] / last[1][1]) / log(last[1][0] / last[0][0])
+    samples = cell.samples * exp(log(present / share) / (2 * rate))
+    return f"{cell.stage}, {cell.way}, would need about {float(f'{samples:.1g}'):.0f} samples"

@@ -1,29 +1,27 @@
-"""What `ommatid bench` found, on disk: bench.json, which others read again, and bench.csv, one row a cell.
+"""Results of `ommatid bench` on disk: bench.json, which other commands read, and bench.csv, one row per cell.
 
-A cell is one setting of one stage: what it costs in seconds and memory, and how far its result is from the right one.
-Errors are in units of their stage: render, root mean square over sensor pixels in values of f; calibrate, over entries
-of H; reconstruct, over pixels of f in posterior standard deviations of each.
+A cell is one setting of one stage: its cost in seconds and memory, and the error of its result. The unit of the error
+depends on the stage: `render`, root mean square over sensor pixels in pixel values of f; `calibrate`, over the entries
+of H; `reconstruct`, over the pixels of f in units of each pixel's posterior standard deviation.
 """
 
 from __future__ import annotations
 
-import csv
 import json
-from dataclasses import asdict, dataclass, fields
-from io import StringIO
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import write_text
+from ommatid.runtime.files import write_csv, write_text
 
 JSON, CSV = "bench.json", "bench.csv"
-ALONE = "alone"  # the setting of a dense form without refinement, which no scene can ask for
-AUTO = "auto"  # the setting of a cell that takes as many samples as are needed: one point, and no part of a curve
-LOW, HIGH = 0.1, 0.9  # the quantiles that go with a median
+ALONE = "alone"  # the setting of a dense form without refinement, which a scene cannot ask for
+AUTO = "auto"  # the setting of a cell with an adaptive number of samples: a single point, not part of a curve
+QUANTILES = 0.1, 0.5, 0.9
 
 Stage = Literal["render", "calibrate", "reconstruct"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
@@ -34,9 +32,12 @@ UNITS: dict[Stage, str] = {
 }
 
 
-@dataclass(frozen=True)
-class Quantiles:
-    """Median, 10 % and 90 % quantile over repeats with seeds of their own."""
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class Quantiles(_Record):
+    """Median, 10 % and 90 % quantile over repeats with independent seeds."""
 
     median: float
     low: float
@@ -44,20 +45,20 @@ class Quantiles:
 
     @classmethod
     def of(cls, values: list[float]) -> Quantiles:
-        """Of at least one value; quantiles between two values are interpolated."""
-        low, median, high = np.quantile(values, [LOW, 0.5, HIGH]).tolist()
-        return cls(median, low, high)
+        """Return the quantiles of at least one value, interpolated linearly between values."""
+        low, median, high = np.quantile(values, QUANTILES).tolist()
+        return cls(median=median, low=low, high=high)
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One setting of a stage, measured.
+class Cell(_Record):
+    """Measurements of one setting of a stage.
 
-    way : the sampler, the method of calibration (and its sampler), a dense form, "tiles" or "frame"
-    samples : a pixel, as many as were used; of AUTO the most on any pixel, in any repeat;  setting : what else was set
-    scatter : standard deviation of the error's natural logarithm over repeats, None where it says nothing
-    memory : bytes that the process held at its peak, None where the system does not tell
-    mse : mean squared error of the image that this setting brings, with the scene's noise and all else exact
+    way : the sampler, the method of calibration and its sampler, a dense form, "tiles" or "frame"
+    samples : per pixel; of an adaptive cell the largest number at any pixel in any repeat
+    setting : the remaining parameters
+    scatter : standard deviation of the natural logarithm of the error over repeats, None for a single repeat
+    memory : peak memory of the process in bytes, None where the system does not report it
+    mse : mean squared error of the image with this setting, the scene's noise, and the other stages exact
     """
 
     stage: Stage
@@ -74,18 +75,18 @@ class Cell:
 
     @property
     def counted(self) -> bool:
-        """Whether its number of samples was given beforehand, so that it may lie on a curve."""
+        """True if the number of samples was fixed beforehand, so that the cell can be part of a curve."""
         return self.setting != AUTO
 
 
-@dataclass(frozen=True)
-class ConvergenceCurve:
-    """How the error of one way falls with the number of samples: the slope d log error / d log samples.
+class ConvergenceCurve(_Record):
+    """Convergence rate of one method: the slope d log error / d log samples.
 
-    slope_deviation : its standard error, from the scatter over seeds
-    theory : what it should be, None where theory says no number;  why : where that comes from, or why there is none
-    agrees : whether the slope lies within 3 standard errors of theory, and of what theory of a limit leaves open at the
-        counts that were fitted, which `why` tells
+    slope_deviation : standard error of the slope, from the scatter over seeds
+    theory : theoretical slope, None where theory gives no number
+    why : source of the theoretical slope, or the reason why there is none
+    agrees : True if the slope is within 3 standard errors of theory, plus what an asymptotic theory leaves open at the
+        numbers of samples of the fit, as `why` states
     """
 
     stage: Stage
@@ -98,23 +99,61 @@ class ConvergenceCurve:
     agrees: bool | None
 
 
-@dataclass(frozen=True)
-class SkippedJob:
-    """A cell that was not measured, and why; `late` where there was only no time for it."""
+class SkippedJob(_Record):
+    """A cell that was not measured, and the reason; `late` if the only reason is the time limit."""
 
     what: str
     why: str
     late: bool = False
 
 
-@dataclass(frozen=True)
-class BenchTable:
-    """All of bench.json.
+class RecommendedSetting(_Record):
+    """Recommended setting of one stage; keys that do not apply to the stage are absent from the file."""
 
-    scene : fingerprint of what is measured;  fingerprint : of that and of the versions it was measured with
-    against : what renderings and calibrations were held against;  noise_deviation : of the sensor, in values of f
-    budget : seconds that were allowed;  seconds : that all cells took
-    recommended : the cheapest setting that reaches the noise floor, a table a stage; samples are a number or AUTO
+    seconds: float
+    method: str | None = None
+    setting: str | None = None
+    sampler: str | None = None
+    variant: str | None = None
+    samples: int | Literal["auto"] | None = None
+
+    @model_serializer(mode="wrap")
+    def _applicable(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in serialize(self).items() if value is not None}
+
+
+class Recommendation(_Record):
+    """Cheapest settings that reach the noise floor; the stages are absent from the file if none was found.
+
+    noise_floor : mean squared error of the image with exact light and exact H
+    mse : expected mean squared error of the recommended settings
+    reached : True if that is within 10 % of the noise floor
+    """
+
+    noise_floor: float
+    mse: float | None
+    reached: bool
+    why: str
+    render: RecommendedSetting | None = None
+    calibrate: RecommendedSetting | None = None
+    reconstruct: RecommendedSetting | None = None
+
+    @model_serializer(mode="wrap")
+    def _found(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in serialize(self).items() if value is not None or key not in STAGES}
+
+    def of(self, stage: Stage) -> RecommendedSetting | None:
+        """Return the recommended setting of a stage, None if there is none."""
+        return {"render": self.render, "calibrate": self.calibrate, "reconstruct": self.reconstruct}[stage]
+
+
+class BenchTable(_Record):
+    """Content of bench.json.
+
+    scene : fingerprint of what is measured;  fingerprint : of the same and of the versions of the libraries
+    against : description of the reference for renderings and calibrations
+    noise_deviation : standard deviation of the sensor's noise, in pixel values of f
+    budget : time limit in seconds;  seconds : duration of all measurements
     """
 
     title: str
@@ -129,65 +168,67 @@ class BenchTable:
     seconds: float
     cells: tuple[Cell, ...]
     curves: tuple[ConvergenceCurve, ...]
-    recommended: dict[str, Any]
+    recommended: Recommendation
     left_out: tuple[SkippedJob, ...]
 
     def of(self, stage: Stage) -> list[Cell]:
-        """The cells of a stage."""
+        """Return the cells of a stage."""
         return [cell for cell in self.cells if cell.stage == stage]
 
     def describe(self) -> dict[str, Any]:
-        """In JSON's types."""
-        return asdict(self)
-
-
-def bench_files(folder: Path) -> tuple[Path, Path]:
-    """Where bench.json is looked for that serves a run, in this order: the folder of the run, its parent."""
-    return folder / JSON, folder.resolve().parent / JSON
+        """Return the table in JSON's types."""
+        return self.model_dump(mode="json")
 
 
 def write(folder: Path, table: BenchTable) -> None:
-    """Write bench.csv, then bench.json, which stands for both. Raises InputError or DeniedError."""
-    write_text(folder / CSV, rows_of(table.cells))
+    """Write bench.csv, then bench.json, whose presence means that both are complete.
+
+    Raises InputError or MachineError.
+    """
+    rows = [_row(cell) for cell in table.cells]
+    columns = list(rows[0]) if rows else list(Cell.model_fields)
+    write_csv(folder / CSV, columns, (row.values() for row in rows))
     write_text(folder / JSON, json.dumps(table.describe(), indent=2, allow_nan=False) + "\n")
 
 
 def read(path: Path) -> BenchTable:
-    """Read bench.json. Raises InputError where it is missing, cut short or something else."""
+    """Read bench.json. Raises InputError if the file is missing, truncated or not written by `ommatid bench`."""
     try:
-        return TypeAdapter(BenchTable).validate_json(path.read_bytes(), strict=True)
+        return BenchTable.model_validate_json(path.read_bytes(), strict=True)
     except OSError as error:
-        raise InputError(f"{path}: could not be read ({error.strerror}); `ommatid bench` makes one") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); run `ommatid bench` to create it") from error
     except ValidationError as error:
-        raise InputError(f"{path}: expected what `ommatid bench` writes, got something else; make it again") from error
+        place = ".".join(map(str, error.errors()[0]["loc"])) or "the file"
+        raise InputError(
+            f"{path}: expected the output of `ommatid bench`, but {place} is not valid ({error.errors()[0]['msg']});"
+            " run `ommatid bench` again"
+        ) from error
 
 
-def cell_of(line: str) -> Cell:
-    """A cell from JSON. Raises ValueError for what is none."""
-    return TypeAdapter(Cell).validate_json(line, strict=True)
+def bench_tables(folder: Path, camera: Mapping[str, Any]) -> Iterator[BenchTable]:
+    """Yield the valid bench tables of a camera that apply to a run: from the run's folder, then from its parent.
 
-
-def rows_of(cells: tuple[Cell, ...]) -> str:
-    """One row a cell, columns by name; quantities with quantiles have three columns, absent ones stay empty."""
-    stream = StringIO()
-    rows = [_row(cell) for cell in cells]
-    names = list(rows[0]) if rows else [field.name for field in fields(Cell)]
-    writer = csv.DictWriter(stream, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
+    camera : description of the camera, as `Camera.describe` returns it
+    """
+    same_camera = json.loads(json.dumps(camera))
+    for path in (folder / JSON, folder.resolve().parent / JSON):
+        try:
+            table = read(path)
+        except InputError:
+            continue
+        if table.camera == same_camera:
+            yield table
 
 
 def _row(cell: Cell) -> dict[str, Any]:
+    """Return the columns by name; quantities with quantiles take three, absent values are None."""
     row: dict[str, Any] = {}
-    for field in fields(Cell):
-        value = getattr(cell, field.name)
-        if field.name not in ("error", "seconds", "mse"):
-            row[field.name] = value
+    for name, value in cell:
+        if name not in ("error", "seconds", "mse"):
+            row[name] = value
             continue
-        found: dict[str, Any] = {} if value is None else asdict(value)
-        for place in ("median", "low", "high"):
-            row[field.name if place == "median" else f"{field.name}_{place}"] = found.get(place)
-        if field.name == "error":
+        for key in Quantiles.model_fields:
+            row[name if key == "median" else f"{name}_{key}"] = None if value is None else getattr(value, key)
+        if name == "error":
             row["error_unit"] = UNITS[cell.stage]
     return row

@@ -1,11 +1,10 @@
-"""index.html of a batch: every scene with its error, what failed and why, and measured against predicted error of all.
+"""index.html of a batch: the error of every scene, failures with their reasons, and measured against predicted error.
 
-Where the batch is a sweep, `sweep.json` beside it lists the folders with the `values` of the keys that were varied.
+A sweep is a batch with `sweep.json`, which lists its folders with the `values` of the varied keys.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -14,20 +13,21 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from ommatid.batch.sweep_row import NUMBERS, read_rows
+from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 
-from .cached import REPORT, own_files, stamp_of
-from .data import run_description
+from .cached import REPORT, read_stamp, sources_digest
 
-INDEX, SWEEP = "index.html", "sweep.json"
+INDEX = "index.html"
 
 
 @dataclass(frozen=True)
 class BatchEntry:
-    """A scene of a batch: what became of it, or why nothing did; numbers that are not known are None."""
+    """Results of one scene of a batch, or the reason of its failure; numbers are None if not known."""
 
     name: str
     title: str
@@ -44,7 +44,7 @@ class BatchEntry:
 
     @property
     def agrees(self) -> bool | None:
-        """Whether the measured error is one that theory expects; None where that cannot be told."""
+        """True if the measured error is inside the expected interval, None if either is not known."""
         if self.mse is None or self.low is None or self.high is None:
             return None
         return self.low <= self.mse <= self.high
@@ -52,9 +52,9 @@ class BatchEntry:
 
 @dataclass(frozen=True)
 class SweepTable:
-    """Keys that were varied, and a row a scene: its page's link, the keys' values, measured and predicted error.
+    """Varied keys, and for each scene the link to its page, the values, measured and predicted error.
 
-    The link is empty where the scene failed.
+    The link is empty for a failed scene.
     """
 
     keys: tuple[str, ...]
@@ -62,74 +62,71 @@ class SweepTable:
 
 
 def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
-    """Whether index.html of a batch had to be written; nothing is where the batch left no folder.
+    """Write index.html of a batch unless it is up to date or there is no folder, and return True if it was written.
 
-    folders : of the batch, in order, each with why it failed, else an empty text; other runs in `output` come after
-    Raises DeniedError for a disk that is full.
+    folders : of the batch, in order, each with its failure or an empty text; other runs in `output` follow
+    Raises MachineError for a full disk.
     """
     if not output.is_dir():
         return False
-    more = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
-    found = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *more)]
-    swept = sweep_of(output / SWEEP)
-    told = [[asdict(entry) for entry in found], None if swept is None else asdict(swept)]
-    stamp = fingerprint([told, versions("bokeh"), own_files()])
-    if stamp_of(output / INDEX) == stamp:
-        return False
-    write_text(output / INDEX, page(found, swept, output.resolve().name, stamp))
-    return True
+    others = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
+    entries = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *others)]
+    sweep = read_sweep(output / NUMBERS)
+    content = [[asdict(entry) for entry in entries], None if sweep is None else asdict(sweep)]
+    stamp = fingerprint([content, versions("bokeh"), sources_digest()])
+    name = output.resolve().name
+    return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
 
 
 def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
         return BatchEntry(folder.name, folder.name, failure=failure)
     try:
-        run = run_description(folder)
-        error, stages = run["error"], run["stages"]
-        given: dict[str, float] = error.get("expected_given_truth") or {}
-        return BatchEntry(
-            name=folder.name,
-            title=run["title"] or folder.name,
-            link=quote(f"{folder.name}/{REPORT}"),
-            picture=quote(f"{folder.name}/{PICTURE}"),
-            mse=error.get("mse"),
-            predicted=error["predicted_mse"],
-            low=given.get("low"),
-            high=given.get("high"),
-            psnr=error.get("psnr"),
-            ssim=error.get("ssim"),
-            seconds=sum(stage["seconds"] for stage in stages.values()),
-        )
-    except (InputError, KeyError, TypeError, AttributeError) as wrong:
-        return BatchEntry(folder.name, folder.name, failure=str(wrong))
+        report = run_json.read(folder)
+    except InputError as error:
+        return BatchEntry(folder.name, folder.name, failure=str(error))
+    interval = report.error.expected_given_truth
+    return BatchEntry(
+        name=folder.name,
+        title=report.title or folder.name,
+        link=quote(f"{folder.name}/{REPORT}"),
+        picture=quote(f"{folder.name}/{PICTURE}"),
+        mse=report.error.mse,
+        predicted=report.error.predicted_mse,
+        low=None if interval is None else interval.low,
+        high=None if interval is None else interval.high,
+        psnr=report.error.psnr,
+        ssim=report.error.ssim,
+        seconds=sum(stage.seconds for stage in report.stages.values()),
+    )
 
 
-def sweep_of(path: Path) -> SweepTable | None:
-    """What sweep.json tells; None where there is none, or none that can be read."""
+def read_sweep(path: Path) -> SweepTable | None:
+    """Return the content of sweep.json, None if the file is missing or damaged."""
     try:
-        listed: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-        keys = tuple(dict.fromkeys(key for one in listed for key in one["values"]))
-        rows = [
-            (
-                "" if "failed" in one else quote(f"{Path(one['folder']).name}/{REPORT}"),
-                tuple(str(one["values"].get(key, "")) for key in keys),
-                one.get("mse"),
-                one.get("predicted_mse"),
-            )
-            for one in listed
-        ]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        listed = read_rows(path)
+    except InputError:
         return None
+    keys = tuple(dict.fromkeys(key for row in listed for key in row.values))
+    rows = [
+        (
+            "" if row.failed is not None or row.folder is None else quote(f"{Path(row.folder).name}/{REPORT}"),
+            tuple(str(row.values.get(key, "")) for key in keys),
+            row.mse,
+            row.predicted_mse,
+        )
+        for row in listed
+    ]
     return SweepTable(keys, rows) if keys and rows else None
 
 
-def page(entries: list[BatchEntry], swept: SweepTable | None, name: str, stamp: str) -> str:
-    """The index as HTML; without figures where there is nothing to compare."""
+def page(entries: list[BatchEntry], sweep: SweepTable | None, name: str, stamp: str) -> str:
+    """Return the index as HTML; without figures if there is nothing to compare."""
     from .document import fill
 
-    figures = _figures(entries, swept)
-    content = {"entries": entries, "swept": swept, "title": f"Batch: {name}", "stamp": stamp, "words": words(entries)}
-    content |= {"drawn": {drawn.name for drawn in figures}, "document": ""}
+    figures = _figures(entries, sweep)
+    content = {"entries": entries, "sweep": sweep, "title": f"Batch: {name}", "stamp": stamp, "words": words(entries)}
+    content |= {"drawn": {figure.name for figure in figures}, "document": ""}
     if figures:
         from . import plots
 
@@ -138,83 +135,78 @@ def page(entries: list[BatchEntry], swept: SweepTable | None, name: str, stamp: 
 
 
 def words(entries: list[BatchEntry]) -> str:
-    """The batch in a sentence."""
-    done = [entry for entry in entries if not entry.failure]
-    told = [f"{len(done)} of {len(entries)} scenes are done"]
-    judged = [entry for entry in done if entry.agrees is not None]
-    if judged:
-        agreeing = sum(bool(entry.agrees) for entry in judged)
-        told.append(f"the error of {agreeing} of {len(judged)} is what theory expects of their picture")
-    return "; ".join(told) + "."
+    """Return the results of the batch in one sentence."""
+    finished = [entry for entry in entries if not entry.failure]
+    sentence = f"{len(finished)} of {len(entries)} scenes are finished"
+    compared = [entry for entry in finished if entry.agrees is not None]
+    if compared:
+        inside = sum(bool(entry.agrees) for entry in compared)
+        sentence += f"; the error of {inside} of {len(compared)} is inside the 99 % interval expected for its image"
+    return f"{sentence}."
 
 
-def _figures(entries: list[BatchEntry], swept: SweepTable | None) -> list[Any]:
+def _figures(entries: list[BatchEntry], sweep: SweepTable | None) -> list[Any]:
     known = [entry for entry in entries if entry.mse and entry.predicted]
-    drawn = [_measured_against_predicted(known)] if len(known) > 1 else []
-    series = _series(swept) if swept is not None else {}
-    return [*drawn, _swept(swept.keys[0], series)] if swept is not None and series else drawn
+    figures = [_scenes_figure(known)] if len(known) > 1 else []
+    series = {} if sweep is None else _series(sweep)
+    return [*figures, _sweep_figure(sweep.keys[0], series)] if sweep is not None and series else figures
 
 
-def _measured_against_predicted(entries: list[BatchEntry]) -> Any:
+def _scenes_figure(entries: list[BatchEntry]) -> Any:
     from . import plots
 
-    drawn = plots.chart(
-        "scenes",
-        ("predicted mean squared error", "measured mean squared error"),
-        x_axis_type="log",
-        y_axis_type="log",
-    )
-    ends = [min(entry.predicted or 0 for entry in entries), max(entry.predicted or 0 for entry in entries)]
-    drawn.line(ends, ends, line_dash="6 4", line_color=plots.SOFT)
+    axes = "predicted mean squared error", "measured mean squared error"
+    chart = plots.chart("scenes", axes, x_axis_type="log", y_axis_type="log")
+    ends = [end(entry.predicted or 0 for entry in entries) for end in (min, max)]
+    chart.line(ends, ends, line_dash="6 4", line_color=plots.SOFT)
     columns = {name: [getattr(entry, name) for entry in entries] for name in ("title", "mse", "predicted")}
     columns["low"] = [entry.low or entry.mse for entry in entries]
     columns["high"] = [entry.high or entry.mse for entry in entries]
     data = plots.source(columns, "scenes")
-    drawn.segment(
-        "predicted", "low", "predicted", "high", source=data, line_width=9, line_alpha=0.35, line_color=plots.SOFT
-    )
-    marks = drawn.scatter("predicted", "mse", source=data, size=10, color=plots.MARK)
+    chart.segment("predicted", "low", "predicted", "high", source=data, **plots.INTERVAL)
+    marks = chart.scatter("predicted", "mse", source=data, size=10, color=plots.MARK)
     tips = [("scene", "@title"), ("predicted", "@predicted{%.4g}"), ("measured", "@mse{%.4g}")]
-    plots.hover(drawn, [marks], tips, {"@predicted": "printf", "@mse": "printf"})
-    return drawn
+    plots.hover(chart, [marks], tips, ("predicted", "mse"))
+    return chart
 
 
-def _series(swept: SweepTable) -> dict[str, list[tuple[float, float, float]]]:
-    """Value of the first key, measured and predicted error of what did not fail, a series a choice of the others.
+def _series(sweep: SweepTable) -> dict[str, list[tuple[float, float, float]]]:
+    """Return (value of the first key, measured error, predicted error) of the scenes, by values of the other keys.
 
-    None where the first key's values are no numbers above 0, or only one.
+    The dictionary is empty if the values of the first key are not positive numbers, or all the same.
     """
-    found: dict[str, list[tuple[float, float, float]]] = {}
-    for _, values, mse, predicted in swept.rows:
+    series: dict[str, list[tuple[float, float, float]]] = {}
+    for _, values, mse, predicted in sweep.rows:
         if not predicted:
             continue
-        number = _number(values[0])
+        number = _positive_number(values[0])
         if number is None:
             return {}
-        others = ", ".join(f"{key} {value}" for key, value in zip(swept.keys[1:], values[1:], strict=True))
-        found.setdefault(others or "measured", []).append((number, mse or predicted, predicted))
-    several = len({number for series in found.values() for number, _, _ in series}) > 1
-    return {name: sorted(series) for name, series in found.items()} if several else {}
+        others = ", ".join(f"{key} {value}" for key, value in zip(sweep.keys[1:], values[1:], strict=True))
+        series.setdefault(others or "measured", []).append((number, mse or predicted, predicted))
+    varies = len({number for points in series.values() for number, _, _ in points}) > 1
+    return {name: sorted(points) for name, points in series.items()} if varies else {}
 
 
-def _number(text: str) -> float | None:
+def _positive_number(text: str) -> float | None:
     try:
-        found = float(Fraction(text))
+        number = float(Fraction(text))
     except (ValueError, ZeroDivisionError):
         return None
-    return found if isfinite(found) and found > 0 else None
+    return number if isfinite(number) and number > 0 else None
 
 
-def _swept(key: str, series: dict[str, list[tuple[float, float, float]]]) -> Any:
+def _sweep_figure(key: str, series: dict[str, list[tuple[float, float, float]]]) -> Any:
     from . import plots
 
-    drawn = plots.chart("sweep", (key, "mean squared error"), x_axis_type="log", y_axis_type="log")
-    for place, (name, points) in enumerate(series.items()):
-        columns = dict(zip(("value", "mse", "predicted"), map(list, zip(*points, strict=True)), strict=True))
-        data, colour = plots.source({**columns, "series": [name] * len(points)}, ""), plots.SERIES[place % 8]
-        drawn.line("value", "predicted", source=data, line_color=colour, line_dash="6 4", legend_label=name)
-        marks = drawn.scatter("value", "mse", source=data, color=colour, size=9, legend_label=name)
+    chart = plots.chart("sweep", (key, "mean squared error"), x_axis_type="log", y_axis_type="log")
+    for index, (name, points) in enumerate(series.items()):
+        values, measured, predicted = map(list, zip(*points, strict=True))
+        columns = {"value": values, "mse": measured, "predicted": predicted, "series": [name] * len(points)}
+        data, colour = plots.source(columns), plots.SERIES[index % len(plots.SERIES)]
+        chart.line("value", "predicted", source=data, line_color=colour, line_dash="6 4", legend_label=name)
+        marks = chart.scatter("value", "mse", source=data, color=colour, size=9, legend_label=name)
         tips = [("", "@series"), (key, "@value"), ("measured", "@mse{%.4g}"), ("predicted", "@predicted{%.4g}")]
-        plots.hover(drawn, [marks], tips, {"@predicted": "printf", "@mse": "printf"})
-    plots.legend(drawn, "top_left")
-    return drawn
+        plots.hover(chart, [marks], tips, ("predicted", "mse"))
+    plots.legend(chart, "top_left")
+    return chart

@@ -1,4 +1,4 @@
-"""report.html in a run's folder: kept while what it shows has not changed, written anew when it has."""
+"""report.html in a run's folder, which is rewritten only if its content changes."""
 
 from __future__ import annotations
 
@@ -6,59 +6,53 @@ import hashlib
 import re
 from pathlib import Path
 
-from ommatid.runtime.files import fingerprint, write_text
+from ommatid.bench.table import bench_tables
+from ommatid.reconstruct.output import run_json
+from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
+from ommatid.scenes import stack
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
-from .data import read_run, run_description
-from .point_response import Ideal
-from .time_curves import bench_of
+from .data import read_run
+from .point_response import IdealMatrix
 
 REPORT = "report.html"
 HERE = Path(__file__).parent
-BEGIN = 4096  # characters of a page, in which its stamp stands
+HEAD = 4096  # characters at the beginning of a page that contain its stamp
 
 
 def cached_page(
-    folder: Path, ideal: Ideal | None, recorded: Stack | None = None, calibrated: Model | None = None
+    folder: Path, ideal: IdealMatrix | None, recorded: Stack | None = None, calibrated: Model | None = None
 ) -> bool:
-    """Whether report.html of a finished run had to be written.
+    """Write report.html of a finished run unless it is up to date, and return True if it was written.
 
-    ideal : H of one sub-imager as designed;  recorded, calibrated : of the folder, read only where they are not given
-    Raises InputError for files that are missing or damaged, DeniedError for a disk that is full.
+    ideal : H of one sub-imager as designed;  recorded, calibrated : the folder's stack and model, read if not given
+    Raises InputError for missing or damaged files, MachineError for a full disk.
     """
-    from ommatid.scenes import stack
-
     recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
-    bench = bench_of(folder, recorded.camera.describe())
-    made_from = fingerprint([run_description(folder), bench, versions("bokeh"), own_files()])
-    path = folder / REPORT
-    if stamp_of(path) == made_from:
-        return False
-    from .document import page
+    bench = next(bench_tables(folder, recorded.camera.describe()), None)
+    described = None if bench is None else bench.describe()
+    stamp = fingerprint([run_json.read(folder).plain(), described, versions("bokeh"), sources_digest()])
 
-    write_text(path, page(read_run(folder, recorded, calibrated), ideal, bench, made_from))
-    return True
+    def make() -> str:
+        from .document import page  # imports Bokeh
 
+        return page(read_run(folder, recorded, calibrated), ideal, bench, stamp)
 
-def stamp_of(path: Path) -> str:
-    """Of a page on disk; empty where there is none of ours, or half of one."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return ""
-    found = re.search(r'<meta name="ommatid" content="([0-9a-f]+)">', text[:BEGIN])
-    return found[1] if found and text.rstrip().endswith("</html>") else ""
+    return cached(folder / REPORT, stamp, read_stamp, make, write_text)[1]
 
 
-def own_files() -> str:
-    """SHA-256 of all that decides how pages look: a page that an older program drew is drawn anew."""
+def read_stamp(path: Path) -> tuple[None, str | None]:
+    """Return None and the fingerprint of a page on disk, which is None for a foreign or truncated file."""
+    text = path.read_text(encoding="utf-8")
+    match = re.search(r'<meta name="ommatid" content="([0-9a-f]+)">', text[:HEAD])
+    return None, match[1] if match and text.rstrip().endswith("</html>") else None
+
+
+def sources_digest() -> str:
+    """Return the SHA-256 of the modules and templates of this package: a new version redraws the pages."""
     total = hashlib.sha256()
-    for path in sorted(
-        path
-        for path in (*HERE.iterdir(), *(HERE / "templates").iterdir())
-        if path.suffix in (".py", ".html", ".css", ".js")
-    ):
+    for path in sorted((*HERE.glob("*.py"), *(HERE / "templates").iterdir())):
         total.update(path.read_bytes())
     return total.hexdigest()

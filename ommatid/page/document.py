@@ -1,4 +1,4 @@
-"""A run as one HTML page that needs nothing else: style, program, figures and numbers are all in it."""
+"""The report of a run as one HTML page that contains its style, program, figures and numbers."""
 
 from __future__ import annotations
 
@@ -6,64 +6,62 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ommatid.bench.table import BenchTable
+
 from . import error_groups, plots, point_response, sensor, tables, time_curves, words
-from . import maps as images
+from . import maps as result_maps
 from .data import Run, maps
-from .point_response import Ideal
+from .point_response import IdealMatrix
 from .sensor import MOST_VALUES
 
-HERE = Path(__file__).parent / "templates"
+TEMPLATES = Path(__file__).parent / "templates"
 LARGEST = 2_950_000  # bytes of a page
-SMALLEST = 4  # times fewer of the sensor's values, before a page may be larger than that
+LARGEST_REDUCTION = 4  # of the number of the sensor's values, to keep a page below LARGEST
 
 
-def page(run: Run, ideal: Ideal | None, bench: dict[str, Any] | None, stamp: str) -> str:
-    """The report of a run as HTML.
+def page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: str) -> str:
+    """Return the report of a run as HTML.
 
-    ideal : H of one sub-imager as designed, None where that is not known;  bench : curves of the same camera
-    stamp : what the page was made from, by which it is known to be up to date
+    ideal : H of one sub-imager as designed, None if not known;  bench : results of `ommatid bench` for the camera
+    stamp : fingerprint of the content, by which an up-to-date page is recognised
     """
-    share = 1
+    reduction = 1
     while True:
-        made = _page(run, ideal, bench, stamp, MOST_VALUES // share)
-        if len(made.encode()) <= LARGEST or share >= SMALLEST:
-            return made
-        share *= 2
+        html = _page(run, ideal, bench, stamp, MOST_VALUES // reduction)
+        if len(html.encode()) <= LARGEST or reduction >= LARGEST_REDUCTION:
+            return html
+        reduction *= 2
 
 
-def _page(run: Run, ideal: Ideal | None, bench: dict[str, Any] | None, stamp: str, values: int) -> str:
-    shown, mosaic, found = maps(run), sensor.mosaic(run.stack, values), error_groups.groups(run)
-    panels, kinds, curves = (
-        images.panels(shown),
-        point_response.responses(run.model, ideal),
-        time_curves.time_curves(run, bench),
-    )
-    figures = [*images.figures(shown, panels), *sensor.figures(mosaic)]
-    figures += [drawn for kind in kinds for drawn in point_response.figures(kind)]
-    figures += [error_groups.figure(found)] if found else []
+def _page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: str, sensor_values: int) -> str:
+    shown, mosaic, groups = maps(run), sensor.mosaic(run.stack, sensor_values), error_groups.groups(run)
+    panels, responses = result_maps.panels(shown), point_response.responses(run.model, ideal)
+    curves = time_curves.time_curves(run, bench)
+    figures = [*result_maps.figures(shown, panels), *sensor.figures(mosaic)]
+    figures += [figure for response in responses for figure in point_response.figures(response)]
+    figures += [error_groups.figure(groups)] if groups else []
     figures += [time_curves.figure(curves)] if curves else []
     lenses, facts = tables.geometry(run)
     content: dict[str, Any] = {
         "title": run.title,
-        "verdict": words.verdict(run.description),
-        "agreement": words.agreement(run.description["error"]),
-        "cautions": words.cautions(run.description),
-        "key_numbers": words.key_numbers(run.description),
+        "verdict": words.verdict(run.report),
+        "agreement": words.agreement(run.report.error),
+        "cautions": words.cautions(run.report),
+        "key_numbers": words.key_numbers(run.report),
         "maps": shown,
         "panels": panels,
-        "budget": words.budget(run.description["error"]),
-        "groups": found,
-        "group_words": error_groups.words(found) if found else "",
+        "budget": words.budget(run.report.error),
+        "groups": groups,
+        "group_words": error_groups.words(groups) if groups else "",
         "mosaic": mosaic,
         "mosaic_words": sensor.words(mosaic),
-        "views": _views(mosaic),
-        "responses": [(kind, point_response.words(kind), _titled(kind)) for kind in kinds],
+        "responses": [(response, point_response.words(response), _titled(response)) for response in responses],
         "curves": curves,
         "curve_words": time_curves.words(curves) if curves else "",
-        "plan": tables.plan(run),
-        "more_time": tables.more_time(run),
-        "given_time": tables.given_time(run),
-        "left_out": tables.skipped(run),
+        "stages": tables.stages(run),
+        "more_samples": tables.more_samples(run),
+        "time_limit": tables.time_limit(run),
+        "skipped": tables.skipped(run),
         "lenses": lenses,
         "facts": facts,
         "numbers": tables.numbers(run),
@@ -73,40 +71,37 @@ def _page(run: Run, ideal: Ideal | None, bench: dict[str, Any] | None, stamp: st
     return fill("page.html", {**content, "document": plots.document(figures), "stamp": stamp})
 
 
-def _views(mosaic: sensor.Mosaic) -> dict[str, float]:
-    """Height over width of each view of the sensor."""
-    found: dict[str, float] = {}
-    for name in ("packed", "place"):
-        left, right, top, bottom = sensor.extent(mosaic, name)
-        found[name] = (bottom - top) / (right - left)
-    return found
-
-
-def _titled(kind: point_response.PointResponse) -> list[tuple[str, str, str]]:
-    """Name, title and words of each map of a response; the ideal one was not measured."""
-    titles = point_response.TITLES | ({"measured": "Response"} if kind.exact else {})
+def _titled(response: point_response.PointResponse) -> list[tuple[str, str, str]]:
+    """Return figure name, title and description of each map of a response."""
+    titles = point_response.titles(response)
     return [
-        (f"response-{kind.lens}-{name}", titles[name], images.values_in_words(image))
-        for name, image in point_response.shown(kind)
+        (f"response-{response.lens}-{name}", titles[name], result_maps.value_words(image))
+        for name, image in response.maps.items()
     ]
 
 
 def fill(template: str, content: Mapping[str, Any]) -> str:
-    """A template with its content, style and programs. Text is escaped unless it comes from here."""
+    """Return a template with its content, style and programs; all text of the content is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
     def code(text: str) -> Markup:
-        """A sentence whose commands stand between backticks."""
+        """Mark commands between backticks."""
         parts = text.split("`")
-        marked = [Markup("<code>{}</code>").format(part) if place % 2 else part for place, part in enumerate(parts)]
+        marked = [Markup("<code>{}</code>").format(part) if index % 2 else part for index, part in enumerate(parts)]
         return Markup("").join(marked)
 
-    house = Environment(
-        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    house.filters["code"] = code
-    files = {"css": "page.css", "paper": "print.css", "js": "page.js"}
-    ours = {name: Markup((HERE / file).read_text(encoding="utf-8")) for name, file in files.items()}
-    drawn = {"bokeh": Markup(plots.script()), "document": Markup(content["document"])} if content["document"] else {}
-    return house.get_template(template).render({"bokeh": "", **content, **ours, **drawn})
+    environment.filters["code"] = code
+    files = {"css": "page.css", "print_css": "print.css", "js": "page.js"}
+    trusted = {name: Markup((TEMPLATES / file).read_text(encoding="utf-8")) for name, file in files.items()}
+    trusted["bokeh"] = Markup("")
+    if content["document"]:
+        trusted |= {"bokeh": Markup(plots.script()), "document": Markup(content["document"])}
+    return environment.get_template(template).render({**content, **trusted})

@@ -1,4 +1,4 @@
-"""Measured against predicted error: pixels sorted by their posterior deviation, and what became of each group."""
+"""Measured against predicted error in groups of pixels with similar posterior standard deviations."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from ommatid.runtime.arrays import FloatArray
+
 from . import plots
 from .data import Run
 
 GROUPS = 12
-FEWEST = 20  # pixels in a group, on average
-SURE = 0.99
-WIDE = 10  # ratio of the largest to the smallest error, from which on axes are logarithmic
+FEWEST_PIXELS = 20  # per group, on average
+CONFIDENCE = 0.99
+LOG_RATIO = 10  # ratio of the largest to the smallest error from which on the axes are logarithmic
 
 
 @dataclass(frozen=True)
 class ErrorGroup:
-    """Pixels of like posterior deviation: how many, what was predicted and measured (rms), and the band.
+    """RMS errors of a group of pixels: predicted from the posterior variance, and measured.
 
-    low, high : what holds the measured rms 99 times in 100 where errors are Gaussian and independent (chi-squared)
+    low, high : interval that contains the measured error with 99 % probability if the errors are Gaussian and
+        independent (chi-squared)
     """
 
     pixels: int
@@ -30,60 +33,57 @@ class ErrorGroup:
     low: float
     high: float
 
+    @property
+    def is_inside(self) -> bool:
+        """True if the measured error is inside the interval."""
+        return self.low <= self.measured <= self.high
+
 
 def groups(run: Run) -> list[ErrorGroup]:
-    """From the smallest posterior deviation to the largest; none without the truth."""
+    """Return the groups in order of increasing posterior standard deviation; none if the truth is not known."""
     if run.truth is None:
         return []
     errors = np.square(run.estimate.astype(np.float64) - run.truth).ravel()
     variances = run.variance.astype(np.float64).ravel()
-    count = int(np.clip(errors.size // FEWEST, 1, GROUPS))
+    count = int(np.clip(errors.size // FEWEST_PIXELS, 1, GROUPS))
     edges = np.unique(np.quantile(variances, np.linspace(0, 1, count + 1)[1:-1]))
-    # Equal deviations belong to one group: frames have many that are.
-    place = np.searchsorted(edges, variances, side="left")
-    return [_group(errors[place == number], variances[place == number]) for number in np.unique(place)]
+    # Pixels of equal variance, of which frames have many, belong to one group.
+    group = np.searchsorted(edges, variances, side="left")
+    return [_group(errors[group == index], variances[group == index]) for index in np.unique(group)]
 
 
-def _group(errors: Any, variances: Any) -> ErrorGroup:
+def _group(errors: FloatArray, variances: FloatArray) -> ErrorGroup:
     predicted = float(np.sqrt(variances.mean()))
     low, high = (
         predicted * float(np.sqrt(stats.chi2.ppf(quantile, errors.size) / errors.size))
-        for quantile in ((1 - SURE) / 2, (1 + SURE) / 2)
+        for quantile in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
     )
     return ErrorGroup(int(errors.size), predicted, float(np.sqrt(errors.mean())), low, high)
 
 
-def figure(found: list[ErrorGroup]) -> Any:
-    """Measured against predicted rms, with the line where they agree and the band around it."""
-    numbers = [value for group in found for value in (group.predicted, group.measured, group.low, group.high)]
-    positive = [value for value in numbers if value > 0]
-    scale = "log" if positive and max(positive) > WIDE * min(positive) and len(positive) == len(numbers) else "linear"
-    drawn = plots.chart(
-        "errors",
-        ("predicted error of a pixel, rms", "measured error, rms"),
-        x_axis_type=scale,
-        y_axis_type=scale,
+def figure(groups: list[ErrorGroup]) -> Any:
+    """Draw measured against predicted RMS error, with the line of equality and the 99 % intervals."""
+    numbers = [value for group in groups for value in (group.predicted, group.measured, group.low, group.high)]
+    scale = "log" if min(numbers) > 0 and max(numbers) > LOG_RATIO * min(numbers) else "linear"
+    chart = plots.chart(
+        "errors", ("predicted RMS error of a pixel", "measured RMS error"), x_axis_type=scale, y_axis_type=scale
     )
-    data = plots.source(
-        {name: [getattr(group, name) for group in found] for name in ErrorGroup.__annotations__}, "groups"
-    )
-    ends = [min(group.predicted for group in found), max(group.predicted for group in found)]
-    drawn.line(ends, ends, line_dash="6 4", line_width=1.5, line_color=plots.SOFT)
-    band = drawn.segment(
-        x0="predicted", x1="predicted", y0="low", y1="high", source=data, line_width=9,
-        line_alpha=0.35, line_color=plots.SOFT,
-    )  # fmt: skip
-    marks = drawn.scatter(x="predicted", y="measured", source=data, size=9, color=plots.MARK)
+    names = ErrorGroup.__annotations__
+    data = plots.source({name: [getattr(group, name) for group in groups] for name in names}, "groups")
+    ends = [min(group.predicted for group in groups), max(group.predicted for group in groups)]
+    chart.line(ends, ends, line_dash="6 4", line_width=1.5, line_color=plots.SOFT)
+    intervals = chart.segment(x0="predicted", x1="predicted", y0="low", y1="high", source=data, **plots.INTERVAL)
+    marks = chart.scatter(x="predicted", y="measured", source=data, size=9, color=plots.MARK)
     tips = [("pixels", "@pixels"), ("predicted", "@predicted{%.4g}"), ("measured", "@measured{%.4g}")]
-    plots.hover(drawn, [marks, band], tips, {"@predicted": "printf", "@measured": "printf"})
-    return drawn
+    plots.hover(chart, [marks, intervals], tips, ("predicted", "measured"))
+    return chart
 
 
-def words(found: list[ErrorGroup]) -> str:
-    """How many groups agree, and what to think of it."""
-    inside = sum(group.low <= group.measured <= group.high for group in found)
-    ratios = [group.measured / group.predicted for group in found if group.predicted > 0]
-    told = f"{inside} of {len(found)} groups of pixels lie where 99 in 100 would if errors were independent"
+def words(groups: list[ErrorGroup]) -> str:
+    """Return how many groups agree with the prediction, and how to interpret it."""
+    inside = sum(group.is_inside for group in groups)
+    ratios = [group.measured / group.predicted for group in groups if group.predicted > 0]
+    sentence = f"{inside} of {len(groups)} groups are inside their intervals"
     if ratios:
-        told += f"; measured is {min(ratios):.2f} to {max(ratios):.2f} times predicted"
-    return told + ". Errors of neighbours go together, so that groups may lie farther out than that."
+        sentence += f"; the ratio of measured to predicted error is {min(ratios):.2f} to {max(ratios):.2f}"
+    return f"{sentence}. Errors of neighbouring pixels are correlated, so more groups may be outside than 1 in 100."

@@ -1,4 +1,4 @@
-"""Truth, estimate, error and posterior deviation side by side, on ranges that they share."""
+"""Maps of truth, estimate, error and posterior standard deviation with shared ranges."""
 
 from __future__ import annotations
 
@@ -8,47 +8,50 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import plots
-from .data import Image, ResultMaps
-from .plots import Colours
+from ommatid.runtime.arrays import Float32Array
+from ommatid.scenes.constants import WHITE
 
-UNIT = "value (0 to 255)"
-SHOWN = 99.5  # per cent of the pixels whose colours a scale tells apart; a few at the edges would grey out the others
+from . import plots
+from .data import ResultMaps
+from .plots import ColourScale
+
+UNIT = "pixel value (0 to 255)"
+SHOWN = 99.5  # per cent of the pixels that a colour scale distinguishes; a few outliers would take all of its range
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A map, how it is coloured, and what is said of it."""
+    """A map with its colour scale and its description in words."""
 
     name: str
     title: str
-    image: Image
-    colours: Colours
+    image: Float32Array
+    colours: ColourScale
     words: str
 
 
 def panels(maps: ResultMaps) -> list[Panel]:
-    """What there is to see, in order: truth and error only where the truth is known."""
-    grey = Colours(plots.GREY, *_ends(maps.estimate if maps.truth is None else maps.truth, maps.truth is None), UNIT)
-    spread = _most(maps.deviation)
-    found: list[Panel] = []
-    if maps.truth is not None:
-        found.append(Panel("truth", "Truth", maps.truth, grey, values_in_words(maps.truth)))
-    found.append(Panel("estimate", "Estimate", maps.estimate, grey, values_in_words(maps.estimate)))
+    """Return the panels in order; truth and error only if the truth is known."""
+    shown: list[Panel] = []
+    if maps.truth is None:
+        grey = ColourScale(plots.GREY, *_range(maps.estimate, (100 - SHOWN) / 2), UNIT)
+    else:
+        grey = ColourScale(plots.GREY, *_range(maps.truth, 0.0), UNIT)
+        shown.append(Panel("truth", "Truth", maps.truth, grey, value_words(maps.truth)))
+    shown.append(Panel("estimate", "Estimate", maps.estimate, grey, value_words(maps.estimate)))
     if maps.error is not None:
-        size = _most(np.abs(maps.error))
-        colours = Colours(plots.DIVERGING, -size, size, "estimate minus truth")
-        found.append(Panel("error", "Error", maps.error, colours, _error_in_words(maps.error, size)))
-    colours = Colours(plots.SEQUENTIAL, 0.0, spread, "standard deviation")
-    words = values_in_words(maps.deviation)
-    found.append(Panel("deviation", "Posterior deviation", maps.deviation, colours, words))
-    return found
+        limit = _limit(np.abs(maps.error))
+        colours = ColourScale(plots.DIVERGING, -limit, limit, "estimate minus truth")
+        shown.append(Panel("error", "Error", maps.error, colours, _error_words(maps.error, limit)))
+    colours = ColourScale(plots.SEQUENTIAL, 0.0, _limit(maps.deviation), "standard deviation of a pixel")
+    title = "Posterior standard deviation"
+    return [*shown, Panel("deviation", title, maps.deviation, colours, value_words(maps.deviation))]
 
 
 def figures(maps: ResultMaps, shown: list[Panel]) -> list[Any]:
-    """A figure a panel: one source and one pair of ranges, so that they move together and know each other's values.
+    """Return a figure per panel, with one source and one pair of ranges, so that they move together.
 
-    The errors' column is left empty, for the page computes it from the others where it is read.
+    The errors are zero in the source: the page computes them from the other maps when it is opened.
     """
     columns = {panel.name: [np.ascontiguousarray(panel.image)] for panel in shown}
     if "error" in columns:
@@ -57,43 +60,41 @@ def figures(maps: ResultMaps, shown: list[Panel]) -> list[Any]:
     view = plots.view(0, maps.columns, 0, maps.rows)
     tips = [("row", "$y{0}"), ("column", "$x{0}")]
     tips += [(panel.title.lower(), f"@{panel.name}{{%.5g}}") for panel in shown]
-    formatters = {f"@{panel.name}": "printf" for panel in shown}
-    # The last blocks may be cut by the edge, and Bokeh's pixels are all of one size.
-    places = 0, 0, shown[0].image.shape[1] * maps.block, shown[0].image.shape[0] * maps.block
+    # The target's edge may cut the last blocks, but Bokeh draws all pixels in one size.
+    rows, columns_shown = shown[0].image.shape
+    area = 0, 0, columns_shown * maps.block, rows * maps.block
     return [
-        plots.map_figure(panel.name, data, panel.name, panel.colours, view, tips, places=places, formatters=formatters)
+        plots.map_figure(panel.name, data, panel.name, panel.colours, view, tips, area=area, formatted=tuple(columns))
         for panel in shown
     ]
 
 
-def values_in_words(image: NDArray[Any]) -> str:
-    """Smallest, largest and mean value, and how many are missing."""
+def value_words(image: NDArray[Any]) -> str:
+    """Return smallest, largest and mean value, and the number of missing values, in words."""
     known = image[np.isfinite(image)]
     if not known.size:
         return "no value is known"
     missing = image.size - known.size
-    told = f"values from {known.min():.4g} to {known.max():.4g}, mean {known.mean(dtype=np.float64):.4g}"
-    return told + (f"; {missing} of {image.size} are missing" if missing else "")
+    words = f"{known.min():.4g} to {known.max():.4g}, mean {known.mean(dtype=np.float64):.4g}"
+    return words + (f"; {missing} of {image.size} are missing" if missing else "")
 
 
-def _error_in_words(error: Image, size: float) -> str:
+def _error_words(error: Float32Array, limit: float) -> str:
     squares = np.square(error, dtype=np.float64)
-    beyond = int(np.sum(np.abs(error) > size))
-    told = f"rms {float(np.sqrt(np.nanmean(squares))):.3g}, largest {float(np.nanmax(np.abs(error))):.3g}"
-    return told + (f"; colours end at {size:.3g}, {beyond} lie beyond" if beyond else "")
+    outside = int(np.sum(np.abs(error) > limit))
+    words = f"RMS {float(np.sqrt(np.nanmean(squares))):.3g}, largest {float(np.nanmax(np.abs(error))):.3g}"
+    return words + (f"; {outside} outside the colour scale, which ends at ±{limit:.3g}" if outside else "")
 
 
-def _ends(image: Image, doubtful: bool) -> tuple[float, float]:
-    """The range of a picture; of one that may have gone astray in places without its outermost values."""
+def _range(image: Float32Array, aside: float) -> tuple[float, float]:
+    """Return the range of an image without `aside` per cent of the values at either end."""
     known = image[np.isfinite(image)]
     if not known.size:
-        return 0.0, 255.0
-    aside = (100 - SHOWN) / 2 if doubtful else 0.0
+        return 0.0, WHITE
     low, high = (float(end) for end in np.percentile(known, [aside, 100 - aside]))
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 
-def _most(image: Image) -> float:
+def _limit(image: Float32Array) -> float:
     known = image[np.isfinite(image)]
-    found = float(np.percentile(known, SHOWN)) if known.size else 0.0
-    return found or 1.0
+    return (float(np.percentile(known, SHOWN)) if known.size else 0.0) or 1.0

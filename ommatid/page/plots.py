@@ -1,7 +1,7 @@
-"""Bokeh's figures as a page needs them; the only module of the page that imports Bokeh.
+"""Bokeh figures for the pages; the only module of the page that imports Bokeh.
 
-A figure fills the element `plot-NAME`, whose height the page's style sheet gives it: borders are fixed, so that it
-knows what is left for square pixels. Colours of axes and text are set in the browser, light or dark.
+A figure fills the element `plot-NAME`, whose height is set by the style sheet. Its borders are fixed, so that the style
+sheet can reserve the space for square pixels. Colours of axes and text are set in the browser, light or dark.
 """
 
 # pyright: basic
@@ -36,34 +36,40 @@ Tips = list[tuple[str, str]]
 GREY = tuple(palettes.Greys256)
 SEQUENTIAL = tuple(palettes.Viridis256)
 DIVERGING = tuple(palettes.interp_palette(palettes.RdBu11, 255))
-NOTHING = "#d81b60"  # of pixels that say nothing: no palette has it
-MARK, SOFT = "#2b8cbe", "#87919c"  # of marks and of what they are compared with, on light and on dark paper
+MISSING_COLOUR = "#d81b60"  # of pixels without a value: in none of the palettes
+MARK, SOFT = "#2b8cbe", "#87919c"  # of measured values and of references, on light and dark backgrounds
 SERIES = tuple(palettes.Dark2_8)
-CROSS = "#ff2d78"  # of the lines through the pointer's place
-DARK = "#101820"  # of a sensor where no sub-image falls on it
-BORDERS = {"min_border_left": 52, "min_border_right": 14, "min_border_top": 8}  # page.css knows them too
-BELOW_MAP, BELOW = 108, 50
-WHOLE = "return Math.floor(value).toString()"
+CROSSHAIR = "#ff2d78"
+DARK = "#101820"  # of the sensor between the sub-images
+INTERVAL = {"line_width": 9, "line_alpha": 0.35, "line_color": SOFT}
+BORDERS = {"min_border_left": 52, "min_border_right": 14, "min_border_top": 8}  # page.css depends on these
+BORDER_BELOW_MAP, BORDER_BELOW = 108, 50
+TEXT_SIZE = "12px"
 
 
 @dataclass(frozen=True)
-class Colours:
-    """How numbers become colours: the palette's ends, and what they are numbers of."""
+class ColourScale:
+    """A palette, the values at its ends, and the name of the quantity."""
 
     palette: tuple[str, ...]
     low: float
     high: float
     unit: str
 
-    def mapper(self, low: float | None = None, high: float | None = None, **more: Any) -> Any:
-        """Bokeh's; `low` and `high` where the pixels are stored as other numbers."""
-        ends = self.low if low is None else low, self.high if high is None else high
-        return LinearColorMapper(palette=list(self.palette), low=ends[0], high=ends[1], nan_color=NOTHING, **more)
+    def mapper(self, low: float | None = None, high: float | None = None, **options: Any) -> Any:
+        """Return Bokeh's colour mapper; `low` and `high` are given if the pixels are stored as codes."""
+        return LinearColorMapper(
+            palette=list(self.palette),
+            low=self.low if low is None else low,
+            high=self.high if high is None else high,
+            nan_color=MISSING_COLOUR,
+            **options,
+        )
 
 
 @dataclass(frozen=True)
 class View:
-    """Ranges that several maps share, and the lines that show the pointer's place in all of them."""
+    """Ranges that several maps share, and the lines that show the pointer's position in all of them."""
 
     x: Any
     y: Any
@@ -71,18 +77,18 @@ class View:
 
 
 def view(left: float, right: float, top: float, bottom: float) -> View:
-    """Rows grow downwards; nobody gets farther away than twice the whole."""
-    wide, high = right - left, bottom - top
-    spans = tuple(Span(dimension=name, line_color=CROSS, line_width=1, line_dash="4 3") for name in ("width", "height"))
+    """Return a view with rows increasing downwards; one can zoom out to twice its size."""
+    width, height = right - left, bottom - top
+    spans = [Span(dimension=name, line_color=CROSSHAIR, line_width=1, line_dash="4 3") for name in ("width", "height")]
     return View(
-        Range1d(start=left, end=right, bounds=(left - wide / 2, right + wide / 2)),
-        Range1d(start=bottom, end=top, bounds=(top - high / 2, bottom + high / 2)),
+        Range1d(start=left, end=right, bounds=(left - width / 2, right + width / 2)),
+        Range1d(start=bottom, end=top, bounds=(top - height / 2, bottom + height / 2)),
         (spans[0], spans[1]),
     )
 
 
-def source(columns: Mapping[str, Sequence[Any]], name: str) -> Any:
-    """Columns that figures share; the page finds them by name."""
+def source(columns: Mapping[str, Sequence[Any]], name: str = "") -> Any:
+    """Return columns that figures share; the page's program finds them by name."""
     return ColumnDataSource({key: list(values) for key, values in columns.items()}, name=name)
 
 
@@ -90,28 +96,30 @@ def map_figure(
     name: str,
     data: Any,
     field: str,
-    colours: Colours,
+    colours: ColourScale,
     shown: View,
     tips: Tips,
     *,
-    places: tuple[Any, Any, Any, Any],
+    area: tuple[Any, Any, Any, Any],
     axes: tuple[str, str] = ("column", "row"),
     mapper: Any = None,
-    formatters: dict[str, Any] | None = None,
-    ground: str | None = None,
+    formatted: Sequence[str] = (),
+    formatters: Mapping[str, Any] | None = None,
+    background: str | None = None,
 ) -> Any:
-    """A map, or several beside each other, with a colour bar below.
+    """Return a figure of a map, or of several maps side by side, with a colour bar below.
 
-    places : x, y, width and height, numbers or columns of `data`;  mapper : where pixels are stored as other numbers
-    ground : colour of what no map covers
+    area : x, y, width and height, as numbers or columns of `data`;  mapper : of pixels that are stored as codes
+    formatted : columns with printf formats in `tips`;  formatters : other formatters of tooltips
+    background : colour outside the maps
     """
-    drawn = _blank(name, BELOW_MAP, axes, x_range=shown.x, y_range=shown.y)
-    x, y, width, height = places
-    drawn.image(
+    plot = _blank(name, BORDER_BELOW_MAP, axes, x_range=shown.x, y_range=shown.y)
+    x, y, width, height = area
+    plot.image(
         image=field, source=data, x=x, y=y, dw=width, dh=height, color_mapper=mapper or colours.mapper(), level="image"
     )
-    drawn.grid.visible = False
-    drawn.background_fill_color = ground
+    plot.grid.visible = False
+    plot.background_fill_color = background
     bar = ColorBar(
         color_mapper=colours.mapper(),
         ticker=BasicTicker(desired_num_ticks=5),
@@ -121,51 +129,52 @@ def map_figure(
         margin=0,
         background_fill_color=None,
         title_text_font_style="normal",
-        title_text_font_size="12px",
-        major_label_text_font_size="12px",
+        title_text_font_size=TEXT_SIZE,
+        major_label_text_font_size=TEXT_SIZE,
         location="center",
     )
-    drawn.add_layout(bar, "below")
-    whole = CustomJSHover(code=WHOLE)
-    known = {"$x": whole, "$y": whole, **(formatters or {})}
-    drawn.add_tools(
-        PanTool(),
-        WheelZoomTool(modifiers="ctrl", zoom_on_axis=False),
-        HoverTool(tooltips=tips, formatters=known, attachment="horizontal"),
-        CrosshairTool(overlay=shown.spans),
-    )
-    drawn.toolbar.active_scroll = drawn.tools[1]
-    return drawn
+    plot.add_layout(bar, "below")
+    integer = CustomJSHover(code="return Math.floor(value).toString()")
+    all_formatters = {"$x": integer, "$y": integer, **_printf(formatted), **(formatters or {})}
+    wheel = WheelZoomTool(modifiers="ctrl", zoom_on_axis=False)
+    hover = HoverTool(tooltips=tips, formatters=all_formatters, attachment="horizontal")
+    plot.add_tools(PanTool(), wheel, hover, CrosshairTool(overlay=shown.spans))
+    plot.toolbar.active_scroll = wheel
+    return plot
 
 
 def chart(name: str, axes: tuple[str, str], **options: Any) -> Any:
-    """An empty chart of numbers against numbers."""
-    drawn = _blank(name, BELOW, axes, **options)
-    drawn.grid.grid_line_alpha = 0.35
-    return drawn
+    """Return an empty chart."""
+    plot = _blank(name, BORDER_BELOW, axes, **options)
+    plot.grid.grid_line_alpha = 0.35
+    return plot
 
 
-def hover(drawn: Any, renderers: Sequence[Any], tips: Tips, formatters: dict[str, Any] | None = None) -> None:
-    """Values under the pointer for some of a chart's marks."""
-    drawn.add_tools(HoverTool(renderers=list(renderers), tooltips=tips, formatters=formatters or {}))
+def hover(plot: Any, renderers: Sequence[Any], tips: Tips, formatted: Sequence[str]) -> None:
+    """Add tooltips to marks of a chart; `formatted` are the columns with printf formats in `tips`."""
+    plot.add_tools(HoverTool(renderers=list(renderers), tooltips=tips, formatters=_printf(formatted)))
 
 
-def legend(drawn: Any, place: str) -> None:
-    """A legend without a box of its own; what is clicked on goes away and comes back."""
-    drawn.legend.location = place
-    drawn.legend.click_policy = "hide"
-    drawn.legend.label_text_font_size = "12px"
-    drawn.legend.background_fill_alpha = 0.7
-    drawn.legend.spacing = 1
+def _printf(columns: Sequence[str]) -> dict[str, Any]:
+    return {f"@{name}": "printf" for name in columns}
 
 
-def _blank(name: str, below: int, axes: tuple[str, str], **options: Any) -> Any:
-    drawn = figure(
+def legend(plot: Any, location: str) -> None:
+    """Add a legend; a click on an entry hides or shows its marks."""
+    plot.legend.location = location
+    plot.legend.click_policy = "hide"
+    plot.legend.label_text_font_size = TEXT_SIZE
+    plot.legend.background_fill_alpha = 0.7
+    plot.legend.spacing = 1
+
+
+def _blank(name: str, border_below: int, axes: tuple[str, str], **options: Any) -> Any:
+    plot = figure(
         name=name,
         tools="",
         toolbar_location=None,
         sizing_mode="stretch_both",
-        min_border_bottom=below,
+        min_border_bottom=border_below,
         background_fill_color=None,
         border_fill_color=None,
         x_axis_label=axes[0],
@@ -173,52 +182,52 @@ def _blank(name: str, below: int, axes: tuple[str, str], **options: Any) -> Any:
         **BORDERS,
         **options,
     )
-    drawn.axis.axis_label_text_font_style = "normal"
-    drawn.axis.axis_label_text_font_size = "12px"
-    drawn.axis.major_label_text_font_size = "12px"
-    drawn.axis.axis_label_standoff = 4
-    drawn.axis.minor_tick_line_color = None
-    return drawn
+    plot.axis.axis_label_text_font_style = "normal"
+    plot.axis.axis_label_text_font_size = TEXT_SIZE
+    plot.axis.major_label_text_font_size = TEXT_SIZE
+    plot.axis.axis_label_standoff = 4
+    plot.axis.minor_tick_line_color = None
+    return plot
 
 
 def script() -> str:
-    """Bokeh's own program, to be put into the page: no part of it for widgets, tables or WebGL is needed."""
+    """Return BokehJS for embedding, without its widgets, tables and WebGL."""
     [path] = Resources(mode="absolute", minified=True, components=["bokeh"]).js_files
     return Path(path).read_text(encoding="utf-8").replace("</script", "<\\/script")
 
 
 def document(figures: Sequence[Any]) -> str:
-    """The figures as JSON that can stand in a page: Bokeh's document, and which of its roots goes where.
+    """Return the figures as JSON that can be embedded in HTML: Bokeh's document, and the element of each root.
 
-    The same figures always give the same text: models that Bokeh counts through a process are counted anew.
+    The same figures always give the same text: Bokeh numbers its models through a process, and they are renumbered.
     """
-    made = Document()
-    for drawn in figures:
-        made.add_root(drawn)
+    bokeh_document = Document()
+    for plot in figures:
+        bokeh_document.add_root(plot)
     numbers: dict[str, str] = {}
-    content = _renumbered(made.to_json(deferred=False), numbers)
-    roots = {numbers[drawn.id]: f"plot-{drawn.name}" for drawn in figures}
+    content = _renumbered(bokeh_document.to_json(deferred=False), numbers)
+    roots = {numbers[plot.id]: f"plot-{plot.name}" for plot in figures}
     return json.dumps({"document": content, "roots": roots}, allow_nan=False).replace("<", "\\u003c")
 
 
 def _renumbered(content: Any, numbers: dict[str, str]) -> Any:
     if isinstance(content, list | tuple):
-        return [_renumbered(one, numbers) for one in content]
+        return [_renumbered(item, numbers) for item in content]
     if not isinstance(content, dict):
         return content
-    found = {key: _renumbered(value, numbers) for key, value in content.items() if key != "id"}
+    copy = {key: _renumbered(value, numbers) for key, value in content.items() if key != "id"}
     if "id" in content:
-        found["id"] = numbers.setdefault(content["id"], f"m{len(numbers)}")
-    return found
+        copy["id"] = numbers.setdefault(content["id"], f"m{len(numbers)}")
+    return copy
 
 
 def decoded(low: float, step: float, missing: int) -> Any:
-    """Says the value that a whole number stands for."""
-    code = "return value == missing ? 'none: dead' : (low + step * value).toPrecision(5)"
+    """Return a formatter for the value that a code stands for."""
+    code = "return value == missing ? 'none (dead pixel)' : (low + step * value).toPrecision(5)"
     return CustomJSHover(args={"low": low, "step": step, "missing": missing}, code=code)
 
 
-def within(corner: str, data: Any) -> Any:
-    """Says how far the pointer is from the corner, a column of `data`, of the map that it is on."""
+def distance_from(corner: str, data: Any) -> Any:
+    """Return a formatter for the distance of the pointer from the corner, a column of `data`, of the map below it."""
     code = "return Math.floor(value - data.data[corner][special_vars.index]).toString()"
     return CustomJSHover(args={"corner": corner, "data": data}, code=code)

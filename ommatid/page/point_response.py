@@ -1,7 +1,7 @@
-"""What one sub-imager sees of a point source: a column of H at its pixels, beside the ideal one.
+"""Point-spread function of one sub-imager per lens type: a column of H at its pixels, beside the ideal one.
 
-A source is a pixel of f of value 1, so that the response is the share of it that each sensor pixel reads. Sub-images
-are upright here, as H orders them.
+The source is a pixel of f of value 1, so that the response is the fraction of it that each sensor pixel records.
+Sub-images are upright here, as H orders them.
 """
 
 from __future__ import annotations
@@ -11,34 +11,34 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.lens_type import LensType, SubImager
+from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import Model
 from ommatid.scenes.optics.boxes import overlap
 
 from . import plots
-from .plots import Colours
+from .plots import ColourScale
 
-Ideal = Callable[[SubImager], sparse.csr_array]
-Grid = NDArray[np.float64]
+IdealMatrix = Callable[[SubImager], sparse.csr_array]
 
-MARGIN = 2  # sensor pixels around what responds
-SMALLEST = 3.0  # standard errors at which the colours of a difference end, at least
-KINDS = ("measured", "ideal", "difference")
-TITLES = {"measured": "Measured response", "ideal": "Ideal response", "difference": "Their difference"}
+MARGIN = 2  # sensor pixels around the response
+SMALLEST_LIMIT = 3.0  # standard errors: smallest end of the colour scale of a difference
+TITLES = {"measured": "Calibrated", "ideal": "Ideal", "difference": "Difference"}
+TIPS = {"measured": "calibrated", "ideal": "ideal", "difference": "difference in standard errors"}
 
 
 @dataclass(frozen=True)
 class PointResponse:
-    """The middle sub-imager of a lens type and the source in the middle of its view.
+    """Response of the central sub-imager of a lens type to the source in the centre of its field of view.
 
-    source : row and column of f;  corner : row and column of the sub-image where the maps begin
-    measured, ideal : shares, (rows, columns);  difference : of the two in standard errors, NaN where there is none
-    exact : whether H is the ideal one
+    source : row and column of f;  corner : row and column of the sub-image at which the maps begin
+    maps : "measured" and, if known, "ideal" fractions, (rows, columns), and their "difference" in standard errors,
+        NaN where there is no standard error
+    is_exact : True if H is the ideal one
     """
 
     lens: str
@@ -46,136 +46,130 @@ class PointResponse:
     l: int  # noqa: E741  (the paper's letter)
     source: tuple[int, int]
     corner: tuple[int, int]
-    measured: Grid
-    ideal: Grid | None
-    difference: Grid | None
-    exact: bool
+    maps: dict[str, FloatArray]
+    is_exact: bool
 
 
-def responses(model: Model, ideal: Ideal | None) -> list[PointResponse]:
-    """One a lens type.
+def responses(model: Model, ideal: IdealMatrix | None) -> list[PointResponse]:
+    """Return a response per lens type.
 
-    ideal : H of one sub-imager as designed, (its pixels, N);  raises InputError where there is no closed form
+    ideal : H of one sub-imager as designed, (its pixels, N); raises InputError if there is no closed form
     """
-    return [_response(model, place, kind, ideal) for place, kind in enumerate(model.camera.types)]
+    return [_response(model, index, ideal) for index in range(len(model.camera.types))]
 
 
-def _response(model: Model, place: int, kind: LensType, ideal: Ideal | None) -> PointResponse:
-    camera = model.camera
-    sub = camera.sub_imager(place, kind.array[0] // 2, kind.array[1] // 2)
-    row, column = (int(middle) for middle in kind.middle(sub.window))
-    target = row * camera.columns + column
-    if model.stored is None:  # of boxes: their product
-        measured, error = _of_boxes(camera, sub, row, column), None
+def _response(model: Model, index: int, ideal: IdealMatrix | None) -> PointResponse:
+    camera, lens_type = model.camera, model.camera.types[index]
+    sub = camera.sub_imager(index, lens_type.array[0] // 2, lens_type.array[1] // 2)
+    row, column = (int(center) for center in lens_type.middle(sub.window))
+    unknown = row * camera.columns + column
+    maps: dict[str, FloatArray] = {}
+    error = None
+    if model.stored is None:  # box footprints: a product
+        maps["measured"] = _box_response(camera, sub, row, column)
     else:
-        start = camera.type_slices()[place].start + (sub.k * kind.array[1] + sub.l) * kind.pixels[0] * kind.pixels[1]
-        measured, error = _stored(model, slice(start, start + kind.pixels[0] * kind.pixels[1]), target, kind.pixels)
-    perfect = None if ideal is None or model.is_exact else _perfect(ideal, sub, target)
-    difference = None if perfect is None or error is None else _in_errors(measured - perfect, error)
-    rows, columns = _around(measured if perfect is None else np.abs(measured) + np.abs(perfect))
-    cut = np.s_[rows, columns]
+        pixels = lens_type.pixels[0] * lens_type.pixels[1]
+        start = camera.type_slices()[index].start + (sub.k * lens_type.array[1] + sub.l) * pixels
+        maps["measured"], error = _stored_response(model, slice(start, start + pixels), unknown, lens_type.pixels)
+    ideal_map = None if ideal is None or model.is_exact else _ideal_response(ideal, sub, unknown)
+    if ideal_map is not None:
+        maps["ideal"] = ideal_map
+        if error is not None:
+            maps["difference"] = _in_standard_errors(maps["measured"] - ideal_map, error)
+    rows, columns = _bounds(maps["measured"] if ideal_map is None else np.abs(maps["measured"]) + np.abs(ideal_map))
     return PointResponse(
-        lens=kind.name,
+        lens=lens_type.name,
         k=sub.k,
         l=sub.l,
         source=(row, column),
         corner=(rows.start, columns.start),
-        measured=measured[cut],
-        ideal=None if perfect is None else perfect[cut],
-        difference=None if difference is None else difference[cut],
-        exact=model.is_exact,
+        maps={name: image[rows, columns] for name, image in maps.items()},
+        is_exact=model.is_exact,
     )
 
 
-def _of_boxes(camera: Camera, sub: SubImager, row: int, column: int) -> Grid:
+def _box_response(camera: Camera, sub: SubImager, row: int, column: int) -> FloatArray:
     down = overlap(sub.type.ratio, sub.type.pixels[0], sub.window[0], camera.rows)[:, [row]].toarray()
     across = overlap(sub.type.ratio, sub.type.pixels[1], sub.window[1], camera.columns)[:, [column]].toarray()
     return np.asarray(down @ across.T, dtype=np.float64)
 
 
-def _stored(model: Model, rows: slice, column: int, shape: tuple[int, int]) -> tuple[Grid, Grid]:
-    """A column of H at some measurements, and the standard errors of its entries."""
+def _stored_response(model: Model, rows: slice, column: int, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return some rows of a column of H, and the standard errors of these entries."""
     matrix = model.matrix
     entries = slice(int(matrix.indptr[rows.start]), int(matrix.indptr[rows.stop]))
     chosen = np.flatnonzero(matrix.indices[entries] == column)
-    pointers: NDArray[np.int64] = matrix.indptr[rows.start : rows.stop + 1].astype(np.int64)
-    numbers: NDArray[np.int64] = np.arange(rows.stop - rows.start, dtype=np.int64)
-    place: NDArray[np.int64] = np.repeat(numbers, np.diff(pointers))[chosen]
-    found, variance = np.zeros(numbers.size), np.zeros(numbers.size)
-    np.add.at(found, place, matrix.data[entries][chosen])
-    np.add.at(variance, place, model.variance[entries][chosen])
-    return found.reshape(shape), np.sqrt(variance).reshape(shape)
+    counts: IntArray = np.diff(matrix.indptr[rows.start : rows.stop + 1].astype(np.int64))
+    pixel: IntArray = np.repeat(np.arange(counts.size, dtype=np.int64), counts)[chosen]
+    response, variance = np.zeros(counts.size), np.zeros(counts.size)
+    np.add.at(response, pixel, matrix.data[entries][chosen])
+    np.add.at(variance, pixel, model.variance[entries][chosen])
+    return response.reshape(shape), np.sqrt(variance).reshape(shape)
 
 
-def _perfect(ideal: Ideal, sub: SubImager, column: int) -> Grid | None:
+def _ideal_response(ideal: IdealMatrix, sub: SubImager, column: int) -> FloatArray | None:
     try:
         matrix = ideal(sub)
-    except InputError:  # it has no closed form
+    except InputError:  # no closed form
         return None
     return np.asarray(matrix[:, [column]].toarray(), dtype=np.float64).reshape(sub.type.pixels)
 
 
-def _in_errors(difference: Grid, error: Grid) -> Grid:
-    """NaN where an entry has no error but differs: what was never lit is not known to the last digit."""
-    found = np.where(difference == 0, 0.0, np.nan)
-    np.divide(difference, error, out=found, where=error > 0)
-    return found
+def _in_standard_errors(difference: FloatArray, error: FloatArray) -> FloatArray:
+    """Return NaN where a difference has no standard error: entries without rays are not known to the last digit."""
+    score = np.where(difference == 0, 0.0, np.nan)
+    np.divide(difference, error, out=score, where=error > 0)
+    return score
 
 
-def _around(response: Grid) -> tuple[slice, slice]:
-    """What responds, with a margin; all where nothing does."""
+def _bounds(response: FloatArray) -> tuple[slice, slice]:
+    """Return the rows and columns of a response with a margin; all of them if it is zero."""
     lit = response > 1e-4 * response.max(initial=0.0)
     if not lit.any():
         return slice(0, response.shape[0]), slice(0, response.shape[1])
-    found: list[slice] = []
+    bounds: list[slice] = []
     for axis, size in enumerate(response.shape):
-        places = np.flatnonzero(lit.any(axis=1 - axis))
-        found.append(slice(max(0, int(places[0]) - MARGIN), min(size, int(places[-1]) + 1 + MARGIN)))
-    return found[0], found[1]
+        indices = np.flatnonzero(lit.any(axis=1 - axis))
+        bounds.append(slice(max(0, int(indices[0]) - MARGIN), min(size, int(indices[-1]) + 1 + MARGIN)))
+    return bounds[0], bounds[1]
 
 
-def shown(response: PointResponse) -> list[tuple[str, Grid]]:
-    """The maps that there are, by kind."""
-    maps = zip(KINDS, (response.measured, response.ideal, response.difference), strict=True)
-    return [(kind, image) for kind, image in maps if image is not None]
+def titles(response: PointResponse) -> dict[str, str]:
+    """Return the titles of the maps by name; an ideal H was not calibrated."""
+    return {name: TITLES[name] for name in response.maps} | ({"measured": "Response"} if response.is_exact else {})
 
 
 def figures(response: PointResponse) -> list[Any]:
-    """A figure a map: measured and ideal with the same colours, the difference in standard errors."""
-    maps = dict(shown(response))
-    high = max(float(maps[kind].max()) for kind in ("measured", "ideal") if kind in maps) or 1.0
-    (top, left), (rows, columns) = response.corner, response.measured.shape
+    """Return a figure per map: calibrated and ideal with the same colours, the difference in standard errors."""
+    maps = response.maps
+    high = max(float(maps[name].max()) for name in ("measured", "ideal") if name in maps) or 1.0
+    (top, left), (rows, columns) = response.corner, maps["measured"].shape
     view = plots.view(left, left + columns, top, top + rows)
-    data = plots.source({kind: [np.ascontiguousarray(image.astype(np.float32))] for kind, image in maps.items()}, "")
+    data = plots.source({name: [np.ascontiguousarray(image.astype(np.float32))] for name, image in maps.items()})
     tips = [("row of the sub-image", "$y{0}"), ("column", "$x{0}")]
-    tips += [(SAID[kind], f"@{kind}{{%.4g}}") for kind in maps]
-    made: list[Any] = []
-    for kind, image in maps.items():
-        colours = Colours(plots.SEQUENTIAL, 0.0, high, "share of the source")
-        if kind == "difference":
-            size = max(SMALLEST, float(np.nanmax(np.abs(image), initial=0.0)))
-            colours = Colours(plots.DIVERGING, -size, size, "standard errors")
-        name = f"response-{response.lens}-{kind}"
-        formatters = {f"@{other}": "printf" for other in maps}
-        places = left, top, columns, rows
-        made.append(plots.map_figure(name, data, kind, colours, view, tips, places=places, formatters=formatters))
-    return made
-
-
-SAID = {"measured": "measured", "ideal": "ideal", "difference": "difference in standard errors"}
+    tips += [(TIPS[name], f"@{name}{{%.4g}}") for name in maps]
+    drawn: list[Any] = []
+    for name, image in maps.items():
+        colours = ColourScale(plots.SEQUENTIAL, 0.0, high, "fraction of the source")
+        if name == "difference":
+            limit = max(SMALLEST_LIMIT, float(np.nanmax(np.abs(image), initial=0.0)))
+            colours = ColourScale(plots.DIVERGING, -limit, limit, "standard errors")
+        plot_name, area = f"response-{response.lens}-{name}", (left, top, columns, rows)
+        drawn.append(plots.map_figure(plot_name, data, name, colours, view, tips, area=area, formatted=tuple(maps)))
+    return drawn
 
 
 def words(response: PointResponse) -> str:
-    """What is shown, and how far measured and ideal go apart."""
-    row, column = response.source
-    told = (
-        f"Sub-imager ({response.k}, {response.l}) of lens type {response.lens} and a point source at row {row}, column"
-        f" {column} of the target: its pixels read {response.measured.sum():.4g} of the source all together, the"
-        f" brightest {response.measured.max():.4g}"
+    """Return sub-imager and source, the total and the maximum of the response, and the largest difference in words."""
+    (row, column), measured = response.source, response.maps["measured"]
+    words = (
+        f"Sub-imager ({response.k}, {response.l}) of lens type {response.lens}, point source at row {row}, column"
+        f" {column} of the target. The sub-imager records {measured.sum():.4g} of the source, its brightest pixel"
+        f" {measured.max():.4g}"
     )
-    if response.ideal is not None:
-        told += f"; ideal are {response.ideal.sum():.4g} and {response.ideal.max():.4g}"
-    if response.difference is not None and np.isfinite(response.difference).any():
-        largest = float(np.nanmax(np.abs(response.difference)))
-        told += f". Measured and ideal differ by up to {largest:.2g} standard errors in a pixel"
-    return told + "."
+    ideal, difference = response.maps.get("ideal"), response.maps.get("difference")
+    if ideal is not None:
+        words += f"; the ideal values are {ideal.sum():.4g} and {ideal.max():.4g}"
+    if difference is not None and np.isfinite(difference).any():
+        words += f". Calibrated and ideal values differ by at most {np.nanmax(np.abs(difference)):.2g} standard errors"
+    return words + "."

@@ -1,7 +1,7 @@
-"""The flat sensor as the hardware would record it, seen from behind: sub-images upside down behind their lenses.
+"""Image of the flat sensor as the hardware would record it, seen from behind: sub-images are inverted by their lenses.
 
-Places are sensor pixels from the camera's axis, columns towards -x and rows towards -y, as in a recorded mosaic. The
-sub-images are small patches on a wide sensor, so they are also shown packed, in the same order.
+Positions are in sensor pixels from the camera's axis, columns towards -x and rows towards -y, as in a recorded mosaic.
+The sub-images are small patches on a wide sensor, so they are also shown packed, in the same order.
 """
 
 from __future__ import annotations
@@ -12,49 +12,49 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.hardware.frames import patches
-from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.stack import Stack
 
 from . import plots
 from .data import reduced
-from .plots import Colours
+from .plots import ColourScale
 
-LEVELS = 65534  # in which values are told apart on a page; the next number stands for a pixel without a value
-MISSING = 65535
+LEVELS = 65534  # codes of values on a page
+MISSING = 65535  # code of a pixel without a value
 MOST_VALUES = 180_000
-MOST_SHOWN = 2000  # sub-imagers
-GAP = 0.12  # of a sub-image, between two that are packed
+MOST_SUB_IMAGERS = 2000
+GAP = 0.12  # between packed sub-images, as a fraction of their size
 
-UNITS = {False: "value (0 to 255)", True: "digital number (DN)"}
+DIGITAL = "digital number (DN)"
 AXES = {
-    "packed": ("packed columns", "packed rows"),
-    "place": ("sensor pixels from the axis, along columns", "along rows"),
+    "packed": ("packed column", "packed row"),
+    "place": ("column from the axis (sensor pixels)", "row from the axis"),
 }
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A sub-image as it lies on the sensor, (rows, columns) or their block means, and where.
+    """A sub-image as it lies on the sensor, (rows, columns), or its block means.
 
-    place, packed : top left corner as (row, column), on the sensor and packed
+    place, packed : (row, column) of the top left corner on the sensor and in the packed view
     """
 
     lens: str
     k: int
     l: int  # noqa: E741  (the paper's letter)
     size: tuple[int, int]
-    image: Numbers
+    image: FloatArray
     place: tuple[float, float]
     packed: tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Mosaic:
-    """The patches that are shown, of how many, the blocks over which they are averaged, and what they hold."""
+    """The patches that are shown, the number of all patches, the side of averaged blocks, unit, and dead pixels."""
 
     patches: list[Patch]
     count: int
@@ -66,142 +66,150 @@ class Mosaic:
     def ends(self) -> tuple[float, float]:
         """Smallest and largest value."""
         known = np.concatenate([patch.image[np.isfinite(patch.image)] for patch in self.patches])
-        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 255.0)
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, WHITE)
         return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+    def extent(self, name: str) -> tuple[float, float, float, float]:
+        """Return left, right, top and bottom of a view, "packed" or "place", with a margin."""
+        corners = np.array([getattr(patch, name) for patch in self.patches])
+        ends = corners + np.array([patch.size for patch in self.patches])
+        (top, left), (bottom, right) = corners.min(axis=0), ends.max(axis=0)
+        margin = 0.02 * max(bottom - top, right - left)
+        return left - margin, right + margin, top - margin, bottom + margin
+
+    def aspect(self, name: str) -> float:
+        """Return height over width of a view."""
+        left, right, top, bottom = self.extent(name)
+        return (bottom - top) / (right - left)
 
 
 def mosaic(stack: Stack, most: int = MOST_VALUES) -> Mosaic:
-    """The sub-images of a stack where they were recorded; digital numbers where there are any."""
+    """Return the sub-images of a stack at their positions; digital numbers if the stack has them.
+
+    most : number of values, from which on blocks of sensor pixels are averaged
+    """
     camera = stack.camera
     values = stack.values if stack.recording is None else stack.recording.digital
     block = 1
-    while _values(camera, block) > most and block < max(max(kind.pixels) for kind in camera.types):
+    while _value_count(camera, block) > most and block < max(max(lens_type.pixels) for lens_type in camera.types):
         block += 1
-    places, packed = patches(camera), _packed(camera)
-    shown = _shown(camera)
-    slices = camera.slices()
-    found: list[Patch] = []
-    for number in shown:
-        sub = camera.sub_imagers[number]
-        upright = values[slices[number]].reshape(sub.type.pixels)
-        found.append(
+    places, packed, slices = patches(camera), _packed_corners(camera), camera.slices()
+    shown: list[Patch] = []
+    for index in _shown(camera):
+        sub = camera.sub_imagers[index]
+        upright = values[slices[index]].reshape(sub.type.pixels)
+        shown.append(
             Patch(
-                sub.type.name,
-                sub.k,
-                sub.l,
-                sub.type.pixels,
-                reduced(upright[::-1, ::-1], block).astype(np.float64),
-                (float(places[number][0]), float(places[number][1])),
-                packed[number],
+                lens=sub.type.name,
+                k=sub.k,
+                l=sub.l,
+                size=sub.type.pixels,
+                image=reduced(upright[::-1, ::-1], block).astype(np.float64),
+                place=(float(places[index][0]), float(places[index][1])),
+                packed=packed[index],
             )
         )
-    unit = UNITS[stack.recording is not None]
-    return Mosaic(found, len(camera.sub_imagers), block, unit, int(np.sum(~np.isfinite(values))))
+    unit = "pixel value (0 to 255)" if stack.recording is None else DIGITAL
+    return Mosaic(shown, len(camera.sub_imagers), block, unit, int(np.sum(~np.isfinite(values))))
 
 
-def _values(camera: Camera, block: int) -> int:
-    return sum(kind.count * -(-kind.pixels[0] // block) * -(-kind.pixels[1] // block) for kind in camera.types)
-
-
-def _shown(camera: Camera) -> list[int]:
-    """Which sub-imagers: all, or those in the middle of each array where they are too many."""
-    share = min(1.0, (MOST_SHOWN / len(camera.sub_imagers)) ** 0.5)
-    return [number for number, sub in enumerate(camera.sub_imagers) if share == 1 or _central(sub.type, sub, share)]
-
-
-def _central(kind: LensType, sub: Any, share: float) -> bool:
-    return all(
-        abs(place - (count - 1) / 2) <= share * count / 2
-        for place, count in zip((sub.k, sub.l), kind.array, strict=True)
+def _value_count(camera: Camera, block: int) -> int:
+    return sum(
+        lens_type.count * -(-lens_type.pixels[0] // block) * -(-lens_type.pixels[1] // block)
+        for lens_type in camera.types
     )
 
 
-def _packed(camera: Camera) -> list[tuple[float, float]]:
-    """Top left corners, (row, column), of the patches with little between them; lens types side by side."""
-    found: list[tuple[float, float]] = []
+def _shown(camera: Camera) -> list[int]:
+    """Return the indices of all sub-imagers, or of the central ones of each array if there are too many."""
+    share = min(1.0, (MOST_SUB_IMAGERS / len(camera.sub_imagers)) ** 0.5)
+    return [index for index, sub in enumerate(camera.sub_imagers) if share == 1 or _is_central(sub, share)]
+
+
+def _is_central(sub: SubImager, share: float) -> bool:
+    return all(
+        abs(index - (count - 1) / 2) <= share * count / 2
+        for index, count in zip((sub.k, sub.l), sub.type.array, strict=True)
+    )
+
+
+def _packed_corners(camera: Camera) -> list[tuple[float, float]]:
+    """Return top left corners, (row, column), of the patches with small gaps; lens types side by side."""
+    corners: list[tuple[float, float]] = []
     left = 0.0
-    for kind in camera.types:
-        steps = [count * (1 + GAP) for count in kind.pixels]
-        tall = kind.array[0] * steps[0]
-        for place in range(kind.count):
-            row, column = divmod(place, kind.array[1])
-            found.append((row * steps[0] - tall / 2, left + column * steps[1]))
-        left += kind.array[1] * steps[1] + 2 * GAP * max(kind.pixels)
-    return found
+    for lens_type in camera.types:
+        steps = [count * (1 + GAP) for count in lens_type.pixels]
+        height = lens_type.array[0] * steps[0]
+        for index in range(lens_type.count):
+            row, column = divmod(index, lens_type.array[1])
+            corners.append((row * steps[0] - height / 2, left + column * steps[1]))
+        left += lens_type.array[1] * steps[1] + 2 * GAP * max(lens_type.pixels)
+    return corners
 
 
-def figures(shown: Mosaic) -> list[Any]:
-    """The packed view and the one at true places, from one source."""
-    low, high = shown.ends
+def figures(mosaic: Mosaic) -> list[Any]:
+    """Return the packed view and the one with true positions, from one source."""
+    low, high = mosaic.ends
     step = (high - low) / LEVELS
     columns: dict[str, list[Any]] = {
-        "image": [np.ascontiguousarray(_codes(patch.image, low, step)) for patch in shown.patches],
-        "lens": [patch.lens for patch in shown.patches],
-        "k": [patch.k for patch in shown.patches],
-        "l": [patch.l for patch in shown.patches],
+        "image": [np.ascontiguousarray(_codes(patch.image, low, step)) for patch in mosaic.patches],
+        "lens": [patch.lens for patch in mosaic.patches],
+        "k": [patch.k for patch in mosaic.patches],
+        "l": [patch.l for patch in mosaic.patches],
+        "height": [patch.image.shape[0] * mosaic.block for patch in mosaic.patches],
+        "width": [patch.image.shape[1] * mosaic.block for patch in mosaic.patches],
     }
-    for name in ("packed", "place"):
-        columns[f"{name}_row"] = [getattr(patch, name)[0] for patch in shown.patches]
-        columns[f"{name}_column"] = [getattr(patch, name)[1] for patch in shown.patches]
-    columns["height"] = [patch.image.shape[0] * shown.block for patch in shown.patches]
-    columns["width"] = [patch.image.shape[1] * shown.block for patch in shown.patches]
+    for name in AXES:
+        columns[f"{name}_row"] = [getattr(patch, name)[0] for patch in mosaic.patches]
+        columns[f"{name}_column"] = [getattr(patch, name)[1] for patch in mosaic.patches]
     data = plots.source(columns, "sensor")
-    colours = Colours(plots.GREY, low, high, shown.unit)
-    made: list[Any] = []
-    for name in ("packed", "place"):
-        tips = [
-            ("lens type", "@lens"),
-            ("sub-imager k, l", "@k, @l"),
-            ("its row on the sensor", f"$y{{{name}_row}}"),
-            ("its column on the sensor", f"$x{{{name}_column}}"),
-            ("value", "@image{value}"),
-        ]
-        formatters = {"$y": plots.within(f"{name}_row", data), "$x": plots.within(f"{name}_column", data)}
-        formatters["@image"] = plots.decoded(low, step, MISSING)
-        made.append(
-            plots.map_figure(
-                name,
-                data,
-                "image",
-                colours,
-                _view(shown, name),
-                tips,
-                places=(f"{name}_column", f"{name}_row", "width", "height"),
-                axes=AXES[name],
-                mapper=colours.mapper(0, LEVELS, high_color=plots.NOTHING),
-                formatters=formatters,
-                ground=plots.DARK if name == "place" else None,
-            )
-        )
-    return made
+    colours = ColourScale(plots.GREY, low, high, mosaic.unit)
+    return [_figure(name, mosaic, data, colours, step) for name in AXES]
 
 
-def extent(shown: Mosaic, name: str) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of what is shown `packed` or at its `place`, with a margin."""
-    corners = np.array([getattr(patch, name) for patch in shown.patches])
-    ends = corners + np.array([patch.size for patch in shown.patches])
-    (top, left), (bottom, right) = corners.min(axis=0), ends.max(axis=0)
-    margin = 0.02 * max(bottom - top, right - left)
-    return left - margin, right + margin, top - margin, bottom + margin
+def _figure(name: str, mosaic: Mosaic, data: Any, colours: ColourScale, step: float) -> Any:
+    row, column = f"{name}_row", f"{name}_column"
+    tips = [
+        ("lens type", "@lens"),
+        ("sub-imager k, l", "@k, @l"),
+        ("sensor row in the sub-image", f"$y{{{row}}}"),
+        ("sensor column in the sub-image", f"$x{{{column}}}"),
+        ("value", "@image{value}"),
+    ]
+    formatters = {
+        "$y": plots.distance_from(row, data),
+        "$x": plots.distance_from(column, data),
+        "@image": plots.decoded(colours.low, step, MISSING),
+    }
+    return plots.map_figure(
+        name,
+        data,
+        "image",
+        colours,
+        plots.view(*mosaic.extent(name)),
+        tips,
+        area=(column, row, "width", "height"),
+        axes=AXES[name],
+        mapper=colours.mapper(0, LEVELS, high_color=plots.MISSING_COLOUR),
+        formatters=formatters,
+        background=plots.DARK if name == "place" else None,
+    )
 
 
-def _view(shown: Mosaic, name: str) -> plots.View:
-    return plots.view(*extent(shown, name))
-
-
-def _codes(image: Numbers, low: float, step: float) -> NDArray[np.uint16]:
+def _codes(image: FloatArray, low: float, step: float) -> NDArray[np.uint16]:
     codes = np.full(image.shape, MISSING, dtype=np.uint16)
     known = np.isfinite(image)
     codes[known] = np.rint((image[known] - low) / step).astype(np.uint16)
     return codes
 
 
-def words(shown: Mosaic) -> str:
-    """The mosaic for those who do not see it."""
-    kinds = list(dict.fromkeys(patch.lens for patch in shown.patches))
-    each = [f"{sum(patch.lens == kind for patch in shown.patches)} of lens type {kind}" for kind in kinds]
-    low, high = shown.ends
-    told = f"{len(shown.patches)} sub-images, {', '.join(each)}, upside down as lenses turn them, left to right in the"
-    told += f" order of the lens types; from {low:.4g} to {high:.4g}, {shown.unit}"
-    told += f"; {shown.dead} sensor pixels are dead" if shown.dead else ""
-    return told
+def words(mosaic: Mosaic) -> str:
+    """Return number, order and range of the sub-images in words."""
+    names = [patch.lens for patch in mosaic.patches]
+    counts = [f"{names.count(name)} of lens type {name}" for name in dict.fromkeys(names)]
+    low, high = mosaic.ends
+    words = (
+        f"{len(names)} sub-images ({', '.join(counts)}), inverted as the lenses project them, lens types from left to"
+        f" right; {mosaic.unit} from {low:.4g} to {high:.4g}"
+    )
+    return words + (f"; {mosaic.dead} sensor pixels are dead" if mosaic.dead else "")

@@ -1,117 +1,124 @@
-"""The tables of a page: what ran, what was left out, geometry, seeds, versions, and what the run printed."""
+"""Tables of a page: stages, effect of more samples, skipped effects, geometry, all numbers, seeds and versions."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from ommatid.analysis import depth_error, run_table, study
-from ommatid.analysis.summary import describe as show
-from ommatid.analysis.summary import skipped_words
+from ommatid.analysis.summary import describe, skipped_words
+from ommatid.reconstruct.output.run_json import StageReport
+from ommatid.scenes.setup import Setup
 
 from .data import Run
 
-GAP = "\N{NO-BREAK SPACE}"
+NBSP = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
 class PageTable:
-    """A caption, the names of columns, and rows whose first cell is their header."""
+    """A caption, the column headers, and rows whose first cell is the row header."""
 
     caption: str
     header: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
 
 
-def plan(run: Run) -> PageTable:
-    """What ran, how, and how long."""
-    stages = run.description["stages"]
-    total = sum(stage["seconds"] for stage in stages.values()) or 1.0
+def stages(run: Run) -> PageTable:
+    """Return method and run time of every stage."""
+    total = sum(stage.seconds for stage in run.report.stages.values()) or 1.0
     rows = [
-        (name, _how(name, stage, run), f"{stage['seconds']:.3g}{GAP}s", f"{100 * stage['seconds'] / total:.0f}{GAP}%")
-        for name, stage in stages.items()
+        (name, _method(name, stage, run), _seconds(stage.seconds), f"{100 * stage.seconds / total:.0f}{NBSP}%")
+        for name, stage in run.report.stages.items()
     ]
-    return PageTable("What ran", ("stage", "how", "time", "share"), rows)
+    return PageTable("Stages of this run", ("stage", "method", "time", "share"), rows)
 
 
-def more_time(run: Run) -> PageTable | None:
-    """What more samples would take and bring; None where nothing was rendered.
-
-    The estimator is taken as it is. Of less noise another follows, which leans less on the prior and errs less.
-    """
-    spent = run.description.get("spent", {})
-    if not spent.get("more"):
-        return None
-    here = {"seconds": sum(spent["stages"].values()), "predicted_mse": run.description["error"]["predicted_mse"]}
-    known = [("as here", here), *((f"{one['times']} times as many", one) for one in spent["more"])]
-    rows = [(name, f"{one['seconds']:.3g}{GAP}s", f"{one['predicted_mse']:.4g}") for name, one in known]
-    rows.append(("without end", "", f"{spent['noise_alone']:.4g}"))
-    return PageTable("What more samples would bring", ("samples", "time", "squared error of this estimator"), rows)
-
-
-def given_time(run: Run) -> str:
-    """What became of the time that a run was given; nothing where it was given none."""
-    spent = run.description.get("spent", {})
-    if "within" not in spent:
-        return ""
-    chosen = ", ".join(f"{key} = {value}" for key, value in spent["chosen"].items())
-    taken = f"took {spent['seconds']:.3g}{GAP}s with what it measured beforehand"
-    return f"The run was given {spent['within']:g}{GAP}s and {taken}; it chose {chosen}."
-
-
-def _how(name: str, stage: dict[str, Any], run: Run) -> str:
-    told = [str(stage["method"])] if "method" in stage else []
-    if "samples" in stage:
-        told.append(run_table.samples_of(stage))
-    told += [str(stage[key]) for key in ("sampler", "variant") if key in stage]
+def _method(name: str, stage: StageReport, run: Run) -> str:
+    words = [] if stage.method is None else [stage.method]
+    if stage.samples is not None:
+        words.append(run_table.samples_of(stage))
+    words += [value for value in (stage.sampler, stage.variant) if value is not None]
     if name == "reconstruct":
-        solver = run.description["solver"]
-        told.append(f"{solver['method']}: {solver['why']}")
-    return ", ".join(told)
+        words.append(f"{run.report.solver.method}: {run.report.solver.why}")
+    return ", ".join(words)
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.3g}{NBSP}s"
+
+
+def more_samples(run: Run) -> PageTable | None:
+    """Return run time and predicted error with more samples, None if nothing was rendered.
+
+    The error is that of this run's estimator. The optimal one for less noise relies less on the prior and is better.
+    """
+    spent = run.report.spent
+    if not spent.more:
+        return None
+    present = ("as in this run", sum(spent.stages.values()), run.report.error.predicted_mse)
+    known = [present, *((f"{more.times} times as many", more.seconds, more.predicted_mse) for more in spent.more)]
+    rows = [(name, _seconds(seconds), f"{mse:.4g}") for name, seconds, mse in known]
+    rows.append(("unlimited", "", f"{spent.noise_alone:.4g}"))
+    header = ("samples", "time", "mean squared error with this estimator")
+    return PageTable("Predicted error with more samples", header, rows)
+
+
+def time_limit(run: Run) -> str:
+    """Return how a run with a time limit used it, or an empty string."""
+    spent = run.report.spent
+    if spent.within is None:
+        return ""
+    chosen = ", ".join(f"{key} = {value}" for key, value in spent.chosen.items())
+    return (
+        f"Time limit: {spent.within:g}{NBSP}s. The run took {_seconds(spent.seconds)} including trial measurements,"
+        f" and chose {chosen}."
+    )
 
 
 def skipped(run: Run) -> PageTable:
-    """What was not computed, and why."""
-    rows = [(skip["what"], skipped_words(skip)) for skip in run.description["skipped"]]
-    return PageTable("What was left out", ("what", "why"), rows)
+    """Return the effects and computations that were skipped, with the reasons."""
+    rows = [(skipped.what, skipped_words(skipped.why, skipped.bound)) for skipped in run.report.skipped]
+    return PageTable("Skipped effects", ("effect", "reason"), rows)
 
 
 def geometry(run: Run) -> tuple[PageTable, list[tuple[str, str]]]:
-    """A row a lens type, and the rest in names and values."""
-    described = show(run.stack.scene, run.stack.camera, "", {})
-    header = ("lens type", "magnification", "array", "pixels of a sub-image", "sees rows", "sees columns")
-    header += ("focal length", "sensor behind lens", "measurements")
+    """Return a table of the lens types, and names and values of the other dimensions."""
+    camera = run.stack.camera
+    described = describe(Setup(run.stack.scene, camera), "", None)
+    header = ("lens type", "magnification", "array", "pixels per sub-image", "rows seen", "columns seen")
+    header += ("focal length", "lens to sensor", "measurements")
     rows = [
         (
-            kind["name"],
-            kind["magnification"],
-            _times(kind["array"]),
-            _times(kind["pixels"]),
-            _range(kind["sees_rows"]),
-            _range(kind["sees_columns"]),
-            f"{kind['focal_length']:.4g} mm",
-            f"{kind['sensor_depth']:.4g} mm",
-            str(kind["measurements"]),
+            lens["name"],
+            lens["magnification"],
+            _product(lens["array"]),
+            _product(lens["pixels"]),
+            _range(lens["sees_rows"]),
+            _range(lens["sees_columns"]),
+            f"{lens['focal_length']:.4g} mm",
+            f"{lens['sensor_depth']:.4g} mm",
+            str(lens["measurements"]),
         )
-        for kind in described["lens_types"]
+        for lens in described["lens_types"]
     ]
-    target, camera = described["target"], run.stack.camera
+    target = described["target"]
     facts = [
         ("target", f"{target['rows']} × {target['columns']} pixels, {target['height']:g} × {target['width']:g} mm"),
-        ("distance", f"{target['distance']:g} mm"),
-        ("pitch of sensor pixels", f"{1000 * camera.pixel_pitch:g} µm"),
-        ("pitch of lenses", f"{camera.lens_pitch:g} mm"),
+        ("distance of the target", f"{target['distance']:g} mm"),
+        ("pitch of the sensor pixels", f"{1000 * camera.pixel_pitch:g} µm"),
+        ("pitch of the lenses", f"{camera.lens_pitch:g} mm"),
         *(
-            (f"pixels seen by {count} lens types", str(seen))
-            for count, seen in described["pixels_seen_by_fewer_types"].items()
+            (f"pixels seen by only {count} of {len(rows)} lens types", str(pixels))
+            for count, pixels in described["pixels_seen_by_fewer_types"].items()
         ),
-        *(("edge", words) for words in described["where"]),
+        *(("edge of the target", words) for words in described["where"]),
     ]
     return PageTable("Lens types", header, rows), facts
 
 
-def _times(pair: list[int]) -> str:
-    return f"{pair[0]}{GAP}×{GAP}{pair[1]}"
+def _product(pair: list[int]) -> str:
+    return f"{pair[0]}{NBSP}×{NBSP}{pair[1]}"
 
 
 def _range(ends: list[float]) -> str:
@@ -119,30 +126,32 @@ def _range(ends: list[float]) -> str:
 
 
 def numbers(run: Run) -> PageTable:
-    """The table that `run` prints, without what stands elsewhere on the page."""
+    """Return the table that `run` prints, without the rows that the page shows elsewhere."""
     rows = [
         (name.strip(), value)
-        for name, value in run_table.rows(run.description)
-        if not name.startswith("left out") and not name.startswith("    from ")
+        for name, value in run_table.rows(run.report)
+        if not name.startswith(("left out", "    from "))
     ]
-    return PageTable("The run in numbers", ("what", "how much"), list(rows))
+    return PageTable("All numbers", ("quantity", "value"), rows)
 
 
-def further(run: Run) -> list[PageTable]:
-    """Error against distance, and the study, where there are any."""
-    found: list[PageTable] = []
-    if run.description.get("depth"):
-        found.append(
-            PageTable("Error against distance", ("distance", "error"), list(depth_error.rows(run.description["depth"])))
-        )
-    if run.description.get("study"):
-        caption = "The same stack with other ideas of H"
-        found.append(PageTable(caption, ("H", "error"), list(study.rows(run.description["study"]))))
+def further(run: Run) -> list[tuple[str, PageTable]]:
+    """Return names and tables of error against distance and of the study, where the run has them."""
+    found: list[tuple[str, PageTable]] = []
+    if run.report.depth:
+        rows = depth_error.rows(run.report.depth)
+        found.append(("Depth", PageTable("Error against distance", ("distance", "error"), rows)))
+    if run.report.study:
+        rows = study.rows(run.report.study)
+        found.append(("Study", PageTable("The same stack with other models of H", ("H", "error"), rows)))
     return found
 
 
 def origins(run: Run) -> list[PageTable]:
-    """Seeds and versions, from which the run can be repeated."""
-    seeds = [(name, "none" if seed is None else str(seed)) for name, seed in run.description["seeds"].items()]
-    versions = [(name, str(release)) for name, release in run.description["versions"].items()]
-    return [PageTable("Seeds", ("of", "seed"), seeds), PageTable("Versions", ("package", "release"), versions)]
+    """Return seeds and versions, which are needed to repeat the run."""
+    seeds = [(name, "none" if seed is None else str(seed)) for name, seed in run.report.seeds]
+    versions = list(run.report.versions.items())
+    return [
+        PageTable("Seeds", ("random numbers", "seed"), seeds),
+        PageTable("Versions", ("package", "version"), versions),
+    ]

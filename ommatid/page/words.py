@@ -1,117 +1,121 @@
-"""A run in words: one sentence on whether it is right, how sharp it is, and what limits it."""
+"""Sentences of a report: agreement of the error with theory, resolution, and the largest contribution to the error."""
 
 from __future__ import annotations
 
 from math import sqrt
-from typing import Any
 
-from ommatid.reconstruct.restore import MOST_FEIGNED
+from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
+from ommatid.reconstruct.restore import MAX_SPURIOUS_INFORMATION
 
+SCALE = "on a scale of 0 to 255"
+# Cause of a part of the predicted error, and the remedy:
 CAUSES = {
-    "null_space": ("what no lens sees", "another lens type would help; `ommatid design` ranks them"),
-    "noise": ("the sensor's noise", "only more light or a better sensor would help"),
-    "quantisation": ("the sensor's bits", "more of them would help"),
-    "rendering": ("the noise of the rendering itself", "more render.samples would help"),
-    "calibration": ("how well H is known", "more calibration.samples would help"),
-    "misalignment": ("where the lenses really stand", "a calibration would help"),
+    "null_space": (
+        "the null space of H, which no lens type measures",
+        "another lens type would reduce it; `ommatid design` ranks candidates",
+    ),
+    "noise": ("sensor noise", "only more light or a better sensor would reduce it"),
+    "quantisation": ("quantisation", "more bits would reduce it"),
+    "rendering": ("noise of the rendering", "a larger `render.samples` would reduce it"),
+    "calibration": ("uncertainty of H", "a larger `calibration.samples` would reduce it"),
+    "misalignment": ("misalignment of the lenses", "a calibration would remove it"),
 }
 
 
-def verdict(description: dict[str, Any]) -> str:
-    """The run in one sentence: measured against expected error, sharpness, and what limits it."""
-    if not description["diagnostics"]["pixels_used"]:
-        return "No sensor pixel is left, so what is shown is the prior, not an image."
-    return f"{_error(description['error'])}; {_sharpness(description)}; {_limit(description['error'])}."
+def verdict(report: RunReport) -> str:
+    """Return the main results in three sentences: measured against expected error, resolution, largest cause."""
+    if not report.diagnostics.pixels_used:
+        return "No sensor pixel could be used: the estimate is the prior, not an image."
+    return f"{_error(report.error)} {_resolution(report)} {_largest_cause(report.error)}"
 
 
-def _error(error: dict[str, Any]) -> str:
-    predicted = sqrt(error["predicted_mse"])
-    if error.get("mse") is None:
-        return f"The truth is not known; theory expects pixels to be off by {predicted:.3g} of 255 (rms)"
-    told = f"Pixels are off by {sqrt(error['mse']):.3g} of 255 (rms)"
-    given = error.get("expected_given_truth")
+def _error(error: ErrorReport) -> str:
+    predicted = sqrt(error.predicted_mse)
+    if error.mse is None:
+        return f"The truth is not known; the predicted RMS error of a pixel is {predicted:.3g} {SCALE}."
+    measured = f"The RMS error of a pixel is {sqrt(error.mse):.3g} {SCALE}"
+    given = error.expected_given_truth
     if given is None:
-        return f"{told}, where theory expects {predicted:.3g} on average over all pictures"
-    between = f"{sqrt(given['mse']):.3g}, and {sqrt(given['low']):.3g} to {sqrt(given['high']):.3g} in 99 of 100 runs"
-    said = {
-        "agrees": "as theory expects of this picture",
-        "worse": "more than theory allows for this picture",
-        "better": "less than theory expects of this picture",
+        return f"{measured}; the predicted error, averaged over all images, is {predicted:.3g}."
+    interval = f"expected: {sqrt(given.mse):.3g}; 99 % interval: {sqrt(given.low):.3g} to {sqrt(given.high):.3g}"
+    comparison = {
+        "agrees": "as expected for this image",
+        "worse": "more than expected for this image",
+        "better": "less than expected for this image",
     }[agreement(error)]
-    return f"{told}, {said} ({between})"
+    return f"{measured}, {comparison} ({interval})."
 
 
-def agreement(error: dict[str, Any]) -> str:
-    """Whether the measured error is what theory expects: agrees, worse, better or, where it cannot be told, unknown."""
-    given, mse = error.get("expected_given_truth"), error.get("mse")
-    if given is None or mse is None:
+def agreement(error: ErrorReport) -> str:
+    """Return how the measured error compares with the expected interval: agrees, worse, better or unknown."""
+    given = error.expected_given_truth
+    if given is None or error.mse is None:
         return "unknown"
-    if mse > given["high"]:
+    if error.mse > given.high:
         return "worse"
-    return "agrees" if mse >= given["low"] else "better"
+    return "agrees" if error.mse >= given.low else "better"
 
 
-def _sharpness(description: dict[str, Any]) -> str:
-    width = description["diagnostics"]["resolution"]
+def _resolution(report: RunReport) -> str:
+    width = report.diagnostics.resolution
     if width is None:
-        return "nothing is resolved"
+        return "Nothing is resolved."
     pixels = f"{width:.2g} {'pixel' if f'{width:.2g}' == '1' else 'pixels'}"
     if width < 1.05:
-        return f"it is as sharp as the target's grid ({pixels})"
-    return f"it is resolved to {pixels} of the target"
+        return f"The median resolution is that of the target's pixel grid ({pixels})."
+    return f"The median resolution is {pixels} of the target."
 
 
-def _limit(error: dict[str, Any]) -> str:
-    total = error["predicted_mse"]
+def _largest_cause(error: ErrorReport) -> str:
+    total = error.predicted_mse
     if total <= 0:
-        return "nothing limits it"
-    name, part = max(error["budget"].items(), key=lambda item: item[1])
-    cause, cure = CAUSES.get(name, (name.replace("_", " "), "see the table of its parts"))
-    return f"what limits it most is {cause}, {100 * part / total:.0f} % of the expected squared error: {cure}"
+        return "The predicted error is zero."
+    name, part = max(error.budget.items(), key=lambda item: item[1])
+    cause, remedy = CAUSES.get(name, (name.replace("_", " "), "see the error budget"))
+    return f"The largest part of the predicted squared error, {100 * part / total:.0f} %, is due to {cause}: {remedy}."
 
 
-def cautions(description: dict[str, Any]) -> list[str]:
-    """What a reader should know before the numbers are trusted, a sentence each."""
-    found: list[str] = []
-    diagnostics = description["diagnostics"]
-    if description["model"]["feigned_information"] > MOST_FEIGNED:
-        found.append(
-            "Do not trust the predicted error: the lens types leave pixels open on which the noise of H feigns"
-            " information."
+def cautions(report: RunReport) -> list[str]:
+    """Return warnings that a reader needs before the numbers, one sentence each."""
+    warnings: list[str] = []
+    diagnostics = report.diagnostics
+    if report.model.spurious_information > MAX_SPURIOUS_INFORMATION:
+        warnings.append(
+            "Do not trust the predicted error: the lens types leave pixels undetermined, and the noise of H adds"
+            " spurious information about them."
         )
-    if diagnostics.get("fit_doubtful"):
-        found.append("Do not trust the prior or noise that was found: the stack does not tell it.")
-    if diagnostics["pixels_dead"] or diagnostics["pixels_saturated"]:
-        found.append(
-            f"{diagnostics['pixels_dead']} dead and {diagnostics['pixels_saturated']} saturated sensor pixels are left"
-            " out of the estimate."
+    if diagnostics.fit_doubtful:
+        warnings.append("Do not trust the fitted prior or noise: the stack does not determine them.")
+    if diagnostics.pixels_dead or diagnostics.pixels_saturated:
+        warnings.append(
+            f"{diagnostics.pixels_dead} dead and {diagnostics.pixels_saturated} saturated sensor pixels are excluded"
+            " from the estimate."
         )
-    return found
+    return warnings
 
 
-def key_numbers(description: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What stands large at the top: a name, a number, and what it is compared with."""
-    error, stages = description["error"], description["stages"]
-    found: list[tuple[str, str, str]] = []
-    if error.get("mse") is not None:
-        found.append(("Mean squared error", f"{error['mse']:.4g}", f"predicted {error['predicted_mse']:.4g}"))
-        psnr = "exact" if error["psnr"] is None else f"{error['psnr']:.2f} dB"
-        found.append(("PSNR", psnr, "peak 255"))
-        if error["ssim"] is not None:
-            found.append(("Structural similarity", f"{error['ssim']:.4f}", "1 is the truth itself"))
+def key_numbers(report: RunReport) -> list[tuple[str, str, str]]:
+    """Return the numbers at the top of the page: name, value, and what it compares with."""
+    error = report.error
+    numbers: list[tuple[str, str, str]] = []
+    if error.mse is None:
+        numbers.append(("Predicted mean squared error", f"{error.predicted_mse:.4g}", "Eq. 5"))
     else:
-        found.append(("Predicted squared error", f"{error['predicted_mse']:.4g}", "a pixel, Eq. 5"))
-    seconds = sum(stage["seconds"] for stage in stages.values())
-    counted = f"{description['measurements']} measurements, {description['unknowns']} unknowns"
-    return [*found, ("Time", f"{seconds:.3g} s", counted)]
+        numbers.append(("Mean squared error", f"{error.mse:.4g}", f"predicted: {error.predicted_mse:.4g}"))
+        psnr = "exact" if error.psnr is None else f"{error.psnr:.2f} dB"
+        numbers.append(("PSNR", psnr, "for a peak of 255"))
+        if error.ssim is not None:
+            numbers.append(("Structural similarity", f"{error.ssim:.4f}", "identical images: 1"))
+    seconds = sum(stage.seconds for stage in report.stages.values())
+    sizes = f"{report.measurements} measurements, {report.unknowns} unknowns"
+    return [*numbers, ("Run time", f"{seconds:.3g} s", sizes)]
 
 
-def budget(error: dict[str, Any]) -> list[tuple[str, float, float]]:
-    """Parts of the expected squared error, the largest first: cause, part, share of the whole in per cent."""
-    total = error["predicted_mse"]
-    parts = sorted(error["budget"].items(), key=lambda item: -item[1])
+def budget(error: ErrorReport) -> list[tuple[str, float, float]]:
+    """Return the parts of the predicted squared error, the largest first: cause, part, share in per cent."""
+    parts = sorted(error.budget.items(), key=lambda item: -item[1])
     return [
-        (CAUSES.get(name, (name.replace("_", " "), ""))[0], part, 100 * part / total)
+        (CAUSES.get(name, (name.replace("_", " "), ""))[0], part, 100 * part / error.predicted_mse)
         for name, part in parts
         if part > 0
     ]

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from itertools import combinations
 from math import inf, isfinite
 
-from ommatid.reconstruct.prediction import TRIM, observability
+from ommatid.reconstruct.measured_error import TRIM
+from ommatid.reconstruct.prediction import observability
 
 from .tile_errors import (
     ACTUAL,

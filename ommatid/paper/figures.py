@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from ommatid.reconstruct.forms.form import Vector
-from ommatid.reconstruct.prediction import TRIM
+from ommatid.reconstruct.measured_error import TRIM
 from ommatid.runtime.files import write_whole
+from ommatid.scenes.constants import WHITE
 
 from .photographs import Photograph, TileCrops, Trials
 from .tile_errors import ACTUAL, EXPECTED, THREE, PaperTile, TileError, inner
@@ -27,7 +28,6 @@ APART = 8  # actual noise variances from mark to mark
 ERROR = "expected squared error a pixel (squared units of f)"
 NOISE = "actual noise variance (squared units of f)"
 EXPECTS = "noise variance that\nthe estimator expects"
-PEAK = 255.0
 
 
 def draw_sweeps(path: Path, shown: list[PaperTile]) -> None:
@@ -166,7 +166,7 @@ def _ratios(axes: Any, trials: Trials, levels: list[float]) -> None:
 def _thumbnails(figure: Any, cut: TileCrops, side: int) -> None:
     panels = figure.subplots(1, len(cut.places))
     for axes, image, colour, place in zip(panels, cut.images, COLOURS, cut.places, strict=True):
-        axes.imshow(image.reshape(side, side), cmap="gray", vmin=0.0, vmax=PEAK)
+        axes.imshow(image.reshape(side, side), cmap="gray", vmin=0.0, vmax=WHITE)
         axes.set_title(f"row {place[0]}, column {place[1]}", fontsize=9)
         axes.set_xticks([])
         axes.set_yticks([])

@@ -5,8 +5,6 @@ H of a perfect camera and the recording of its light are passed in; everything e
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.files import check_output, make_folder, write_text
+from ommatid.runtime.files import check_output, make_folder, write_csv
 from ommatid.runtime.progress import Progress, no_progress
 
 from . import figures
@@ -62,7 +60,7 @@ def write_paper(
     progress(0.8)
     diverse = [computed[SMALLEST, THREE], *distortion(matrix_of)]
     _write_numbers(folder, computed, found, judged)
-    _write_table(folder / "distortion.csv", ("lenses", "measurements", "noise_variance", "mse"), _diverse(diverse))
+    write_csv(folder / "distortion.csv", ("lenses", "measurements", "noise_variance", "mse"), _diverse(diverse))
     _write_figures(folder, computed, found)
     figures.draw_distortion(folder / "distortion.png", diverse, BENT)
     progress(1.0)
@@ -107,12 +105,12 @@ def _write_figures(folder: Path, computed: Tiles, found: Photograph) -> None:
 def _write_numbers(folder: Path, computed: Tiles, found: Photograph, judged: list[Claim]) -> None:
     columns = ("lenses", "expected_noise_variance", "actual_noise_variance", "mse", "trimmed_mse")
     for name, side in (("fig2.csv", 19), ("fig4.csv", 35)):
-        _write_table(folder / name, columns, (row for tile in _combinations(computed, side) for row in sweep(tile)))
-    _write_table(folder / "fig3.csv", ("lenses", "row", "column", "expected_squared_error"), _maps(computed))
-    _write_table(folder / "fig5.csv", ("side", *columns[1:4]), _sides(computed))
+        write_csv(folder / name, columns, (row for tile in _combinations(computed, side) for row in sweep(tile)))
+    write_csv(folder / "fig3.csv", ("lenses", "row", "column", "expected_squared_error"), _maps(computed))
+    write_csv(folder / "fig5.csv", ("side", *columns[1:4]), _sides(computed))
     numbered = [f"tile_{place[0]}_{place[1]}" for place in found.cut.places]
-    _write_table(folder / "fig7.csv", ("bits", "noise_variance", "predicted", "mean", *numbered), _measured(found))
-    _write_table(folder / CLAIMS, ("claim", "holds", "numbers", "remark"), map(_claim, judged))
+    write_csv(folder / "fig7.csv", ("bits", "noise_variance", "predicted", "mean", *numbered), _measured(found))
+    write_csv(folder / CLAIMS, ("claim", "holds", "numbers", "remark"), map(_claim, judged))
 
 
 def _maps(computed: Tiles) -> Iterable[Row]:
@@ -150,12 +148,3 @@ def _levels(trials: Trials) -> Iterable[Row]:
 def _claim(claim: Claim) -> Row:
     numbers = "; ".join(f"{name}: {number:.9g}" for name, number in claim.numbers.items())
     return claim.claim, claim.holds, numbers, claim.remark
-
-
-def _write_table(path: Path, columns: Sequence[str], lines: Iterable[Row]) -> None:
-    """Write a CSV file of numbers to their last digit, whole or not at all."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([float(cell) if isinstance(cell, float) else cell for cell in line] for line in lines)
-    write_text(path, text.getvalue())

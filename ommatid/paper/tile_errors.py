@@ -18,7 +18,7 @@ from scipy import sparse
 
 from ommatid.reconstruct.forms.form import Vector
 from ommatid.reconstruct.forms.svd import Svd, svd
-from ommatid.reconstruct.prediction import TRIM
+from ommatid.reconstruct.measured_error import TRIM
 from ommatid.reconstruct.prior import independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.scenes import scene

@@ -9,14 +9,15 @@ from typing import Any
 
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
-from ommatid.runtime.errors import naming_source
+from ommatid.reconstruct.output.run_json import RunReport, StudyCase
+from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.cache import cached_model, cached_stack
@@ -28,7 +29,11 @@ from ommatid.simulate.validation import check_scene, check_scene_memory
 
 def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
     """A scene, its camera and its target, all checked before anything is written."""
-    scene = read(path, changes, lenses)
+    return checked(read(path, changes, lenses))
+
+
+def checked(scene: Scene) -> Setup:
+    """Derive the camera of a scene and load its image. Raises InputError if either cannot be done."""
     camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
     if scene.world is not None:
         from ommatid.simulate.renderer.world import files
@@ -53,19 +58,19 @@ def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Mem
 
 def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `run` does of a scene, here or on a worker, and says of it."""
-    description = results(setup, folder, watch)
+    report = results(setup, folder, watch)
     write_page(setup.camera, folder, watch)
-    return description
+    return report.plain()
 
 
 @one_thread()
-def results(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
     """All of a run but its page, and what run.json says of it."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.method_choice import choose_method
-    from ommatid.reconstruct.output.result_files import RUN, cached_results
-    from ommatid.reconstruct.output.run_json import write_run
+    from ommatid.reconstruct.output import run_json
+    from ommatid.reconstruct.output.result_files import cached_results
 
     scene, camera = setup.scene, setup.camera
     check_scene(setup)
@@ -79,18 +84,18 @@ def results(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
         model, made = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
     watch.done("calibrate", made)
     with watch.progress("reconstruct") as progress:
-        description, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
+        report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     watch.done("reconstruct", made)
-    more: dict[str, Any] = {}
+    complete = report
     if scene.world is not None:
-        from ommatid.analysis.depth_error import of_run
+        from ommatid.analysis.depth_error import depth_error_of_run
 
-        more["depth"] = of_run(folder, camera)
+        complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        more["study"] = _studied(setup, stack, folder, watch)
-    if any(description.get(key) != value for key, value in more.items()):
-        write_run(folder / RUN, {**description, **more})
-    return {**description, **more}
+        complete = complete.with_changes(study=_studied(setup, stack, folder, watch))
+    if complete.plain() != report.plain():
+        run_json.write(folder, complete)
+    return complete
 
 
 def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
@@ -112,10 +117,11 @@ def render(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
 def predict_scene(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
     """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
     from ommatid.analysis.predict import predict_scene
+    from ommatid.analysis.prediction_table import json_of
 
     del folder, watch
     with naming_source(setup.scene.source):
-        return predict_scene(setup.scene).describe()
+        return json_of(predict_scene(setup.scene))
 
 
 def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
@@ -129,6 +135,22 @@ def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, boo
 
         judge = for_prior(setup)
     return cached_model(path, setup, progress, judge)
+
+
+def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
+    """Write the scene in `path` as a plain Mitsuba scene, and describe its files and sensors.
+
+    Raises InputError for a scene with a world or with lenses that are more than pinholes.
+    """
+    from ommatid.runtime.files import check_output
+    from ommatid.simulate.renderer.export import export
+
+    check_output(output, path)
+    setup = opened(path, changes, lenses)
+    if setup.scene.world is not None:
+        raise InputError(f"{path}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
+    picture = export(setup, output)
+    return {"file": str(output), "picture": str(picture), "sensors": [sub.name for sub in setup.camera.sub_imagers]}
 
 
 def facts(chosen: bool) -> dict[str, str]:
@@ -148,7 +170,7 @@ def _rendered(setup: Setup, folder: Path, watch: RunObserver) -> Stack:
     return stack
 
 
-def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> list[dict[str, Any]]:
+def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> tuple[StudyCase, ...]:
     """The same stack with every idea of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models

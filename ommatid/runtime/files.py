@@ -1,39 +1,44 @@
-"""Writing files so that each appears whole or not at all, and naming what they were made from."""
+"""Atomic writing of files, and caching of results by the fingerprint of what they were made from."""
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import hashlib
+import io
 import json
 import os
 import secrets
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, MachineError
 
-PART = ".part."  # in the name of a file that is not whole
+Content = TypeVar("Content")
+Made = TypeVar("Made")
+
+PART = ".part."  # in the name of a file that is still being written
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a file beside `path`, then rename it: readers never see half of it.
+    """Let `write` fill a temporary file in the same folder, then rename it to `path`: readers never see half a file.
 
-    Raises DeniedError when the disk is full or refuses, InputError when the folder does not exist.
+    Raises MachineError if the disk is full or refuses, InputError if the folder does not exist.
     """
     check_output(path)
     clear_abandoned(path.parent, path.name)
     try:
-        with _beside(path) as beside:
-            write(beside)
-            with beside.open("rb+") as stream:
+        with _temporary_file(path) as temporary:
+            write(temporary)
+            with temporary.open("rb+") as stream:
                 os.fsync(stream.fileno())
-            beside.replace(path)
+            temporary.replace(path)
     except OSError as error:
         reason = error.strerror or str(error)
         raise MachineError(
@@ -42,52 +47,61 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
 
 
 @contextmanager
-def _beside(path: Path) -> Generator[Path]:
-    """An empty file beside `path` that is locked as long as somebody fills it, and is then gone, or renamed."""
+def _temporary_file(path: Path) -> Generator[Path]:
+    """Create an empty file beside `path`, locked while it is being written; remove it unless it was renamed."""
     while True:
-        beside = path.with_name(f".{secrets.token_hex(4)}{PART}{path.name}")
-        with beside.open("xb") as held:
-            with suppress(OSError):  # where files cannot be locked nobody clears up either
-                fcntl.flock(held, fcntl.LOCK_EX)
-            if not beside.exists():  # who clears up came between the two lines before
+        temporary = path.with_name(f".{secrets.token_hex(4)}{PART}{path.name}")
+        with temporary.open("xb") as stream:
+            with suppress(OSError):  # on file systems without locks, clear_abandoned removes nothing
+                fcntl.flock(stream, fcntl.LOCK_EX)
+            if not temporary.exists():  # another process cleared it before it was locked
                 continue
             try:
-                yield beside
+                yield temporary
             finally:
-                beside.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
             return
 
 
 def clear_abandoned(folder: Path, name: str | None = None) -> None:
-    """Remove what dead processes were writing, to the file called `name` or to any: nobody holds its lock."""
-    for left in folder.glob(f".{'[0-9a-f]' * 8}{PART}{'*' if name is None else escape(name)}"):
-        with suppress(OSError), left.open("rb") as stream:  # another's, or just gone
+    """Remove temporary files of dead processes (their locks are free), of the file `name` or of all files."""
+    for temporary in folder.glob(f".{'[0-9a-f]' * 8}{PART}{'*' if name is None else escape(name)}"):
+        with suppress(OSError), temporary.open("rb") as stream:  # in use, or removed meanwhile
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            left.unlink()
+            temporary.unlink()
 
 
 def check_output(path: Path, *inputs: Path) -> None:
-    """Raise InputError where a result could not be written, or would replace what it is made from."""
+    """Raise InputError if a result could not be written to `path`, or would replace one of its `inputs`."""
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
     if path.is_dir():
         raise InputError(f"{path}: expected the name of a file, got a folder")
-    for read in inputs:
-        if path.resolve() == read.resolve():
+    for source in inputs:
+        if path.resolve() == source.resolve():
             raise InputError(f"{path}: would replace the file that is read; choose another name with -o")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text, whole or not at all."""
-    write_whole(path, lambda beside: _write_text(beside, text))
+    """Write UTF-8 text atomically."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_text(text, encoding="utf-8")
+
+    write_whole(path, write)
 
 
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a CSV file atomically: a header, then one line per row; None becomes an empty field."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents. Raises DeniedError or InputError in one sentence."""
+    """Create a folder and its parents. Raises MachineError or InputError."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
@@ -106,5 +120,28 @@ def digest(*arrays: NDArray[Any]) -> str:
 
 
 def fingerprint(description: object) -> str:
-    """SHA-256 of a JSON description: two results with one fingerprint were made from the same."""
+    """SHA-256 of a JSON description; results with equal fingerprints were made from the same."""
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
+
+
+def cached(
+    path: Path,
+    wanted: str,
+    read: Callable[[Path], tuple[Content, str | None]],
+    make: Callable[[], Made],
+    write: Callable[[Path, Made], None],
+) -> tuple[Content, bool]:
+    """Return the result at `path` and False if it was made from what `wanted` names; else make it, and True.
+
+    path : file, or folder of several files that belong together
+    wanted : fingerprint of everything that the result depends on
+    read : yields the result and its fingerprint; may raise OSError, ValueError, KeyError, TypeError or AttributeError
+        for a file that is missing, damaged or of another kind, which is then made again
+    write : writes what `make` returns; the result is read back, so that it is the same in this run and the next
+    """
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        content, made_from = read(path)
+        if made_from == wanted:
+            return content, False
+    write(path, make())
+    return read(path)[0], True

@@ -7,7 +7,7 @@ bound must say so. What claims more than it has is a silent loss.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, fields
+from dataclasses import asdict, astuple, fields
 from math import log10
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from ommatid.reconstruct.estimator.certificate import NOTHING
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import make_folder, write_text
+from ommatid.runtime.files import make_folder, write_csv, write_text
 
 from .cases import Matrices, StabilityCase, cases, sweep
 from .exact_answer import ExactAnswer, exact_answer
@@ -126,7 +126,8 @@ def write_stability(folder: Path, matrices: Matrices, progress: Callable[[float]
     curves, table = run(matrices, progress)
     outcomes = [one.outcome for one in curves] + table
     automatic = [one for one in outcomes if one.asked == AUTO]
-    write_text(folder / "stability.csv", _csv(outcomes))
+    columns = [field.name for field in fields(StabilityOutcome)]
+    write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
     write_text(folder / "stability.md", markdown(automatic))
     write_figure(folder / "stability.png", curves)
     counts = {verdict: sum(one.verdict == verdict for one in automatic) for verdict in (RIGHT, REFUSED, FEWER, SILENT)}
@@ -169,14 +170,3 @@ def markdown(outcomes: Iterable[StabilityOutcome]) -> str:
             found = f"{one.ran} | {one.refined:.1f} | {one.variance:.1f} | {one.bound:.0e}"
             lines.append(f"| {one.case} | {size} | {found} | {one.verdict} |")
     return "\n".join(lines) + "\n"
-
-
-def _csv(outcomes: list[StabilityOutcome]) -> str:
-    import csv
-    from io import StringIO
-
-    stream = StringIO()
-    writer = csv.DictWriter(stream, [field.name for field in fields(StabilityOutcome)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(one) for one in outcomes)
-    return stream.getvalue()

@@ -1,11 +1,12 @@
-"""The marginal likelihood of the measurements, by which a prior and the noise are found from the stack alone.
+"""The evidence: the marginal likelihood of the measurements, which a fit of prior and noise maximises.
 
-They are where it is largest (Mardia and Marshall 1984),
+With (Mardia and Marshall 1984)
 
     g - H f0 ~ N(0, C),   C = H P0 H^T + Rv,
 
-minus twice its logarithm being log det C + r^T C^-1 r. With P0 = L L^T and B = Rv^-1/2 H L, everything comes from the
-Cholesky factor of I + B^T B, (N, N), and from sums of squares: r^T C^-1 r = |Rv^-1/2 (r - H L u)|^2 + |u|^2.
+minus twice its logarithm is log det C + r^T C^-1 r, without constants. With P0 = L L^T and B = Rv^-1/2 H L, everything
+follows from the Cholesky factor of I + B^T B, (N, N), and from sums of squares:
+r^T C^-1 r = |Rv^-1/2 (r - H L u)|^2 + |u|^2.
 """
 
 from __future__ import annotations
@@ -17,121 +18,131 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from ..forms.form import Matrix, Vector
+from ommatid.runtime.arrays import FloatArray
+
 from ..prior import Prior, between_pixels, lag_distances
 
-WHOLE = 1e-6  # of what a measurement sees: what may lie outside the tile that it counts for
+OUTSIDE = 1e-6  # share of a measurement's footprint that may lie outside its tile
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The measurements and what is known of them.
+    """Measurements, and the known parts of their covariance.
 
-    residual : (M,) r = g - H f0;  known_noise : (M,), of Rv the part that is not to be found
-    prior : P0 where it is known; None where P0 = variance exp(-distance / length) is to be found
-    noise_known : whether all of Rv is
+    residual : (M,) r = g - H f0;  known_noise : (M,), the part of Rv that is not to be fitted
+    prior : P0 where it is known; None where P0 = variance exp(-distance / length) is to be fitted
+    noise_known : True if `known_noise` is all of Rv
     """
 
     matrix: sparse.csr_array
-    residual: Vector
-    known_noise: Vector
+    residual: FloatArray
+    known_noise: FloatArray
     shape: tuple[int, int]
     prior: Prior | None
     noise_known: bool
 
-    def score(self, logarithms: Vector) -> tuple[float, Vector]:
-        """Minus the logarithm of the likelihood, and its gradient, by the logarithms of what is to be found.
+    def score(self, logarithms: FloatArray) -> tuple[float, FloatArray]:
+        """Return minus the log evidence and its gradient with respect to the logarithms of the parameters.
 
-        logarithms : of variance and length (in pixels) unless P0 is known, then of the noise variance unless that is
+        logarithms : of variance and length (pixels) unless P0 is known, then of the noise variance unless that is known
         """
         if self.matrix.shape[0] < self.matrix.shape[1]:
-            return self._by_measurements(logarithms)
-        return self._by_pixels(logarithms)
+            return self._score_by_measurements(logarithms)
+        return self._score_by_pixels(logarithms)
 
-    def _by_pixels(self, logarithms: Vector) -> tuple[float, Vector]:
-        numbers, noise = self._numbers(logarithms)
+    def _score_by_pixels(self, logarithms: FloatArray) -> tuple[float, FloatArray]:
+        parameters, noise = self._parameters(logarithms)
         if self.prior is None:
-            correlation, derivative = self._correlation(numbers[1])
-            unit, variance = np.asarray(linalg.cholesky(correlation, lower=True, check_finite=False)), numbers[0]
+            correlation, derivative = self._correlation(parameters[1])
+            unit, variance = np.asarray(linalg.cholesky(correlation, lower=True, check_finite=False)), parameters[0]
         else:
             unit, variance, derivative = _dense(self.prior.root), 1.0, None
-        half = variance**0.5 * unit
-        inner: Matrix = half.T @ (self._weighted(1 / noise) @ half)
+        root = variance**0.5 * unit
+        inner: FloatArray = root.T @ (self._normal_matrix(1 / noise) @ root)
         inner[np.diag_indices_from(inner)] += 1.0
         factor = np.asarray(linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)), True
-        white: Vector = half.T @ (self.matrix.T @ (self.residual / noise))
-        u: Vector = np.asarray(linalg.cho_solve(factor, white, check_finite=False))
-        left: Vector = (self.residual - self.matrix @ (half @ u)) / noise
+        right_side: FloatArray = root.T @ (self.matrix.T @ (self.residual / noise))
+        u: FloatArray = np.asarray(linalg.cho_solve(factor, right_side, check_finite=False))
+        multipliers: FloatArray = (self.residual - self.matrix @ (root @ u)) / noise
         determinant = float(np.log(noise).sum() + 2 * np.log(np.diagonal(factor[0])).sum())
-        value = 0.5 * (determinant + float(noise @ left**2 + u @ u))
-        shrunk = np.asarray(linalg.cho_solve(factor, np.eye(u.size), check_finite=False))
-        slope = [] if derivative is None else _by_prior(unit, derivative, shrunk, u)
+        value = 0.5 * (determinant + float(noise @ multipliers**2 + u @ u))
+        inverse = np.asarray(linalg.cho_solve(factor, np.eye(u.size), check_finite=False))
+        slope = [] if derivative is None else _prior_slope(unit, derivative, inverse, u)
         if not self.noise_known:
-            told = float(np.sum(self._weighted(noise**-2) * (half @ shrunk @ half.T)))
-            slope.append(0.5 * numbers[-1] * (float(np.sum(1 / noise)) - told - float(left @ left)))
+            trace = float(np.sum(self._normal_matrix(noise**-2) * (root @ inverse @ root.T)))
+            squares = float(multipliers @ multipliers)
+            slope.append(0.5 * parameters[-1] * (float(np.sum(1 / noise)) - trace - squares))
         return value, np.array(slope)
 
-    def _by_measurements(self, logarithms: Vector) -> tuple[float, Vector]:
-        """The same from C itself, the smaller matrix where measurements are fewer than pixels."""
-        numbers, noise = self._numbers(logarithms)
+    def _score_by_measurements(self, logarithms: FloatArray) -> tuple[float, FloatArray]:
+        """Return the same from C itself, the smaller matrix where measurements are fewer than pixels."""
+        parameters, noise = self._parameters(logarithms)
         if self.prior is None:
-            parts = [numbers[0] * self._observed(matrix) for matrix in self._correlation(numbers[1])]
+            parts = [parameters[0] * self._observed(matrix) for matrix in self._correlation(parameters[1])]
         else:
-            half = self.matrix @ _dense(self.prior.root)
-            parts = [half @ half.T]
-        matrix = parts[0] + np.diag(noise)
-        factor = np.asarray(linalg.cholesky(matrix, lower=True, check_finite=False)), True
-        pull: Vector = np.asarray(linalg.cho_solve(factor, self.residual, check_finite=False))
-        value = float(np.log(np.diagonal(factor[0])).sum()) + 0.5 * float(self.residual @ pull)
+            root = self.matrix @ _dense(self.prior.root)
+            parts = [root @ root.T]
+        covariance = parts[0] + np.diag(noise)
+        factor = np.asarray(linalg.cholesky(covariance, lower=True, check_finite=False)), True
+        multipliers: FloatArray = np.asarray(linalg.cho_solve(factor, self.residual, check_finite=False))
+        value = float(np.log(np.diagonal(factor[0])).sum()) + 0.5 * float(self.residual @ multipliers)
         inverse = np.asarray(linalg.cho_solve(factor, np.eye(noise.size), check_finite=False))
         changes = [] if self.prior is not None else parts
-        slope = [0.5 * (float(np.sum(inverse * change)) - float(pull @ change @ pull)) for change in changes]
+        slope = [
+            0.5 * (float(np.sum(inverse * change)) - float(multipliers @ change @ multipliers)) for change in changes
+        ]
         if not self.noise_known:
-            slope.append(0.5 * numbers[-1] * (float(np.trace(inverse)) - float(pull @ pull)))
+            slope.append(0.5 * parameters[-1] * (float(np.trace(inverse)) - float(multipliers @ multipliers)))
         return value, np.array(slope)
 
-    def _numbers(self, logarithms: Vector) -> tuple[list[float], Vector]:
-        numbers = [exp(value) for value in logarithms]
-        return numbers, self.known_noise + (0.0 if self.noise_known else numbers[-1])
+    def _parameters(self, logarithms: FloatArray) -> tuple[list[float], FloatArray]:
+        """Return the parameters and the whole noise, (M,)."""
+        parameters = [exp(value) for value in logarithms]
+        return parameters, self.known_noise + (0.0 if self.noise_known else parameters[-1])
 
-    def _observed(self, between: Matrix) -> Matrix:
-        """H P H^T: (M, M)."""
-        return np.asarray(self.matrix @ (self.matrix @ between).T)
+    def _observed(self, covariance: FloatArray) -> FloatArray:
+        """Return H P H^T: (M, M)."""
+        return np.asarray(self.matrix @ (self.matrix @ covariance).T)
 
     def blocks(self, side: int) -> list[Evidence]:
-        """The same, cut into tiles of at most `side` x `side` pixels, each with the measurements that see it alone."""
+        """Cut into tiles of at most `side` x `side` pixels, each with the measurements that see it alone."""
         rows, columns = (np.array_split(np.arange(size), -(-size // side)) for size in self.shape)
         if len(rows) == len(columns) == 1:
             return [self]
-        numbers = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
-        tiles = [(some_rows, some_columns) for some_rows in rows for some_columns in columns]
-        return [self._tile(numbers[np.ix_(*tile)].ravel(), (tile[0].size, tile[1].size)) for tile in tiles]
+        indices = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
+        return [
+            self._tile(indices[np.ix_(tile_rows, tile_columns)].ravel(), (tile_rows.size, tile_columns.size))
+            for tile_rows in rows
+            for tile_columns in columns
+        ]
 
     def _tile(self, pixels: NDArray[np.intp], shape: tuple[int, int]) -> Evidence:
-        seen = abs(self.matrix)
-        total, inside = seen.sum(axis=1), seen[:, pixels].sum(axis=1)
-        whole = (total > 0) & (inside >= (1 - WHOLE) * total)
+        weights = abs(self.matrix)
+        total, inside = weights.sum(axis=1), weights[:, pixels].sum(axis=1)
+        whole = (total > 0) & (inside >= (1 - OUTSIDE) * total)
         prior = None if self.prior is None else self.prior.restrict(pixels)
         matrix = sparse.csr_array(self.matrix[whole][:, pixels])
         return Evidence(matrix, self.residual[whole], self.known_noise[whole], shape, prior, self.noise_known)
 
-    def _correlation(self, length: float) -> tuple[Matrix, Matrix]:
-        """P1 = exp(-distance / length) and its derivative by the logarithm of the length: (N, N) each."""
+    def _correlation(self, length: float) -> tuple[FloatArray, FloatArray]:
+        """Return P1 = exp(-distance / length) and its derivative by the logarithm of the length: (N, N) each."""
         lags = lag_distances(self.shape) / length
         return between_pixels(np.exp(-lags), self.shape), between_pixels(lags * np.exp(-lags), self.shape)
 
-    def _weighted(self, weights: Vector) -> Matrix:
+    def _normal_matrix(self, weights: FloatArray) -> FloatArray:
+        """Return H^T diag(weights) H: (N, N)."""
         return np.asarray((self.matrix.T @ sparse.csr_array(self.matrix.multiply(weights[:, None]))).toarray())
 
 
-def _dense(root: Matrix) -> Matrix:
+def _dense(root: FloatArray) -> FloatArray:
     return np.diag(root) if root.ndim == 1 else root
 
 
-def _by_prior(unit: Matrix, derivative: Matrix, shrunk: Matrix, u: Vector) -> list[float]:
-    # With G = (I + B^T B)^-1: H^T C^-1 H = L^-T (I - G) L^-1 and H^T C^-1 r = L^-T u, so no large numbers cancel.
-    half_way = np.asarray(linalg.solve_triangular(unit, derivative, lower=True, check_finite=False))
-    inside = np.asarray(linalg.solve_triangular(unit, half_way.T, lower=True, check_finite=False))
-    by_variance = u.size - float(np.trace(shrunk)) - float(u @ u)
-    by_length = float(np.trace(inside)) - float(np.sum(shrunk * inside)) - float(u @ inside @ u)
+def _prior_slope(unit: FloatArray, derivative: FloatArray, inverse: FloatArray, u: FloatArray) -> list[float]:
+    """Return derivatives by the logarithms of variance and length; inverse : G = (I + B^T B)^-1."""
+    # H^T C^-1 H = L^-T (I - G) L^-1 and H^T C^-1 r = L^-T u, so no large numbers cancel.
+    left = np.asarray(linalg.solve_triangular(unit, derivative, lower=True, check_finite=False))
+    inside = np.asarray(linalg.solve_triangular(unit, left.T, lower=True, check_finite=False))
+    by_variance = u.size - float(np.trace(inverse)) - float(u @ u)
+    by_length = float(np.trace(inside)) - float(np.sum(inverse * inside)) - float(u @ inside @ u)
     return [0.5 * by_variance, 0.5 * by_length]

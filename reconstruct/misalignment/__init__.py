@@ -1,1 +1,1 @@
-"""Cameras whose sub-imagers stand beside their places."""
+"""Reconstruction with misaligned sub-imagers: as noise, fitted to the stack, or ignored at a known cost."""

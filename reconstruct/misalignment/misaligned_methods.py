@@ -1,6 +1,6 @@
-"""Ways to an estimate that expect a misaligned camera: with more noise, or by finding how its sub-imagers stand.
+"""Methods that expect a misaligned camera: with additional noise, or with an H fitted to the stack.
 
-Both work on the H of the camera as drawn, and need a dense problem.
+Both start from H of the camera as designed, and need a dense problem.
 """
 
 from __future__ import annotations
@@ -10,16 +10,15 @@ from functools import cached_property
 
 import numpy as np
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.model import Model
 
 from ..estimator.estimate import Estimate, estimate
 from ..expected_error import ExpectedError, Interval, variance_of_sum
 from ..methods.dense_method import DenseMethod
-from ..methods.method import Method, MethodResult, Vector
+from ..methods.method import Method, MethodResult
 from .alignment import Alignment, align
-from .robust_noise import Whitening, robust_error, robust_noise, whitening
-
-CAUSE = "misalignment"
+from .robust_noise import CAUSE, Whitening, robust_error, robust_noise, whitening
 
 
 class RobustMethod(Method):
@@ -29,79 +28,82 @@ class RobustMethod(Method):
     def _solved(self) -> tuple[Whitening, Estimate]:
         task = self.task
         prior, camera = task.prior_on(task.shape), task.model.camera
-        wrong = robust_noise(camera, prior)
-        white = whitening(camera, wrong, task.expected_noise, task.used)
-        problem = white.problem(wrong.matrix[task.used], prior)
+        misaligned = robust_noise(camera, prior)
+        white = whitening(camera, misaligned, task.expected_noise, task.used)
+        problem = white.problem(misaligned.matrix[task.used], prior)
         recorded = white.vector(task.recorded[task.used])
         return white, estimate(problem, recorded, task.settings.method, task.settings.tolerance)
 
-    def estimated(self) -> Vector:
-        """f^ alone: (N,)."""
+    def estimated(self) -> FloatArray:
+        """Return f^ alone: (N,)."""
         return self._solved[1].image
 
-    def result(self, noise: dict[str, Vector], truth: Vector | None) -> MethodResult:
-        """The estimate and its error where the noise is as given, and misalignment as its tolerance draws it.
+    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+        """Return the estimate and its error with the given noise and misalignment as its tolerance says.
 
-        There is no interval for a given image: what misalignment does to it is not what it does to the prior's images.
+        There is no interval for a given image: misalignment acts on it otherwise than on images of the prior.
         """
         del truth
-        white, found = self._solved
+        white, solved = self._solved
         unit = np.ones(self.task.expected_noise.size)
         return MethodResult(
-            found.image,
-            found.multipliers
-            / np.sqrt(self.task.expected_noise),  # so that weighted with `believed` they are chi-squared
-            found.solver,
-            robust_error(found.form, white, noise, CAUSE),
+            solved.image,
+            solved.multipliers / np.sqrt(self.task.expected_noise),  # their squares times the noise are chi-squared
+            solved.solver,
+            robust_error(solved.form, white, noise),
             None,
-            lambda weights: variance_of_sum(found.form, weights, unit),
+            lambda weights: variance_of_sum(solved.form, weights, unit),
         )
 
 
 class AlignedMethod(Method):
-    """H is that of the misalignments which the stack itself makes most likely."""
+    """H is that of the misalignments which are most likely given the stack."""
 
     @cached_property
     def alignment(self) -> Alignment:
-        """Where the sub-imagers are found to stand."""
+        """Fitted misalignments, and what is left unknown of them."""
         task = self.task
         prior = task.prior_on(task.shape)
         return align(task.model.camera, task.recorded[task.used], task.expected_noise, prior, task.used)
 
     @cached_property
     def _dense(self) -> DenseMethod:
-        return DenseMethod(replace(self.task, model=_with(self.task.model, self.alignment)), self.hands)
+        return DenseMethod(replace(self.task, model=_aligned_model(self.task.model, self.alignment)), self.hands)
 
-    def estimated(self) -> Vector:
-        """f^ alone: (N,)."""
+    def estimated(self) -> FloatArray:
+        """Return f^ alone: (N,)."""
         return self._dense.estimated()
 
-    def result(self, noise: dict[str, Vector], truth: Vector | None) -> MethodResult:
-        """The estimate and its error where the noise is as given; what is left unknown of misalignment adds to it."""
-        found, left = self._dense.result(noise, truth), self.alignment
-        more = float(left.variance.mean())
-
-        def of_sum(weights: Vector) -> float:
-            return found.variance_of_sum(weights) + left.variance_of_sum(weights)
-
-        expected = found.expected
+    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+        """Return the estimate and its error with the given noise; the remaining uncertainty of the fit adds to it."""
+        result, alignment = self._dense.result(noise, truth), self.alignment
+        added = float(alignment.variance.mean())
+        expected = result.expected
         return replace(
-            found,
+            result,
             expected=ExpectedError(
-                expected.variance + left.variance, expected.missing, {**expected.parts, CAUSE: more}, expected.resolved
+                expected.variance + alignment.variance,
+                expected.missing,
+                {**expected.parts, CAUSE: added},
+                expected.resolved,
             ),
-            interval=None if found.interval is None else _wider(found.interval, more),
-            variance_of_sum=of_sum,
+            interval=None if result.interval is None else _wider(result.interval, added),
+            variance_of_sum=lambda weights: result.variance_of_sum(weights) + alignment.variance_of_sum(weights),
         )
 
 
-def _with(model: Model, found: Alignment) -> Model:
-    none = np.zeros((0, found.matrix.nnz), np.float32)
-    record = {**model.record, "method": "fitted"}
-    return replace(model, stored=found.matrix, variance=np.zeros(found.matrix.nnz), batches=none, record=record)
+def _aligned_model(model: Model, alignment: Alignment) -> Model:
+    entries = alignment.matrix.nnz
+    return replace(
+        model,
+        stored=alignment.matrix,
+        variance=np.zeros(entries),
+        batches=np.zeros((0, entries), np.float32),
+        record={**model.record, "method": "fitted"},
+    )
 
 
-def _wider(interval: Interval, more: float) -> Interval:
-    """With one more error, of a mean square of `more`, which may be next to nothing or several times as large."""
-    mean = interval.mse + more
+def _wider(interval: Interval, added: float) -> Interval:
+    """Return an interval with one more error of mean square `added`, which may be almost zero or several times that."""
+    mean = interval.mse + added
     return Interval(mean, interval.low, interval.high * mean / interval.mse)

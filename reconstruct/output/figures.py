@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.files import write_whole
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.stack import Stack
 
 from ..restore import Reconstruction
@@ -26,7 +27,7 @@ def write_estimate(path: Path, estimate: Image) -> None:
     """Write an estimate, (rows, columns), as 8-bit PNG, a pixel for a pixel; values outside 0 to 255 are clipped."""
     from skimage import io
 
-    pixels = np.clip(np.round(estimate), 0, 255).astype(np.uint8)
+    pixels = np.clip(np.round(estimate), 0, WHITE).astype(np.uint8)
     imsave: Any = io.imsave  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
     write_whole(path, lambda beside: imsave(beside, pixels, check_contrast=False))
 

@@ -2,50 +2,53 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
-from ommatid.scenes.formats.exr import read
+from ommatid.scenes.formats import exr
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import TRUTH, Scene, with_changes
+from ommatid.scenes.scene import TRUTH, with_changes
 from ommatid.scenes.stack import Stack
 
 from ..restore import Reconstruction, check_match, restore
 from . import figures, run_json
+from .report import report_of
+from .run_json import RunReport
 
-ESTIMATE, PICTURE, OVERVIEW, RUN = "estimate.exr", "estimate.png", "overview.png", "run.json"
-OURS = ("prior", "estimator", "tiles")
+ESTIMATE, PICTURE, OVERVIEW = "estimate.exr", "estimate.png", "overview.png"
+ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
 
 
-def changed(stack: Stack, overrides: list[str], path: Path) -> Stack:
-    """The stack with what its scene tells the estimator changed. Raises InputError for any other key."""
+def with_estimator_changes(stack: Stack, overrides: list[str], path: Path) -> Stack:
+    """Return a stack with other keys of its scene's estimator. Raises InputError for any other key.
+
+    overrides : as KEY=VALUE;  path : of the stack, for error messages
+    """
     if not overrides:
         return stack
     scene = with_changes(stack.scene.plain(), path, overrides, ())
     for override in overrides:
         table = override.partition("=")[0].split(".")[0].strip()
-        if table not in OURS:
-            raise InputError(f"--set: [{table}] is already recorded in {path}; here only {', '.join(OURS)} can be set")
-    return replace(stack, scene=_with(stack.scene, scene))
+        if table not in ESTIMATOR_TABLES:
+            raise InputError(
+                f"--set: [{table}] is already recorded in {path}; here only {', '.join(ESTIMATOR_TABLES)} can be set"
+            )
+    changes = {table: getattr(scene, table) for table in ESTIMATOR_TABLES}
+    return replace(stack, scene=stack.scene.model_copy(update=changes))
 
 
-def _with(recorded: Scene, told: Scene) -> Scene:
-    return recorded.model_copy(update={table: getattr(told, table) for table in OURS})
-
-
-def truth_beside(path: Path, stack: Stack) -> NDArray[np.float64] | None:
-    """The target, (N,), from truth.exr in the stack's folder if it is the one that was rendered; else None."""
+def truth_beside(path: Path, stack: Stack) -> FloatArray | None:
+    """Read the target, (N,), from truth.exr in the stack's folder; None unless it is the one that was rendered."""
     try:
-        truth = read(path.parent / TRUTH)[0].channels["Y"]
+        truth = exr.read(path.parent / TRUTH)[0].channels["Y"]
     except (InputError, KeyError):
         return None
     return truth.astype(np.float64).ravel() if digest(truth) == stack.record.get("truth") else None
@@ -54,59 +57,62 @@ def truth_beside(path: Path, stack: Stack) -> NDArray[np.float64] | None:
 def reconstruct(
     stack: Stack,
     model: Model,
-    truth: NDArray[np.float64] | None,
+    truth: FloatArray | None,
     names: tuple[Path, Path],
     workers: Workers | None = None,
     progress: Progress = no_progress,
-) -> tuple[Reconstruction, dict[str, Any]]:
-    """The estimate and what run.json says of it. Raises InputError if stack and model do not belong together."""
+) -> tuple[Reconstruction, RunReport]:
+    """Return the reconstruction and the content of run.json.
+
+    names : of the files of stack and model, for error messages
+    Raises InputError if stack and model do not belong together.
+    """
     check_match(stack, model, names)
     restoration = restore(stack, model, truth, workers, progress)
-    return restoration, run_json.describe(stack, model, restoration)
+    return restoration, report_of(stack, model, restoration)
 
 
-def write_results(folder: Path, stack: Stack, restoration: Reconstruction, description: dict[str, Any]) -> None:
-    """Write the four files of a run; run.json comes last and so stands for all. Raises DeniedError."""
-    record = {"title": stack.scene.title, "fingerprint": description["fingerprint"]}
-    run_json.write_estimate(folder / ESTIMATE, restoration, record)
+def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, Any]) -> None:
+    """Write channels `estimate`, `variance` (diagonal of Eq. 5) and, where it is known, `truth`, as float32."""
+    channels = {"estimate": restoration.estimate, "variance": restoration.expected.variance}
+    if restoration.truth is not None:
+        channels["truth"] = restoration.truth
+    maps = {name: values.reshape(restoration.shape).astype(np.float32) for name, values in channels.items()}
+    exr.write(path, [exr.Part("estimate", maps, record)])
+
+
+def write_results(folder: Path, stack: Stack, restoration: Reconstruction, report: RunReport) -> None:
+    """Write the four files of a run. run.json comes last: where it is, all are there. Raises MachineError."""
+    record = {"title": stack.scene.title, "fingerprint": report.fingerprint}
+    write_estimate(folder / ESTIMATE, restoration, record)
     figures.write_estimate(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
     figures.write_overview(folder / OVERVIEW, stack.scene.title, stack, restoration)
-    run_json.write_run(folder / RUN, description)
+    run_json.write(folder, report)
 
 
-def _of(model: Model) -> tuple[NDArray[Any], ...]:
-    entries = () if model.stored is None else (model.stored.data, model.stored.indices, model.stored.indptr)
-    return (*entries, model.variance, model.batches)
-
-
-def made_from(stack: Stack, model: Model) -> str:
+def fingerprint_of(stack: Stack, model: Model) -> str:
     """Fingerprint of everything that an estimate depends on."""
-    arrays = (stack.values, stack.variance, *_of(model))
-    records = [stack.record, model.record]
-    return fingerprint([digest(*arrays), records, stack.scene.plain()])
+    entries = () if model.stored is None else (model.stored.data, model.stored.indices, model.stored.indptr)
+    arrays = (stack.values, stack.variance, *entries, model.variance, model.batches)
+    return fingerprint([digest(*arrays), [stack.record, model.record], stack.scene.plain()])
 
 
-def _standing(folder: Path) -> dict[str, Any] | None:
-    """run.json of a folder whose results are all there, whole and of one reconstruction; else None."""
-    if not all((folder / name).is_file() for name in (ESTIMATE, PICTURE, OVERVIEW, RUN)):
-        return None
-    try:
-        old: dict[str, Any] = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        estimated = read(folder / ESTIMATE)[0].record["fingerprint"]
-        return old if old["fingerprint"] == estimated else None
-    except (InputError, ValueError, KeyError, TypeError):
-        return None
+def _read_results(folder: Path) -> tuple[RunReport, str | None]:
+    """Return run.json, and its fingerprint if all results are there, whole and of one reconstruction."""
+    report = run_json.read(folder)
+    made_from = exr.read(folder / ESTIMATE)[0].record["fingerprint"]
+    whole = report.fingerprint == made_from and all((folder / name).is_file() for name in (PICTURE, OVERVIEW))
+    return report, made_from if whole else None
 
 
 def cached_results(
     folder: Path, stack: Stack, model: Model, names: tuple[Path, Path], progress: Progress = no_progress
-) -> tuple[dict[str, Any], bool]:
-    """What run.json in `folder` says, and whether the reconstruction had to be made for it."""
-    wanted = made_from(stack, model)
-    old = _standing(folder)
-    if old is not None and old["fingerprint"] == wanted:
-        return old, False
-    restoration, description = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
-    description = {"fingerprint": wanted, **description}
-    write_results(folder, stack, restoration, description)
-    return description, True
+) -> tuple[RunReport, bool]:
+    """Return run.json of a folder, and True if the reconstruction had to be made for it."""
+    current = fingerprint_of(stack, model)
+
+    def make() -> tuple[Reconstruction, RunReport]:
+        restoration, report = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
+        return restoration, report.with_changes(fingerprint=current)
+
+    return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made))

@@ -1,168 +1,256 @@
-"""What a run says of itself: run.json and estimate.exr.
+"""The content of run.json: its types, and the one function that writes it and the one that reads it.
 
-The keys of run.json are a contract: stages, error, solver, model, skipped, versions, seeds.
+The keys of the file are a contract, explained in docs/files.md. A key whose field was not set is absent from the file;
+None is null. Readers ignore keys that they do not know.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
-from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
-from ommatid.runtime.versions import versions
-from ommatid.scenes.formats import exr
-from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import SkippedEffect
-from ommatid.scenes.scene import Scene
-from ommatid.scenes.skipped import skipped_effects
-from ommatid.scenes.stack import STRAIGHT, Stack
 
-from ..estimator.estimate import Solver
-from ..fitting.prior_fit import PriorFit
-from ..restore import Reconstruction
-from . import time_spent
+RUN = "run.json"
 
 
-def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, Any]) -> None:
-    """Write channels `estimate`, `variance` (diagonal of Eq. 5) and, where it is known, `truth`, as float32."""
-    shape = restoration.shape
-    channels = {
-        "estimate": restoration.estimate.reshape(shape).astype(np.float32),
-        "variance": restoration.expected.variance.reshape(shape).astype(np.float32),
-    }
-    if restoration.truth is not None:
-        channels["truth"] = restoration.truth.reshape(shape).astype(np.float32)
-    exr.write(path, [exr.Part("estimate", channels, record)])
+class Record(BaseModel):
+    """A part of run.json; frozen, and built from keywords, from JSON or from an object with these attributes."""
+
+    model_config = ConfigDict(frozen=True, from_attributes=True, allow_inf_nan=False)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the fields that were set, in JSON's types."""
+        return self.model_dump(mode="json", exclude_unset=True)
 
 
-def describe(stack: Stack, model: Model, restoration: Reconstruction) -> dict[str, Any]:
-    """Everything that run.json says, in JSON's types."""
-    error: dict[str, Any] = {
-        "predicted_mse": restoration.expected.mse,
-        "predicted_trimmed_mse": restoration.trimmed_mse,
-        "budget": restoration.budget(),
-    }
-    if restoration.error is not None:
-        error = {**asdict(restoration.error), **error}
-    if restoration.interval is not None:
-        error["expected_given_truth"] = asdict(restoration.interval)
-    stages = {
-        "render": {**_how(stack.record), **_stage(stack.record)},
-        "calibrate": {"method": model.record["method"], **_stage(model.record)},
-        "reconstruct": {"seconds": restoration.seconds},
-    }
-    described: dict[str, Any] = {
-        "title": stack.scene.title,
-        "measurements": model.measurements,
-        "unknowns": model.unknowns,
-        "stages": stages,
-        "error": error,
-        "solver": {"way": restoration.choice.method, **_solver(restoration.solver)},
-        "diagnostics": _diagnostics(restoration),
-        "model": {
-            **model.record.get("agreement", _unknown(model)),
-            "feigned_information": restoration.spurious_information,
-            **({"fit": model.record["fit"]} if "fit" in model.record else {}),
-        },
-        "skipped": [
-            left.describe() for left in (*skipped_effects(_as_run(stack, model), model.camera), *_of_world(stack))
-        ],
-        "versions": {
-            **model.record.get("versions", {}),
-            **stack.record.get("versions", {}),
-            **versions("scipy", "scikit-image"),
-        },
-        "seeds": {
-            "scene": stack.record.get("seed"),  # recorded frames have none
-            "data": stack.record.get("first_seed"),
-            "calibration": model.record.get("first_seed"),
-        },
-    }
-    return {**described, "spent": time_spent.spent(described, calibrated=model.record["method"] != "ideal")}
+class StageReport(Record):
+    """How one stage was done, and how long it took when it was."""
+
+    method: str | None = None
+    seconds: float = 0.0
+    samples: int | None = None
+    fewest_samples: int | None = None
+    passes: int | None = None
+    sampler: str | None = None
+    variant: str | None = None
+    rays: int | None = None
+    reached: bool | None = None
+    not_reached: dict[str, str] = {}
+    auto: dict[str, Any] = {}
 
 
-def _solver(solver: Solver) -> dict[str, Any]:
-    return {
-        "method": solver.method,
-        "why": solver.why,
-        "condition": solver.condition if isfinite(solver.condition) else None,
-        "digits": solver.digits,
-        "bound": solver.bound,
-        "unit": solver.unit,
-        "variance_bound": solver.variance_bound,
-        "refinements": solver.refinements,
-        "tried": [{"method": name, "why_not": reason} for name, reason in solver.tried],
-    }
+class IntervalReport(Record):
+    """Expected mean squared error of this image, and the interval that holds it in 99 of 100 cases."""
+
+    mse: float
+    low: float
+    high: float
 
 
-def _diagnostics(restoration: Reconstruction) -> dict[str, Any]:
-    width = float(np.median(restoration.expected.resolution))
-    fit, residual = restoration.fit, restoration.residual
-    described: dict[str, Any] = {
-        "pixels_used": int(restoration.usable.used.sum()),
-        "pixels_dead": restoration.usable.dead,
-        "pixels_saturated": restoration.usable.saturated,
-        "degrees_of_freedom": restoration.expected.degrees_of_freedom,
-        "resolution": width if isfinite(width) else None,
-        "chi_squared": None if residual is None else asdict(residual),
-    }
-    if fit is not None:
-        names = ("variance", "correlation_length", "noise_variance")
-        found = {name: value for name, value in zip(names, _numbers(fit), strict=True) if value is not None}
-        doubts = [value if isfinite(value) else None for value in fit.spread]
-        described["fit"] = {
-            name: {"value": value, "log_deviation": doubt}
-            for (name, value), doubt in zip(found.items(), doubts, strict=True)
-        }
-        described["fit_measurements"], described["fit_doubtful"] = fit.measurements, fit.doubtful
-    return described
+class ErrorReport(Record):
+    """Measured and predicted error; `budget` holds the parts of `predicted_mse` by cause."""
+
+    mse: float | None = None
+    trimmed_mse: float | None = None
+    psnr: float | None = None
+    ssim: float | None = None
+    predicted_mse: float
+    predicted_trimmed_mse: float | None = None
+    budget: dict[str, float]
+    expected_given_truth: IntervalReport | None = None
 
 
-def _numbers(fit: PriorFit) -> tuple[float | None, ...]:
-    return fit.variance, fit.length, fit.noise_variance
+class RejectedForm(Record):
+    """A form of the estimator that was given up, with the reason."""
+
+    method: str
+    why_not: str
 
 
-def _unknown(model: Model) -> dict[str, float | None]:
-    known = 0.0 if model.record["method"] == "ideal" else None
-    return {"rms_difference_from_ideal": known, "max_z": None, "p_value": None}
+class SolverReport(Record):
+    """The method and form that ran, and the bounds on their numerical error."""
+
+    way: str
+    method: str
+    why: str
+    condition: float | None
+    digits: float
+    bound: float | None
+    unit: str
+    variance_bound: float
+    refinements: int
+    tried: tuple[RejectedForm, ...] = ()
 
 
-def _of_world(stack: Stack) -> tuple[SkippedEffect, ...]:
-    """What rendering left out once it had seen the world."""
-    if not stack.record.get(STRAIGHT):
-        return ()
-    return (SkippedEffect("light that bounces", "nothing in the world reflects any: paths have one segment"),)
+class ResidualReport(Record):
+    """Chi-squared of the residual, its expectation and its standard deviation."""
+
+    chi_squared: float
+    expected: float
+    deviation: float
 
 
-def _as_run(stack: Stack, model: Model) -> Scene:
-    return stack.scene.model_copy(update={"calibration": model.scene.calibration})
+class FittedNumber(Record):
+    """A fitted value and the standard deviation of its logarithm, None where the likelihood does not bend."""
+
+    value: float
+    log_deviation: float | None
 
 
-def write_run(path: Path, description: dict[str, Any]) -> None:
-    """Write run.json."""
-    write_text(path, json.dumps(description, indent=2, allow_nan=False) + "\n")
+class DiagnosticsReport(Record):
+    """Numbers to judge an estimate by."""
+
+    pixels_used: int
+    pixels_dead: int
+    pixels_saturated: int
+    degrees_of_freedom: float
+    resolution: float | None
+    chi_squared: ResidualReport | None
+    fit: dict[str, FittedNumber] = {}
+    fit_measurements: int | None = None
+    fit_doubtful: bool = False
 
 
-def _how(record: dict[str, Any]) -> dict[str, Any]:
-    return {"method": record["method"]} if "method" in record else {}
+class ModelReport(Record):
+    """Agreement of H with the ideal one, spurious information, and the fit of the geometry if there was one."""
+
+    rms_difference_from_ideal: float | None
+    max_z: float | None
+    p_value: float | None
+    # Files of earlier versions call it feigned_information.
+    spurious_information: float = Field(validation_alias=AliasChoices("spurious_information", "feigned_information"))
+    fit: dict[str, Any] | None = None
 
 
-def _stage(record: dict[str, Any]) -> dict[str, Any]:
-    keys = (
-        "seconds",
-        "samples",
-        "fewest_samples",
-        "passes",
-        "sampler",
-        "variant",
-        "rays",
-        "reached",
-        "not_reached",
-        "auto",
-    )
-    return {key: record[key] for key in keys if key in record}
+class SkippedReport(Record):
+    """An effect that was left out, the reason, and the largest change of a measurement that it would bring."""
+
+    what: str
+    why: str
+    bound: float | None = None
+
+
+class MoreTime(Record):
+    """Seconds and expected error of `times` as many samples."""
+
+    times: int
+    seconds: float
+    predicted_mse: float
+
+
+class RequestedTime(Record):
+    """Seconds that a number of scenes were given together."""
+
+    seconds: float
+    scenes: int
+
+
+class TimeReport(Record):
+    """Seconds of all stages, the gain from more samples, and the request of --within if there was one."""
+
+    seconds: float
+    stages: dict[str, float]
+    noise_alone: float
+    more: tuple[MoreTime, ...] = ()
+    within: float | None = None
+    asked: RequestedTime | None = None
+    chosen: dict[str, int | Literal["auto"]] = {}
+
+
+class SeedReport(Record):
+    """Seed of the scene, and the first seeds of rendering and calibration; None where nothing was drawn."""
+
+    scene: int | None
+    data: int | None
+    calibration: int | None
+
+
+class RegionReport(Record):
+    """Mean over a region of the estimate and its standard deviation (Eq. 5); corner and size are (row, column)."""
+
+    corner: tuple[int, int]
+    size: tuple[int, int]
+    mean: float
+    deviation: float
+
+
+class DepthBin(Record):
+    """Error of the pixels within a range of distances (mm); None where there is no surface."""
+
+    nearest: float | None
+    farthest: float | None
+    pixels: int
+    rms_error: float
+    expected_deviation: float
+    rms_disparity: float
+    rms_disparity_by_type: dict[str, float]
+
+
+class StudyCase(Record):
+    """Mean squared errors with one model of H.
+
+    predicted : Eq. 5;  expected : of this image, `low` and `high` holding it in 99 of 100 cases
+    Measured and expected errors are None without the truth, the latter also where it is not known.
+    """
+
+    model: str
+    mse: float | None
+    predicted: float
+    expected: float | None
+    low: float | None
+    high: float | None
+    seconds: float
+
+
+class RunReport(Record):
+    """Everything that run.json holds."""
+
+    fingerprint: str = ""
+    title: str
+    measurements: int
+    unknowns: int
+    stages: dict[str, StageReport]
+    error: ErrorReport
+    solver: SolverReport
+    diagnostics: DiagnosticsReport
+    model: ModelReport
+    skipped: tuple[SkippedReport, ...]
+    versions: dict[str, str]
+    seeds: SeedReport
+    spent: TimeReport
+    region: RegionReport | None = None
+    depth: tuple[DepthBin, ...] = ()
+    study: tuple[StudyCase, ...] = ()
+
+    def with_changes(self, **fields: object) -> RunReport:
+        """Return a copy with some fields replaced."""
+        return self.model_copy(update=fields)
+
+
+def write(folder: Path, report: RunReport) -> None:
+    """Write run.json of a folder."""
+    write_text(folder / RUN, json.dumps(report.plain(), indent=2, allow_nan=False) + "\n")
+
+
+def read(folder: Path) -> RunReport:
+    """Read run.json of a folder. Raises InputError where there is none, or where a key is missing or wrong."""
+    path = folder / RUN
+    try:
+        report = RunReport.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: expected the results of a run, got no file that can be read ({error})") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"])) or "the file"
+        raise InputError(
+            f"{path}: expected the results of a run, got a file whose {key} is not: {first['msg'].lower()};"
+            " delete it and run the scene again"
+        ) from error
+    if not report.fingerprint:
+        raise InputError(f"{path}: expected the results of a run, got a file without fingerprint; run the scene again")
+    return report

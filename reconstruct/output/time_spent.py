@@ -1,39 +1,38 @@
-"""What a run took, and what more samples would buy: from its error budget, nothing is computed anew."""
+"""The time that a run took, and the error that more samples would reach, from its error budget alone."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
-FALL = {"independent": 1.0}  # exponents of a part of the error against samples, by sampler: theory's
-STRATIFIED = 1.5  # of all other samplers; pinholes
-MORE = (2, 4, 16)  # times the samples, of which it is said what they would buy
-STAGES = {"render": "rendering", "calibrate": "calibration"}  # and their parts of the error budget
+from .run_json import ErrorReport, MoreTime, StageReport, TimeReport
+
+INDEPENDENT = 1.0  # variance of independent samples falls as 1 / samples
+STRATIFIED = 1.5  # that of all other samplers as samples^-1.5, for pinholes
+MORE = (2, 4, 16)  # factors on the number of samples
+STAGES = {"render": "rendering", "calibrate": "calibration"}  # to their parts of the error budget
 
 
-def spent(description: dict[str, Any], calibrated: bool) -> dict[str, Any]:
-    """Of a run as run.json describes it; `calibrated`: whether H took samples.
+def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibrated: bool) -> TimeReport:
+    """Return the seconds of a run and what more samples would cost and bring.
 
-    seconds : of all stages, when they were done;  noise_alone : the expected error without the parts of both stages
-    more : the expected seconds and error of so many times the samples of both, with the exponents of theory
-    Both errors are those of the estimator as it is; told of the smaller noise it does better, most where much of its
-    error is what the lens types hardly see.
+    calibrated : whether H took samples
+    Errors with more samples are those of the estimator as it is. An estimator that expects the smaller noise does
+    better, most of all where much of its error is in what the lens types hardly see.
     """
-    stages, error = description["stages"], description["error"]
-    taken = {name: float(stage.get("seconds", 0.0)) for name, stage in stages.items()}
-    parts = {stage: error["budget"][part] for stage, part in STAGES.items()}
-    sampler = stages["render"].get("sampler")
-    rest = error["predicted_mse"] - sum(parts.values())
-    found: dict[str, Any] = {"seconds": sum(taken.values()), "stages": taken, "noise_alone": rest}
+    seconds = {name: stage.seconds for name, stage in stages.items()}
+    parts = [error.budget[part] for part in STAGES.values()]
+    rest, total = error.predicted_mse - sum(parts), sum(seconds.values())
+    sampler = stages["render"].sampler
     if sampler is None:  # recorded frames
-        return found
-    fall = FALL.get(sampler, STRATIFIED)
-    grows = taken["render"] + (taken["calibrate"] if calibrated else 0.0)
-    found["more"] = [
-        {
-            "times": times,
-            "seconds": found["seconds"] + (times - 1) * grows,
-            "predicted_mse": rest + sum(part * times**-fall for part in parts.values()),
-        }
+        return TimeReport(seconds=total, stages=seconds, noise_alone=rest)
+    fall = INDEPENDENT if sampler == "independent" else STRATIFIED
+    growing = seconds["render"] + (seconds["calibrate"] if calibrated else 0.0)
+    more = tuple(
+        MoreTime(
+            times=times,
+            seconds=total + (times - 1) * growing,
+            predicted_mse=rest + sum(part * times**-fall for part in parts),
+        )
         for times in MORE
-    ]
-    return found
+    )
+    return TimeReport(seconds=total, stages=seconds, noise_alone=rest, more=more)

@@ -1,7 +1,7 @@
 """OpenEXR files with float32 channels and one JSON attribute; the only module that imports OpenEXR.
 
-The library writes non-contiguous arrays wrongly, loses lists in headers, reports a full disk not at all
-when little is written, and reads a truncated file as a shorter one: all of that is dealt with here.
+It works around defects of the library, which writes non-contiguous arrays wrongly, loses lists in headers, does not
+report a full disk when little is written, and reads a truncated file as a shorter one.
 """
 
 # pyright: basic
@@ -30,7 +30,7 @@ ATTRIBUTE = "ommatid"
 
 @dataclass(frozen=True)
 class Part:
-    """One image of a file: (rows, columns) arrays by channel name, and what is said about them."""
+    """One image of a file: (rows, columns) arrays by channel name, and a record in JSON's types."""
 
     name: str
     channels: dict[str, NDArray[np.float32]]
@@ -38,9 +38,9 @@ class Part:
 
 
 def write(path: Path, parts: Sequence[Part]) -> None:
-    """Write the parts, each with a SHA-256 of its pixels and one of its record, and check that they arrived.
+    """Write the parts, each with a SHA-256 of its pixels and one of its record, and check that they can be read.
 
-    Raises InputError for a folder that does not exist, DeniedError for a disk that is full.
+    Raises InputError for a folder that does not exist, MachineError for a full disk.
     """
     import OpenEXR
 
@@ -55,20 +55,19 @@ def write(path: Path, parts: Sequence[Part]) -> None:
         header = {
             "compression": OpenEXR.ZIP_COMPRESSION,
             "type": OpenEXR.scanlineimage,
-            "displayWindow": window,  # the format wants one for all parts
+            "displayWindow": window,  # OpenEXR requires the same one for all parts
             ATTRIBUTE: json.dumps(record),
         }
         files.append(OpenEXR.Part(header, channels, name=part.name))
 
     def fill(beside: Path) -> None:
         try:
-            with _quiet():
+            with _silenced():
                 OpenEXR.File(files).write(str(beside))
-            arrived = len(read(beside)) == len(parts)
+            if len(read(beside)) != len(parts):
+                raise InputError("parts are missing")
         except (RuntimeError, InputError) as error:
             raise OSError(errno.ENOSPC, f"not all of it could be stored: {error}") from error
-        if not arrived:
-            raise OSError(errno.ENOSPC, "not all of it could be stored")
 
     write_whole(path, fill)
 
@@ -96,8 +95,8 @@ def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | N
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        with _quiet():
-            check_memory(_promised(path), f"{path}: to read it", "take a smaller one, or free some memory")
+        with _silenced():
+            check_memory(_declared_size(path), f"{path}: to read it", "take a smaller one, or free some memory")
             file = OpenEXR.File(str(path), separate_channels=True)
         return [
             (
@@ -113,8 +112,8 @@ def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | N
         raise InputError(f"{path}: expected an OpenEXR file, got one that cannot be read ({error})") from error
 
 
-def _promised(path: Path) -> int:
-    """Bytes of all channels as the headers tell, twice: the library's copy and ours."""
+def _declared_size(path: Path) -> int:
+    """Bytes of all channels by the headers, twice: for the library's copy and for the arrays here."""
     import OpenEXR
 
     total = 0
@@ -146,19 +145,19 @@ def _seal(channels: dict[str, NDArray[np.float32]]) -> str:
 
 
 @contextmanager
-def _quiet() -> Generator[None]:
-    """Keep the library's own warnings off stdout and stderr: what is wrong is said by an exception."""
+def _silenced() -> Generator[None]:
+    """Discard the library's warnings on stdout and stderr; errors are reported by exceptions."""
     sys.stdout.flush()
     sys.stderr.flush()
     saved = os.dup(1), os.dup(2)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    null = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, 1)
-        os.dup2(nowhere, 2)
-        with redirect_stdout(io.StringIO()):  # some warnings take the way through Python, whose buffer outlives this
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        with redirect_stdout(io.StringIO()):  # some warnings pass through Python's sys.stdout
             yield
     finally:
         os.dup2(saved[0], 1)
         os.dup2(saved[1], 2)
-        for descriptor in (*saved, nowhere):
+        for descriptor in (*saved, null):
             os.close(descriptor)

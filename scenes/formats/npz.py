@@ -1,4 +1,4 @@
-"""Archives of arrays, read so that a damaged one is refused whatever is wrong with it, and before memory is taken."""
+"""NPZ and NPY files, read safely: damaged and too large ones are refused before memory is allocated."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.memory import check_memory
 
-MOST_DEFLATED = 1032  # bytes that one byte of a deflated file can become
+MOST_DEFLATED = 1032  # largest ratio of inflated to deflated bytes
 
-# What numpy and zipfile raise for damaged files: RuntimeError for an encrypted one, TokenError for a header that is no
-# Python, RecursionError and MemoryError for one that is too much of it, NotImplementedError for an unknown compression.
+# Exceptions of numpy and zipfile for damaged files: RuntimeError for an encrypted one, TokenError for a header that is
+# not Python, RecursionError and MemoryError for too long a header, NotImplementedError for an unknown compression.
 _UNREADABLE = (
     *(ValueError, KeyError, IndexError, TypeError, OSError, EOFError, RuntimeError, SyntaxError, MemoryError),
     *(OverflowError, AttributeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
@@ -28,76 +28,75 @@ _UNREADABLE = (
 
 
 def read(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an archive by their names.
+    """Read all arrays of an archive by their names.
 
-    Raises ValueError that says why it cannot be read, OSError where there is no such file among the reasons, and
-    InputError for arrays that memory does not hold.
+    Raises ValueError that says why it cannot be read, and InputError for arrays that do not fit into memory.
     """
     try:
-        with path.open("rb") as stream:  # numpy leaves a damaged file open, so we open it
-            needed = _promised(stream, path.stat().st_size)
+        with path.open("rb") as stream:  # opened here, as numpy leaves a damaged file open
+            needed = _declared_size(stream, path.stat().st_size)
     except _UNREADABLE as error:
         raise ValueError(_reason(error)) from error
     check_memory(needed, f"{path}: to read it", "close other programs")
     try:
-        with _quiet(), path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        with _silenced(), path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except _UNREADABLE as error:
         raise ValueError(_reason(error)) from error
 
 
-def _promised(stream: IO[bytes], size: int) -> int:
-    """Bytes of all arrays as their headers tell. Raises ValueError where the file cannot hold as much."""
+def _declared_size(stream: IO[bytes], size: int) -> int:
+    """Bytes of all arrays by their headers. Raises ValueError if the file is too short to hold them."""
     total = 0
     with zipfile.ZipFile(stream) as archive:
         for member in archive.infolist():
             with archive.open(member) as inside:
-                promised = array_size(inside)
-            if promised > member.file_size or member.file_size > MOST_DEFLATED * size:
+                size_of_array = array_size(inside)
+            if size_of_array > member.file_size or member.file_size > MOST_DEFLATED * size:
                 raise ValueError(f"{member.filename} is cut short")
-            total += promised
+            total += size_of_array
     return total
 
 
 def array_size(stream: IO[bytes]) -> int:
-    """Bytes of the array whose NPY header a stream begins with. Raises ValueError for one that is none."""
-    shape, kind = header(stream)
-    return prod(shape) * kind.itemsize
+    """Bytes of the array whose NPY header begins a stream. Raises ValueError if there is no such header."""
+    shape, dtype = header(stream)
+    return prod(shape) * dtype.itemsize
 
 
 def header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of the array whose NPY header a stream begins with. Raises ValueError for one that is none."""
+    """Shape and dtype of the array whose NPY header begins a stream. Raises ValueError if there is no such header."""
     version = np.lib.format.read_magic(stream)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    with _quiet():
-        shape, _, kind = read_header(stream)
+    with _silenced():
+        shape, _, dtype = read_header(stream)
     if any(count < 0 for count in shape):
         raise ValueError(f"a shape of {shape}")
-    if kind.hasobject:
+    if dtype.hasobject:
         raise ValueError("it holds pickled objects")
-    return shape, kind
+    return shape, dtype
 
 
 def array(path: Path) -> NDArray[Any]:
-    """The array of an NPY file. Raises ValueError that says why it cannot be read, InputError for too large a one."""
+    """Read an NPY file. Raises ValueError that says why it cannot be read, InputError if memory is too small."""
     try:
         with path.open("rb") as stream:
-            promised = array_size(stream)
-            if promised > path.stat().st_size:
+            size = array_size(stream)
+            if size > path.stat().st_size:
                 raise ValueError("it is cut short")
     except _UNREADABLE as error:
         raise ValueError(_reason(error)) from error
-    check_memory(3 * promised, f"{path}: to read it", "take a smaller one, or free some memory")
+    check_memory(3 * size, f"{path}: to read it", "take a smaller one, or free some memory")
     try:
-        with _quiet(), path.open("rb") as stream:
+        with _silenced(), path.open("rb") as stream:
             return np.load(stream, allow_pickle=False)
     except _UNREADABLE as error:
         raise ValueError(_reason(error)) from error
 
 
 @contextmanager
-def _quiet() -> Generator[None]:
-    """Keep numpy's words about headers of other days off stderr."""
+def _silenced() -> Generator[None]:
+    """Suppress numpy's warnings about headers of old formats."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

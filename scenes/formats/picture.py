@@ -1,6 +1,6 @@
-"""The target's picture as numbers in the paper's range, 0 to 255; row 0 is its top.
+"""The target's picture in the paper's range of values, 0 to 255; row 0 is its top.
 
-Colour becomes luminance, 8 bits stay as they are, 16 bits are divided by 257, floats stay as they are.
+Colour becomes luminance; 8-bit and floating-point values are kept, 16-bit values are divided by 257.
 """
 
 from __future__ import annotations
@@ -14,29 +14,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
+from ..constants import WHITE
 from ..scene import Scene
 from . import npz, tiff
 from .exr import Part, read_channels, write
 
-Image = NDArray[np.float64]
+Image = FloatArray  # for modules that still import it
 
 LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
 
 
-def load(scene: Scene) -> Image:
-    """The target, (rows, columns), cropped as the scene says, in the precision of float32.
+def load(scene: Scene) -> FloatArray:
+    """Load the target, (rows, columns), cropped as the scene says, rounded to float32.
 
-    Zeros where a world takes the target's place: what it looks like is not known before it is rendered.
-    Raises InputError if the picture is missing, unreadable, too small for the crop or holds NaN.
+    A target without a picture, of a scene with a world, is zero: its image is not known before it is rendered.
+    Raises InputError if the picture is missing, unreadable, too small for the crop or contains NaN.
     """
     target = scene.target
     where = f"{scene.source}: target.image"
     if target.image is None:
         if target.shape is None:
-            raise InputError(f"{where} is absent, and so is target.shape, which would do for a [world]; name a picture")
+            raise InputError(f"{where} and target.shape are absent; name a picture, or give the shape for a [world]")
         check_memory(prod(target.shape) * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one")
         return np.zeros(target.shape)
     picture = luminance(_pixels(target.image, where), where)
@@ -57,36 +59,38 @@ def load(scene: Scene) -> Image:
     return rounded
 
 
-def shape(scene: Scene) -> tuple[int, int]:
-    """Rows and columns of the target, from the scene file alone where it says."""
+def target_shape(scene: Scene) -> tuple[int, int]:
+    """Rows and columns of the target; the picture is read only if the scene does not say."""
     if scene.target.shape is not None:
         return scene.target.shape
     rows, columns = load(scene).shape
     return rows, columns
 
 
-def write_truth(path: Path, image: Image, depth: Image | None = None, record: dict[str, Any] | None = None) -> None:
-    """Write a target as OpenEXR, float32, channel Y; of a world also `depth` in mm, NaN where there is nothing."""
+def write_truth(
+    path: Path, image: FloatArray, depth: FloatArray | None = None, record: dict[str, Any] | None = None
+) -> None:
+    """Write a target as OpenEXR, float32, channel Y; of a world also `depth`, mm, NaN if nothing is hit."""
     channels = {"Y": image.astype(np.float32)}
     if depth is not None:
         channels["depth"] = depth.astype(np.float32)
     write(path, [Part("truth", channels, record or {})])
 
 
-def luminance(pixels: NDArray[Any], where: str) -> Image:
-    """Any (rows, columns[, channels]) picture as one channel of values from 0 to 255. Raises InputError."""
-    numbers = grey(pixels, where)
+def luminance(pixels: NDArray[Any], where: str) -> FloatArray:
+    """Convert a (rows, columns[, channels]) picture to one channel of values from 0 to 255. Raises InputError."""
+    values = grey(pixels, where)
     if pixels.dtype == np.bool_:
-        return numbers * 255.0
+        return values * WHITE
     if pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
-        return numbers
+        return values
     if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
-        return numbers / 257.0
+        return values / 257.0
     raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
 
 
-def grey(pixels: NDArray[Any], where: str) -> Image:
-    """Any (rows, columns[, channels]) picture as one channel of the numbers that it holds. Raises InputError."""
+def grey(pixels: NDArray[Any], where: str) -> FloatArray:
+    """Convert a (rows, columns[, channels]) picture to one channel, without scaling its values. Raises InputError."""
     if pixels.ndim not in (2, 3) or pixels.size == 0 or (pixels.ndim == 3 and pixels.shape[2] not in (1, 2, 3, 4)):
         raise InputError(f"{where}: expected a picture of rows x columns, grey or colour, got shape {pixels.shape}")
     if pixels.dtype.kind not in "buif":
@@ -102,7 +106,7 @@ def grey(pixels: NDArray[Any], where: str) -> Image:
     return values[..., :3] @ np.array(LUMINANCE) if channels >= 3 else values[..., 0]
 
 
-def _crop(picture: Image, scene: Scene) -> Image:
+def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
     target = scene.target
     row, column = target.origin or (0, 0)
     rows, columns = target.shape or (picture.shape[0] - row, picture.shape[1] - column)
@@ -116,14 +120,14 @@ def _crop(picture: Image, scene: Scene) -> Image:
 
 def _pixels(image: str, where: str) -> NDArray[Any]:
     if image.startswith("photo:"):
-        return decode(_shipped(image.removeprefix("photo:"), where), where)
+        return decode(_photo_path(image.removeprefix("photo:"), where), where)
     path = Path(image)
     if not path.is_file():
         raise InputError(f"{where}: there is no picture {path}; name a PNG, TIFF, EXR or NPY file, or photo:camera")
     return decode(path, where)
 
 
-def _shipped(name: str, where: str) -> Path:
+def _photo_path(name: str, where: str) -> Path:
     package = importlib.util.find_spec("skimage")
     if package is None or package.origin is None:
         raise InputError(f"{where}: 'photo:{name}' comes with scikit-image, which is not installed")
@@ -135,9 +139,9 @@ def _shipped(name: str, where: str) -> Path:
 
 
 def decode(path: Path, where: str) -> NDArray[Any]:
-    """The numbers that a picture file holds, as they are. Raises InputError that begins with `where`."""
-    kind = path.suffix.lower()
-    if kind == ".exr":
+    """Read a picture file as stored, without conversion. Raises InputError that begins with `where`."""
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
         try:
             channels = read_channels(path)
         except InputError as error:
@@ -147,20 +151,20 @@ def decode(path: Path, where: str) -> NDArray[Any]:
         if not {"R", "G", "B"} <= channels.keys():
             raise InputError(f"{where}: {path} has channels {', '.join(channels)}; expected Y, or R, G and B")
         return np.stack([channels[name] for name in "RGB"], axis=-1)
-    if kind not in _READERS:
+    if suffix not in _READERS:
         raise InputError(f"{where}: expected a PNG, TIFF, EXR or NPY file, got {path}")
     try:
-        return _READERS[kind](path)
+        return _READERS[suffix](path)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-    except Exception as error:  # every decoder raises kinds of its own
+    except Exception as error:  # every decoder has exceptions of its own
         raise InputError(
             f"{where}: {path} could not be read as a picture; it is damaged or another kind of file"
         ) from error
 
 
-def _scanned(path: Path) -> NDArray[Any]:
-    """A PNG or JPEG picture. Pillow has a limit to its size, and warns below it; here there is that of memory."""
+def _read_with_pillow(path: Path) -> NDArray[Any]:
+    """Read a PNG or JPEG picture. Its size is limited by memory instead of Pillow's fixed limit."""
     from PIL import Image
     from skimage import io
 
@@ -169,8 +173,8 @@ def _scanned(path: Path) -> NDArray[Any]:
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as opened:
             needed = tiff.BYTES * prod(opened.size) * len(opened.getbands())
-            inks = opened.mode == "CMYK"
-        if inks:
+            is_cmyk = opened.mode == "CMYK"
+        if is_cmyk:
             raise InputError(f"{path}: expected grey or RGB, got inks (CMYK); save it as RGB")
         check_memory(needed, f"{path}: to read it", "take a smaller picture, or free some memory")
         return np.asarray(imread(path))
@@ -181,5 +185,5 @@ def _scanned(path: Path) -> NDArray[Any]:
 _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
     ".npy": npz.array,
     **dict.fromkeys((".tif", ".tiff"), tiff.picture),
-    **dict.fromkeys((".png", ".jpg", ".jpeg"), _scanned),
+    **dict.fromkeys((".png", ".jpg", ".jpeg"), _read_with_pillow),
 }

@@ -1,4 +1,4 @@
-"""Which sensor pixels a point source on a pixel of f may reach, by the ideal geometry and a margin around it."""
+"""Assignment of recorded point sources to sensor pixels, by the ideal footprints and a margin around them."""
 
 from __future__ import annotations
 
@@ -7,29 +7,28 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
 from ..lens_type import LensType
 
-Vector = NDArray[np.float64]
-Whole = NDArray[np.int64]
+TIE = 1e-9  # pixels of f, below which a distance to the edge of a footprint counts as 0
 
 
 @dataclass(frozen=True)
 class FootprintInterval:
-    """Along one axis, the middles in f of the footprints of a type's (sub-imagers x pixels): (S,), `half` as long."""
+    """Footprints of a type's (sub-imagers x pixels) along one axis: `middle`, (S,), and `half` their length, in f."""
 
-    middle: Vector
+    middle: FloatArray
     half: float
 
-    def near(self, place: int, margin: float) -> tuple[Whole, Vector]:
-        """Which intervals overlap pixel `place` of f or come as near as `margin`, and how far their middles are."""
-        away = np.abs(self.middle - (place + 0.5))
-        found = np.flatnonzero(away < self.half + margin + 0.5 - 1e-9)
-        return found, away[found]
+    def near(self, position: int, margin: float) -> tuple[IntArray, FloatArray]:
+        """Indices of the intervals within `margin` of pixel `position` of f, and the distances of their middles."""
+        distance = np.abs(self.middle - (position + 0.5))
+        near = np.flatnonzero(distance < self.half + margin + 0.5 - TIE)
+        return near, distance[near]
 
 
 @dataclass(frozen=True)
@@ -41,64 +40,69 @@ class FootprintAssignment:
 
     @cached_property
     def _axes(self) -> list[tuple[FootprintInterval, FootprintInterval]]:
-        return [(_interval(kind, 0), _interval(kind, 1)) for kind in self.camera.types]
+        return [(_interval(lens_type, 0), _interval(lens_type, 1)) for lens_type in self.camera.types]
 
-    def reached(self, row: int, column: int) -> tuple[Whole, Vector]:
-        """Sensor pixels that a source may reach, and how far their footprints' middles are: (n,) each.
+    def reached(self, row: int, column: int) -> tuple[IntArray, FloatArray]:
+        """Sensor pixels that a source may reach, and the distances of their footprints: (n,) each.
 
-        The distance is the larger one of rows and columns, in pixels of f beyond half a footprint.
+        The distance is the larger one along rows and columns, in pixels of f, minus half a footprint.
         """
-        numbers: list[Whole] = []
-        distances: list[Vector] = []
-        for kind, place, (down, across) in zip(self.camera.types, self.camera.type_slices(), self._axes, strict=True):
-            (rows, above), (columns, beside) = down.near(row, self.margin), across.near(column, self.margin)
-            k, i = np.divmod(rows, kind.pixels[0])
-            l, j = np.divmod(columns, kind.pixels[1])  # noqa: E741
-            pixel = ((k[:, None] * kind.array[1] + l) * kind.pixels[0] + i[:, None]) * kind.pixels[1] + j
-            numbers.append(place.start + pixel.ravel())
-            distances.append(np.maximum(above[:, None], beside).ravel() - down.half)
-        return np.concatenate(numbers), np.concatenate(distances)
+        pixels: list[IntArray] = []
+        distances: list[FloatArray] = []
+        for lens_type, first, (down, across) in zip(
+            self.camera.types, self.camera.type_slices(), self._axes, strict=True
+        ):
+            (rows, row_distance), (columns, column_distance) = (
+                down.near(row, self.margin),
+                across.near(column, self.margin),
+            )
+            k, i = np.divmod(rows, lens_type.pixels[0])
+            l, j = np.divmod(columns, lens_type.pixels[1])  # noqa: E741
+            pixel = ((k[:, None] * lens_type.array[1] + l) * lens_type.pixels[0] + i[:, None]) * lens_type.pixels[1] + j
+            pixels.append(first.start + pixel.ravel())
+            distances.append(np.maximum(row_distance[:, None], column_distance).ravel() - down.half)
+        return np.concatenate(pixels), np.concatenate(distances)
 
-    def shared_out(self, places: Whole, file: Path) -> tuple[Whole, Whole]:
-        """Sensor pixels that some source of one exposure may reach, and the pixel of f of the nearest: (n,) each.
+    def nearest_sources(self, positions: IntArray, file: Path) -> tuple[IntArray, IntArray]:
+        """Sensor pixels that any source of one exposure may reach, and the pixel of f of the nearest: (n,) each.
 
-        places : (sources, 2) rows and columns of f
-        Raises InputError where the very footprint of a sensor pixel holds two of them.
+        positions : (sources, 2) rows and columns of f
+        Raises InputError if two sources lie in the footprint of one sensor pixel.
         """
-        found = [self.reached(row, column) for row, column in places.tolist()]
-        pixel = np.concatenate([numbers for numbers, _ in found])
-        distance = np.concatenate([distances for _, distances in found])
-        source = np.repeat(np.arange(len(found)), [numbers.size for numbers, _ in found])
+        reached = [self.reached(row, column) for row, column in positions.tolist()]
+        pixel = np.concatenate([pixels for pixels, _ in reached])
+        distance = np.concatenate([distances for _, distances in reached])
+        source = np.repeat(np.arange(len(reached)), [pixels.size for pixels, _ in reached])
         order = np.lexsort((distance, pixel))
         pixel, distance, source = pixel[order], distance[order], source[order]
-        again = pixel[1:] == pixel[:-1]
-        both = again & (distance[1:] < 0.5 - 1e-9)  # the nearer one lies in the footprint, then, too
-        if both.any():
-            first = int(np.flatnonzero(both)[0])
-            one, other = (tuple(places[source[first + step]].tolist()) for step in (0, 1))
+        repeated = pixel[1:] == pixel[:-1]
+        both_inside = repeated & (distance[1:] < 0.5 - TIE)  # the source before is nearer, so it is inside too
+        if both_inside.any():
+            first = int(np.flatnonzero(both_inside)[0])
+            one, other = (tuple(positions[source[first + step]].tolist()) for step in (0, 1))
             raise InputError(
                 f"{file}: the points at {one} and {other}, row and column of f, lie in the footprint of one sensor"
                 " pixel; record them in two images"
             )
-        nearest = np.concatenate([[True], ~again])
-        unknown = places[:, 0] * self.camera.columns + places[:, 1]
+        nearest = np.concatenate([[True], ~repeated])
+        unknown = positions[:, 0] * self.camera.columns + positions[:, 1]
         return pixel[nearest], unknown[source[nearest]]
 
 
-def _interval(kind: LensType, axis: int) -> FootprintInterval:
-    starts = np.array([float(kind.origin[axis] + number * kind.step) for number in range(kind.array[axis])])
-    ratio = float(kind.ratio)
-    middles = starts[:, None] + ratio * (np.arange(kind.pixels[axis], dtype=np.float64) + 0.5)
+def _interval(lens_type: LensType, axis: int) -> FootprintInterval:
+    starts = [float(lens_type.origin[axis] + number * lens_type.step) for number in range(lens_type.array[axis])]
+    ratio = float(lens_type.ratio)
+    middles = np.array(starts)[:, None] + ratio * (np.arange(lens_type.pixels[axis], dtype=np.float64) + 0.5)
     return FootprintInterval(np.asarray(middles.ravel(), dtype=np.float64), ratio / 2)
 
 
-def unseen(camera: Camera, places: Whole) -> Whole:
-    """Pixels of f that lie in some footprint and not among `places`, (n, 2) rows and columns."""
-    touched = np.zeros(camera.shape, dtype=bool)
-    for kind in camera.types:
-        down, across = _interval(kind, 0), _interval(kind, 1)
+def unrecorded(camera: Camera, positions: IntArray) -> IntArray:
+    """Indices of the pixels of f that lie in some footprint but are not in `positions`, (n, 2) rows and columns."""
+    seen = np.zeros(camera.shape, dtype=bool)
+    for lens_type in camera.types:
+        down, across = _interval(lens_type, 0), _interval(lens_type, 1)
         rows = [bool(down.near(row, 0.0)[0].size) for row in range(camera.rows)]
         columns = [bool(across.near(column, 0.0)[0].size) for column in range(camera.columns)]
-        touched |= np.outer(rows, columns)
-    touched[places[:, 0], places[:, 1]] = False
-    return np.flatnonzero(touched)
+        seen |= np.outer(rows, columns)
+    seen[positions[:, 0], positions[:, 1]] = False
+    return np.flatnonzero(seen)

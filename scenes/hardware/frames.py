@@ -1,9 +1,9 @@
-"""Frames of a real camera: where its sub-images lie in them, and how digital numbers become values of f.
+"""Frames of a real camera: positions of the sub-images, and conversion of digital numbers to values of f.
 
 A mosaic is a picture of the whole flat sensor, seen from behind the camera looking at the target: its columns run
-towards -x, its rows towards -y, and its middle is the camera's axis (0, 0) unless the `origin` says otherwise. A lens
-turns its image by 180 degrees, so every sub-image lies upside down in it and is turned upright when it is cut out.
-Pictures of one sub-imager each come in the order of measurements, upright already unless said otherwise.
+towards -x, its rows towards -y, and its middle is the camera's axis (0, 0) unless an `origin` is given. A lens rotates
+its image by 180 degrees, so that sub-images lie upside down in a mosaic and are rotated when they are cut out.
+Pictures of single sub-imagers are in the order of measurements, and upright by default.
 """
 
 from __future__ import annotations
@@ -17,20 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
+from ..constants import WHITE
 from ..formats import tiff
 from ..formats.picture import decode, grey
 
-Vector = NDArray[np.float64]
-Grid = NDArray[np.float64]
-
-KINDS = (".png", ".tif", ".tiff", ".exr", ".npy")
-TIE = 1e-6  # sensor pixels by which a place half way between two pixels may be computed wrongly
+SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy")
+TIE = 1e-6  # sensor pixels, rounding error of a position half way between two pixels
 DARK, FLAT = "dark frames", "flat frames"
 TIFF = (".tif", ".tiff")
-COLOURS = 4  # channels of a picture, at most: more are pictures one after the other
+COLOURS = 4  # most channels of a picture; a longer last axis is columns
 
 
 @dataclass(frozen=True)
@@ -38,51 +37,51 @@ class AcquisitionSettings:
     """How frames were recorded.
 
     dark, flat : frames without light and of a uniform target of value `flat_value`;  none: numbers are values of f
-    origin : row and column of a mosaic where the first sub-imager's patch has its top left pixel; None: it follows
-    upright : whether sub-images need not be turned;  None: those of a mosaic must be, others need not
+    origin : row and column in a mosaic of the top left pixel of the first sub-imager's patch; None: from the middle
+    upright : True if sub-images are upright in the frames;  None: those of a mosaic are not, single ones are
     """
 
     dark: tuple[Path, ...] = ()
     flat: tuple[Path, ...] = ()
-    flat_value: float = 255.0
+    flat_value: float = WHITE
     origin: tuple[int, int] | None = None
     upright: bool | None = None
 
     def describe(self) -> dict[str, Any]:
-        """What decides, beside the files, in JSON's types."""
+        """The settings without the files, in JSON's types; part of fingerprints."""
         return {"flat_value": self.flat_value, "origin": self.origin, "upright": self.upright}
 
 
 @dataclass(frozen=True)
 class SensorLayout:
-    """How the pictures of one exposure become (M,) numbers.
+    """How the pictures of one exposure are arranged to (M,) numbers.
 
     shapes : of the pictures of an exposure;  corners : (sub-imagers, 2) top left pixels of the patches in a mosaic,
-    None where every sub-imager has a picture of its own;  turned : whether they are upside down
-    beside : sensor pixels, along one axis, between a patch and the whole pixels cut out for it, at most
+        None if every sub-imager has its own picture;  rotated : True if sub-images are upside down
+    beside : largest distance, in sensor pixels along one axis, between a patch and the whole pixels cut out for it
     """
 
     camera: Camera
     shapes: tuple[tuple[int, ...], ...]
-    corners: NDArray[np.int64] | None
-    turned: bool
+    corners: IntArray | None
+    rotated: bool
     beside: float
 
-    def cut(self, pictures: Sequence[Grid]) -> Vector:
-        """The numbers of an exposure in the order of measurements: (M,)."""
+    def cut(self, pictures: Sequence[FloatArray]) -> FloatArray:
+        """The numbers of one exposure in the order of measurements: (M,)."""
         sizes = [sub.type.pixels for sub in self.camera.sub_imagers]
         if self.corners is None:
-            cut = list(pictures)
+            patches = list(pictures)
         else:
-            places = zip(self.corners.tolist(), sizes, strict=True)
-            cut = [
-                pictures[0][row : row + rows, column : column + columns] for (row, column), (rows, columns) in places
+            pairs = zip(self.corners.tolist(), sizes, strict=True)
+            patches = [
+                pictures[0][row : row + rows, column : column + columns] for (row, column), (rows, columns) in pairs
             ]
-        return np.concatenate([np.ravel(patch[::-1, ::-1] if self.turned else patch) for patch in cut])
+        return np.concatenate([np.ravel(patch[::-1, ::-1] if self.rotated else patch) for patch in patches])
 
-    def exposures(self, paths: Sequence[Path], what: str) -> Iterator[tuple[Path, Vector]]:
-        """The numbers of each exposure in some files, (M,), and its last file. Raises InputError for another shape."""
-        pictures: list[Grid] = []
+    def exposures(self, paths: Sequence[Path], what: str) -> Iterator[tuple[Path, FloatArray]]:
+        """Yield the last file and the numbers, (M,), of each exposure. Raises InputError for another shape."""
+        pictures: list[FloatArray] = []
         for path in paths:
             for pixels in pictures_of(path, what):
                 picture = grey(pixels, str(path))
@@ -98,24 +97,24 @@ class SensorLayout:
                     pictures = []
         if pictures:
             raise InputError(
-                f"{paths[-1]}: expected {what} in sets of {len(self.shapes)} pictures, one a sub-imager, and"
+                f"{paths[-1]}: expected {what} in sets of {len(self.shapes)} pictures, one per sub-imager, and"
                 f" {len(pictures)} are left over"
             )
 
 
 @dataclass(frozen=True)
 class RecordedFrames:
-    """What was recorded, in digital numbers: (exposures, M), and the means of dark and flat frames, (M,).
+    """Recorded digital numbers, (exposures, M), and the means of dark and flat frames, (M,).
 
-    averaged : dark or flat frames, whichever are fewer
-    files : of each exposure;  sources : SHA-256 of all files by name
-    whole : whether numbers are whole, rounded by the sensor
+    averaged : number of dark or of flat frames, whichever is smaller
+    files : the last file of each exposure;  sources : names and SHA-256 of all files
+    whole : True if all numbers are integers, rounded by the sensor
     """
 
     layout: SensorLayout
-    numbers: Grid
-    dark: Vector | None
-    flat: Vector | None
+    numbers: FloatArray
+    dark: FloatArray | None
+    flat: FloatArray | None
     averaged: int
     settings: AcquisitionSettings
     files: list[Path]
@@ -123,64 +122,67 @@ class RecordedFrames:
     sources: list[dict[str, str]]
 
     @property
-    def scale(self) -> Vector:
-        """Values of f in a digital number, (M,); NaN for dead pixels."""
+    def scale(self) -> FloatArray:
+        """Units of f per digital number, (M,); NaN for dead pixels."""
         if self.flat is None:
             return np.ones(self.layout.camera.measurements)
-        signal: Vector = self.flat if self.dark is None else self.flat - self.dark
+        signal: FloatArray = self.flat if self.dark is None else self.flat - self.dark
         alive = np.isfinite(signal) & (signal > 0)
-        scale: Vector = np.full(signal.shape, np.nan)
+        scale: FloatArray = np.full(signal.shape, np.nan)
         scale[alive] = self.settings.flat_value / signal[alive]
         return scale
 
-    def values(self) -> Grid:
+    def values(self) -> FloatArray:
         """(image - dark) / (flat - dark) flat_value, NaN for dead pixels: (exposures, M)."""
         return (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
 
 
-def read_frames(camera: Camera, images: Sequence[Path], bench: AcquisitionSettings, *, mosaics: bool) -> RecordedFrames:
-    """Read recorded images, and the bench's dark and flat frames.
+def read_frames(
+    camera: Camera, images: Sequence[Path], settings: AcquisitionSettings, *, mosaics: bool
+) -> RecordedFrames:
+    """Read recorded images, and the dark and flat frames of the settings.
 
-    mosaics : whether each image is an exposure of its own; else one may be a picture of one sub-imager
-    Raises InputError, naming the file, for what cannot be read, has another size, or comes in another number.
+    mosaics : True if each image is one exposure; otherwise images may be pictures of single sub-imagers
+    Raises InputError, naming the file, for damaged files, pictures of another size and a wrong number of them.
     """
-    listed = [path for given in images for path in files_in(given)]
-    dark, flat = ([path for given in paths for path in files_in(given)] for paths in (bench.dark, bench.flat))
-    if not listed:
+    files, dark, flat = (
+        [file for path in paths for file in files_in(path)] for paths in (images, settings.dark, settings.flat)
+    )
+    if not files:
         raise InputError("expected recorded images, got none; name PNG, TIFF, EXR or NPY files")
-    layout = _layout(camera, listed, bench, mosaics=mosaics)
-    exposures = list(layout.exposures(listed, "images"))
+    layout = _layout(camera, files, settings, mosaics=mosaics)
+    exposures = list(layout.exposures(files, "images"))
     numbers = np.array([recorded for _, recorded in exposures])
-    without, uniform = (list(layout.exposures(paths, what)) for paths, what in ((dark, DARK), (flat, FLAT)))
+    dark_frames, flat_frames = (list(layout.exposures(paths, what)) for paths, what in ((dark, DARK), (flat, FLAT)))
     return RecordedFrames(
         layout=layout,
         numbers=numbers,
-        dark=_mean(without),
-        flat=_mean(uniform),
-        averaged=min(len(without), len(uniform)),
-        settings=bench,
+        dark=_mean(dark_frames),
+        flat=_mean(flat_frames),
+        averaged=min(len(dark_frames), len(flat_frames)),
+        settings=settings,
         files=[path for path, _ in exposures],
         whole=bool((numbers == np.rint(numbers)).all()),
-        sources=[{"name": path.name, "sha256": _sha256(path)} for path in (*listed, *dark, *flat)],
+        sources=[{"name": path.name, "sha256": _sha256(path)} for path in (*files, *dark, *flat)],
     )
 
 
 def files_in(path: Path) -> list[Path]:
-    """The file, or the pictures in a folder by name. Raises InputError where there is none."""
+    """The file itself, or the pictures in a folder sorted by name. Raises InputError if there is none."""
     if not path.is_dir():
         return [path]
-    found = sorted(file for file in path.iterdir() if file.suffix.lower() in KINDS and not file.name.startswith("."))
-    if not found:
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
+    if not files:
         raise InputError(f"{path}: expected a folder of PNG, TIFF, EXR or NPY files, got none of them in it")
-    return found
+    return files
 
 
 def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
-    """The numbers in a file as they are: one picture, or all of a (count, rows, columns) array.
+    """The pictures in a file as stored: a single one, or all of a (count, rows, columns) array.
 
-    Raises InputError where there are none.
+    Raises InputError if there is none.
     """
-    if path.suffix.lower() not in KINDS:
+    if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected {what} as PNG, TIFF, EXR or NPY files, whose numbers are the sensor's")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file among the {what}")
@@ -188,7 +190,7 @@ def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
     if pages:
         return pages
     pixels = decode(path, what)
-    # A last axis of up to four is one of colours; a sensor has more columns.
+    # A last axis of up to four is colours; a sensor has more columns.
     several = pixels.ndim == 3 and pixels.shape[2] > COLOURS
     pictures = list(pixels) if several else [pixels]
     if not pictures or pixels.dtype.kind not in "uif":
@@ -197,18 +199,18 @@ def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
 
 
 def _pages(path: Path) -> list[NDArray[Any]]:
-    """The pages of a TIFF that has several, whoever wrote it; else none, and it is read as any picture."""
+    """The pages of a TIFF that has several; of any other file none, as it is read as a single picture."""
     try:
         pages = tiff.pages(path)
     except InputError:
         raise
-    except Exception:  # the library has kinds of its own; what is damaged is said where single pictures are read
+    except Exception:  # tifffile has many; reading it as a single picture reports the damage
         return []
     return pages if len(pages) > 1 and all(page.dtype.kind in "uif" for page in pages) else []
 
 
-def patches(camera: Camera) -> Grid:
-    """Top left corners of the patches in sensor pixels from the camera's axis, as a mosaic shows them.
+def patches(camera: Camera) -> FloatArray:
+    """Top left corners of the patches in sensor pixels from the camera's axis, in a mosaic's coordinates.
 
     (sub-imagers, 2): rows, growing towards -y, and columns, growing towards -x.
     """
@@ -219,14 +221,14 @@ def patches(camera: Camera) -> Grid:
 
 def corners(
     camera: Camera, shape: tuple[int, ...], origin: tuple[int, int] | None, path: Path
-) -> tuple[NDArray[np.int64], float]:
-    """Top left pixels, (sub-imagers, 2), of the patches in a mosaic, and how far beside them the patches lie, at most.
+) -> tuple[IntArray, float]:
+    """Top left pixels, (sub-imagers, 2), of the patches in a mosaic, and the largest distance of a patch to them.
 
-    Raises InputError where a patch leaves the mosaic.
+    Raises InputError if a patch leaves the mosaic.
     """
-    places = patches(camera)
-    places += np.array(shape) / 2 if origin is None else np.array(origin) - places[0]
-    nearest = np.floor(places + 0.5 + TIE).astype(np.int64)
+    exact = patches(camera)
+    exact += np.array(shape) / 2 if origin is None else np.array(origin) - exact[0]
+    nearest = np.floor(exact + 0.5 + TIE).astype(np.int64)
     sizes = np.array([sub.type.pixels for sub in camera.sub_imagers])
     outside = (nearest < 0).any(axis=1) | (nearest + sizes > np.array(shape)).any(axis=1)
     if outside.any():
@@ -236,30 +238,30 @@ def corners(
         raise InputError(
             f"{path}: the sub-image {camera.sub_imagers[first].name} of {sizes[first][0]} x {sizes[first][1]} pixels at"
             f" row {row}, column {column} leaves the mosaic of {shape[0]} x {shape[1]} pixels; all of them span"
-            f" {span[0]} x {span[1]}: record the whole sensor, or say with --origin where the first of them begins"
+            f" {span[0]} x {span[1]}: record the whole sensor, or give the corner of the first with --origin"
         )
-    return nearest, float(np.abs(places - nearest).max())
+    return nearest, float(np.abs(exact - nearest).max())
 
 
-def _layout(camera: Camera, images: Sequence[Path], bench: AcquisitionSettings, *, mosaics: bool) -> SensorLayout:
+def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSettings, *, mosaics: bool) -> SensorLayout:
     first = pictures_of(images[0], "images")
     shape, subs = grey(first[0], str(images[0])).shape, camera.sub_imagers
     count = len(first) + (0 if mosaics else sum(len(pictures_of(path, "images")) for path in images[1:]))
-    alone = len(subs) == 1 and shape == subs[0].type.pixels
-    if alone or (count > 1 and not mosaics):
-        if bench.origin is not None:
+    single = len(subs) == 1 and shape == subs[0].type.pixels
+    if single or (count > 1 and not mosaics):
+        if settings.origin is not None:
             raise InputError("--origin: expected a mosaic of the whole sensor, got pictures of one sub-imager each")
         if not mosaics and count != len(subs):
             raise InputError(
-                f"{images[0]}: expected one mosaic of the whole sensor or {len(subs)} pictures, one a sub-imager, got"
+                f"{images[0]}: expected one mosaic of the whole sensor or {len(subs)} pictures, one per sub-imager, got"
                 f" {count}"
             )
-        return SensorLayout(camera, tuple(sub.type.pixels for sub in subs), None, bench.upright is False, 0.0)
-    found, beside = corners(camera, shape, bench.origin, images[0])
-    return SensorLayout(camera, (shape,), found, not bench.upright, beside)
+        return SensorLayout(camera, tuple(sub.type.pixels for sub in subs), None, settings.upright is False, 0.0)
+    pixels, beside = corners(camera, shape, settings.origin, images[0])
+    return SensorLayout(camera, (shape,), pixels, not settings.upright, beside)
 
 
-def _mean(exposures: list[tuple[Path, Vector]]) -> Vector | None:
+def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:
     return np.mean([numbers for _, numbers in exposures], axis=0) if exposures else None
 
 

@@ -1,4 +1,4 @@
-"""Where recorded point sources stood: which pixels of f shone in which exposure."""
+"""Positions of recorded point sources: the pixels of f that were lit in each exposure."""
 
 from __future__ import annotations
 
@@ -7,52 +7,50 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import IntArray
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
 
-Whole = NDArray[np.int64]
-
 COLUMNS = ("image", "row", "column")
 
 
-def positions_by_rows(camera: Camera, files: Sequence[Path]) -> list[Whole]:
-    """One source an exposure, pixel after pixel of f by rows, the whole of it once or several times: (1, 2) each."""
+def positions_by_rows(camera: Camera, files: Sequence[Path]) -> list[IntArray]:
+    """One source per exposure, at pixel after pixel of f by rows, once or several times: (1, 2) each."""
     count = len(files)
     if count == 0 or count % camera.unknowns:
         raise InputError(
-            f"expected an image for each of the {camera.unknowns} pixels of f, once or several times, got {count}; say"
-            " with --places where the points of each stood"
+            f"expected an image for each of the {camera.unknowns} pixels of f, once or several times, got {count}; give"
+            " the positions of the points with --places"
         )
     rows, columns = np.divmod(np.arange(count) % camera.unknowns, camera.columns)
     return list(np.stack([rows, columns], axis=1)[:, None, :])
 
 
-def read_positions(path: Path, camera: Camera, files: Sequence[Path]) -> list[Whole]:
+def read_positions(path: Path, camera: Camera, files: Sequence[Path]) -> list[IntArray]:
     """Row and column of f of every source of each exposure, (sources, 2) each, from a CSV file.
 
-    Its columns are image, row and column; an image is called by its file, or by its number from 0.
-    Raises InputError, naming the line, for what is no place, lies outside f, or stands there twice.
+    Its columns are image, row and column; an image is given by its file name, or by its number from 0.
+    Raises InputError, naming the line, for a position that is damaged, outside f, or given twice.
     """
-    found: list[list[tuple[int, int]]] = [[] for _ in files]
+    positions: list[list[tuple[int, int]]] = [[] for _ in files]
     for number, line in _lines(path):
         where = f"{path}: line {number}"
         image = _image(line["image"], files, where)
-        row, column = (_whole(line[name], name, where) for name in ("row", "column"))
+        row, column = (_integer(line[name], name, where) for name in ("row", "column"))
         if not (0 <= row < camera.rows and 0 <= column < camera.columns):
             raise InputError(
                 f"{where}: row {row}, column {column} lies outside f of {camera.rows} x {camera.columns} pixels, which"
                 " are counted from 0"
             )
-        if (row, column) in found[image]:
-            raise InputError(f"{where}: row {row}, column {column} is said twice of one image; remove one of them")
-        found[image].append((row, column))
-    for file, places in zip(files, found, strict=True):
-        if not places:
-            raise InputError(f"{path}: says of no point in {file}; add its place, or leave the image out")
-    return [np.array(places, dtype=np.int64) for places in found]
+        if (row, column) in positions[image]:
+            raise InputError(f"{where}: row {row}, column {column} is given twice for one image; remove one of them")
+        positions[image].append((row, column))
+    for file, of_file in zip(files, positions, strict=True):
+        if not of_file:
+            raise InputError(f"{path}: has no point of {file}; add its position, or leave the image out")
+    return [np.array(of_file, dtype=np.int64) for of_file in positions]
 
 
 def _lines(path: Path) -> list[tuple[int, dict[str, str]]]:
@@ -63,7 +61,7 @@ def _lines(path: Path) -> list[tuple[int, dict[str, str]]]:
             reader.fieldnames = header
             lines = [(reader.line_num, line) for line in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: could not be read as a CSV file of places ({error})") from error
+        raise InputError(f"{path}: could not be read as a CSV file of positions ({error})") from error
     if not set(COLUMNS) <= set(header):
         raise InputError(f"{path}: expected the columns image,row,column in its first line, got '{','.join(header)}'")
     for number, line in lines:
@@ -76,17 +74,17 @@ def _image(text: str, files: Sequence[Path], where: str) -> int:
     name = text.strip()
     if name.isdecimal() and int(name) < len(files):
         return int(name)
-    places = [place for place, file in enumerate(files) if name in (str(file), file.name)]
-    if len(places) == 1:
-        return places[0]
-    known = "none of that name is" if not places else f"{len(places)} are of that name"
+    matches = [index for index, file in enumerate(files) if name in (str(file), file.name)]
+    if len(matches) == 1:
+        return matches[0]
+    reason = f"{len(matches)} images have that name" if matches else "no image has that name"
     raise InputError(
-        f"{where}: expected an image by its file's name or by its number from 0 to {len(files) - 1}, got '{name}', and"
-        f" {known} among the images"
+        f"{where}: expected an image by its file's name or by its number from 0 to {len(files) - 1}, got '{name}';"
+        f" {reason}"
     )
 
 
-def _whole(text: str, name: str, where: str) -> int:
+def _integer(text: str, name: str, where: str) -> int:
     try:
         return int(text)
     except ValueError as error:

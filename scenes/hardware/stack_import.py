@@ -1,4 +1,4 @@
-"""Recorded frames of a real camera as a stack of sub-images, which is reconstructed as a rendered one is."""
+"""Import of a real camera's frames as a stack of sub-images, which is reconstructed like a rendered one."""
 
 from __future__ import annotations
 
@@ -7,30 +7,29 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import fingerprint
 from ommatid.runtime.versions import versions
 
 from ..recording import Recording
 from ..setup import Setup
-from ..stack import Stack, recorded
+from ..stack import Stack, stack_from_recording
 from ..tables.sensor import SensorTable
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
 
-FAR = 0.1  # sensor pixels beside whole ones, above which H of the design is not that of the frames
 
+def import_stack(setup: Setup, images: Sequence[Path], settings: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:
+    """Read recorded images as a stack; also return the frames.
 
-def import_stack(setup: Setup, images: Sequence[Path], bench: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:
-    """The stack that recorded images make, and what it was cut from.
-
-    images : one mosaic, or one picture a sub-imager in the order of measurements
-    The variance is a rendering's and so 0; dead pixels are NaN. Raises InputError for what cannot be cut.
+    images : one mosaic, or one picture per sub-imager in the order of measurements
+    The stack's variance, which is that of a rendering, is 0; dead pixels are NaN. Raises InputError for images that do
+    not fit the camera.
     """
     camera, start = setup.camera, perf_counter()
-    frames = read_frames(camera, images, bench, mosaics=False)
-    made_from = {"camera": camera.describe(), "bench": bench.describe(), "source": frames.sources}
+    frames = read_frames(camera, images, settings, mosaics=False)
+    made_from = {"camera": camera.describe(), "bench": settings.describe(), "source": frames.sources}
     record = {
         "fingerprint": fingerprint(made_from),
         "method": "imported",
@@ -38,44 +37,31 @@ def import_stack(setup: Setup, images: Sequence[Path], bench: AcquisitionSetting
         "seconds": perf_counter() - start,
         "versions": versions("scikit-image", "OpenEXR"),
     }
-    kept, none = setup.resolved, np.zeros(camera.measurements)
-    if kept.sensor is None:
-        return Stack(kept, camera, _as_stored(frames.values()[0]), none, record), frames
-    recording = _recording(kept.source, kept.sensor, frames)
-    kept = kept.model_copy(update={"sensor": recording.sensor})
-    return recorded(kept, camera, recording, none, record), frames
+    stored, zeros = setup.resolved, np.zeros(camera.measurements)
+    if stored.sensor is None:
+        return Stack(stored, camera, _as_float32(frames.values()[0]), zeros, record), frames
+    recording = _recording(stored.source, stored.sensor, frames)
+    stored = stored.model_copy(update={"sensor": recording.sensor})
+    return stack_from_recording(stored, camera, recording, zeros, record), frames
 
 
 def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Recording:
-    """Digital numbers as they are. What is one dark and one flat frame is taken for the mean that [sensor] tells of."""
+    """The recording of unscaled digital numbers.
+
+    A single dark or flat frame is taken for the mean of `sensor.frames`; of several, their number is used instead.
+    """
     if frames.dark is None or frames.flat is None:
         raise InputError(
-            f"{source}: what a [sensor] records is told from its dark and its flat frames; give them with --dark and"
+            f"{source}: a [sensor] needs dark and flat frames to convert its readings; pass them with --dark and"
             " --flat, or remove [sensor]"
         )
     if frames.averaged > 1:
         sensor = sensor.model_copy(update={"frames": frames.averaged})
-    digital, dark, flat = (_as_stored(numbers) for numbers in (frames.numbers[0], frames.dark, frames.flat))
+    digital, dark, flat = (_as_float32(values) for values in (frames.numbers[0], frames.dark, frames.flat))
     return Recording(sensor, digital, dark, flat, np.full(digital.size, frames.settings.flat_value))
 
 
-def _as_stored(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    with np.errstate(over="ignore"):  # what the file cannot hold is as dead as what is infinite
+def _as_float32(values: FloatArray) -> FloatArray:
+    """Values rounded to float32, as the file stores them."""
+    with np.errstate(over="ignore"):  # pixels beyond float32 become infinite and count as dead
         return values.astype(np.float32).astype(np.float64)
-
-
-def warnings(frames: RecordedFrames) -> list[str]:
-    """What the user should know of the frames, a sentence each."""
-    said: list[str] = []
-    if frames.layout.beside > FAR:
-        said.append(
-            f"the sub-images stand up to {frames.layout.beside:.2f} sensor pixels beside whole pixels of the mosaic, so"
-            " that H of the design is not theirs: calibrate it from recorded points (ommatid calibrate --points)"
-        )
-    return [*said, *dead(frames)]
-
-
-def dead(frames: RecordedFrames) -> list[str]:
-    """A sentence where pixels are dead."""
-    count = int(np.sum(~np.isfinite(frames.scale)))
-    return [f"{count} sensor pixels are dead: their flat frame is not above the dark one"] if count else []

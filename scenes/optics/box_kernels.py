@@ -1,6 +1,6 @@
-"""Averages over boxes and their adjoint, compiled: each reads and writes memory once.
+"""Averages over boxes and their adjoint, compiled; each reads and writes memory once.
 
-Work is cut into ranges of rows that do not depend on how many threads share them, so neither do the results.
+Work is divided into ranges of rows that do not depend on the number of threads, so neither do the results.
 """
 
 # pyright: basic
@@ -12,12 +12,12 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def average(image, order, row_start, row_share, column_start, column_share, out, first, last):
-    """Averages of `image` over boxes, for places first to last in `order` of the sensor rows; see `boxes.Axis`."""
+    """Fill `out` with averages of `image` over boxes, for sensor rows order[first:last]; see `boxes.BoxAxis`."""
     columns = image.shape[1]
     across, pixels = out.shape[1], out.shape[3]
     line = np.empty(columns)
-    for place in range(first, last):
-        row = order[place]
+    for position in range(first, last):
+        row = order[position]
         line[:] = 0.0
         for q in range(row_share.shape[1]):
             share = row_share[row, q]
@@ -37,7 +37,7 @@ def average(image, order, row_start, row_share, column_start, column_share, out,
 
 @numba.njit(cache=True, nogil=True)
 def spread(readings, order, row_start, row_share, column_start, column_share, out, first, last):
-    """Add to rows first to last of `out` what the adjoint of `average` makes of `readings`."""
+    """Add the adjoint of `average`, applied to `readings`, to rows first to last of `out`."""
     columns = out.shape[1]
     across, pixels = readings.shape[1], readings.shape[3]
     wide = row_share.shape[1]

@@ -1,7 +1,7 @@
-"""H of a perfect camera without a matrix: every sensor pixel averages f over a box (Wood et al., section 2).
+"""The ideal H without a matrix: every sensor pixel averages f over a box (Wood et al., section 2).
 
-A box is a product of an interval of rows and one of columns, so each lens type is two short tables. Overlaps of
-intervals with pixels are computed in whole numbers and are exact for any ratio.
+A box is a product of an interval of rows and one of columns, so that a lens type is two short tables. Overlaps of
+intervals with pixels are computed in integers and are exact for any ratio.
 """
 
 from __future__ import annotations
@@ -14,25 +14,23 @@ from functools import cached_property
 from math import lcm
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.processors import processors
 
 from ..camera import Camera
 from ..lens_type import LensType
 
-Image = NDArray[np.float64]
-
-ROWS_AT_ONCE = 64  # a piece of work for one thread; fixed, so that results do not depend on how many there are
+ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 
 
 def overlap(ratio: Fraction, pixels: int, start: Fraction, size: int) -> sparse.csr_array:
-    """Shares, (pixels, size), of `size` unit cells in `pixels` intervals of length `ratio` that begin at `start`."""
+    """Shares of `size` unit cells in `pixels` adjacent intervals of length `ratio` from `start` on: (pixels, size)."""
     unit = lcm(ratio.denominator, start.denominator)
     length = int(ratio * unit)
     lower = int(start * unit) + length * np.arange(pixels, dtype=np.int64)
-    width = -(-length // unit) + 1  # cells that an interval can touch
+    width = -(-length // unit) + 1  # most cells that an interval touches
     cells = (lower // unit)[:, None] + np.arange(width)
     shared = np.minimum(lower[:, None] + length, (cells + 1) * unit) - np.maximum(lower[:, None], cells * unit)
     touched = (shared > 0) & (cells >= 0) & (cells < size)
@@ -42,87 +40,83 @@ def overlap(ratio: Fraction, pixels: int, start: Fraction, size: int) -> sparse.
 
 @dataclass(frozen=True)
 class BoxAxis:
-    """One axis of a lens type: for each of its S = (sub-imagers) x (pixels) intervals the shares of pixels of f.
+    """Shares of pixels of f in each of the S = (sub-imagers) x (pixels) intervals along one axis of a lens type.
 
-    shares : (S, size) CSR, sub-imagers one after the other, as measurements are ordered
+    shares : (S, size) CSR, in the order of measurements
     """
 
     shares: sparse.csr_array
 
     @cached_property
-    def start(self) -> NDArray[np.int64]:
-        """The pixel of f at which each interval's shares begin, so that all of them lie on the axis: (S,)."""
+    def start(self) -> IntArray:
+        """The first pixel of f in each row of the table `share`, such that all of the row lies on the axis: (S,)."""
         first = self.shares.indices[self.shares.indptr[:-1]].astype(np.int64)
-        return np.minimum(first, self.shares.shape[1] - self._wide)
+        return np.minimum(first, self.shares.shape[1] - self._width)
 
     @cached_property
-    def share(self) -> Image:
-        """Shares of the pixels from there on: (S, most that one touches)."""
-        table = np.zeros((self.start.size, self._wide))
+    def share(self) -> FloatArray:
+        """Shares of the pixels of f from `start` on: (S, largest number of pixels in an interval)."""
+        table = np.zeros((self.start.size, self._width))
         rows = np.repeat(np.arange(self.start.size), np.diff(self.shares.indptr))
         table[rows, self.shares.indices - self.start[rows]] = self.shares.data
         return table
 
     @property
-    def _wide(self) -> int:
+    def _width(self) -> int:
         return int(np.diff(self.shares.indptr).max())
 
     @cached_property
-    def order(self) -> NDArray[np.int64]:
-        """Intervals by where they begin, so that neighbours in memory are used one after the other: (S,)."""
+    def order(self) -> IntArray:
+        """Intervals sorted by their first pixel, so that memory is accessed in order: (S,)."""
         return np.argsort(self.start, kind="stable")
 
 
 @dataclass(frozen=True)
 class Box:
-    """All sub-imagers of one lens type: H is the Kronecker product of `down` and `across`, in another order of rows."""
+    """H of one lens type: the Kronecker product of `down` and `across`, with its rows in the order of measurements."""
 
-    kind: LensType
+    lens_type: LensType
     down: BoxAxis
     across: BoxAxis
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """Rows and columns of sub-imagers, rows and columns of their pixels."""
-        return (*self.kind.array, *self.kind.pixels)
+        return (*self.lens_type.array, *self.lens_type.pixels)
 
-    def forward(self, image: Image, out: Image) -> None:
+    def forward(self, image: FloatArray, out: FloatArray) -> None:
         """H f: (rows, columns) to `out`, (measurements of the type,)."""
         from .box_kernels import average  # pyright: ignore[reportUnknownVariableType]
 
-        down, across = self.down, self.across
-        tables = (down.share, across.share)
-        target = out.reshape(self.shape)
-        _by_rows(
-            down.start.size,
-            lambda first, last: average(
-                image, down.order, down.start, tables[0], across.start, tables[1], target, first, last
-            ),
-        )
+        down, across, target = self.down, self.across, out.reshape(self.shape)
+        down_share, across_share = down.share, across.share  # computed here, not in threads
 
-    def adjoint(self, readings: Image, out: Image) -> None:
+        def work(first: int, last: int) -> None:
+            average(image, down.order, down.start, down_share, across.start, across_share, target, first, last)
+
+        _by_rows(down.start.size, work)
+
+    def adjoint(self, readings: FloatArray, out: FloatArray) -> None:
         """Add H^T g to `out`: (measurements of the type,) to (rows, columns)."""
         from .box_kernels import spread  # pyright: ignore[reportUnknownVariableType]
 
-        down, across = self.down, self.across
-        tables = (down.share, across.share)
-        source = readings.reshape(self.shape)
-        _by_rows(
-            out.shape[0],
-            lambda first, last: spread(
-                source, down.order, down.start, tables[0], across.start, tables[1], out, first, last
-            ),
-        )
+        down, across, source = self.down, self.across, readings.reshape(self.shape)
+        down_share, across_share = down.share, across.share  # computed here, not in threads
 
-    def numbers(self, rows: slice, columns: slice) -> NDArray[np.int64]:
-        """Which measurements see nothing but a window of f, by where they begin: (m,)."""
-        k, i = np.divmod(_inside(self.down, rows), self.kind.pixels[0])
-        l, j = np.divmod(_inside(self.across, columns), self.kind.pixels[1])  # noqa: E741
-        _, wide, tall, broad = self.shape
-        return (((k[:, None] * wide + l) * tall + i[:, None]) * broad + j).ravel()
+        def work(first: int, last: int) -> None:
+            spread(source, down.order, down.start, down_share, across.start, across_share, out, first, last)
 
-    def part(self, rows: slice, columns: slice) -> sparse.csr_array:
-        """H of the window from these measurements: (m, pixels of the window)."""
+        _by_rows(out.shape[0], work)
+
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Indices of the type's measurements inside a window of f, by their first pixel: (m,)."""
+        k, i = np.divmod(_inside(self.down, rows), self.lens_type.pixels[0])
+        l, j = np.divmod(_inside(self.across, columns), self.lens_type.pixels[1])  # noqa: E741
+        _, sub_columns, rows_each, columns_each = self.shape
+        return (((k[:, None] * sub_columns + l) * rows_each + i[:, None]) * columns_each + j).ravel()
+
+    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
+        """H from the window to the measurements inside it: (m, pixels of the window)."""
         down = self.down.shares[_inside(self.down, rows)][:, rows]
         across = self.across.shares[_inside(self.across, columns)][:, columns]
         return sparse.csr_array(sparse.kron(down, across, format="csr"))
@@ -130,75 +124,77 @@ class Box:
 
 @dataclass(frozen=True)
 class BoxFootprints:
-    """H of all lens types of a perfect camera, applied without ever being stored."""
+    """The ideal H of all lens types, applied without being stored."""
 
     camera: Camera
 
     @cached_property
     def boxes(self) -> tuple[Box, ...]:
-        """One for each lens type."""
+        """H of each lens type."""
         camera = self.camera
-        return tuple(Box(kind, _axis(kind, 0, camera.rows), _axis(kind, 1, camera.columns)) for kind in camera.types)
+        return tuple(
+            Box(lens_type, _axis(camera, lens_type, 0), _axis(camera, lens_type, 1)) for lens_type in camera.types
+        )
 
     @property
     def entries(self) -> int:
-        """How many H would have if it were stored."""
+        """Number of entries of H, if it were stored."""
         return sum(int(box.down.shares.nnz) * int(box.across.shares.nnz) for box in self.boxes)
 
-    def forward(self, image: Image) -> Image:
+    def forward(self, image: FloatArray) -> FloatArray:
         """H f: (N,) or (rows, columns) to (M,)."""
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.camera.shape)
         out = np.empty(self.camera.measurements)
-        for box, place in zip(self.boxes, self.camera.type_slices(), strict=True):
-            box.forward(grid, out[place])
+        for box, pixels in zip(self.boxes, self.camera.type_slices(), strict=True):
+            box.forward(grid, out[pixels])
         return out
 
-    def adjoint(self, measurements: Image) -> Image:
+    def adjoint(self, measurements: FloatArray) -> FloatArray:
         """H^T g: (M,) to (N,)."""
         out = np.zeros(self.camera.shape)
         readings = np.ascontiguousarray(measurements, dtype=np.float64)
-        for box, place in zip(self.boxes, self.camera.type_slices(), strict=True):
-            box.adjoint(readings[place], out)
+        for box, pixels in zip(self.boxes, self.camera.type_slices(), strict=True):
+            box.adjoint(readings[pixels], out)
         return out.ravel()
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
-        """What two windows have in common whose `part` is the same."""
+        """A key that is equal for two windows only if their submatrices are equal."""
         return tuple((_pattern(box.down, rows), _pattern(box.across, columns)) for box in self.boxes)
 
-    def measurements_inside(self, rows: slice, columns: slice) -> NDArray[np.int64]:
-        """Which measurements see nothing but a window of f, by where they begin: (m,)."""
-        places = zip(self.camera.type_slices(), self.boxes, strict=True)
-        return np.concatenate([place.start + box.numbers(rows, columns) for place, box in places])
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Indices of the measurements that see nothing outside a window of f: (m,)."""
+        pairs = zip(self.camera.type_slices(), self.boxes, strict=True)
+        return np.concatenate([pixels.start + box.measurements_inside(rows, columns) for pixels, box in pairs])
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
-        """H of the window from these measurements: (m, pixels of the window)."""
-        return sparse.csr_array(sparse.vstack([box.part(rows, columns) for box in self.boxes], format="csr"))
+        """H from the window to the measurements inside it: (m, pixels of the window)."""
+        return sparse.csr_array(sparse.vstack([box.submatrix(rows, columns) for box in self.boxes], format="csr"))
 
 
-def _axis(kind: LensType, axis: int, size: int) -> BoxAxis:
-    starts = [kind.origin[axis] + number * kind.step for number in range(kind.array[axis])]
-    parts = [overlap(kind.ratio, kind.pixels[axis], start, size) for start in starts]
+def _axis(camera: Camera, lens_type: LensType, axis: int) -> BoxAxis:
+    starts = [lens_type.origin[axis] + number * lens_type.step for number in range(lens_type.array[axis])]
+    parts = [overlap(lens_type.ratio, lens_type.pixels[axis], start, camera.shape[axis]) for start in starts]
     return BoxAxis(sparse.csr_array(sparse.vstack(parts, format="csr")))
 
 
-def _inside(axis: BoxAxis, window: slice) -> NDArray[np.int64]:
-    """Which intervals lie in a window as a whole, by where they begin."""
+def _inside(axis: BoxAxis, window: slice) -> IntArray:
+    """Indices of the intervals that lie in a window as a whole, sorted by their first pixel."""
     first = axis.shares.indices[axis.shares.indptr[:-1]]
     last = axis.shares.indices[axis.shares.indptr[1:] - 1]
-    chosen = np.flatnonzero((first >= window.start) & (last < window.stop))
-    return chosen[np.argsort(first[chosen], kind="stable")]
+    inside = np.flatnonzero((first >= window.start) & (last < window.stop))
+    return inside[np.argsort(first[inside], kind="stable")]
 
 
 def _pattern(axis: BoxAxis, window: slice) -> bytes:
-    part = axis.shares[_inside(axis, window)]
-    return part.indptr.tobytes() + (part.indices - window.start).tobytes() + part.data.tobytes()
+    shares = axis.shares[_inside(axis, window)]
+    return shares.indptr.tobytes() + (shares.indices - window.start).tobytes() + shares.data.tobytes()
 
 
 def _by_rows(rows: int, work: Callable[[int, int], None]) -> None:
-    pieces = [(first, min(first + ROWS_AT_ONCE, rows)) for first in range(0, rows, ROWS_AT_ONCE)]
-    if len(pieces) == 1:
-        work(*pieces[0])
+    tasks = [(first, min(first + ROWS_AT_ONCE, rows)) for first in range(0, rows, ROWS_AT_ONCE)]
+    if len(tasks) == 1:
+        work(*tasks[0])
         return
     with ThreadPoolExecutor(processors()) as threads:
-        for _ in threads.map(work, *zip(*pieces, strict=True)):
+        for _ in threads.map(work, *zip(*tasks, strict=True)):
             pass

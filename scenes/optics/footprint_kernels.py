@@ -1,14 +1,14 @@
-"""Areas of texels' images within sensor pixels, compiled; see `footprints` for what they are of.
+"""Areas of texels' images within sensor pixels, compiled for `footprints`.
 
 The image of a texel's edge on the sensor is a rational curve of degree 5, (U, V) = (X(t), Y(t)) / W(t) for t from 0 to
 1, in sensor pixels. By Green's theorem the area of a texel's image within pixel [j, j + 1] x [i, i + 1] is the sum over
 its edges of
 
-    integral of min(max(U - j, 0), 1) dV   over where i < V < i + 1.
+    integral of min(max(U - j, 0), 1) dV   over i < V < i + 1.
 
-Pixels' own sides need no integral, and the sum is continuous where edges and sides coincide. Each edge is cut where it
-crosses sides, so that pieces are smooth; a piece in pixel (i, j) adds its integral of (U - j) dV to that, and the
-rise of V to all pixels of the texel to its left.
+The sides of pixels need no integral, and the sum is continuous where edges and sides coincide. Each edge is cut where
+it crosses sides, so that the integrand of each piece is smooth; a piece in pixel (i, j) adds its integral of (U - j) dV
+to that pixel, and its rise of V to all pixels to the left within the texel's bounds.
 """
 
 # pyright: basic
@@ -24,15 +24,15 @@ BERNSTEIN = np.array([[comb(i, k) / comb(DEGREE, k) for k in range(DEGREE + 1)] 
 NODES, WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(6))  # exact to degree 11; X dY has degree 9
 NODES = NODES + 0.5
 ROUNDING = 4 * np.finfo(np.float64).eps
-SHALLOWEST = 1e-6  # W; it is 1 in the middle of a patch, and near that on all of it
-DEEPEST = 40  # halvings; roots nearer each other enclose no area that counts
+LEAST_DEPTH = 1e-6  # of W, which is 1 in the middle of a patch, and about 1 all over it
+MOST_HALVINGS = 40  # roots closer together enclose no area that matters
 
 
 @numba.njit(cache=True, nogil=True)
 def curve(start, other, length, down, k1, k2, project, powers, net):
-    """The image of an edge: coefficients of t^k, and of Bernstein's polynomials, of X, Y, W: (3, 6).
+    """Fill `powers` and `net`, (3, 6), with the coefficients of X, Y, W of an edge in t^k and in Bernstein polynomials.
 
-    The edge runs in x, or `down` in y, from `start` over `length`, the other coordinate is `other`: in units of r.
+    The edge runs along x, or along y if `down`, from `start` over `length`; the other coordinate is `other`; in r.
     """
     w0, w1, w2 = start * start + other * other, 2 * start * length, length * length
     bend = k1 + 2 * w0 * k2
@@ -53,7 +53,7 @@ def curve(start, other, length, down, k1, k2, project, powers, net):
 
 @numba.njit(cache=True, nogil=True)
 def value(powers, t):
-    """A polynomial and its derivative."""
+    """The values at t of a polynomial and of its derivative."""
     total, slope = powers[5], 0.0
     for k in range(4, -1, -1):
         slope = slope * t + total
@@ -63,7 +63,7 @@ def value(powers, t):
 
 @numba.njit(cache=True, nogil=True)
 def single_root(powers, low, high, rising):
-    """The only root between `low` and `high`, by Newton's method kept in a shrinking bracket."""
+    """The only root between `low` and `high`, by Newton's method within a shrinking bracket."""
     t = (low + high) / 2
     for _ in range(100):
         f, slope = value(powers, t)
@@ -81,13 +81,14 @@ def single_root(powers, low, high, rising):
 
 
 @numba.njit(cache=True, nogil=True)
-def crossings(powers, net, tolerance, found, count):
-    """Add to `found` where a polynomial changes its sign between 0 and 1; less than `tolerance` counts as 0.
+def crossings(powers, net, tolerance, roots, count):
+    """Add to `roots` where a polynomial changes sign between 0 and 1; values below `tolerance` count as 0.
 
-    Bernstein's coefficients change sign at least as often as the polynomial; halves are looked at until it is once.
+    Bernstein's coefficients change sign at least as often as the polynomial; intervals are halved until they change
+    once at most. Returns the number of roots in all.
     """
-    nets = np.empty((DEEPEST + 2, 6))
-    ends = np.empty((DEEPEST + 2, 2))
+    nets = np.empty((MOST_HALVINGS + 2, 6))
+    ends = np.empty((MOST_HALVINGS + 2, 2))
     for k in range(6):
         nets[0, k] = net[k]
     ends[0, 0], ends[0, 1] = 0.0, 1.0
@@ -105,15 +106,15 @@ def crossings(powers, net, tolerance, found, count):
                     changes += 1
                 before = sign
         if changes == 1:
-            if count < found.size:
-                found[count] = single_root(powers, low, high, first < 0)
+            if count < roots.size:
+                roots[count] = single_root(powers, low, high, first < 0)
                 count += 1
-        elif changes > 1 and waiting + 2 <= DEEPEST and high - low > 2.0**-DEEPEST:
+        elif changes > 1 and waiting + 2 <= MOST_HALVINGS and high - low > 2.0**-MOST_HALVINGS:
             middle = (low + high) / 2
-            if abs(value(powers, middle)[0]) <= tolerance and count < found.size:
-                found[count] = middle  # a root that neither half may own
+            if abs(value(powers, middle)[0]) <= tolerance and count < roots.size:
+                roots[count] = middle  # a root at the middle may be missed by both halves
                 count += 1
-            for level in range(1, 6):  # de Casteljau: the left half's coefficients pass by, the right half's remain
+            for level in range(1, 6):  # de Casteljau: `nets[waiting]` ends as the right half
                 nets[waiting + 1, level - 1] = nets[waiting, 0]
                 for k in range(6 - level):
                     nets[waiting, k] = (nets[waiting, k] + nets[waiting, k + 1]) / 2
@@ -126,7 +127,7 @@ def crossings(powers, net, tolerance, found, count):
 
 @numba.njit(cache=True, nogil=True)
 def bounds(net):
-    """Least and largest U and V of a curve, from the net that it stays in."""
+    """Bounds (least U, largest U, least V, largest V) of a curve, from the hull of its Bernstein coefficients."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for k in range(6):
         u, v = net[0, k] / net[2, k], net[1, k] / net[2, k]
@@ -136,37 +137,37 @@ def bounds(net):
 
 
 @numba.njit(cache=True, nogil=True)
-def cuts(powers, net, box, size, found):
-    """Sorted values of t at which a curve crosses sides of pixels, 0 and 1 among them; how many.
+def cuts(powers, net, box, size, roots):
+    """Fill `roots` with the sorted t, 0 and 1 included, where a curve crosses sides of pixels; return their number.
 
     size : (columns, rows) of pixels
     """
-    found[0], found[1], count = 0.0, 1.0, 2
+    roots[0], roots[1], count = 0.0, 1.0, 2
     line, corners = np.empty(6), np.empty(6)
     for axis in range(2):
         for n in range(max(0, int(np.ceil(box[2 * axis]))), min(size[axis], int(np.floor(box[2 * axis + 1]))) + 1):
             for k in range(6):
                 line[k] = powers[axis, k] - n * powers[2, k]
                 corners[k] = net[axis, k] - n * net[2, k]
-            count = crossings(line, corners, ROUNDING * (n + 1), found, count)
-    for last in range(2, count):  # few, and compiled much sooner than a call of sort()
-        t, place = found[last], last
-        while found[place - 1] > t:
-            found[place] = found[place - 1]
-            place -= 1
-        found[place] = t
+            count = crossings(line, corners, ROUNDING * (n + 1), roots, count)
+    for last in range(2, count):  # insertion sort: they are few, and sort() takes long to compile
+        t, position = roots[last], last
+        while roots[position - 1] > t:
+            roots[position] = roots[position - 1]
+            position -= 1
+        roots[position] = t
     return count
 
 
 @numba.njit(cache=True, nogil=True)
-def add(powers, net, sign, size, first, cells, found):
+def add(powers, net, sign, size, first, cells, roots):
     """Add a curve's integrals, times `sign`, to the pixels `cells` that begin at pixel `first` = (row, column)."""
     box = bounds(net)
     if box[3] <= first[0] or box[2] >= first[0] + cells.shape[0]:
         return
-    count = cuts(powers, net, box, size, found)
+    count = cuts(powers, net, box, size, roots)
     for piece in range(count - 1):
-        low, length = found[piece], found[piece + 1] - found[piece]
+        low, length = roots[piece], roots[piece + 1] - roots[piece]
         w = value(powers[2], low + length / 2)[0]
         row = int(np.floor(value(powers[1], low + length / 2)[0] / w)) - first[0]
         if row < 0 or row >= cells.shape[0]:
@@ -186,10 +187,10 @@ def add(powers, net, sign, size, first, cells, found):
 
 
 @numba.njit(cache=True, nogil=True)
-def surround(x, y, row, column, k1, k2, project, powers, nets):
-    """The image of a texel: its edges, top, right, bottom and left, and (left, right, top, bottom) that hold them.
+def texel_edges(x, y, row, column, k1, k2, project, powers, nets):
+    """Fill `powers` and `nets` with a texel's edges, top, right, bottom, left; return (left, right, top, bottom).
 
-    One that the plane of a tilted patch does not show, W being next to nothing, lies nowhere.
+    The bounds are empty for a texel that lies behind the plane of a tilted patch, where W is about 0 or less.
     """
     wide, tall = x[column + 1] - x[column], y[row + 1] - y[row]
     curve(x[column], y[row], wide, False, k1, k2, project, powers[0], nets[0])
@@ -199,7 +200,7 @@ def surround(x, y, row, column, k1, k2, project, powers, nets):
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for edge in range(4):
         for k in range(6):
-            if nets[edge, 2, k] < SHALLOWEST:
+            if nets[edge, 2, k] < LEAST_DEPTH:
                 return 0.0, 0.0, 0.0, 0.0
         box = bounds(nets[edge])
         left, right = min(left, box[0]), max(right, box[1])
@@ -209,24 +210,24 @@ def surround(x, y, row, column, k1, k2, project, powers, nets):
 
 @numba.njit(cache=True, nogil=True)
 def shares(x, y, k1, k2, project, size, least):
-    """What share of each pixel each texel's image covers, where that is more than `least`: pixels, texels, shares.
+    """The shares of pixels that texels' images cover, where larger than `least`: indices of pixels, of texels, shares.
 
     x, y : (columns + 1,) and (rows + 1,) of the texels' edges in units of r;  size : (columns, rows) of pixels
-    project : (3, 3) that makes (X, Y, W) of image tangents and 1
+    project : (3, 3) matrix from (image tangents, 1) to (X, Y, W)
     """
     capacity, stored = 1024, 0
     pixels, texels, values = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)
-    powers, nets, found = np.empty((4, 3, 6)), np.empty((4, 3, 6)), np.empty(6 * (size[0] + size[1] + 4))
-    signs = (1.0, 1.0, -1.0, -1.0)  # once around: edges run from the left and from the top
+    powers, nets, roots = np.empty((4, 3, 6)), np.empty((4, 3, 6)), np.empty(6 * (size[0] + size[1] + 4))
+    signs = (1.0, 1.0, -1.0, -1.0)  # around the texel: edges run from the left and from the top
     for texel in range((y.size - 1) * (x.size - 1)):
-        box = surround(x, y, texel // (x.size - 1), texel % (x.size - 1), k1, k2, project, powers, nets)
+        box = texel_edges(x, y, texel // (x.size - 1), texel % (x.size - 1), k1, k2, project, powers, nets)
         if box[1] <= 0 or box[3] <= 0 or box[0] >= size[0] or box[2] >= size[1]:
             continue
         first = max(0, int(np.floor(box[2]))), max(0, int(np.floor(box[0])))
         last = min(size[1], int(np.ceil(box[3]))), min(size[0], int(np.ceil(box[1])))
         cells = np.zeros((last[0] - first[0], last[1] - first[1]))
         for edge in range(4):
-            add(powers[edge], nets[edge], signs[edge], size, first, cells, found)
+            add(powers[edge], nets[edge], signs[edge], size, first, cells, roots)
         if stored + cells.size > capacity:
             capacity = 2 * (stored + cells.size)
             pixels, texels, values = longer(pixels, capacity), longer(texels, capacity), longer(values, capacity)
@@ -241,8 +242,8 @@ def shares(x, y, k1, k2, project, size, least):
 
 @numba.njit(cache=True, nogil=True)
 def longer(array, capacity):
-    """A copy with room for more."""
+    """A copy of an array with a larger capacity."""
     copy = np.empty(capacity, array.dtype)
-    for k in range(array.size):  # compiled much sooner than a slice
+    for k in range(array.size):  # compiles much faster than a slice
         copy[k] = array[k]
     return copy

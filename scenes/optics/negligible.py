@@ -1,8 +1,8 @@
-"""Which effects of its lenses and its sensor a scene needs, decided before anything is rendered.
+"""Optical and sensor effects that are negligible in a scene, found before anything is rendered.
 
-An effect is left out where it is small in itself and small beside the noise: where images drawn from the prior would
-change by it, on average, less than a tenth of the noise's variance. With it goes a bound on what any target of values
-from 0 to 255 would show of it. `render.complete` leaves nothing out.
+An effect is skipped if it is small in itself and small compared to the noise: if it would change images drawn from the
+prior, on average, by less than a tenth of the noise variance. Each skipped effect comes with a bound on the change for
+any target of values from 0 to 255. `render.complete` skips nothing.
 """
 
 from __future__ import annotations
@@ -15,27 +15,25 @@ import numpy as np
 from scipy import sparse
 
 from ..camera import Camera
+from ..constants import AIRY_FIRST_ZERO, WHITE
 from ..lens_type import LensOptics, LensType
 from ..scene import Scene
-from ..tables.sensor import SensorTable
 
 if TYPE_CHECKING:
     from .blur import Blur
 
-MOST_DISK = 1 / 20  # of a pixel of f: a disk of defocus that may be left out
-MOST_AIRY = 1 / 5  # of a sensor pixel: an Airy disk, to its first dark ring, that may be left out
-MOST_OF_NOISE = 0.1  # of the noise's variance: what leaving out may change
-MOST_SHOT = 0.1  # of the variance of read noise: shot noise that hides below it
-FIRST_ZERO = 1.21967  # of J1(pi x): the Airy disk's radius in units of wavelength times f-number
-WHITE = 255.0
-SURE = 5.0  # standard deviations
+MOST_DISK = 1 / 20  # pixels of f, diameter of a negligible disk of defocus
+MOST_AIRY = 1 / 5  # sensor pixels, diameter of a negligible Airy disk, to its first dark ring
+MOST_OF_NOISE = 0.1  # of the noise variance: change by a negligible effect
+MOST_SHOT = 0.1  # of the variance of read noise: negligible shot noise
+BOUND_DEVIATIONS = 5.0  # standard deviations in a bound on noise
 
 
 @dataclass(frozen=True)
 class SkippedEffect:
-    """An effect that is not simulated, why, and by how much a measurement changes at most, in units of f.
+    """An effect that is not simulated, why, and the largest change of a measurement, in units of f.
 
-    bound : 0 where nothing changes at all
+    bound : 0 if nothing changes at all
     """
 
     what: str
@@ -43,142 +41,153 @@ class SkippedEffect:
     bound: float = 0.0
 
     def describe(self) -> dict[str, Any]:
-        """In JSON's types; the bound only where there is one."""
+        """The effect in JSON's types, without a bound of 0."""
         return {"what": self.what, "why": self.why, **({"bound": self.bound} if self.bound else {})}
 
 
 @dataclass(frozen=True)
 class BlurChange:
-    """What leaving out a blur changes in H: at most, for values from 0 to 255; and the mean square for the prior."""
+    """Change of a row of H without a blur: `most` of a measurement for values from 0 to 255, `mean_square` of H f.
+
+    mean_square : for independent pixels of variance 1
+    """
 
     most: float
     mean_square: float
 
 
 def without_negligible_effects(scene: Scene, camera: Camera) -> tuple[Camera, tuple[SkippedEffect, ...]]:
-    """The camera with those effects alone that this scene needs, and what was left out."""
-    if scene.render.complete or scene.world is not None or all(kind.optics.aperture is None for kind in camera.types):
+    """The camera without the effects that are negligible in this scene, and what was skipped."""
+    if (
+        scene.render.complete
+        or scene.world is not None
+        or all(lens_type.optics.aperture is None for lens_type in camera.types)
+    ):
         return camera, ()
     allowed = MOST_OF_NOISE * noise_variance(scene, camera)
-    found: list[SkippedEffect] = []
+    skipped: list[SkippedEffect] = []
     if camera.wavelength is not None:
-        airy = _without_diffraction(camera, camera.wavelength, scene.prior.variance, allowed)
-        if airy is not None:
+        diffraction = _negligible_diffraction(camera, camera.wavelength, scene.prior.variance, allowed)
+        if diffraction is not None:
             camera = replace(camera, wavelength=None)
-            found.append(airy)
+            skipped.append(diffraction)
     types: list[LensType] = []
-    for kind in camera.types:
-        open_lens = _without_aperture(camera, kind, scene.prior.variance, allowed)
-        types.append(kind if open_lens is None else replace(kind, optics=_as_pinhole(kind.optics)))
-        found += [] if open_lens is None else [open_lens]
-    return replace(camera, types=tuple(types)), tuple(found)
+    for lens_type in camera.types:
+        aperture = _negligible_aperture(camera, lens_type, scene.prior.variance, allowed)
+        if aperture is None:
+            types.append(lens_type)
+        else:
+            types.append(replace(lens_type, optics=LensOptics(distortion=lens_type.optics.distortion)))
+            skipped.append(aperture)
+    return replace(camera, types=tuple(types)), tuple(skipped)
 
 
 def noise_variance(scene: Scene, camera: Camera) -> float:
-    """Variance of a measurement by the sensor, of its quietest lens type where the target is the prior's mean."""
+    """Sensor noise variance of the pixel with the least noise, for a target at the prior's mean."""
     if scene.noise is not None:
         return scene.noise.variance + scene.noise.quantisation_variance
     if scene.sensor is None:
         return 0.0
     from . import radiometry
 
-    dark = {kind.name: 0.0 for kind in camera.types if kind.optics.surfaces is not None}  # of them nothing is left out
-    variances = radiometry.expected_noise(scene, camera, radiometry.electrons(scene, camera, dark))
+    # Lenses with surfaces are always simulated in full; a solid angle of 0 takes their pixels out of the minimum.
+    without = {lens_type.name: 0.0 for lens_type in camera.types if lens_type.optics.surfaces is not None}
+    variances = radiometry.expected_noise(scene, camera, radiometry.electrons(scene, camera, without))
     return float(np.nanmin(variances, initial=np.inf))
 
 
-def shot_noise_hides(sensor: SensorTable, white: float) -> bool:
-    """Whether the counting of `white` electrons, those of a value of 255, shows below the noise of reading them."""
-    return white + sensor.dark_current * sensor.exposure < MOST_SHOT * sensor.read_noise**2
+def negligible_shot_noise(scene: Scene, camera: Camera) -> SkippedEffect | None:
+    """The skipped shot noise, or None if it exceeds a tenth of the read noise or if the light cannot be computed.
 
-
-def without_shot_noise(scene: Scene, camera: Camera) -> SkippedEffect | None:
-    """None where the counting of electrons shows, or where it is not known how many there are.
-
-    The bound is five standard deviations of what is left out, at a value of 255.
+    The bound is five standard deviations of the shot noise at a value of 255.
     """
-    if scene.sensor is None or scene.render.complete or any(kind.optics.aperture is None for kind in camera.types):
+    sensor = scene.sensor
+    if sensor is None or scene.render.complete or any(lens_type.optics.aperture is None for lens_type in camera.types):
         return None
     from . import radiometry
 
-    response, sensor = radiometry.electrons(scene, camera), scene.sensor
-    counted = WHITE * response + sensor.dark_current * sensor.exposure
-    if not shot_noise_hides(sensor, WHITE * float(response.max())):
+    response = radiometry.electrons(scene, camera)
+    dark = sensor.dark_current * sensor.exposure
+    if WHITE * float(response.max()) + dark >= MOST_SHOT * sensor.read_noise**2:
         return None
+    counted = WHITE * response + dark
     most = f"{float(counted.max()):.3g} electrons at most"
-    why = f"{most}, whose shot noise hides below the read noise of {sensor.read_noise:g}"
-    return SkippedEffect("shot noise", why, SURE * float(np.max(np.sqrt(counted) / response)))
+    why = f"{most}, whose shot noise is far below the read noise of {sensor.read_noise:g}"
+    return SkippedEffect("shot noise", why, BOUND_DEVIATIONS * float(np.max(np.sqrt(counted) / response)))
 
 
-def _as_pinhole(glass: LensOptics) -> LensOptics:
-    return LensOptics(distortion=glass.distortion)
-
-
-def _without_diffraction(camera: Camera, wavelength: float, contrast: float, allowed: float) -> SkippedEffect | None:
-    """None where diffraction is needed, by one lens type at least."""
+def _negligible_diffraction(
+    camera: Camera, wavelength: float, prior_variance: float, allowed: float
+) -> SkippedEffect | None:
+    """The skipped diffraction, or None if at least one lens type needs it."""
     from .blur import blur_of
 
     widest = most = 0.0
-    for kind in camera.types:
-        if kind.optics.surfaces is not None:
+    for lens_type in camera.types:
+        if lens_type.optics.surfaces is not None:
             return None
-        if kind.optics.aperture is None:
+        if lens_type.optics.aperture is None:
             continue
-        disk = 2 * FIRST_ZERO * wavelength * camera.depth(kind) / kind.optics.aperture / camera.pixel_pitch
+        disk = 2 * AIRY_FIRST_ZERO * wavelength * camera.depth(lens_type) / lens_type.optics.aperture
+        disk = disk / camera.pixel_pitch
         if disk >= MOST_AIRY:
             return None
-        change = _change(camera, kind, replace(blur_of(camera, kind), airy=0.0))
-        if contrast * change.mean_square > allowed:
+        change = _change(camera, lens_type, replace(blur_of(camera, lens_type), airy=0.0))
+        if prior_variance * change.mean_square > allowed:
             return None
         widest, most = max(widest, disk), max(most, change.most)
-    why = f"the Airy disk is {widest:.2g} of a sensor pixel wide, and the noise hides what it does"
+    why = f"the Airy disk is {widest:.2g} sensor pixels wide, and its effect is far below the noise"
     return SkippedEffect("diffraction", why, most)
 
 
-def _without_aperture(camera: Camera, kind: LensType, contrast: float, allowed: float) -> SkippedEffect | None:
-    """None where a type's aperture is needed, or where there is none."""
-    if kind.optics.aperture is None or camera.wavelength is not None:
+def _negligible_aperture(
+    camera: Camera, lens_type: LensType, prior_variance: float, allowed: float
+) -> SkippedEffect | None:
+    """The skipped aperture of a lens type, or None if it is needed or if there is none."""
+    if lens_type.optics.aperture is None or camera.wavelength is not None:
         return None
     if camera.tolerance is not None and (camera.tolerance.focal_length or camera.tolerance.tilt):
-        return None  # which put sub-imagers out of focus
+        return None  # both defocus sub-imagers
     from .blur import Blur, blur_of
 
-    blur = blur_of(camera, kind)
-    what = f"samples of the aperture of lens type {kind.name}"
-    uneven = _unevenness(camera, kind)
+    blur = blur_of(camera, lens_type)
+    what = f"samples of the aperture of lens type {lens_type.name}"
+    falloff = _illumination_change(camera, lens_type)
     if blur.disk == 0:
-        if contrast * (uneven / float(kind.ratio)) ** 2 > allowed:  # m^2 entries of 1/m^2, each changed by that share
+        if prior_variance * (falloff / float(lens_type.ratio)) ** 2 > allowed:  # m^2 entries of 1/m^2 change by falloff
             return None
-        return SkippedEffect(what, "it is in focus: all rays of a sensor point meet on the target", WHITE / 2 * uneven)
+        return SkippedEffect(what, "it is in focus: all rays of a sensor point meet on the target", WHITE / 2 * falloff)
     if blur.disk >= MOST_DISK:
         return None
-    change = _change(camera, kind, Blur())
-    if contrast * change.mean_square > allowed:
+    change = _change(camera, lens_type, Blur())
+    if prior_variance * change.mean_square > allowed:
         return None
-    why = f"the disk of defocus is {blur.disk:.2g} pixels of f wide, and the noise hides what it does"
-    return SkippedEffect(what, why, change.most + WHITE / 2 * uneven)
+    why = f"the disk of defocus is {blur.disk:.2g} pixels of f wide, and its effect is far below the noise"
+    return SkippedEffect(what, why, change.most + WHITE / 2 * falloff)
 
 
-def _change(camera: Camera, kind: LensType, less: Blur) -> BlurChange:
-    """What another blur changes in a row of H, of a pixel far from the target's edges."""
+def _change(camera: Camera, lens_type: LensType, reduced: Blur) -> BlurChange:
+    """Change of a row of H, far from the target's edges, if the blur is reduced to `reduced`."""
     from .blur import blur_of, matrix
 
-    blur = blur_of(camera, kind)
+    blur = blur_of(camera, lens_type)
     margin = ceil(blur.reach) + 1
-    side = ceil(kind.ratio) + 1 + 2 * margin
-    alone = replace(kind, array=(1, 1), pixels=(1, 1), origin=(margin, margin), left=None)
-    small = replace(camera, rows=side, columns=side, types=(alone,), lens_columns=None)
-    row = sparse.csr_array(matrix(small, alone, blur) - matrix(small, alone, less)).data
+    side = ceil(lens_type.ratio) + 1 + 2 * margin
+    single = replace(lens_type, array=(1, 1), pixels=(1, 1), origin=(margin, margin), left=None)
+    small = replace(camera, rows=side, columns=side, types=(single,), lens_columns=None)
+    row = sparse.csr_array(matrix(small, single, blur) - matrix(small, single, reduced)).data
     most = WHITE * max(float(row[row > 0].sum()), -float(row[row < 0].sum()))
     return BlurChange(most, float(np.square(row).sum()))
 
 
-def _unevenness(camera: Camera, kind: LensType) -> float:
-    """By how much more light than its middle a pixel's edge gets at most, relative: cos^4, at the patch's corner."""
-    depth = camera.depth(kind)
+def _illumination_change(camera: Camera, lens_type: LensType) -> float:
+    """Largest relative change of illumination (cos^4) across a pixel, at the corner of the patch."""
+    depth = camera.depth(lens_type)
     furthest = max(
-        hypot(sub.patch[0] - sub.lens[0], sub.patch[1] - sub.lens[1]) for sub in camera.sub_imagers if sub.type == kind
+        hypot(sub.patch[0] - sub.lens[0], sub.patch[1] - sub.lens[1])
+        for sub in camera.sub_imagers
+        if sub.type == lens_type
     )
-    corner = furthest + hypot(*kind.pixels) / 2 * camera.pixel_pitch
+    corner = furthest + hypot(*lens_type.pixels) / 2 * camera.pixel_pitch
     slope = corner / depth
     return 4 * slope / (1 + slope**2) * camera.pixel_pitch / 2**0.5 / depth

@@ -1,4 +1,4 @@
-"""What the scene file says of the camera: its pitches, its lens types, and how exactly it was put together."""
+"""The table [camera] of the scene file: pitches, lens types and tolerances."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
 
 class Surface(Table):
-    """One surface of a lens, in the order in which light from the target meets them."""
+    """One surface of a lens; surfaces are listed from the target to the sensor."""
 
     radius: Radius | None = Field(
-        default=None, description="of curvature, positive where its centre lies towards the sensor; absent: flat"
+        default=None, description="of curvature, positive if its centre lies towards the sensor; absent: flat"
     )
     thickness: Length | None = Field(default=None, description="to the next surface; of the last one absent")
     glass: str | None = Field(default=None, description="behind the surface, by name, such as N-BK7; absent: air")
     index: float | None = Field(default=None, ge=1, le=5, description="of refraction behind it, instead of a glass")
-    semi_diameter: Length = Field(description="half the diameter of its clear opening")
+    semi_diameter: Length = Field(description="half the diameter of its clear aperture")
     conic: float = Field(default=0.0, ge=-100, le=100, description="0: a sphere, -1: a paraboloid")
-    stop: bool = Field(default=False, description="whether this is the aperture stop, the same of one surface only")
+    stop: bool = Field(default=False, description="true for the aperture stop, which is one surface at most")
 
     @model_validator(mode="after")
-    def _one_medium(self) -> Surface:
+    def _check_medium(self) -> Surface:
         if self.glass is not None and self.index is not None:
             raise ValueError("expected a glass or an index of refraction, got both")
         return self
 
 
 class ToleranceTable(Table):
-    """Standard deviations of how each sub-imager stands and is, drawn once for a camera."""
+    """Standard deviations of the misalignment of each sub-imager, which is drawn once per camera."""
 
-    position: Length | None = Field(default=None, description="of a lens beside its place, in x and in y")
+    position: Length | None = Field(default=None, description="of a lens in its plane, in x and in y")
     tilt: Angle | None = Field(default=None, description="of a sub-imager's sensor patch, about x and about y")
     rotation: Angle | None = Field(default=None, description="of a sub-imager's sensor patch, about the axis")
     focal_length: float | None = Field(
         default=None, gt=0, lt=0.2, description="relative, of the distance between lens and sensor, so of magnification"
     )
-    seed: int = Field(default=0, ge=0, lt=2**63, description="of the camera: another one is put together otherwise")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="of the camera: another seed draws other misalignments")
 
 
 class LensTable(Table):
@@ -57,7 +57,7 @@ class LensTable(Table):
     pixels: Literal["fit"] | Pair = Field(description='rows and columns of a sub-image, or "fit"')
     step: Step = Field(default=Fraction(1), description="pixels of the target from one sub-imager's window to the next")
     aperture: Length | None = Field(default=None, description="diameter of a thin lens; absent: a pinhole")
-    focus: Length | None = Field(default=None, description="distance that is shown sharp; absent: the target's")
+    focus: Length | None = Field(default=None, description="distance in focus; absent: the target's")
     distortion: Annotated[tuple[Distortion, Distortion], BeforeValidator(pair)] | None = Field(
         default=None, description="k1, k2: magnification times 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner"
     )
@@ -65,12 +65,12 @@ class LensTable(Table):
         default=None, description="of a real lens, from the target to the sensor, or the file that holds them"
     )
     scale: Literal["fit"] | Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        default=None, description='of the surfaces; "fit": to the focal length that the magnification asks for'
+        default=None, description='factor on the surfaces; "fit": to the focal length that the magnification requires'
     )
 
     @field_validator("pixels", mode="before")
     @classmethod
-    def _pixels(cls, value: object) -> object:
+    def _check_pixels(cls, value: object) -> object:
         numbers: list[object] = list(value) if isinstance(value, list | tuple) else []  # type: ignore[arg-type]
         if value == "fit" or (len(numbers) == 2 and all(type(n) is int and n >= 1 for n in numbers)):  # type: ignore[operator]
             return pair(cast(object, value))
@@ -81,17 +81,17 @@ class LensTable(Table):
 
     @field_validator("surfaces")
     @classmethod
-    def _a_file(cls, value: object) -> object:
+    def _check_file_name(cls, value: object) -> object:
         return file_name(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _one_kind_of_lens(self) -> LensTable:
+    def _check_kind_of_lens(self) -> LensTable:
         if self.surfaces is not None:
             for name in ("aperture", "distortion"):
                 if getattr(self, name) is not None:
-                    raise ValueError(f"{name} belongs to a thin lens; the surfaces of a real one say it, got both")
+                    raise ValueError(f"{name} belongs to a thin lens, and surfaces imply it; remove one, got both")
             if self.focus is not None and isinstance(self.scale, float | int):
-                raise ValueError('a scale of surfaces says already what is sharp; take scale "fit", got focus too')
+                raise ValueError('a number as scale fixes the focus; take scale "fit", got focus too')
         elif self.scale is not None:
             raise ValueError("scale belongs to surfaces, got none")
         if self.focus is not None and self.aperture is None and self.surfaces is None:
@@ -103,19 +103,17 @@ class CameraTable(Table):
     """A flat sensor behind arrays of micro-lenses."""
 
     pixel_pitch: Length = Field(description="side of one sensor pixel")
-    lens_pitch: Length = Field(description="from one lens's centre to the next")
+    lens_pitch: Length = Field(description="distance between the centres of neighbouring lenses")
     wavelength: Length | None = Field(
-        default=None, description="of light; with it apertures diffract; absent: rays alone, glass and sensor at 550 nm"
+        default=None, description="of light; with it apertures diffract; absent: rays only, glass and sensor at 550 nm"
     )
-    tolerance: ToleranceTable | None = Field(
-        default=None, description="how exactly it was put together; absent: perfectly"
-    )
+    tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _names_differ(self) -> CameraTable:
+    def _check_names(self) -> CameraTable:
         names = [lens.name for lens in self.lens]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"expected a name of its own for every lens type, got {name!r} twice")
+                raise ValueError(f"expected a different name for every lens type, got {name!r} twice")
         return self

@@ -1,4 +1,4 @@
-"""What the scene file says of the estimate: what is believed of the image beforehand, and how it is computed."""
+"""The tables of the estimate in the scene file: [prior], [estimator], [tiles] and [study]."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from .units import ExpectedNoise, Length, Memory, pair
 
 
 class PriorTable(Table):
-    """What is known of the image before any light is recorded."""
+    """Mean and covariance of the image before any measurement."""
 
     kind: Literal["independent", "exponential", "power", "fit"] = Field(
         default="independent",
-        description="how pixels go together: not at all; exp(-distance / length); a power of frequency; found by fit",
+        description="correlation of pixels: none; exp(-distance / length); a power of frequency; fitted to the stack",
     )
     mean: float = Field(default=127.5, ge=-LARGEST, le=LARGEST)
-    variance: float = Field(default=5461.25, gt=0, le=LARGEST**2, description="of every pixel; kind fit finds it")
+    variance: float = Field(default=5461.25, gt=0, le=LARGEST**2, description="of every pixel; fitted by kind fit")
     correlation_length: Length | None = Field(
-        default=None, description="on the target, of kind exponential; kind fit finds it"
+        default=None, description="on the target, of kind exponential; fitted by kind fit"
     )
     exponent: float | None = Field(
         default=None, ge=0, le=8, description="a of a power spectrum 1/frequency^a, of kind power; absent: 2"
     )
 
     @model_validator(mode="after")
-    def _only_what_the_kind_has(self) -> PriorTable:
+    def _check_kind(self) -> PriorTable:
         if self.kind == "exponential" and self.correlation_length is None:
             raise ValueError('kind "exponential" needs a correlation_length, such as "10 mm"')
         if self.kind != "exponential" and self.correlation_length is not None:
@@ -41,7 +41,7 @@ class EstimatorTable(Table):
     """How the image is estimated."""
 
     noise_variance: ExpectedNoise | None = Field(
-        default=None, description='what the estimator expects; "fit": found from the stack; absent: all that is known'
+        default=None, description='that the estimator assumes; "fit": fitted to the stack; absent: all known noise'
     )
     method: Literal[
         "auto",
@@ -53,22 +53,23 @@ class EstimatorTable(Table):
         "dual",
         "tiles",
         "frame",
-    ] = Field(default="auto", description="a dense form, tiles, or the whole frame; auto: the cheapest that is right")
-    tolerance: float = Field(default=1e-8, gt=0, le=1, description="relative error that a dense form is allowed")
+    ] = Field(
+        default="auto",
+        description="a dense form, tiles, or a whole frame; auto: the cheapest accurate one",
+    )
+    tolerance: float = Field(default=1e-8, gt=0, le=1, description="largest relative error of a dense form")
     accuracy: float = Field(
-        default=0.01, gt=0, le=1, description="error that a frame is allowed, in its posterior standard deviations"
+        default=0.01, gt=0, le=1, description="largest numerical error of a frame, in posterior standard deviations"
     )
     misalignment: Literal["trust", "robust", "fit"] = Field(
         default="trust",
-        description='of camera.tolerance: none expected; "robust": as more noise; "fit": H is found from the stack',
+        description='of camera.tolerance: none expected; "robust": as more noise; "fit": H is fitted to the stack',
     )
-    memory: Memory | None = Field(
-        default=None, description='never to be exceeded, such as "4 GB"; absent: half of what is free'
-    )
+    memory: Memory | None = Field(default=None, description='limit, such as "4 GB"; absent: half of the free memory')
 
 
 class StudyTable(Table):
-    """One stack reconstructed several times, each time with another idea of H."""
+    """One stack reconstructed several times, each time with another model H."""
 
     models: Annotated[
         tuple[Literal["ideal", "robust", "points", "transport", "fitted", "true"], ...],
@@ -76,18 +77,18 @@ class StudyTable(Table):
         Field(min_length=1),
     ] = Field(
         description="ideal: as designed; robust: that, and misalignment as more noise; points, transport: calibrated;"
-        " fitted: found from the stack; true: as misalignment was drawn"
+        " fitted: to the stack; true: with the misalignment that was drawn"
     )
 
 
 class TilesTable(Table):
-    """How a frame is cut where it is reconstructed tile by tile."""
+    """Division of a frame that is reconstructed tile by tile."""
 
     size: int = Field(default=35, ge=4, le=200, description="rows and columns of a tile, in pixels of the target")
-    overlap: int = Field(default=8, ge=0, description="border of a tile that its neighbours replace")
+    overlap: int = Field(default=8, ge=0, description="border of a tile that is discarded for its neighbours' pixels")
 
     @model_validator(mode="after")
-    def _a_core_is_left(self) -> TilesTable:
+    def _check_core(self) -> TilesTable:
         if 2 * self.overlap >= self.size:
             raise ValueError(
                 f"tiles.overlap {self.overlap} leaves nothing of tiles of {self.size}; expected below half"

@@ -1,4 +1,4 @@
-"""Index of refraction of glasses and plastics by name, after Sellmeier's equation.
+"""Index of refraction of glasses and plastics by name, from Sellmeier's equation.
 
 n^2 = 1 + sum over k of B_k w^2 / (w^2 - C_k), w the wavelength in vacuum in micrometres. Sources:
 
@@ -6,7 +6,7 @@ n^2 = 1 + sum over k of B_k w^2 / (w^2 - C_k), w the wavelength in vacuum in mic
 - fused silica: I. H. Malitson, J. Opt. Soc. Am. 55, 1205 (1965).
 - PMMA, polycarbonate: N. Sultanova, S. Kasarova, I. Nikolov, Acta Phys. Pol. A 116, 585 (2009), one term.
 
-All were measured in air, and lenses stand in air, so its index is 1. Wavelengths are millimetres, as all lengths are.
+All were measured in air, and lenses are in air, so the index of air is 1. Wavelengths are in millimetres.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from math import sqrt
 
 from ommatid.runtime.errors import InputError
 
-GREEN = 550e-6  # mm, where a scene names no wavelength
+from ..constants import GREEN
+
 AIR = "air"
 
 
 @dataclass(frozen=True)
 class Dispersion:
-    """Sellmeier's terms (B, C in square micrometres) and the wavelengths, in mm, between which they hold."""
+    """Sellmeier's terms (B, C in square micrometres) and the range of wavelengths, in mm, where they are valid."""
 
     terms: tuple[tuple[float, float], ...]
     shortest: float
@@ -51,29 +52,27 @@ GLASSES = {
 def index(name: str, wavelength: float = GREEN) -> float:
     """Index of refraction of a glass, or of air, 1, at a wavelength in mm.
 
-    Raises InputError for an unknown name, and for a wavelength at which the glass was not measured.
+    Raises InputError for an unknown name, and for a wavelength outside the glass's measured range.
     """
     if name == AIR:
         return 1.0
     check(name)
-    found = GLASSES[name]
-    if not found.shortest <= wavelength <= found.longest:
+    dispersion = GLASSES[name]
+    if not dispersion.shortest <= wavelength <= dispersion.longest:
         raise InputError(
-            f"the index of {name} is known from {found.shortest * 1e6:.0f} to {found.longest * 1e6:.0f} nm, got a"
-            f" wavelength of {wavelength * 1e6:.4g} nm; give the surface an index of refraction instead of a glass"
+            f"the index of {name} is known from {dispersion.shortest * 1e6:.0f} to {dispersion.longest * 1e6:.0f} nm,"
+            f" got a wavelength of {wavelength * 1e6:.4g} nm; give the surface an index of refraction instead"
         )
     square = (wavelength * 1e3) ** 2
-    return sqrt(1 + sum(strength * square / (square - pole) for strength, pole in found.terms))
+    return sqrt(1 + sum(strength * square / (square - pole) for strength, pole in dispersion.terms))
 
 
 def check(name: str) -> None:
-    """Raise InputError unless a glass of that name is known."""
+    """Raise InputError, with the nearest known name, unless the glass is known."""
     known = [AIR, *GLASSES]
     if name in known:
         return
     folded = {other.casefold(): other for other in known}
     near = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.4)
-    meant = f"; did you mean '{folded[near[0]]}'?" if near else ""
-    raise InputError(
-        f"expected a glass of {', '.join(known)}, got '{name}'{meant or '; give an index of refraction instead'}"
-    )
+    advice = f"did you mean '{folded[near[0]]}'?" if near else "give an index of refraction instead"
+    raise InputError(f"expected a glass among {', '.join(known)}, got '{name}'; {advice}")

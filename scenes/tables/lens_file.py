@@ -1,12 +1,12 @@
-"""Lenses as they are written down: a surface a row, from the target to the sensor.
+"""Lens files: the surfaces of a lens, from the target to the sensor.
 
-Two forms of file are read. TOML holds what a scene file holds, `surfaces = [{radius = "1 mm", thickness = "0.5 mm",
-glass = "N-BK7", semi_diameter = "0.2 mm"}, ...]`, and a `title` if one wants. Any other file is taken for the text that
-PBRT's realistic camera reads: rows of radius, thickness, index of refraction and diameter, in millimetres, where what
-follows a # is a comment and a number alone in the first row is the focal length. PBRT's radii have our sign, positive
-where the centre of curvature lies towards the film. Its index 0 is air; its last thickness, to the film, is left
-out, because the magnification says where the sensor stands; a radius 0 is a plane, the aperture stop where there is air
-on both sides of it or its index is 0.
+Two formats are read. A TOML file holds the key of a scene file, `surfaces = [{radius = "1 mm", thickness = "0.5 mm",
+glass = "N-BK7", semi_diameter = "0.2 mm"}, ...]`, and optionally a `title`. Any other file is read as the text of
+PBRT's realistic camera: rows of radius, thickness, index of refraction and diameter, in millimetres, with comments
+after a #; a single number in the first row is the focal length. PBRT's radii have the sign used here, positive if the
+centre of curvature lies towards the film. Its index 0 is air; its last thickness, to the film, is ignored, because the
+magnification determines the distance of the sensor; a radius of 0 is a plane, and the aperture stop if there is air on
+both sides of it or its index is 0.
 
 Source: M. Pharr, W. Jakob, G. Humphreys, Physically Based Rendering, section 6.4 (third edition).
 """
@@ -30,14 +30,14 @@ COLUMNS = "radius, thickness, index of refraction, diameter"
 
 
 class LensFile(Table):
-    """A lens by itself."""
+    """The content of a lens file in TOML."""
 
     title: str = ""
     surfaces: Annotated[tuple[Surface, ...], BeforeValidator(pair), Field(min_length=1)]
 
 
 def read_lens(path: Path) -> tuple[Surface, ...]:
-    """The surfaces of a lens from a file in TOML (.toml) or in PBRT's text form (any other ending).
+    """Read the surfaces of a lens from a file in TOML (.toml) or in PBRT's text format (any other suffix).
 
     Raises InputError that names the file, the row or the key, what was expected and what came.
     """
@@ -50,14 +50,14 @@ def read_lens(path: Path) -> tuple[Surface, ...]:
     surfaces = _from_toml(text, path) if path.suffix == ".toml" else _from_rows(text, path)
     stops = sum(surface.stop for surface in surfaces)
     if stops > 1:
-        raise InputError(f"{path}: expected one aperture stop at most, got {stops}; mark the smallest alone")
+        raise InputError(f"{path}: expected one aperture stop at most, got {stops}; mark only the smallest")
     return surfaces
 
 
 def with_surfaces(camera: CameraTable, source: Path) -> CameraTable:
-    """The camera's table with every lens file, named relative to the scene file `source`, replaced by what it holds.
+    """The camera's table with every name of a lens file, relative to the scene file `source`, replaced by its surfaces.
 
-    Raises InputError for a damaged file and for a glass that is not known.
+    Raises InputError for a damaged file and for an unknown glass.
     """
     lenses = [
         lens.model_copy(update={"surfaces": read_lens((source.parent / lens.surfaces).resolve())})
@@ -89,7 +89,7 @@ def _from_rows(text: str, path: Path) -> tuple[Surface, ...]:
     lines = [line.partition("#")[0].split() for line in text.splitlines()]
     rows = [(number, _numbers(words, path, number)) for number, words in enumerate(lines, start=1) if words]
     if rows and len(rows[0][1]) == 1:
-        del rows[0]  # the focal length, which follows from the rows
+        del rows[0]  # the focal length, which follows from the surfaces
     if not rows:
         raise InputError(f"{path}: expected rows of {COLUMNS}, got none")
     surfaces: list[Surface] = []
@@ -97,7 +97,7 @@ def _from_rows(text: str, path: Path) -> tuple[Surface, ...]:
     for number, values in rows:
         if len(values) != 4:
             raise InputError(f"{path}, line {number}: expected four numbers ({COLUMNS}), got {len(values)}")
-        surfaces.append(_surface(values, before, last=number == rows[-1][0], place=f"{path}, line {number}"))
+        surfaces.append(_surface(values, before, last=number == rows[-1][0], where=f"{path}, line {number}"))
         before = values[2] or 1.0
     return tuple(surfaces)
 
@@ -115,23 +115,23 @@ def _numbers(words: list[str], path: Path, number: int) -> list[float]:
     return values
 
 
-def _surface(values: list[float], before: float, *, last: bool, place: str) -> Surface:
+def _surface(values: list[float], before: float, *, last: bool, where: str) -> Surface:
     radius, thickness, index, diameter = values
     if thickness < 0:
-        raise InputError(f"{place}: expected a thickness of 0 mm or more, got {thickness:g}")
+        raise InputError(f"{where}: expected a thickness of 0 mm or more, got {thickness:g}")
     if index and not 1 <= index <= 5:
-        raise InputError(f"{place}: expected an index of refraction from 1 to 5, or 0 for air, got {index:g}")
+        raise InputError(f"{where}: expected an index of refraction from 1 to 5, or 0 for air, got {index:g}")
     if diameter <= 0:
-        raise InputError(f"{place}: expected a diameter above 0 mm, got {diameter:g}")
-    listed: dict[str, Any] = {"semi_diameter": f"{diameter / 2!r} mm"}
+        raise InputError(f"{where}: expected a diameter above 0 mm, got {diameter:g}")
+    table: dict[str, Any] = {"semi_diameter": f"{diameter / 2!r} mm"}
     if radius:
-        listed["radius"] = f"{radius!r} mm"
+        table["radius"] = f"{radius!r} mm"
     if thickness and not last:
-        listed["thickness"] = f"{thickness!r} mm"
+        table["thickness"] = f"{thickness!r} mm"
     if index > 1:
-        listed["index"] = index
-    listed["stop"] = radius == 0 and (index == 0 or index == before == 1)
+        table["index"] = index
+    table["stop"] = radius == 0 and (index == 0 or index == before == 1)
     try:
-        return Surface.model_validate(listed)
+        return Surface.model_validate(table)
     except ValidationError as error:
-        raise InputError(f"{place}: {explain(error, listed, Surface)}") from error
+        raise InputError(f"{where}: {explain(error, table, Surface)}") from error

@@ -1,4 +1,4 @@
-"""One clear sentence out of a validation error: the key, what was expected, what came, the nearest known key."""
+"""Error messages for the scene file: the key, what was expected, what came, and the nearest known key."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from ommatid.runtime.errors import shortened, shortened_repr
 
 
 def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]) -> str:
-    """The first thing wrong with `data`, as a sentence without the file's name."""
+    """Describe the first error in `data` in one sentence, without the file's name."""
     problems = error.errors()
-    # A misspelt key also reads as a missing one: name the misspelling.
+    # A misspelt key is also reported as a missing one: prefer the misspelling.
     unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
     first = (unknown or problems)[0]
     sentence = _sentence(first, data, model)
     others = len(problems) - 1
-    return sentence + (f" (and {others} more to mend)" if others else "")
+    return sentence + (f" (and {others} more to correct)" if others else "")
 
 
 def known_keys(model: type[BaseModel], prefix: str = "") -> list[str]:
-    """Every key of the scene file in dotted form, lens types without their names."""
+    """All keys of the scene file in dotted form, those of lens types without the type's name."""
     keys: list[str] = []
     for name, field in model.model_fields.items():
         keys.append(prefix + name)
@@ -39,10 +39,10 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel]) -> str:
-    kind = problem["type"]
-    location = problem["loc"] if kind == "extra_forbidden" else _trim(problem["loc"])
+    error_type = problem["type"]
+    location = problem["loc"] if error_type == "extra_forbidden" else _keys_only(problem["loc"])
     key = shortened(_dotted(location, data))
-    if kind == "extra_forbidden":
+    if error_type == "extra_forbidden":
         keys = known_keys(model)
         bare = ".".join(part for part in location if isinstance(part, str))
         near = difflib.get_close_matches(bare, keys, n=1, cutoff=0.5)
@@ -50,7 +50,7 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
         elsewhere = [known for known in keys if known.rsplit(".", 1)[-1] == last]
         nearest = (elsewhere or near or difflib.get_close_matches(bare, keys, n=1, cutoff=0.0))[0]
         return f"unknown key '{key}'; the nearest known key is '{nearest}'"
-    if kind == "missing":
+    if error_type == "missing":
         return f"the key '{key}' is missing and has no default; add it"
     message = problem["msg"].removeprefix("Value error, ")
     message = message.replace("Input should be", "expected").replace(
@@ -61,8 +61,8 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
     return f"{key}: {message}" if key else message
 
 
-def _trim(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
-    # pydantic appends the branch of a union or the kind of a tuple: these are no keys of the file.
+def _keys_only(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
+    # pydantic appends the branch of a union or the type of a tuple, which are not keys of the file.
     return tuple(
         part for part in location if isinstance(part, int) or part.isidentifier() or ("-" in part and "[" not in part)
     )
@@ -75,12 +75,12 @@ def _dotted(location: tuple[int | str, ...], data: Any) -> str:
             data = data[part]
         except (KeyError, IndexError, TypeError):
             data = None
-        parts.append(_name(data, part) if isinstance(part, int) else part)
+        parts.append(_item_name(data, part) if isinstance(part, int) else part)
     return ".".join(parts)
 
 
-def _name(table: Any, place: int) -> str:
+def _item_name(table: Any, index: int) -> str:
     try:
         return str(table["name"])
     except (KeyError, TypeError):
-        return str(place)
+        return str(index)

@@ -10,18 +10,18 @@ from ommatid.runtime.errors import InputError, shortened
 
 from . import toml
 
-MOST_NAMED = 10  # lens types in a sentence
+MOST_NAMED = 10  # lens types in a message
 
 
 def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
-    """Set keys such as `noise.variance=1e-6` or `camera.lens.II.pixels=[2,2]`; an empty value removes the key.
+    """A copy with keys set, such as `noise.variance=1e-6` or `camera.lens.II.pixels=[2,2]`; an empty value removes one.
 
-    The value is read as TOML, else as text. Raises InputError if the key's table does not exist.
+    Values are read as by `value_of`. Raises InputError if a lens type of a key does not exist.
     """
     changed = copy.deepcopy(data)
-    for written in overrides:
-        key, equals, text = written.partition("=")
-        override = shortened(written)
+    for assignment in overrides:
+        key, equals, text = assignment.partition("=")
+        override = shortened(assignment)
         if not equals or not key.strip():
             raise InputError(f"--set {override}: expected KEY=VALUE, such as noise.variance=1e-6")
         *tables, last = [part.strip() for part in key.split(".")]
@@ -31,7 +31,7 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str,
         for name in tables:
             table = _inside(table, name, override)
         if not isinstance(table, dict):
-            raise InputError(f"--set {override}: '{'.'.join(tables)}' is no table, so it has no key '{last}'")
+            raise InputError(f"--set {override}: '{'.'.join(tables)}' is not a table, so it has no key '{last}'")
         if text.strip():
             table[last] = value_of(text)
         else:
@@ -46,12 +46,12 @@ def _inside(table: Any, name: str, override: str) -> Any:
             raise InputError(f"--set {override}: no lens type is called '{name}'; there are {_names(lenses)}")
         return lenses[name]
     if not isinstance(table, dict):
-        raise InputError(f"--set {override}: '{name}' does not stand in a table")
+        raise InputError(f"--set {override}: '{name}' is not in a table")
     return table.setdefault(name, {})  # type: ignore[return-value]
 
 
 def value_of(text: str) -> Any:
-    """What a value on the command line is: TOML, else text."""
+    """The value of a text from the command line: parsed as TOML if possible, else the text itself."""
     try:
         return toml.loads(f"value = {text}")["value"]
     except ValueError:
@@ -59,21 +59,21 @@ def value_of(text: str) -> Any:
 
 
 def keep_lenses(data: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """Keep the named lens types in the order named; one named again joins a second time, called NAME-2.
+    """Keep the named lens types in the given order; a name given twice adds a copy called NAME-2.
 
-    Raises InputError if a name is unknown. No names: everything stays.
+    Without names, `data` is returned unchanged. Raises InputError for an unknown name.
     """
-    wanted = list(names)
-    if not wanted:
+    names = list(names)
+    if not names:
         return data
     camera = data.get("camera")
     listed: Any = camera.get("lens") if isinstance(camera, dict) else None  # type: ignore[union-attr]
     lenses = _by_name(listed) if isinstance(listed, list) else {}  # pyright: ignore[reportUnknownArgumentType]
     chosen: list[Any] = []
-    for place, name in enumerate(wanted):
+    for index, name in enumerate(names):
         if name not in lenses:
-            raise InputError(f"--lens {','.join(wanted)}: no lens type is called '{name}'; there are {_names(lenses)}")
-        earlier = wanted[:place].count(name)
+            raise InputError(f"--lens {','.join(names)}: no lens type is called '{name}'; there are {_names(lenses)}")
+        earlier = names[:index].count(name)
         chosen.append({**lenses[name], "name": name if earlier == 0 else f"{name}-{earlier + 1}"})
     return {**data, "camera": {**camera, "lens": chosen}}  # type: ignore[dict-item]
 

@@ -1,10 +1,10 @@
-"""What every table of the scene file has in common: it is frozen and takes no unknown key, no value of another kind."""
+"""The base of every table of the scene file: frozen, without unknown keys or values of another type."""
 
 from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict
 
-LARGEST = 1e12  # of a value: files hold float32, and squares of values have to fit as well
+LARGEST = 1e12  # of a pixel value: files hold float32, and squares of values must fit too
 
 
 class Table(BaseModel):

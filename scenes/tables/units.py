@@ -1,4 +1,4 @@
-"""Quantities of the scene file - lengths, ratios, counts, pairs - checked and converted where they are read.
+"""Quantities of the scene file - lengths, ratios, counts, pairs - checked and converted when they are read.
 
 Lengths become millimetres here and nowhere else.
 """
@@ -8,20 +8,24 @@ from __future__ import annotations
 import os
 import re
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
+from math import isfinite
 from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
 from ommatid.runtime.errors import shortened_repr
 
-LONGEST = 80  # characters of a quantity: whatever its library does with each, it is done at once
+LONGEST = 80  # characters of a quantity, which keeps the time to parse it short
 NUMBER = r"[-+]?(\d[\d_]*\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
 UNIT = r"(?:[^\W\d]+|°)((\*\*|\^)-?\d|[²³])?"
 QUANTITY = re.compile(rf"\s*{NUMBER}(\s*/\s*{NUMBER})?\s*\*?\s*{UNIT}(\s*[*/]\s*{UNIT})*\s*")
 RATIO = re.compile(rf"\s*{NUMBER}(/\d+)?\s*")
-EXTREME = 1e15  # of millimetres, seconds, radians or lux: beyond, squares and ratios leave what floats can tell
-LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes that systems take
+EXTREME = 1e15  # largest quantity in mm, s, rad or lux, and inverse of the smallest: squares and ratios stay finite
+LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes that file systems accept
+LARGEST_VARIANCE = 1e24
+FEWEST_SAMPLES, MOST_SAMPLES = 16, 2**24
+AUTO = "auto"  # samples: as many as needed
 
 
 @cache
@@ -32,17 +36,17 @@ def _units() -> Any:
 
 
 def _quantity(text: str, unit: str) -> float:
-    """A number and its unit, in another unit. Raises an exception of one of many kinds.
+    """Convert a text of a number and its unit to another unit. Raises one of pint's many exceptions.
 
-    The library computes what stands in a text, 9**9**9 for weeks; so nothing but a number and units goes there.
+    Pint evaluates expressions, and 9**9**9 would take weeks; so only a number with units is passed on.
     """
     if len(text) > LONGEST or QUANTITY.fullmatch(text) is None:
         raise ValueError("neither a number nor a unit")
     return float(_units().Quantity(text).to(unit).magnitude)
 
 
-def _in_units(value: object, unit: str, what: str, examples: tuple[str, str], *, signed: bool = False) -> float:
-    """A text such as "6 um" as a number of `unit`. Raises ValueError that says what was expected."""
+def _in_units(value: object, *, unit: str, what: str, examples: tuple[str, str], signed: bool = False) -> float:
+    """Convert a text such as "6 um" to a number of `unit`. Raises ValueError that says what was expected."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         example = f"{value} {examples[0].split()[1]}"
         raise ValueError(f'expected {what} with its unit, such as "{example}", got the bare number {value}')
@@ -50,40 +54,20 @@ def _in_units(value: object, unit: str, what: str, examples: tuple[str, str], *,
         raise ValueError(f'expected {what} with its unit, such as "{examples[0]}", got {shortened_repr(value)}')
     try:
         number = _quantity(value, unit)
-    except Exception as error:  # pint raises a dozen kinds, tokenize's among them
+    except Exception as error:  # pint raises a dozen types, tokenize's among them
         raise ValueError(
             f'expected {what} with its unit, such as "{examples[1]}" or "{examples[0]}", got {shortened_repr(value)}'
         ) from error
-    if not (number != 0 and abs(number) < float("inf")) or (number < 0 and not signed):
+    if number == 0 or not isfinite(number) or (number < 0 and not signed):
         raise ValueError(f"expected {what} {'other than' if signed else 'above'} zero, got {shortened_repr(value)}")
     if not 1 / EXTREME <= abs(number) <= EXTREME:
         raise ValueError(f"expected {what} between {1 / EXTREME:g} and {EXTREME:g} {unit}, got {shortened_repr(value)}")
     return number
 
 
-def _length(value: object) -> float:
-    return _in_units(value, "mm", "a length", ("1 mm", "6 um"))
-
-
-def _radius(value: object) -> float:
-    return _in_units(value, "mm", "a radius of curvature", ("1 mm", "-800 um"), signed=True)
-
-
-def _time(value: object) -> float:
-    return _in_units(value, "s", "a time", ("10 ms", "0.5 s"))
-
-
 def duration(text: str) -> float:
-    """Seconds, of a text such as "30 s", "30s" or "2 min". Raises ValueError that says what was expected."""
-    return _in_units(text, "s", "a time", ("30 s", "2 min"))
-
-
-def _angle(value: object) -> float:
-    return _in_units(value, "rad", "an angle", ("1 deg", "2 mrad"))
-
-
-def _illuminance(value: object) -> float:
-    return _in_units(value, "lux", "an illuminance", ("500 lux", "1 klux"))
+    """Convert a text such as "30 s", "30s" or "2 min" to seconds. Raises ValueError that says what was expected."""
+    return _in_units(text, unit="s", what="a time", examples=("30 s", "2 min"))
 
 
 def _ratio(value: object) -> Fraction:
@@ -91,7 +75,7 @@ def _ratio(value: object) -> Fraction:
         if isinstance(value, bool) or not isinstance(value, str | int | float | Fraction):
             raise ValueError
         text = str(value)
-        if len(text) > LONGEST or RATIO.fullmatch(text) is None:  # 1e-9999999999 would be a number of so many digits
+        if len(text) > LONGEST or RATIO.fullmatch(text) is None:  # 1e-9999999999 would be a huge denominator
             raise ValueError
         ratio = Fraction(text)
     except (ValueError, ZeroDivisionError) as error:
@@ -116,52 +100,12 @@ def _step(value: object) -> Fraction:
 
 
 def pair(value: object) -> object:
-    """A list of TOML as the tuple that frozen tables hold; anything else as it is."""
+    """Convert a list of TOML to the tuple that frozen tables hold; return anything else unchanged."""
     return tuple(value) if isinstance(value, list) else value  # type: ignore[arg-type]
 
 
-def _text_of(ratio: Fraction) -> str | int:
+def _plain_ratio(ratio: Fraction) -> str | int:
     return int(ratio) if ratio.denominator == 1 else str(ratio)
-
-
-Length = Annotated[
-    float,
-    BeforeValidator(_length),
-    PlainSerializer(lambda value: f"{value!r} mm"),
-    WithJsonSchema({"type": "string", "description": 'a length with its unit, such as "6 um"'}),
-]
-Radius = Annotated[
-    float,
-    BeforeValidator(_radius),
-    PlainSerializer(lambda value: f"{value!r} mm"),
-    WithJsonSchema({"type": "string", "description": 'a length with its unit and its sign, such as "-0.8 mm"'}),
-]
-Time = Annotated[
-    float,
-    BeforeValidator(_time),
-    PlainSerializer(lambda value: f"{value!r} s"),
-    WithJsonSchema({"type": "string", "description": 'a time with its unit, such as "10 ms"'}),
-]
-Angle = Annotated[
-    float,
-    BeforeValidator(_angle),
-    PlainSerializer(lambda value: f"{value!r} rad"),
-    WithJsonSchema({"type": "string", "description": 'an angle with its unit, such as "0.1 deg"'}),
-]
-Illuminance = Annotated[
-    float,
-    BeforeValidator(_illuminance),
-    PlainSerializer(lambda value: f"{value!r} lux"),
-    WithJsonSchema({"type": "string", "description": 'an illuminance, such as "500 lux"'}),
-]
-_RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
-Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_text_of), _RATIO]
-Step = Annotated[Fraction, BeforeValidator(_step), PlainSerializer(_text_of), _RATIO]
-Count = Annotated[int, Field(ge=1)]
-Pair = Annotated[tuple[Count, Count], BeforeValidator(pair)]
-Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(pair)]
-
-FEWEST_SAMPLES, MOST_SAMPLES = 16, 2**24
 
 
 def _samples(value: object) -> object:
@@ -175,21 +119,11 @@ def _samples(value: object) -> object:
     )
 
 
-AUTO = "auto"  # samples: as many as are needed
-Samples = Annotated[
-    int | Literal["auto"],
-    BeforeValidator(_samples),
-    WithJsonSchema(
-        {"anyOf": [{"type": "integer", "minimum": FEWEST_SAMPLES, "maximum": MOST_SAMPLES}, {"const": AUTO}]}
-    ),
-]
-
-
 def _memory(value: object) -> int:
     if isinstance(value, str):
         try:
             size = int(_quantity(value, "byte"))
-        except Exception as error:  # as for lengths
+        except Exception as error:  # of many types, as for lengths
             raise ValueError(f'expected an amount of memory such as "4 GB", got {shortened_repr(value)}') from error
         if 0 < size < 2**63:
             return size
@@ -197,7 +131,7 @@ def _memory(value: object) -> int:
 
 
 def file_name(value: str) -> str:
-    """The name, if a file can have it. Raises ValueError that says what was expected."""
+    """Return the name if a file can have it. Raises ValueError that says what was expected."""
     if "\0" in value or not value.strip():
         raise ValueError(f"expected the name of a file, got {shortened_repr(value)}")
     name = os.fsencode(value)
@@ -206,21 +140,78 @@ def file_name(value: str) -> str:
     return value
 
 
+def _expected_noise(value: object) -> object:
+    if value == "fit":
+        return value
+    if isinstance(value, float | int) and not isinstance(value, bool) and 0 <= value <= LARGEST_VARIANCE:
+        return float(value)
+    raise ValueError(f'expected a variance from 0 to 1e24, or "fit", got {shortened_repr(value)}')
+
+
+def _from_text(unit: str, what: str, *examples: str, signed: bool = False) -> BeforeValidator:
+    first, second = examples
+    return BeforeValidator(partial(_in_units, unit=unit, what=what, examples=(first, second), signed=signed))
+
+
+def _to_text(unit: str) -> PlainSerializer:
+    return PlainSerializer(lambda value: f"{value!r} {unit}")
+
+
+def _text_schema(description: str) -> WithJsonSchema:
+    return WithJsonSchema({"type": "string", "description": description})
+
+
+_RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
+
+Length = Annotated[
+    float,
+    _from_text("mm", "a length", "1 mm", "6 um"),
+    _to_text("mm"),
+    _text_schema('a length with its unit, such as "6 um"'),
+]
+Radius = Annotated[
+    float,
+    _from_text("mm", "a radius of curvature", "1 mm", "-800 um", signed=True),
+    _to_text("mm"),
+    _text_schema('a length with its unit and its sign, such as "-0.8 mm"'),
+]
+Time = Annotated[
+    float,
+    _from_text("s", "a time", "10 ms", "0.5 s"),
+    _to_text("s"),
+    _text_schema('a time with its unit, such as "10 ms"'),
+]
+Angle = Annotated[
+    float,
+    _from_text("rad", "an angle", "1 deg", "2 mrad"),
+    _to_text("rad"),
+    _text_schema('an angle with its unit, such as "0.1 deg"'),
+]
+Illuminance = Annotated[
+    float,
+    _from_text("lux", "an illuminance", "500 lux", "1 klux"),
+    _to_text("lux"),
+    _text_schema('an illuminance, such as "500 lux"'),
+]
+Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_plain_ratio), _RATIO]
+Step = Annotated[Fraction, BeforeValidator(_step), PlainSerializer(_plain_ratio), _RATIO]
+Count = Annotated[int, Field(ge=1)]
+Pair = Annotated[tuple[Count, Count], BeforeValidator(pair)]
+Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(pair)]
 FileName = Annotated[str, AfterValidator(file_name)]
+Samples = Annotated[
+    int | Literal["auto"],
+    BeforeValidator(_samples),
+    WithJsonSchema(
+        {"anyOf": [{"type": "integer", "minimum": FEWEST_SAMPLES, "maximum": MOST_SAMPLES}, {"const": AUTO}]}
+    ),
+]
 Memory = Annotated[
     int,
     BeforeValidator(_memory),
     PlainSerializer(lambda size: f"{size} B", return_type=str),
     WithJsonSchema({"type": "string", "examples": ["4 GB"]}),
 ]
-
-
-def _expected_noise(value: object) -> object:
-    if value == "fit" or (isinstance(value, float | int) and not isinstance(value, bool) and 0 <= value <= 1e24):
-        return value if value == "fit" else float(cast(float, value))
-    raise ValueError(f'expected a variance from 0 to 1e24, or "fit", got {shortened_repr(value)}')
-
-
 ExpectedNoise = Annotated[
     float | str,
     BeforeValidator(_expected_noise),

@@ -111,5 +111,5 @@ def scales(camera: Camera, sub: SubImager) -> FloatArray:
     half = float(sub.type.ratio) * hypot(*sub.type.pixels) / 2
     aside = hypot(sub.lens[0] - sub.patch[0], sub.lens[1] - sub.patch[1]) * camera.distance / sub.depth
     furthest = half + aside / camera.target_pitch
-    corner = camera.corner / camera.target_pitch
+    corner = camera.half_diagonal / camera.target_pitch
     return np.array([1.0, 1.0, 1 / half, 1 / half, corner**2 / furthest**3, 1.0])

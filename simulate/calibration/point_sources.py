@@ -78,7 +78,7 @@ def responses_from_points(
     scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
     renderer = Renderer(camera, variant, scene.render.sampler, together=False)  # each type has its own spacing
     if plans is None:
-        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.counted, scene.render.sampler))
+        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
     sweeps = {group: SourceSweep(renderer, group) for group in renderer.groups}
     shares = {group: sweep.visible.spacing**2 for group, sweep in sweeps.items()}
     parts: list[Part] = []

@@ -45,7 +45,7 @@ def responses_from_rays(setup: Setup, progress: Progress = no_progress, plans: P
     check_transport_variant(variant)
     renderer = Renderer(setup.simulated, variant, scene.render.sampler, together=False)
     if plans is None:
-        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.counted, scene.render.sampler))
+        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
     parts: list[Part] = []
     blocks = [(group, block) for group in renderer.groups for block in renderer.blocks(group, plans[group].samples)]
     for index, (group, block) in enumerate(blocks):

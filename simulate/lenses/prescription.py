@@ -19,6 +19,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import GREEN
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface
@@ -141,9 +142,7 @@ def prescribe(surfaces: Sequence[Surface], wavelength: float | None = None) -> P
     marked = [index for index, surface in enumerate(surfaces) if surface.stop]
     if len(marked) > 1:
         raise InputError(f"expected one aperture stop at most, got {len(marked)}; mark the smallest alone")
-    index = [
-        surface.index or glass.index(surface.glass or glass.AIR, wavelength or glass.GREEN) for surface in surfaces
-    ]
+    index = [surface.index or glass.index(surface.glass or glass.AIR, wavelength or GREEN) for surface in surfaces]
     if index[-1] != 1:
         raise InputError(
             f"expected air behind the last surface, got an index of {index[-1]:g}; end the list with the surface"

@@ -18,8 +18,8 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.tables.glass import GREEN
 
 from .prescription import Prescription, prescription_of
 from .ray_trace import exit_disk_of, path, reach, spread, trace
@@ -125,7 +125,7 @@ def _real(camera: Camera, lens_type: LensType) -> dict[str, Any]:
 
 
 def _diffraction(camera: Camera, working: float) -> dict[str, float]:
-    airy = 2.44 * (camera.wavelength or GREEN) * working
+    airy = 2 * AIRY_FIRST_ZERO * (camera.wavelength or GREEN) * working
     return {"working_f_number": working, "airy_diameter": airy, "airy_pixels": airy / camera.pixel_pitch}
 
 

@@ -36,7 +36,7 @@ def export(setup: Setup, path: Path) -> Path:
     plugins = scene_of(target_of(camera, texture_of({"filename": picture.name})))
     for sub in camera.sub_imagers:
         name = sub.name.replace(".", "_")  # a dot would be a path into the scene
-        plugins[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.counted)
+        plugins[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.sample_count)
     state = mi.parser.parse_dict(mi.parser.ParserConfig("scalar_rgb"), plugins)
     write_whole(path, lambda beside: mi.parser.write_file(state, str(beside)))
     return picture

@@ -17,6 +17,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Sampler, Scene
 
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 EXACT_SUMS = 2**22, 2**50  # float32 sums of whole numbers below, and float64 ones, lose less than 1/4
 MOST_TEXELS = 2**24  # that float32 can number
 FAR = 1e4  # in distances of the target: how far stock sensors see into a world
-WHITE = 255.0  # the value that the radiance called white is shown as
 
 
 class Renderer:
@@ -66,7 +66,7 @@ class Renderer:
         self.camera = camera
         fast = not variant.startswith("scalar")
         self.groups: dict[str, tuple[LensType, ...]] = {lens_type.name: (lens_type,) for lens_type in camera.types}
-        if fast and together and all(lens_type.optics.pinhole for lens_type in camera.types):
+        if fast and together and all(lens_type.optics.is_pinhole for lens_type in camera.types):
             self.groups = {"camera": camera.types}
         self.channels = 3 if variant.endswith("rgb") and world is None else 1
         self.exact_below = EXACT_SUMS[fast]

@@ -58,11 +58,6 @@ class Checkpoint:
         self._saved = monotonic()
 
 
-def clear(path: Path) -> None:
-    """Remove the checkpoint of the result at `path`, if there is one."""
-    _beside(path).unlink(missing_ok=True)
-
-
 def _beside(path: Path) -> Path:
     return path.with_name(f".{path.name}.partial.npz")
 
@@ -77,6 +72,6 @@ def open_checkpoint(path: Path, fingerprint: str) -> Generator[Checkpoint]:
         try:
             checkpoint.save()
         except MachineError:  # the original exception is the one to report
-            clear(path)
+            _beside(path).unlink(missing_ok=True)
         raise
-    clear(path)
+    _beside(path).unlink(missing_ok=True)

@@ -64,7 +64,7 @@ def law(sampler: Sampler, camera: Camera) -> ConvergenceLaw:
     """Return the law of a sampler in front of a camera's lenses and a flat target, constant over each pixel of f."""
     if sampler == "independent":
         return ConvergenceLaw(-0.5, "independent samples: the variance of a mean of n is 1/n of one's")
-    if not all(lens_type.optics.pinhole for lens_type in camera.types):
+    if not all(lens_type.optics.is_pinhole for lens_type in camera.types):
         why = "rays differ in four or six numbers, and the sampler stratifies them only two by two"
         return ConvergenceLaw(None, why, IN_THE_LIMIT)
     if sampler == "ldsampler":

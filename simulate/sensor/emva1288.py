@@ -18,7 +18,7 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
-from ommatid.scenes.recording import ROUNDING, Recording, dark_level, flat_values
+from ommatid.scenes.recording import ROUNDING, Recording, dark_electrons, flat_values
 from ommatid.scenes.tables.sensor import SensorTable
 
 Purpose = Literal["dark signal", "response", "exposure", "dark frames", "flat frames"]
@@ -97,7 +97,7 @@ class _Pixels:
         self, light: FloatArray, rng: np.random.Generator, shape: tuple[int, ...], frames: int = 1
     ) -> FloatArray | IntArray:
         """Electrons of `frames` frames together."""
-        electrons = np.maximum(light, 0.0) * self.response + dark_level(self.sensor)
+        electrons = np.maximum(light, 0.0) * self.response + dark_electrons(self.sensor)
         # Beyond this a pixel is certainly full, and NumPy's Poisson generator has a limit.
         expected = frames * np.minimum(electrons, 2 * self.sensor.full_well + 1e6)
         return rng.poisson(expected, shape) if self.shot else np.broadcast_to(expected, shape)

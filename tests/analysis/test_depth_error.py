@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ommatid.analysis.depth_error import PICTURE, describe, disparity, figure, of_run, rows
+from ommatid.analysis.depth_error import PICTURE, depth_error_of_run, disparity, draw, error_by_depth, rows
 from ommatid.scenes.formats.exr import Part, write
 from ommatid.scenes.formats.picture import decode, write_truth
 from ommatid.scenes.scene import TRUTH
@@ -55,47 +55,47 @@ def maps() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64
 
 def test_bins_hold_every_pixel_once_and_their_squares_add_up() -> None:
     depth, error, variance = maps()
-    described = describe(CAMERA, depth, error, variance)
-    counts = np.array([one["pixels"] for one in described])
+    described = error_by_depth(CAMERA, depth, error, variance)
+    counts = np.array([one.pixels for one in described])
     assert counts.sum() == depth.size
     assert counts[-1] == 38
-    assert described[-1]["nearest"] is None
-    assert counts @ [one["rms_error"] ** 2 for one in described] == pytest.approx((error**2).sum())
-    assert counts @ [one["expected_deviation"] ** 2 for one in described] == pytest.approx(variance.sum())
-    ends = [(one["nearest"], one["farthest"]) for one in described[:-1]]
+    assert described[-1].nearest is None
+    assert counts @ [one.rms_error**2 for one in described] == pytest.approx((error**2).sum())
+    assert counts @ [one.expected_deviation**2 for one in described] == pytest.approx(variance.sum())
+    ends = [(one.nearest or 0.0, one.farthest or 0.0) for one in described[:-1]]
     assert ends[0][0] == np.nanmin(depth)
     assert ends[-1][1] == np.nanmax(depth)
     assert all(before[1] <= after[0] for before, after in pairwise(ends))
     widths = np.array([1 / near - 1 / far for near, far in ends])
     assert widths.max() <= (1 / np.nanmin(depth) - 1 / np.nanmax(depth)) / 10 * (1 + 1e-9)
-    json.dumps(described, allow_nan=False)
+    json.dumps([one.plain() for one in described], allow_nan=False)
 
 
 def test_disparity_of_a_bin_is_that_of_its_sub_imagers() -> None:
     depth, error, variance = maps()
     depth[:] = 500.0
-    (one,) = describe(CAMERA, depth, error, variance)
+    (one,) = error_by_depth(CAMERA, depth, error, variance)
     lenses = np.array([sub.lens for sub in CAMERA.sub_imagers])
-    assert one["rms_disparity"] == pytest.approx(float(np.sqrt((lenses**2).sum(axis=1).mean())))  # Z/z - 1 = 1, 1 mm
-    assert one["nearest"] == one["farthest"] == 500
-    assert one["pixels"] == 361
+    assert one.rms_disparity == pytest.approx(float(np.sqrt((lenses**2).sum(axis=1).mean())))  # Z/z - 1 = 1, 1 mm
+    assert one.nearest == one.farthest == 500
+    assert one.pixels == 361
 
 
 def test_a_world_without_surfaces_has_one_bin() -> None:
     _, error, variance = maps()
-    (one,) = describe(CAMERA, np.full(SHAPE, np.nan), error, variance)
-    assert (one["nearest"], one["farthest"], one["pixels"]) == (None, None, 361)
+    (one,) = error_by_depth(CAMERA, np.full(SHAPE, np.nan), error, variance)
+    assert (one.nearest, one.farthest, one.pixels) == (None, None, 361)
     assert rows([one])[0][0] == "no surface"
 
 
 def test_maps_of_different_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="maps of one shape"):
-        describe(CAMERA, np.ones((3, 3)), np.ones((3, 2)), np.ones((3, 3)))
+        error_by_depth(CAMERA, np.ones((3, 3)), np.ones((3, 2)), np.ones((3, 3)))
 
 
 def test_the_table_says_what_was_measured() -> None:
     depth, error, variance = maps()
-    lines = rows(describe(CAMERA, depth, error, variance))
+    lines = rows(error_by_depth(CAMERA, depth, error, variance))
     assert lines[0][0].endswith("mm")
     assert "disparity" in lines[0][1]
     assert len(lines) == 11
@@ -105,7 +105,7 @@ def test_the_table_says_what_was_measured() -> None:
 def test_a_figure_is_drawn(tmp_path: Path, distance: float | None) -> None:
     depth, error, variance = maps()
     depth[:] = depth if distance is None else distance
-    figure(tmp_path / PICTURE, CAMERA, describe(CAMERA, depth, error, variance), "$a$ title")
+    draw(tmp_path / PICTURE, CAMERA, error_by_depth(CAMERA, depth, error, variance), "$a$ title")
     drawn: NDArray[Any] = decode(tmp_path / PICTURE, "test")
     assert drawn.shape[0] > 400
     assert drawn.std() > 5
@@ -117,9 +117,9 @@ def test_a_runs_files_are_enough(tmp_path: Path) -> None:
     maps_of = {"estimate": truth + error, "truth": truth, "variance": variance}
     write(tmp_path / "estimate.exr", [Part("estimate", {k: v.astype(np.float32) for k, v in maps_of.items()}, {})])
     write_truth(tmp_path / TRUTH, truth)
-    assert of_run(tmp_path, CAMERA) == []
+    assert depth_error_of_run(tmp_path, CAMERA) == ()
     write_truth(tmp_path / TRUTH, truth, depth)
-    found, expected = of_run(tmp_path, CAMERA), describe(CAMERA, depth, error, variance)
-    assert [one["pixels"] for one in found] == [one["pixels"] for one in expected]
-    assert [one["rms_error"] for one in found] == pytest.approx([one["rms_error"] for one in expected], rel=1e-5)
+    found, expected = depth_error_of_run(tmp_path, CAMERA), error_by_depth(CAMERA, depth, error, variance)
+    assert [one.pixels for one in found] == [one.pixels for one in expected]
+    assert [one.rms_error for one in found] == pytest.approx([one.rms_error for one in expected], rel=1e-5)
     assert (tmp_path / PICTURE).is_file()

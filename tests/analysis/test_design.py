@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from ommatid.analysis.candidates import magnifications, with_lens
+from ommatid.analysis.design import magnifications, with_lens
 from ommatid.reconstruct.prediction import predict
 from ommatid.reconstruct.prior import independent
 from ommatid.runtime.errors import InputError
@@ -14,9 +14,9 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.tables.estimation import EstimatorTable
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import GALLERY, scene
+from ..runs import document
 
 
 def test_candidates_are_read_as_the_usage_shows_them() -> None:

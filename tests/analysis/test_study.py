@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ommatid.analysis import run_table, study
-from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
@@ -22,9 +22,9 @@ from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import needs, scene
+from ..runs import document
 
 ONE = (("1/2", [3, 3], [8, 8]),)
 SMOOTH = {"kind": "exponential", "correlation_length": "25 mm"}
@@ -71,7 +71,7 @@ def test_what_a_misaligned_camera_costs_and_what_helps() -> None:
         assert sum(found[how].budget().values()) == pytest.approx(found[how].expected.mse, rel=1e-6)
         assert found[how].budget()["misalignment"] > 0
         assert found[how].choice.method == how
-        lines = dict(run_table.rows(run_json.describe(stack, model, found[how])))
+        lines = dict(run_table.rows(report_of(stack, model, found[how])))
         assert "    from misalignment" in lines
     residual = found["robust"].residual
     assert residual is not None
@@ -110,7 +110,7 @@ def test_other_keys_of_the_estimator_still_count(told: dict[str, Any], words: st
 def test_a_calibrated_h_is_not_thrown_away_in_silence() -> None:
     stack, model, truth = recorded(misaligned("fit"))
     calibrated = replace(model, record={**model.record, "method": "points"})
-    with pytest.raises(InputError, match="begins with H as designed, got a calibrated one"):
+    with pytest.raises(InputError, match="starts from H as designed, got a calibrated one"):
         restore(stack, calibrated, truth)
 
 
@@ -141,9 +141,9 @@ def test_a_study_is_kept_and_told(tmp_path: Path) -> None:
     assert study.cached_study(tmp_path, stack, models, truth) == (cases, False)
     assert len(made) == 3, "nothing is made again"
     rows = dict(study.rows(cases))
-    assert "OUTSIDE" in rows["the ideal H on trust"]
+    assert "OUTSIDE" in rows["the ideal H"]
     assert "inside" in rows["the true H"]
-    assert "for this picture" not in rows["the ideal H, misalignment as more noise"]
+    assert "for this picture" not in rows["the ideal H, misalignment as noise"]
     table = (tmp_path / "study.csv").read_text(encoding="utf-8").splitlines()
     assert table[0].startswith("model,mse,predicted")
     assert [line.split(",")[0] for line in table[1:]] == ["ideal", "robust", "true"]

@@ -24,13 +24,12 @@ from ommatid.batch import batch
 from ommatid.batch.batch import Batch, Member, Works
 from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
 from ommatid.reconstruct import method_choice
-from ommatid.reconstruct.method_choice import BASE
+from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files
 from ommatid.runtime.processors import one_thread, processors
 
-from ..cli.test_commands import FILES, MADE
 from ..conftest import TINY, Command, shell
-from ..runtime.test_workers import content
+from ..runs import FILES, MADE, content
 
 COMMAND = ("run", "tiny.toml", "-o", "out", "--sweep", "render.seed=1,2", "--json")
 SCENES = ("tiny+render.seed=1", "tiny+render.seed=2")
@@ -206,24 +205,6 @@ def test_a_batch_that_is_killed_at_any_moment_is_resumed(
 # --- what killed processes leave
 
 
-def test_what_a_dead_process_was_writing_is_removed_and_what_a_living_one_writes_is_not(tmp_path: Path) -> None:
-    path = tmp_path / "a[1].npz"
-    dead = tmp_path / f".0123abcd{files.PART}{path.name}"
-    mine = tmp_path / ".0123abcd.party"
-    for left in (dead, mine):
-        left.write_bytes(b"half")
-
-    def write(beside: Path) -> None:
-        assert not dead.exists()
-        files.clear_abandoned(tmp_path)
-        files.clear_abandoned(tmp_path, path.name)
-        assert beside.exists(), "it is being written"
-        beside.write_bytes(b"whole")
-
-    files.write_whole(path, write)
-    assert {left.name: left.read_bytes() for left in tmp_path.iterdir()} == {path.name: b"whole", mine.name: b"half"}
-
-
 def test_a_run_clears_what_one_that_was_killed_has_left(kept: Path, ommatid: Command) -> None:
     for name in (f".0123abcd{files.PART}estimate.png", ".stack.exr.partial.npz", ".model.npz.partial.npz"):
         (kept / name).write_bytes(b"half")
@@ -267,7 +248,7 @@ def test_as_many_scenes_are_done_side_by_side_as_there_are_processors_and_memory
 def test_memory_is_asked_of_the_scenes_that_need_most(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     large = [Member(here / "tiny.toml", here, ("target.shape=[60,60]", "camera.lens.I.pixels=fit"))] * 3
     small = [Member(here / "tiny.toml", here), Member(here / "missing.toml", here)]
-    needs = [BASE + 7 * 8 * pixels**2 for pixels in (3600, 3600, 3600)]
+    needs = [PROGRAM_MEMORY + 7 * 8 * pixels**2 for pixels in (3600, 3600, 3600)]
     for free, expected in ((needs[0] * 1.5, 1), (needs[0] * 2.5, 2), (needs[0] * 50, 5)):
         monkeypatch.setattr(method_choice, "free_memory", lambda free=free: 2 * int(free))
         assert concurrent_by_memory([estimate_cost(member, (), ()).memory for member in (*small, *large)]) == expected

@@ -12,9 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ommatid.analysis.predict import predict_scene
+from ommatid.analysis.prediction_table import json_of
 from ommatid.batch import sweep_figure
 from ommatid.batch.sweep import SweepAxis, members, sweep_axes
-from ommatid.batch.sweep_table import summary, write_sweep
+from ommatid.batch.sweep_row import read_rows, summary
+from ommatid.batch.sweep_table import write_sweep
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import read
 from ommatid.scenes.tables.overrides import value_of
@@ -152,7 +154,7 @@ def test_predictions_of_a_sweep_are_those_of_each_scene(here: Path, ommatid: Com
     assert {path.name for path in (here / "out").iterdir()} == {"sweep.csv", "sweep.json", "sweep.png"}
     rows = table(here / "out" / "sweep.csv")
     for noise, document, row in zip(NOISES, json.loads(ended.out), rows, strict=True):
-        expected = predict_scene(read(here / "tiny.toml", [f"noise.variance={noise}"])).describe()
+        expected = json_of(predict_scene(read(here / "tiny.toml", [f"noise.variance={noise}"])))
         assert {name: document[name] for name in expected} == expected
         assert document["values"] == {"noise.variance": noise}
         assert float(row["predicted_mse"]) == expected["mse"]
@@ -188,7 +190,7 @@ def test_values_that_are_numbers_of_one_unit_have_a_scale(
     values: list[str], places: list[float], unit: str, logarithmic: bool, categories: bool
 ) -> None:
     found = sweep_figure.scale("noise.variance", values)
-    assert [found.places[value] for value in values] == pytest.approx(places)
+    assert [found.positions[value] for value in values] == pytest.approx(places)
     assert (found.unit, found.logarithmic, found.categories) == (unit, logarithmic, categories)
 
 
@@ -214,13 +216,16 @@ def test_every_point_of_a_sweep_is_drawn(count: int, tmp_path: Path, monkeypatch
     }
     rows = [summary(document) for document in documents(dict(list(keys.items())[:count]))]
     drawn: list[Any] = []
-    monkeypatch.setattr(sweep_figure, "_furnish", lambda *given: drawn.append(given[0]))
+    monkeypatch.setattr(sweep_figure, "_label_axes", lambda *given: drawn.append(given[0]))
     write_sweep(tmp_path, rows)
+    assert [row.flat() | {"values": 0} for row in read_rows(tmp_path / "sweep.json")] == [
+        row.flat() | {"values": 0} for row in rows
+    ]
     [panel] = drawn
     for name, is_line in (("mse", False), ("predicted_mse", True)):
         lines = [line for line in panel.lines if (line.get_marker() == "None") == is_line]
         heights = sorted(float(y) for line in lines for y in line.get_ydata())
-        assert heights == sorted(row[name] for row in rows)
+        assert heights == sorted(getattr(row, name) for row in rows)
     styles = {(str(line.get_color()), line.get_linestyle()) for line in panel.lines if line.get_marker() == "None"}
     assert len(styles) == len(rows) / len(NOISES), "a line for each combination of the other keys, and no two alike"
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.optics.negligible import SkippedEffect, without_negligible_effects, without_shot_noise
+from ommatid.scenes.optics.negligible import SkippedEffect, negligible_shot_noise, without_negligible_effects
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.renderer.renderer import Renderer
@@ -78,7 +78,7 @@ def _exposure(camera: Camera, picture: NDArray[np.float64], samples: int) -> Cal
 
 def _shot() -> Row:
     scene, camera = _scene({"aperture": "0.4 mm"}, {}, sensor=SENSOR)
-    left, sensor = without_shot_noise(scene, camera), scene.sensor
+    left, sensor = negligible_shot_noise(scene, camera), scene.sensor
     assert sensor is not None
     freed, light = electrons(scene, camera), np.full(camera.measurements, 100.0)
 

@@ -143,7 +143,7 @@ def test_a_row_whose_radius_is_almost_none(tmp_path: Path) -> None:
 def test_blur_that_would_take_for_ever() -> None:
     lens = example().camera.lens[0]
     for update, words in (
-        ({"aperture": 1e4, "focus": 1.0}, "beside"),
+        ({"aperture": 1e4, "focus": 1.0}, "its blur reaches"),
         ({"aperture": 9.0, "focus": 1500.0}, "wavelength"),
     ):
         told = example().camera.model_copy(update={"wavelength": 1e-5, "lens": (lens.model_copy(update=update),)})

@@ -1,6 +1,6 @@
-"""The page of a run and the page of a batch as text: what they hold is what the files hold, and nothing else is needed.
+"""The pages of a run and of a batch as text: well-formed, self-contained, and with the content of the files.
 
-What a browser makes of them is tests/test_page_in_browser.py.
+Their behaviour in a browser is tested in test_page_in_browser.py.
 """
 
 from __future__ import annotations
@@ -24,11 +24,21 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 from scipy import stats
 
-from ommatid.page import batch_index, data, error_groups, point_response, sensor, time_curves, words
+from ommatid.bench.table import BenchTable, bench_tables, write
+from ommatid.page import batch_index, data, error_groups, point_response, sensor, tables, time_curves, words
 from ommatid.page.cached import cached_page
 from ommatid.page.document import page
+from ommatid.reconstruct.output.run_json import (
+    DepthBin,
+    DiagnosticsReport,
+    ErrorReport,
+    RunReport,
+    StudyCase,
+    TimeReport,
+)
+from ommatid.reconstruct.restore import MAX_SPURIOUS_INFORMATION
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import derive
+from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats import exr
 from ommatid.scenes.hardware import stack_import
 from ommatid.scenes.hardware.frames import AcquisitionSettings
@@ -38,21 +48,22 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.sensor import SensorTable
 from ommatid.simulate.ideal import ideal_matrix, matrix_as_designed
 
+from ..bench.tables import bench_table, cell, exactly
 from ..conftest import Command
 from ..examples import familywise, scene
-from .runs import F, lettered, seen, synthetic
+from .runs import F, letter_run, record, synthetic
 
 VOID = {"meta", "link", "img", "input", "br"}
 SENSOR = {"illuminance": "100 lx", "exposure": "10 ms"}
 
 
 class Reader(HTMLParser):
-    """Tags in order, text by the id or tag around it, and what is not closed as it was opened."""
+    """Tags in order, text by the tag around it, open tags, and closing tags that do not match."""
 
     def __init__(self) -> None:
         super().__init__()
         self.open: list[str] = []
-        self.wrong: list[str] = []
+        self.mismatched: list[str] = []
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.text: dict[str, str] = {}
 
@@ -63,7 +74,7 @@ class Reader(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         if not self.open or self.open.pop() != tag:
-            self.wrong.append(tag)
+            self.mismatched.append(tag)
 
     def handle_data(self, data: str) -> None:
         if self.open:
@@ -78,34 +89,31 @@ def parsed(text: str) -> Reader:
 
 
 def embedded(text: str) -> Any:
-    """The figures' JSON in a page."""
-    found = re.search(r'<script type="application/json" id="figures">(.*?)</script>', text, flags=re.DOTALL)
-    assert found
-    return json.loads(found[1])
+    """The JSON of the figures in a page."""
+    match = re.search(r'<script type="application/json" id="figures">(.*?)</script>', text, flags=re.DOTALL)
+    assert match
+    return json.loads(match[1])
 
 
 def columns(text: str, name: str) -> dict[str, Any]:
-    """The columns of a named source as a browser decodes them."""
-    [source] = [one for one in sources(text) if one["attributes"].get("name") == name]
+    """The decoded columns of a named source."""
+    models = [model for model in objects(embedded(text)) if model["name"] == "ColumnDataSource"]
+    [source] = [model for model in models if model["attributes"].get("name") == name]
     return {key: decoded(values) for key, values in source["attributes"]["data"]["entries"]}
-
-
-def sources(text: str) -> list[dict[str, Any]]:
-    return [one for one in objects(embedded(text)) if one["name"] == "ColumnDataSource"]
 
 
 def objects(content: Any) -> list[dict[str, Any]]:
     if isinstance(content, list):
-        return [found for one in content for found in objects(one)]
+        return [model for item in content for model in objects(item)]
     if not isinstance(content, dict):
         return []
     own = [content] if content.get("type") == "object" and "attributes" in content else []
-    return own + [found for one in content.values() for found in objects(one)]
+    return own + [model for item in content.values() for model in objects(item)]
 
 
 def decoded(value: Any) -> Any:
     if isinstance(value, list):
-        return [decoded(one) for one in value]
+        return [decoded(item) for item in value]
     if isinstance(value, dict) and value.get("type") == "ndarray":
         assert value["order"] == "little"
         pixels = gzip.decompress(base64.b64decode(value["array"]["data"]))
@@ -114,23 +122,28 @@ def decoded(value: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def told(finished: Path) -> str:
+def html(finished: Path) -> str:
     """The page of the tiny scene's run."""
     return (finished / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> data.Run:
-    """The run of a letter F, of which nobody changes anything."""
-    return lettered(tmp_path_factory.mktemp("letter"))
+def run(tmp_path_factory: pytest.TempPathFactory) -> data.Run:
+    """The run of a letter F; tests must not change its folder."""
+    return letter_run(tmp_path_factory.mktemp("letter"))
 
 
-# --- a page that stands alone
+def html_of(run: data.Run, **changes: Any) -> str:
+    """The page of a run with changes to its report, without ideal H and bench."""
+    return page(replace(run, report=run.report.with_changes(**changes)), None, None, "0")
 
 
-def test_a_page_is_well_formed_and_says_what_it_is(told: str) -> None:
-    reader = parsed(told)
-    assert (reader.open, reader.wrong) == ([], [])
+# --- self-contained and well-formed
+
+
+def test_a_page_is_well_formed_and_says_what_it_is(html: str) -> None:
+    reader = parsed(html)
+    assert (reader.open, reader.mismatched) == ([], [])
     tags = [tag for tag, _ in reader.tags]
     assert dict(reader.tags)["html"] == {"lang": "en"}
     assert [tags.count(tag) for tag in ("h1", "main", "header", "footer", "nav")] == [1] * 5
@@ -144,28 +157,27 @@ def test_a_page_is_well_formed_and_says_what_it_is(told: str) -> None:
     assert {target[1:] for target in targets if target.startswith("#")} <= set(identities)
 
 
-def test_every_figure_is_told_in_words(told: str) -> None:
-    plots = [attributes for _, attributes in parsed(told).tags if str(attributes.get("id", "")).startswith("plot-")]
-    assert {f"plot-{name}" for name in ("truth", "estimate", "error", "deviation", "packed", "place", "errors")} <= {
-        attributes["id"] for attributes in plots
-    }
-    assert set(embedded(told)["roots"].values()) == {attributes["id"] for attributes in plots}
+def test_every_figure_has_a_description_in_words(html: str) -> None:
+    plots = [attributes for _, attributes in parsed(html).tags if str(attributes.get("id", "")).startswith("plot-")]
+    names = ("truth", "estimate", "error", "deviation", "packed", "place", "errors")
+    assert {f"plot-{name}" for name in names} <= {attributes["id"] for attributes in plots}
+    assert set(embedded(html)["roots"].values()) == {attributes["id"] for attributes in plots}
     for attributes in plots:
         assert attributes["role"] == "img"
         assert len(str(attributes["aria-label"])) > 20
 
 
-def test_a_page_asks_for_nothing_else(told: str) -> None:
-    for tag, attributes in parsed(told).tags:
+def test_a_page_requests_no_other_resource(html: str) -> None:
+    for tag, attributes in parsed(html).tags:
         for name in ("src", "href", "data", "action", "poster", "srcset"):
             if attributes.get(name):
                 assert str(attributes[name]).startswith(("#", "data:")), f"{tag} {name}"
-    own = re.sub(r"<script>.*?</script>", "", told, flags=re.DOTALL)  # Bokeh's own program names its sites
+    own = re.sub(r"<script>.*?</script>", "", html, flags=re.DOTALL)  # BokehJS contains addresses of its sites
     assert not re.findall(r"https?://|@import|url\(", own)
-    assert len(told.encode()) < 3_000_000
+    assert len(html.encode()) < 3_000_000
 
 
-def test_a_title_is_text_whatever_stands_in_it(finished: Path, tmp_path: Path) -> None:
+def test_markup_in_a_title_is_escaped(finished: Path, tmp_path: Path) -> None:
     title = '</script><script>alert("x")</script> & <b>'
     run = data.read_run(finished)
     run = replace(run, stack=replace(run.stack, scene=run.stack.scene.model_copy(update={"title": title})))
@@ -174,7 +186,7 @@ def test_a_title_is_text_whatever_stands_in_it(finished: Path, tmp_path: Path) -
     assert parsed(text).text["h1"] == title
     folder = tmp_path / "batch" / "a"
     shutil.copytree(finished, folder)
-    described = {**run.description, "title": title}
+    described = {**run.report.plain(), "title": title}
     (folder / "run.json").write_text(json.dumps(described), encoding="utf-8")
     shutil.copytree(folder, tmp_path / "batch" / "b")
     assert batch_index.cached_index(tmp_path / "batch", {folder: "", folder.parent / "<i>": "because of <script>alert"})
@@ -184,101 +196,97 @@ def test_a_title_is_text_whatever_stands_in_it(finished: Path, tmp_path: Path) -
     assert embedded(listed)
 
 
-# --- what it holds is what the files hold
+# --- content is that of the files
 
 
-def test_the_maps_are_those_of_the_estimate(told: str, finished: Path) -> None:
-    channels, maps = exr.read(finished / "estimate.exr")[0].channels, columns(told, "maps")
+def test_the_maps_are_those_of_estimate_exr(html: str, finished: Path) -> None:
+    channels, maps = exr.read(finished / "estimate.exr")[0].channels, columns(html, "maps")
     np.testing.assert_array_equal(maps["estimate"][0], channels["estimate"])
     np.testing.assert_array_equal(maps["truth"][0], channels["truth"])
     np.testing.assert_array_equal(maps["deviation"][0], np.sqrt(channels["variance"]))
     assert maps["error"][0].shape == channels["estimate"].shape
 
 
-def test_truth_and_estimate_have_one_scale_and_all_maps_one_range(told: str) -> None:
-    found = objects(embedded(told))
-    by_name = {one["attributes"].get("name"): one for one in found if one["name"] == "Figure"}
+def test_truth_and_estimate_share_a_colour_scale_and_all_maps_their_ranges(html: str) -> None:
+    by_name = {model["attributes"].get("name"): model for model in objects(embedded(html)) if model["name"] == "Figure"}
     maps = [by_name[name] for name in ("truth", "estimate", "error", "deviation")]
     for axis, whole in (("x_range", (0, 12)), ("y_range", (12, 0))):
-        ranges = [one["attributes"][axis] for one in maps]
-        assert {one["id"] for one in ranges} == {ranges[0]["id"]}
-        limits = ranges[0]["attributes"]  # what is as Bokeh would have it anyway is not there
+        ranges = [figure["attributes"][axis] for figure in maps]
+        assert {model["id"] for model in ranges} == {ranges[0]["id"]}
+        limits = ranges[0]["attributes"]  # Bokeh omits its defaults, 0 and 1
         assert (limits.get("start", 0), limits.get("end", 1)) == whole
     ends: list[tuple[float, float]] = []
-    for one in maps:
-        mapper = next(part for part in objects(one) if part["name"] == "LinearColorMapper")
+    for figure in maps:
+        mapper = next(model for model in objects(figure) if model["name"] == "LinearColorMapper")
         ends.append((mapper["attributes"]["low"], mapper["attributes"]["high"]))
-    truth = columns(told, "maps")["truth"][0]
+    truth = columns(html, "maps")["truth"][0]
     assert ends[0] == ends[1] == (truth.min(), truth.max())
     assert ends[2][0] == -ends[2][1]
     assert ends[3][0] == 0
 
 
-def test_a_letter_is_upright_in_the_maps_and_upside_down_on_the_sensor(drawn: data.Run, tmp_path: Path) -> None:
-    run = drawn
+def test_a_letter_is_upright_in_the_maps_and_inverted_on_the_sensor(run: data.Run, tmp_path: Path) -> None:
     text = page(run, None, None, "0")
-    np.testing.assert_array_equal(columns(text, "maps")["truth"][0] > 128, F)
-    assert np.corrcoef(columns(text, "maps")["estimate"][0].ravel(), F.ravel())[0, 1] > 0.99
-    # What hardware records is what `import` cuts: the mosaic of the page gives the stack back.
+    for name in ("truth", "estimate"):
+        np.testing.assert_array_equal(columns(text, "maps")[name][0] > 128, F)
+    # `import` cuts recordings of hardware: it recovers the stack from the page's sensor image.
     mosaic, origin, step = mosaic_of(columns(text, "sensor"), sensor.mosaic(run.stack))
     np.save(tmp_path / "mosaic.npy", mosaic)
-    bench, setup = AcquisitionSettings(origin=origin), Setup(run.stack.scene, run.stack.camera)
-    back, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], bench)
-    np.testing.assert_allclose(back.values, run.stack.values, atol=0.51 * step + 1e-4)
-    turned, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], replace(bench, upright=True))
-    assert np.abs(turned.values - run.stack.values).max() > 50, "the comparison can tell"
+    acquisition, setup = AcquisitionSettings(origin=origin), Setup(run.stack.scene, run.stack.camera)
+    recovered, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], acquisition)
+    # Half a step of the codes, and float32 rounding of values up to 255.
+    np.testing.assert_allclose(recovered.values, run.stack.values, rtol=0, atol=0.5 * step + 2**-15)
+    upright = replace(acquisition, upright=True)
+    wrong, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], upright)
+    assert np.abs(wrong.values - run.stack.values).max() > 50, "the wrong orientation is recognised"
 
 
 def mosaic_of(found: dict[str, Any], shown: sensor.Mosaic) -> tuple[NDArray[np.float64], tuple[int, int], float]:
-    """The picture that a page shows of the sensor, where its first patch lies in it, and the step of its values."""
+    """The sensor image of a page, the position of its first patch, and the step of its values."""
     low, high = shown.ends
     step = (high - low) / sensor.LEVELS
-    # Patches that lie between whole pixels are cut at the nearest ones from where the first one is.
+    # Patches between whole pixels are placed at the nearest ones, relative to the first patch.
     first = found["place_row"][0], found["place_column"][0]
-    places = [
+    corners = [
         (int(np.floor(row - first[0] + 0.5 + 1e-6)), int(np.floor(column - first[1] + 0.5 + 1e-6)))
         for row, column in zip(found["place_row"], found["place_column"], strict=True)
     ]
-    top, left = min(row for row, _ in places), min(column for _, column in places)
-    size = max(row for row, _ in places) - top + 40, max(column for _, column in places) - left + 40
-    mosaic = np.zeros(size)
-    for codes, (row, column) in zip(found["image"], places, strict=True):
+    top, left = min(row for row, _ in corners), min(column for _, column in corners)
+    mosaic = np.zeros((max(row for row, _ in corners) - top + 40, max(column for _, column in corners) - left + 40))
+    for codes, (row, column) in zip(found["image"], corners, strict=True):
         rows, across = codes.shape
         mosaic[row - top : row - top + rows, column - left : column - left + across] = low + step * codes
     return mosaic, (-top, -left), step
 
 
 def test_dead_pixels_are_marked_and_counted(tmp_path: Path) -> None:
-    run = lettered(tmp_path, dead=5)
-    text = page(run, None, None, "0")
+    text = page(letter_run(tmp_path, dead=5), None, None, "0")
     codes = np.concatenate([image.ravel() for image in columns(text, "sensor")["image"]])
     assert np.sum(codes == sensor.MISSING) == 5
     assert "5 sensor pixels are dead" in text
-    assert "5 dead and 0 saturated sensor pixels are left out" in text
+    assert "5 dead and 0 saturated sensor pixels are excluded" in text
 
 
-def test_without_the_truth_a_page_promises_no_comparison(tmp_path: Path) -> None:
-    run = lettered(tmp_path, truth=False)
-    text = page(run, None, None, "0")
+def test_without_the_truth_a_page_has_no_comparison(tmp_path: Path) -> None:
+    text = page(letter_run(tmp_path, truth=False), None, None, "0")
     assert set(columns(text, "maps")) == {"estimate", "deviation"}
     assert "The truth is not known" in text
     assert 'id="plot-errors"' not in text
     assert 'id="plot-truth"' not in text
 
 
-def test_a_sensor_shows_what_it_recorded(drawn: data.Run) -> None:
-    run = drawn
+def test_a_sensor_image_shows_digital_numbers(run: data.Run) -> None:
     digital = np.arange(run.stack.values.size, dtype=np.float64)
-    some = np.ones_like(digital)
-    recording = Recording(SensorTable.model_validate(SENSOR), digital, some, some, some)
+    ones = np.ones_like(digital)
+    recording = Recording(SensorTable.model_validate(SENSOR), digital, ones, ones, ones)
     shown = sensor.mosaic(replace(run.stack, recording=recording))
     assert shown.unit == "digital number (DN)"
-    assert shown.patches[0].image[0, 0] == shown.patches[0].image.size - 1, "its last pixel lies at the top left"
+    assert shown.patches[0].image[0, 0] == shown.patches[0].image.size - 1, "its last pixel is at the top left"
 
 
-def test_too_many_sub_imagers_are_shown_from_the_middle() -> None:
+def test_of_too_many_sub_imagers_the_central_ones_are_shown() -> None:
     described = scene((60, 60), (("1/2", [50, 50], [2, 2]),))
-    stack, _ = seen(described, np.zeros((60, 60)))
+    stack, _ = record(described, np.zeros((60, 60)))
     shown = sensor.mosaic(stack)
     assert (shown.count, len(shown.patches)) == (2500, 44 * 44)
     assert min(patch.k for patch in shown.patches) == 3
@@ -286,317 +294,300 @@ def test_too_many_sub_imagers_are_shown_from_the_middle() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1024, 1024), (300, 900)])
-def test_a_large_frame_is_shown_by_means_and_fits(shape: tuple[int, int], drawn: data.Run) -> None:
-    run = synthetic(drawn, shape)
-    text = page(run, None, None, "0")
+def test_a_large_frame_is_reduced_to_means_and_fits(shape: tuple[int, int], run: data.Run) -> None:
+    frame = synthetic(run, shape)
+    text = page(frame, None, None, "0")
     assert len(text.encode()) < 3_000_000
-    maps = columns(text, "maps")
-    block = data.maps(run).block
-    assert maps["estimate"][0].size <= data.MOST_PIXELS
+    estimate = columns(text, "maps")["estimate"][0]
+    block = data.maps(frame).block
+    assert estimate.size <= data.MOST_PIXELS
     assert f"means over blocks of {block} &times; {block} pixels" in text
-    expected = run.estimate[:block, :block].mean(dtype=np.float64)
-    assert maps["estimate"][0][0, 0] == pytest.approx(expected, rel=1e-6)
+    expected = frame.estimate[:block, :block].mean(dtype=np.float64)
+    assert estimate[0, 0] == pytest.approx(expected, rel=2**-23), "the mean, rounded to float32"
 
 
 @given(
     arrays.arrays(np.float32, st.tuples(st.integers(1, 12), st.integers(1, 12)), elements=st.floats(0, 255, width=32)),
     st.integers(1, 5),
 )
-def test_means_over_blocks_keep_the_mean(image: NDArray[np.float32], block: int) -> None:
-    made = data.reduced(image, block)
-    weights = data.reduced(np.ones_like(image), block)
-    assert made.shape == tuple(-(-size // block) for size in image.shape)
-    np.testing.assert_array_equal(weights, 1)
-    rows = [min(block, image.shape[0] - start) for start in range(0, image.shape[0], block)]
-    across = [min(block, image.shape[1] - start) for start in range(0, image.shape[1], block)]
-    total = float((made * np.outer(rows, across)).sum(dtype=np.float64))
-    assert total == pytest.approx(float(image.sum(dtype=np.float64)), rel=1e-5, abs=1e-3)
+def test_means_over_blocks_keep_the_sum(image: NDArray[np.float32], block: int) -> None:
+    means = data.reduced(image, block)
+    assert means.shape == tuple(-(-size // block) for size in image.shape)
+    np.testing.assert_array_equal(data.reduced(np.ones_like(image), block), 1)
+    heights, widths = ([min(block, size - start) for start in range(0, size, block)] for size in image.shape)
+    total = float((means * np.outer(heights, widths)).sum(dtype=np.float64))
+    # Every mean is rounded to float32; the smallest of its numbers is 1.4e-45.
+    assert total == pytest.approx(float(image.sum(dtype=np.float64)), rel=2**-23, abs=1e-40)
 
 
-def test_means_over_blocks_leave_out_what_is_missing() -> None:
+def test_means_over_blocks_leave_out_missing_values() -> None:
     image = np.array([[1, np.nan, np.nan], [3, np.nan, np.nan]])
     np.testing.assert_array_equal(data.reduced(image, 2), [[2, np.nan]])
 
 
-def test_a_study_and_the_error_against_distance_have_tables(drawn: data.Run) -> None:
-    case = {"model": "ideal", "mse": 3.0, "predicted": 1.0, "expected": 1.0, "low": 0.5, "high": 2.0}
-    far = {"nearest": 900.0, "farthest": 950.0, "pixels": 7, "rms_error": 4.0, "expected_deviation": 0.5}
-    more = {"study": [case], "depth": [{**far, "rms_disparity": 0.1}]}
-    text = page(replace(drawn, description={**drawn.description, **more}), None, None, "0")
+def test_a_study_and_the_error_against_distance_have_tables(run: data.Run) -> None:
+    case = StudyCase(model="ideal", mse=3.0, predicted=1.0, expected=1.0, low=0.5, high=2.0, seconds=1.0)
+    far = DepthBin(nearest=900.0, farthest=950.0, pixels=7, rms_error=4.0, expected_deviation=0.5, rms_disparity=0.1,
+                   rms_disparity_by_type={})  # fmt: skip
+    text = html_of(run, study=(case,), depth=(far,))
     assert "OUTSIDE 0.5 to 2" in text
     assert "error 4 rms in 7 pixels" in text
     reader = parsed(text)
-    assert (reader.open, reader.wrong) == ([], [])
+    assert (reader.open, reader.mismatched) == ([], [])
 
 
-def test_a_page_tells_what_was_spent_and_what_more_would_bring(drawn: data.Run) -> None:
-    assert "What more samples would bring" not in page(drawn, None, None, "0")
+def test_a_page_shows_the_run_time_and_the_effect_of_more_samples(run: data.Run) -> None:
+    assert "Predicted error with more samples" not in html_of(run)
     spent: dict[str, Any] = {
         "seconds": 9.0,
         "stages": {"render": 1.25, "calibrate": 2.5, "reconstruct": 0.25},
         "noise_alone": 0.125,
         "more": [{"times": 2, "seconds": 7.75, "predicted_mse": 0.1875}],
     }
-    rows = [("as here", "4", None), ("2 times as many", "7.75", "0.1875"), ("without end", "", "0.125")]
-    text = page(replace(drawn, description={**drawn.description, "spent": spent}), None, None, "0")
-    told = f"{drawn.description['error']['predicted_mse']:.4g}"
-    for name, seconds, error in rows:
-        time = f"{seconds}\N{NO-BREAK SPACE}s" if seconds else ""
-        assert f'<th scope="row">{name}</th><td>{time}</td><td>{error or told}</td>' in text
-    assert "The run was given" not in text
+    text = html_of(run, spent=TimeReport.model_validate(spent))
+    present = f"{run.report.error.predicted_mse:.4g}"
+    for name, seconds, error in (
+        ("as in this run", "4", present),
+        ("2 times as many", "7.75", "0.1875"),
+        ("unlimited", "", "0.125"),
+    ):
+        time = f"{seconds}{tables.NBSP}s" if seconds else ""
+        assert f'<th scope="row">{name}</th><td>{time}</td><td>{error}</td>' in text
+    assert "Time limit" not in text
     within = {"within": 30.0, "chosen": {"render.samples": 700, "calibration.samples": "auto"}}
-    text = page(replace(drawn, description={**drawn.description, "spent": spent | within}), None, None, "0")
-    assert "given 30\N{NO-BREAK SPACE}s and took 9\N{NO-BREAK SPACE}s" in text
-    assert "it chose render.samples = 700, calibration.samples = auto." in text
+    text = html_of(run, spent=TimeReport.model_validate(spent | within))
+    assert f"Time limit: 30{tables.NBSP}s. The run took 9{tables.NBSP}s" in text
+    assert "chose render.samples = 700, calibration.samples = auto." in text
 
 
-def test_commands_in_the_verdict_are_marked_and_the_rest_is_text(
-    drawn: data.Run, monkeypatch: pytest.MonkeyPatch
+def test_commands_in_the_verdict_are_marked_and_the_rest_is_escaped(
+    run: data.Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ommatid.page.words.verdict", lambda _: "a < b; `ommatid design` & more")
-    assert "a &lt; b; <code>ommatid design</code> &amp; more</p>" in page(drawn, None, None, "0")
+    assert "a &lt; b; <code>ommatid design</code> &amp; more</p>" in html_of(run)
 
 
-# --- errors, responses, effort
+# --- error groups, point-spread functions, error against time
 
 
-def independent(seed: int, variance: NDArray[np.float64], run: data.Run) -> data.Run:
-    """A run whose errors are Gaussian, independent, and as large as predicted."""
-    error = np.random.default_rng(seed).normal(0, np.sqrt(variance))
-    zero = np.zeros_like(variance, dtype=np.float32)
-    return replace(run, truth=zero, estimate=error.astype(np.float32), variance=variance.astype(np.float32))
+def with_errors(seed: int, deviation: NDArray[np.float64], predicted: NDArray[np.float64], run: data.Run) -> data.Run:
+    """A run with independent Gaussian errors of a standard deviation, and a predicted one."""
+    error = np.random.default_rng(seed).normal(0, deviation)
+    zero, variance = np.zeros(error.shape, dtype=np.float32), np.square(predicted).astype(np.float32)
+    return replace(run, truth=zero, estimate=error.astype(np.float32), variance=variance)
 
 
-def test_errors_that_are_as_predicted_lie_in_the_band_as_often_as_it_says(drawn: data.Run) -> None:
-    run, variance = drawn, np.geomspace(0.5, 8, 900).reshape(30, 30)
-    found = [group for seed in range(100) for group in error_groups.groups(independent(seed, variance, run))]
-    assert sum(group.pixels for group in found) == 100 * 900
-    inside = sum(group.low <= group.measured <= group.high for group in found)
-    assert stats.binomtest(inside, len(found), error_groups.SURE).pvalue > 0.001
-    larger = independent(0, 4 * variance, run)
-    larger = replace(larger, variance=variance.astype(np.float32))
-    assert not any(group.low <= group.measured <= group.high for group in error_groups.groups(larger))
+def test_errors_that_are_as_predicted_are_inside_the_interval_as_often_as_it_says(run: data.Run) -> None:
+    deviation = np.sqrt(np.geomspace(0.5, 8, 900)).reshape(30, 30)
+    runs = [with_errors(seed, deviation, deviation, run) for seed in range(100)]
+    groups = [group for drawn in runs for group in error_groups.groups(drawn)]
+    assert sum(group.pixels for group in groups) == 100 * 900
+    inside = sum(group.is_inside for group in groups)
+    assert stats.binomtest(inside, len(groups), error_groups.CONFIDENCE).pvalue > 0.001
+    larger = with_errors(0, 2 * deviation, deviation, run)
+    assert not any(group.is_inside for group in error_groups.groups(larger))
 
 
-def test_pixels_of_one_deviation_are_one_group(drawn: data.Run) -> None:
-    run = independent(1, np.full((40, 40), 2.0), drawn)
-    [group] = error_groups.groups(run)
-    assert (group.pixels, group.predicted) == (1600, pytest.approx(2**0.5))
+def test_pixels_of_equal_deviation_are_one_group(run: data.Run) -> None:
+    deviation = np.full((40, 40), 2**0.5)
+    [group] = error_groups.groups(with_errors(1, deviation, deviation, run))
+    assert (group.pixels, group.predicted) == (1600, pytest.approx(2**0.5, rel=2**-23))
 
 
-def test_responses_are_columns_of_h(finished: Path) -> None:
+def test_point_spread_functions_are_columns_of_h(finished: Path) -> None:
     run = data.read_run(finished)
     camera, model = run.stack.camera, run.model
-    [found] = point_response.responses(model, lambda sub: matrix_as_designed(camera, sub))
-    sub = camera.sub_imagers[4]
-    assert (found.lens, found.k, found.l) == ("I", sub.k, sub.l)
-    rows, column = camera.slices()[4], found.source[0] * camera.columns + found.source[1]
-    cut = np.s_[
-        found.corner[0] : found.corner[0] + found.measured.shape[0],
-        found.corner[1] : found.corner[1] + found.measured.shape[1],
-    ]
+    [response] = point_response.responses(model, lambda sub: matrix_as_designed(camera, sub))
+    sub, maps = camera.sub_imagers[4], response.maps
+    assert (response.lens, response.k, response.l) == ("I", sub.k, sub.l)
+    rows, column = camera.slices()[4], response.source[0] * camera.columns + response.source[1]
+    (top, left), (height, width) = response.corner, maps["measured"].shape
+    shown = np.s_[top : top + height, left : left + width]
     measured = model.matrix.toarray()[rows, column].reshape(3, 3)
     ideal = ideal_matrix(camera).toarray()[rows, column].reshape(3, 3)
     assert measured.any()
-    np.testing.assert_array_equal(found.measured, measured[cut])
-    assert found.ideal is not None
-    assert found.difference is not None
-    np.testing.assert_allclose(found.ideal, ideal[cut], rtol=1e-14)
-    known = np.isfinite(found.difference) & (found.difference != 0)
-    assert np.abs(found.difference[known]).max() < stats.t.isf(familywise(known.sum()) / 2, 15)
+    np.testing.assert_array_equal(maps["measured"], measured[shown])
+    np.testing.assert_allclose(maps["ideal"], ideal[shown], rtol=1e-14)
+    scores = maps["difference"]
+    known = np.isfinite(scores) & (scores != 0)
+    assert np.abs(scores[known]).max() < stats.t.isf(familywise(known.sum()) / 2, 15)
 
 
 @pytest.mark.parametrize("glass", [{}, {"aperture": "0.4 mm", "focus": "600 mm"}])
 def test_h_of_one_sub_imager_is_its_part_of_the_whole(glass: dict[str, Any]) -> None:
-    tables = scene((14, 14), (("1/3", [2, 2], [3, 3]), ("1/2", [2, 3], [4, 4]))).plain()
-    tables["camera"]["lens"][1] |= glass
-    camera = derive(parse(tables, Path("test.toml")))
+    plain = scene((14, 14), (("1/3", [2, 2], [3, 3]), ("1/2", [2, 3], [4, 4]))).plain()
+    plain["camera"]["lens"][1] |= glass
+    camera = derive(parse(plain, Path("test.toml")))
     whole = ideal_matrix(camera)
     for sub, rows in zip(camera.sub_imagers, camera.slices(), strict=True):
-        one = matrix_as_designed(camera, sub)
-        np.testing.assert_allclose(one.toarray(), whole[rows].toarray(), rtol=1e-12, atol=1e-15)
+        part = matrix_as_designed(camera, sub)
+        np.testing.assert_allclose(part.toarray(), whole[rows].toarray(), rtol=1e-12, atol=1e-15)
 
 
-def test_the_ideal_h_has_responses_without_a_comparison(drawn: data.Run) -> None:
-    run = drawn
+def test_an_ideal_h_is_shown_without_a_comparison(run: data.Run) -> None:
     text = page(run, lambda sub: matrix_as_designed(run.stack.camera, sub), None, "0")
-    assert "H is the ideal one here" in text
-    assert "Measured response" not in text
+    assert "H is the ideal one, so there is nothing to compare it with" in text
+    assert "Calibrated" not in text
     assert 'id="plot-response-A-measured"' in text
     assert 'id="plot-response-A-ideal"' not in text
     stored = point_response.responses(run.model, None)
     boxes = point_response.responses(replace(run.model, stored=None), None)
     for one, other in zip(stored, boxes, strict=True):
-        np.testing.assert_allclose(one.measured, other.measured, rtol=1e-14)
+        np.testing.assert_allclose(one.maps["measured"], other.maps["measured"], rtol=1e-14)
 
 
-def test_a_response_without_a_closed_form_stands_alone(finished: Path) -> None:
-    def none(sub: Any) -> Any:
+def test_a_point_spread_function_without_a_closed_form_is_shown_alone(finished: Path) -> None:
+    def no_closed_form(sub: Any) -> Any:
         raise InputError(f"{sub.name}: has no closed form")
 
-    run = data.read_run(finished)
-    assert "has no closed form here" in page(run, none, None, "0")
+    assert "has no closed form for this camera" in page(data.read_run(finished), no_closed_form, None, "0")
 
 
-POINTS = st.lists(
-    st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1e6)).map(lambda pair: time_curves.TimePoint("render", "", *pair)),
-    min_size=1,
-)
+def bench(camera: Camera) -> BenchTable:
+    """A bench table with three renderings, an estimate, and a calibration without a known error."""
+    cells = [cell(samples=n, seconds=exactly(0.1 * n), mse=exactly(1 / n)) for n in (1, 2, 4)]
+    cells.append(cell("reconstruct", way="frame", samples=None, seconds=exactly(0.01), mse=exactly(0.5)))
+    cells.append(cell("calibrate", way="points, multijitter", mse=None))
+    return bench_table(camera, cells, why="four samples reach the noise floor")
 
 
-@given(POINTS)
-def test_nothing_is_faster_and_better_than_the_front(points: list[time_curves.TimePoint]) -> None:
-    found = time_curves.front(points)
-    for point in points:
-        assert any(one.seconds <= point.seconds and one.mse <= point.mse for one in found)
-    for one in found:
-        assert not any(other.seconds < one.seconds and other.mse <= one.mse for other in points)
-
-
-def bench(camera: dict[str, Any]) -> dict[str, Any]:
-    def cell(stage: str, seconds: float, mse: float | None, samples: int) -> dict[str, Any]:
-        of = {"low": seconds, "median": seconds, "high": seconds}
-        brought = None if mse is None else {"low": mse, "median": mse, "high": mse}
-        return {"stage": stage, "way": "multijitter", "variant": None, "samples": samples, "setting": "",
-                "repeats": 1, "error": of, "seconds": of, "memory": None, "mse": brought}  # fmt: skip
-
-    cells = [cell("render", 0.1 * n, 1 / n, n) for n in (1, 2, 4)]
-    cells += [cell("reconstruct", 0.01, 0.5, 0), cell("calibrate", 1.0, None, 16)]
-    return {"camera": camera, "cells": cells, "curves": [], "recommended": {"why": "Four samples reach the floor."}}
-
-
-def test_a_bench_of_the_same_camera_is_drawn_and_of_another_is_not(drawn: data.Run, tmp_path: Path) -> None:
-    run = replace(drawn, folder=tmp_path / "run")
-    (tmp_path / "run").mkdir()
-    camera = run.stack.camera.describe()
-    assert "There is no bench" in page(run, None, time_curves.bench_of(tmp_path / "run", camera), "0")
-    other = {**bench(camera), "camera": {**camera, "target.distance": 7.0}}
-    (tmp_path / "bench.json").write_text(json.dumps(other), encoding="utf-8")
-    assert time_curves.bench_of(tmp_path / "run", camera) is None
-    (tmp_path / "bench.json").write_text(json.dumps(bench(camera)), encoding="utf-8")
-    text = page(run, None, time_curves.bench_of(tmp_path / "run", camera), "0")
+def test_a_bench_of_the_same_camera_is_drawn(run: data.Run) -> None:
+    assert "No results of <code>ommatid bench</code>" in html_of(run)
+    table = bench(run.stack.camera)
+    text = page(run, None, table, "0")
     assert 'id="plot-effort"' in text
-    assert "Four samples reach the floor." in text
-    curves = time_curves.time_curves(run, bench(camera))
+    assert "Recommendation of the bench: four samples reach the noise floor." in text
+    curves = time_curves.time_curves(run, table)
     assert curves is not None
     assert {point.stage for point in curves.run} == {"render", "calibrate", "reconstruct"}
-    assert len(curves.points) == 4, "what brings no known error is not drawn"
+    assert len(curves.points) == 4, "a cell without a known error is not drawn"
+
+
+def test_a_bench_serves_the_same_camera_in_the_folder_or_its_parent(run: data.Run, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    camera, table = run.stack.camera.describe(), bench(run.stack.camera)
+    assert not list(bench_tables(folder, camera))
+    write(tmp_path, table)
+    assert list(bench_tables(folder, camera)) == [table]
+    assert not list(bench_tables(folder, {**camera, "target.distance": 7.0}))
+    write(folder, table)
+    assert list(bench_tables(folder, camera)) == [table, table]
     for damaged in ("[1]", "{", '{"camera": 3}', json.dumps({"camera": camera, "cells": [{"mse": 3}]})):
-        (tmp_path / "bench.json").write_text(damaged, encoding="utf-8")
-        assert time_curves.time_curves(run, time_curves.bench_of(tmp_path / "run", camera)) is None
+        (folder / "bench.json").write_text(damaged, encoding="utf-8")
+        assert list(bench_tables(folder, camera)) == [table]
 
 
 # --- words
 
 
-def description(**error: Any) -> dict[str, Any]:
+def described(**error: Any) -> RunReport:
+    """A report with this error and the fields that the verdict depends on."""
     budget = {"null_space": 0.0, "noise": 1.0, "quantisation": 0.0, "rendering": 3.0, "calibration": 0.0}
-    return {
-        "error": {"predicted_mse": 4.0, "budget": budget, **error},
-        "diagnostics": {"pixels_used": 9, "pixels_dead": 0, "pixels_saturated": 0, "resolution": 1.0},
-        "model": {"feigned_information": 0.0},
-    }
+    diagnostics: dict[str, Any] = {"pixels_used": 9, "pixels_dead": 0, "pixels_saturated": 0, "resolution": 1.0}
+    return RunReport.model_construct(
+        error=ErrorReport.model_validate({"predicted_mse": 4.0, "budget": budget, **error}),
+        diagnostics=DiagnosticsReport.model_construct(**diagnostics),
+    )
 
 
-GIVEN = {"mse": 4.0, "low": 2.25, "high": 6.25}
+INTERVAL = {"mse": 4.0, "low": 2.25, "high": 6.25}
 
 
 @pytest.mark.parametrize(
-    ("error", "agreement", "said"),
+    ("error", "agreement", "sentence"),
     [
-        ({"mse": 4.0, "expected_given_truth": GIVEN}, "agrees", "off by 2 of 255 (rms), as theory expects"),
-        ({"mse": 9.0, "expected_given_truth": GIVEN}, "worse", "off by 3 of 255 (rms), more than theory allows"),
-        ({"mse": 1.0, "expected_given_truth": GIVEN}, "better", "off by 1 of 255 (rms), less than theory expects"),
-        ({"mse": 9.0}, "unknown", "where theory expects 2 on average"),
-        ({}, "unknown", "The truth is not known; theory expects pixels to be off by 2 of 255"),
+        ({"mse": 4.0, "expected_given_truth": INTERVAL}, "agrees", "is 2 on a scale of 0 to 255, as expected for this"),
+        ({"mse": 9.0, "expected_given_truth": INTERVAL}, "worse", "is 3 on a scale of 0 to 255, more than expected"),
+        ({"mse": 1.0, "expected_given_truth": INTERVAL}, "better", "is 1 on a scale of 0 to 255, less than expected"),
+        ({"mse": 9.0}, "unknown", "the predicted error, averaged over all images, is 2."),
+        ({}, "unknown", "The truth is not known; the predicted RMS error of a pixel is 2 on a scale of 0 to 255."),
     ],
 )
-def test_the_verdict_compares_what_was_measured_with_what_was_expected(
-    error: dict[str, Any], agreement: str, said: str
-) -> None:
-    told = words.verdict(description(**error))
-    assert words.agreement(description(**error)["error"]) == agreement
-    assert said in told
-    assert "as sharp as the target's grid" in told
-    assert "75 % of the expected squared error: more render.samples would help" in told
-    assert told.endswith(".")
+def test_the_verdict_compares_measured_and_expected_error(error: dict[str, Any], agreement: str, sentence: str) -> None:
+    verdict = words.verdict(described(**error))
+    assert words.agreement(described(**error).error) == agreement
+    assert sentence in verdict
+    assert "that of the target's pixel grid (1 pixel)." in verdict
+    cause = "75 %, is due to noise of the rendering: a larger `render.samples` would reduce it."
+    assert verdict.endswith(cause)
 
 
-def test_the_verdict_of_no_measurement_is_that_there_is_no_image() -> None:
-    nothing = description()
-    nothing["diagnostics"] |= {"pixels_used": 0, "resolution": None}
-    assert "not an image" in words.verdict(nothing)
-    blurred = description()
-    blurred["diagnostics"]["resolution"] = 2.5
-    assert "resolved to 2.5 pixels" in words.verdict(blurred)
+def test_the_verdict_names_missing_measurements_and_low_resolution() -> None:
+    report = described()
+    unused = report.diagnostics.model_copy(update={"pixels_used": 0, "resolution": None})
+    assert "not an image" in words.verdict(report.with_changes(diagnostics=unused))
+    blurred = report.diagnostics.model_copy(update={"resolution": 2.5})
+    assert "The median resolution is 2.5 pixels" in words.verdict(report.with_changes(diagnostics=blurred))
 
 
-def test_what_must_not_be_trusted_is_said_first(finished: Path, told: str) -> None:
-    run = json.loads((finished / "run.json").read_text(encoding="utf-8"))
-    assert run["model"]["feigned_information"] > 0.05, "one lens type leaves pixels open"
-    assert "Do not trust the predicted error" in told
-    assert told.index("Do not trust the predicted error") < told.index("<main")
+def test_spurious_information_is_reported_before_the_numbers(finished: Path, html: str) -> None:
+    report = data.read_run(finished).report
+    assert report.model.spurious_information > MAX_SPURIOUS_INFORMATION, "one lens type leaves pixels undetermined"
+    warning = "Do not trust the predicted error"
+    assert 0 < html.index(warning) < html.index("<main")
 
 
-# --- what is kept
+# --- pages that are up to date
 
 
-def test_a_page_is_kept_until_what_it_shows_changes(finished: Path, tmp_path: Path) -> None:
+def test_a_page_is_rewritten_only_if_its_content_changes(finished: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(finished, tmp_path / "run")
     assert not cached_page(folder, None)
-    told = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    (folder / "run.json").write_text(json.dumps({**told, "title": "Another"}), encoding="utf-8")
+    document = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    (folder / "run.json").write_text(json.dumps({**document, "title": "Another"}), encoding="utf-8")
     assert cached_page(folder, None)
     assert not cached_page(folder, None)
-    camera = data.read_run(folder).stack.camera.describe()
-    (folder / "bench.json").write_text(json.dumps(bench(camera)), encoding="utf-8")
+    write(folder, bench(data.read_run(folder).stack.camera))
     assert cached_page(folder, None)
     assert 'id="plot-effort"' in (folder / "report.html").read_text(encoding="utf-8")
 
 
-def test_what_is_no_run_is_refused(finished: Path, tmp_path: Path) -> None:
+def test_a_folder_without_a_run_is_refused(finished: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(finished, tmp_path / "run")
     for content in ("{", "[]", "{}"):
         (folder / "run.json").write_text(content, encoding="utf-8")
-        with pytest.raises(InputError, match=r"run\.json: expected what a run says of itself"):
+        with pytest.raises(InputError, match=r"run\.json: expected the results of a run"):
             cached_page(folder, None)
 
 
 # --- batches
 
 
-def test_an_index_lists_what_was_done_and_why_not(finished: Path, tmp_path: Path) -> None:
+def test_an_index_lists_results_and_failures(finished: Path, tmp_path: Path) -> None:
     for name in ("a", "b", "older"):
         shutil.copytree(finished, tmp_path / name)
     folders = {tmp_path / "b": "", tmp_path / "gone": "gone.toml: no such scene file", tmp_path / "a": ""}
     assert batch_index.cached_index(tmp_path, folders)
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     reader = parsed(text)
-    assert (reader.open, reader.wrong) == ([], [])
+    assert (reader.open, reader.mismatched) == ([], [])
     links = [attributes["href"] for tag, attributes in reader.tags if tag == "a" and "tabindex" not in attributes]
     assert links[1:] == ["b/report.html", "a/report.html", "older/report.html"]
     assert "failed: gone.toml: no such scene file" in text
-    assert "3 of 4 scenes are done" in text
-    error = json.loads((finished / "run.json").read_text(encoding="utf-8"))["error"]
-    assert f"<td>{error['mse']:.4g}</td><td>{error['predicted_mse']:.4g}</td>" in text
-    assert columns(text, "scenes")["mse"] == [error["mse"]] * 3
+    assert "3 of 4 scenes are finished" in text
+    error = data.read_run(finished).report.error
+    assert f"<td>{error.mse:.4g}</td><td>{error.predicted_mse:.4g}</td>" in text
+    assert columns(text, "scenes")["mse"] == [error.mse] * 3
     assert not batch_index.cached_index(tmp_path, folders)
     assert not batch_index.cached_index(tmp_path / "nothing", folders)
 
 
-def test_an_index_shows_a_sweep_where_there_is_one(finished: Path, tmp_path: Path) -> None:
+def test_an_index_of_a_sweep_shows_its_values_and_errors(finished: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         shutil.copytree(finished, tmp_path / name)
     listed = [
         {"folder": "a", "values": {"noise.variance": "1e-4", "lens": "1/2"}, "mse": 2.0, "predicted_mse": 2.5},
         {"folder": "b", "values": {"noise.variance": "1e-2", "lens": "1/2"}, "mse": 3.0, "predicted_mse": 3.5},
     ]
+    listed = [{"scene": "a.toml", **row} for row in listed]
     (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")
     assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": ""})
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "noise.variance" in parsed(text).text["th"]
     assert 'id="plot-sweep"' in text
-    listed.append({"folder": "c", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"})
+    failed = {"scene": "a.toml", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"}
+    listed.append({"folder": "c", **failed})
     (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")
     assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": "", tmp_path / "c": "below 0"})
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
@@ -604,10 +595,10 @@ def test_an_index_shows_a_sweep_where_there_is_one(finished: Path, tmp_path: Pat
     assert "c/report.html" not in text
     for damaged in ("{}", "[{}]", "nothing"):
         (tmp_path / "sweep.json").write_text(damaged, encoding="utf-8")
-        assert batch_index.sweep_of(tmp_path / "sweep.json") is None
+        assert batch_index.read_sweep(tmp_path / "sweep.json") is None
 
 
-def test_a_batch_has_its_index_even_where_scenes_fail(kept: Path, here: Path, ommatid: Command) -> None:
+def test_a_batch_has_its_index_even_if_scenes_fail(kept: Path, here: Path, ommatid: Command) -> None:
     assert kept.is_dir()
     assert ommatid("run", "tiny.toml", "missing.toml", "-o", "out").code == 2
     text = (here / "out" / "index.html").read_text(encoding="utf-8")
@@ -615,7 +606,7 @@ def test_a_batch_has_its_index_even_where_scenes_fail(kept: Path, here: Path, om
     assert "failed: missing.toml: no such scene file" in text
 
 
-def test_nothing_heavy_is_loaded_for_a_page_that_is_kept(
+def test_bokeh_is_not_loaded_for_a_page_that_is_up_to_date(
     kept: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert kept.is_dir()

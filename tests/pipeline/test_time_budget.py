@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,18 @@ from hypothesis import strategies as st
 
 from ommatid.batch.remote import RunObserver
 from ommatid.bench import table
-from ommatid.bench.table import BenchTable, Cell, Quantiles
 from ommatid.pipeline import bench_curves
 from ommatid.pipeline.time_allocation import NEGLIGIBLE, ErrorCurve, allocate_time, error_curve
 from ommatid.pipeline.time_budget import KEYS, run_within, shared_time
-from ommatid.reconstruct.output.time_spent import spent
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.output.time_spent import time_spent
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.units import duration
 
+from ..bench.tables import bench_table, cell, exactly
 from ..conftest import Command
 from ..examples import scene
 
@@ -164,35 +164,38 @@ def test_where_grids_fit_as_many_are_taken_as_are_needed(tmp_path: Path) -> None
     assert budget["rendering"] + budget["calibration"] < 0.1 * description["error"]["predicted_mse"]
 
 
-def always(value: float) -> Quantiles:
-    return Quantiles(value, value, value)
-
-
 def benched(folder: Path, one: Scene, laws: dict[table.Stage, ErrorCurve], counts: tuple[int, ...]) -> None:
     """Write what `bench` would have measured if these laws were true."""
     ways = {"render": "independent", "calibrate": "points, independent"}
-    cells = tuple(
-        Cell(
-            stage, ways[stage], "scalar_rgb", n, "", 3, always(1.0), always(law.seconds(n)), None, always(law.error(n))
+    cells = [
+        cell(
+            stage,
+            way=ways[stage],
+            variant="scalar_rgb",
+            samples=n,
+            seconds=exactly(law.seconds(n)),
+            mse=exactly(law.error(n)),
         )
         for stage, law in laws.items()
         for n in counts
-    )
-    # Where as many samples were taken as are needed, nothing lies on a curve.
-    cells += tuple(
-        replace(one, samples=2**26, setting=table.AUTO, seconds=always(1e3), mse=always(1e-3)) for one in cells[::2]
-    )
-    slopes = tuple(
-        table.ConvergenceCurve(stage, ways[stage], "scalar_rgb", -law.exponent / 2, 0.01, None, "", None)
+    ]
+    # Cells with an adaptive number of samples are not part of a curve.
+    adaptive = {"samples": 2**26, "setting": table.AUTO, "seconds": exactly(1e3), "mse": exactly(1e-3)}
+    cells += [one.model_copy(update=adaptive) for one in cells[::2]]
+    slopes = [
+        table.ConvergenceCurve(
+            stage=stage,
+            way=ways[stage],
+            variant="scalar_rgb",
+            slope=-law.exponent / 2,
+            slope_deviation=0.01,
+            theory=None,
+            why="",
+            agrees=None,
+        )
         for stage, law in laws.items()
-    )
-    camera = json.loads(json.dumps(derive(one).describe()))
-    told: dict[str, Any] = {"camera": camera, "cells": cells, "curves": slopes, "left_out": ()}
-    blank = {"str": "", "float": 1.0, "dict": {}}
-    for field in fields(BenchTable):
-        if field.name not in told:
-            told[field.name] = blank[str(field.type).partition("[")[0]]
-    table.write(folder, BenchTable(**told))
+    ]
+    table.write(folder, bench_table(derive(one), cells, slopes))
 
 
 def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
@@ -202,14 +205,14 @@ def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
         "calibrate": ErrorCurve(2.0, 256, 1.5, 0.4, 1e-3),
     }
     benched(tmp_path, one, laws, (256, 2**24))
-    found = bench_curves.bench_error_curves(tmp_path / "x", one, derive(one))
+    found = bench_curves.bench_error_curves(tmp_path / "x", Setup.from_scene(one))
     assert found is not None
     for law, read_again in zip(laws.values(), found, strict=True):
         assert read_again.exponent == law.exponent
         assert read_again.seconds(5000) == pytest.approx(law.seconds(5000))
         assert read_again.error(5000) == pytest.approx(law.error(5000), rel=1e-3)
     other = scene((14, 14), (("1/3", [3, 3], [3, 3]),))
-    assert bench_curves.bench_error_curves(tmp_path / "x", other, derive(other)) is None
+    assert bench_curves.bench_error_curves(tmp_path / "x", Setup.from_scene(other)) is None
 
 
 def test_curves_that_begin_at_few_samples_ask_for_no_fewer_than_have_been_taken(tmp_path: Path) -> None:
@@ -245,7 +248,8 @@ def test_every_run_says_what_more_would_buy(here: Path, ommatid: Command) -> Non
     assert found["noise_alone"] == pytest.approx(
         error["predicted_mse"] - error["budget"]["rendering"] - error["budget"]["calibration"]
     )
-    assert spent(run, calibrated=True) == found
+    report = RunReport.model_validate(run)
+    assert time_spent(report.stages, report.error, calibrated=True) == report.spent
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("30s", 30.0), ("2 min", 120.0), ("0.5 h", 1800.0)])

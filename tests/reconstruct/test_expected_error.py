@@ -10,7 +10,7 @@ from scipy import sparse, stats
 
 from ommatid.reconstruct.estimator.estimate import FORMS, factorise
 from ommatid.reconstruct.expected_error import expected_error, expected_given, variance_of_sum
-from ommatid.reconstruct.prior import Prior, exponential
+from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.problem import Problem
 from ommatid.simulate.ideal import ideal_matrix
 
@@ -20,13 +20,13 @@ from .test_estimate import problem, tile
 
 @given(st.integers(0, 10**6), st.floats(0.1, 10))
 @settings(max_examples=40, deadline=None, derandomize=True)
-def test_a_wrong_expectation_never_lowers_the_error(seed: int, factor: float) -> None:
-    """The estimate that expects the real noise has the least error of all linear ones."""
+def test_expecting_another_noise_never_lowers_the_error(seed: int, factor: float) -> None:
+    """The estimator that expects the actual noise has the least error of all linear ones."""
     known = problem(seed, 8, 6)
     noise = {"noise": known.noise_variance}
     right = expected_error(factorise(known)[0], noise)
-    mistaken = Problem(known.matrix, known.prior, factor * known.noise_variance)
-    assert (expected_error(factorise(mistaken)[0], noise).variance >= right.variance * (1 - 1e-9)).all()
+    mismatched = Problem(known.matrix, known.prior, factor * known.noise_variance)
+    assert (expected_error(factorise(mismatched)[0], noise).variance >= right.variance * (1 - 1e-9)).all()
 
 
 def test_parts_add_up() -> None:
@@ -42,7 +42,7 @@ def test_parts_add_up() -> None:
 def test_eq_5_holds_over_a_thousand_images_drawn_from_the_prior(form: str, lenses: int) -> None:
     """The whitened error is chi-squared, with every pixel and with all of them together.
 
-    One type leaves a null space, three leave none: the prior's part and the noise's are both put to the test.
+    One type leaves a null space, three leave none: both the prior's part and the noise's are tested.
     """
     known = tile(lenses, 0.5)
     draws, unknowns = 1000, known.unknowns
@@ -62,25 +62,23 @@ def test_eq_5_holds_over_a_thousand_images_drawn_from_the_prior(form: str, lense
     assert 0.0005 < float(stats.chi2.cdf(together, draws * unknowns)) < 0.9995
 
 
-def test_a_mismatched_expectation_is_predicted_too() -> None:
-    """Eq. 5 with another noise and another, even a correlated, prior than expected, against the errors themselves."""
+def test_the_error_with_more_noise_than_expected_is_predicted() -> None:
+    """Eq. 5 with four times the expected noise, against errors of images drawn from the prior: four standard errors."""
     known = tile(3, 1.0)
     rng = np.random.default_rng(8)
-    draws = 300
-    really = exponential(127.5, 1000.0, (19, 19), 4.0)
+    draws, mean = 300, np.full((361, 1), 127.5)
     form, _ = factorise(known)
-    expected = expected_error(form, {"noise": np.full(706, 4.0)}, really)
-    images = really.mean[:, None] + really.spread(rng.normal(size=(361, draws)))
+    expected = expected_error(form, {"noise": np.full(706, 4.0)})
+    images = rng.normal(127.5, known.prior.root[:, None], (361, draws))
     recorded = known.matrix @ images + rng.normal(0, 2.0, (706, draws))
-    error = form.gain(recorded - known.matrix @ really.mean[:, None]) + really.mean[:, None] - images
-    assert np.mean(error**2) == pytest.approx(expected.mse, rel=0.05)
-    same = expected_error(form, {"noise": np.full(706, 4.0)}, known.prior)
-    assert same.variance == pytest.approx(expected_error(form, {"noise": np.full(706, 4.0)}).variance, rel=1e-9)
+    error = mean + form.gain(recorded - known.matrix @ mean) - images
+    mse = np.mean(error**2, axis=0)
+    assert abs(mse.mean() - expected.mse) < 4 * mse.std(ddof=1) / draws**0.5
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_the_interval_holds_99_errors_in_a_hundred(wide: bool) -> None:
-    """Of one given image, over many draws of the noise, for an estimator that expects another noise as well."""
+def test_the_interval_holds_99_of_100_errors(wide: bool) -> None:
+    """For one image and many draws of the noise, with an estimator that expects another noise."""
     rng = np.random.default_rng(2)
     matrix = sparse.csr_array(rng.normal(size=(60, 30)) / np.geomspace(1, 300 if wide else 2, 30))
     noise = rng.uniform(0.2, 2, 60)
@@ -90,12 +88,12 @@ def test_the_interval_holds_99_errors_in_a_hundred(wide: bool) -> None:
     draws = 20_000
     recorded = (matrix @ truth)[:, None] + rng.normal(size=(60, draws)) * np.sqrt(noise)[:, None]
     errors = np.mean((form.gain(recorded) - truth[:, None]) ** 2, axis=0)
-    assert errors.mean() == pytest.approx(interval.mse, rel=0.02)
+    assert abs(errors.mean() - interval.mse) < 4 * errors.std(ddof=1) / draws**0.5
     outside = np.mean((errors < interval.low) | (errors > interval.high))
-    assert 0.005 < outside < 0.02
+    assert 0.005 < outside < 0.02, "1 %, within a factor of two: a gamma variate is an approximation"
 
 
-def test_the_mean_of_a_region_has_an_error_of_its_own() -> None:
+def test_the_error_of_a_regions_mean() -> None:
     """Against the errors of such means over images drawn from the prior; errors of neighbours cancel in it."""
     known = tile(2, 1.0)
     form, _ = factorise(known)
@@ -126,9 +124,9 @@ def test_degrees_of_freedom_and_resolution() -> None:
 
 def test_resolution_of_a_blur_is_its_width() -> None:
     """Sensor pixels that each average m x m target pixels, side by side: m pixels share one degree of freedom."""
-    one = camera((12, 12), (("1/3", [1, 1], [4, 4]),))
+    side_by_side = camera((12, 12), (("1/3", [1, 1], [4, 4]),))
     prior = Prior(np.zeros(144), np.full(144, 50.0))
-    form, _ = factorise(Problem(ideal_matrix(one), prior, np.full(16, 1e-9)))
+    form, _ = factorise(Problem(ideal_matrix(side_by_side), prior, np.full(16, 1e-9)))
     assert expected_error(form, {}).resolution == pytest.approx(np.full(144, 3.0))
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ommatid.reconstruct.frame_prediction import predict_frame
-from ommatid.reconstruct.method_choice import WAYS, choose_method
+from ommatid.reconstruct.method_choice import METHODS, choose_method
+from ommatid.reconstruct.prediction import predict_frame
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
@@ -220,7 +220,7 @@ def test_which_way_is_chosen(shape: tuple[int, int], lenses: Any, tables: dict[s
     one = wide(shape, lenses, **tables)
     chosen = choose_method(one, derive(one), exact=True)
     assert chosen.method == way
-    assert chosen.method in WAYS
+    assert chosen.method in METHODS
     assert chosen.memory <= 650e6 or one.estimator.memory is None
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from ommatid.reconstruct.prediction import compare, observability, predict, trimmed
+from ommatid.reconstruct.measured_error import measure_error, trimmed_mean
+from ommatid.reconstruct.prediction import observability, predict
 from ommatid.reconstruct.prior import independent
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import read
@@ -149,18 +150,18 @@ def test_measures_of_error() -> None:
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 255, (20, 20))
     noisy = truth + rng.normal(0, 2, truth.shape)
-    found = compare(noisy.ravel(), truth.ravel(), (20, 20))
+    found = measure_error(noisy.ravel(), truth.ravel(), (20, 20))
     assert found.mse == pytest.approx(np.mean((noisy - truth) ** 2))
     assert found.psnr == pytest.approx(10 * np.log10(255**2 / found.mse))
     assert found.ssim is not None
     assert 0.9 < found.ssim < 1
-    same = compare(truth.ravel(), truth.ravel(), (20, 20))
+    same = measure_error(truth.ravel(), truth.ravel(), (20, 20))
     assert (same.mse, same.psnr, same.ssim) == (0, None, pytest.approx(1))
-    assert compare(np.zeros(4), np.ones(4), (2, 2)).trimmed_mse is None
-    assert compare(np.zeros(4), np.ones(4), (2, 2)).ssim is None
+    assert measure_error(np.zeros(4), np.ones(4), (2, 2)).trimmed_mse is None
+    assert measure_error(np.zeros(4), np.ones(4), (2, 2)).ssim is None
 
 
 def test_trimming_takes_the_border_off() -> None:
     image = np.ones((7, 9))
     image[2:-2, 2:-2] = 5
-    assert trimmed(image.ravel(), (7, 9)) == 5
+    assert trimmed_mean(image.ravel(), (7, 9)) == 5

@@ -165,9 +165,9 @@ def test_a_photograph_gains_from_a_fitted_prior() -> None:
 def test_what_cannot_be_found_is_refused_or_doubted() -> None:
     with pytest.raises(InputError, match="10 measurements or more, got 5"):
         fit_prior(Evidence(MATRIX[:5], np.ones(5), np.ones(5), SHAPE, None, True))
-    with pytest.raises(InputError, match="no noise; set estimator"):
+    with pytest.raises(InputError, match="without noise; set estimator"):
         fit_prior(Evidence(MATRIX, np.ones(706), np.zeros(706), SHAPE, None, True))
-    with pytest.raises(InputError, match="nothing can be found"):
+    with pytest.raises(InputError, match="nothing can be fitted"):
         fit_prior(Evidence(MATRIX, np.zeros(706), np.ones(706), SHAPE, None, True))
     flat: PriorFit = fit_prior(
         Evidence(MATRIX, np.random.default_rng(0).normal(size=706), np.full(706, 1.0), SHAPE, None, True)

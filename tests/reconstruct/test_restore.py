@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ommatid.analysis import run_table
-from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.result_files import changed
+from ommatid.reconstruct.output.report import report_of
+from ommatid.reconstruct.output.result_files import with_estimator_changes
 from ommatid.reconstruct.restore import Reconstruction, check_match, restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
@@ -65,7 +65,7 @@ def test_noise_of_h_that_feigns_information_is_told() -> None:
     for lenses in ((), ("I", "II")):
         stack, model, restoration = chain(read(GALLERY / "tile19.toml", ["calibration.samples=1024"], lenses))
         told.append(restoration.spurious_information)
-        lines = run_table.rows(run_json.describe(stack, model, restoration))
+        lines = run_table.rows(report_of(stack, model, restoration))
         warned = any(line.startswith("do not trust") for line, _ in lines)
         assert warned == bool(lenses)
     assert told[1] > 10 * told[0]
@@ -87,7 +87,7 @@ def test_the_budget_says_what_is_there_and_adds_up() -> None:
 def test_more_noise_than_expected_is_in_the_variance_whatever_the_estimator_was_told() -> None:
     described = scene(lenses=THREE, noise={"variance": 4.0}, calibration={"method": "ideal"})
     stack, model, honest = chain(described)
-    told = restore(changed(stack, ["estimator.noise_variance=1e-4"], GALLERY), model)
+    told = restore(with_estimator_changes(stack, ["estimator.noise_variance=1e-4"], GALLERY), model)
     assert told.expected.mse > honest.expected.mse
     assert told.budget()["noise"] > 100 * 4.0 / 361
 
@@ -134,7 +134,7 @@ def test_without_the_truth_nothing_is_claimed_of_the_error() -> None:
     described = scene(lenses=THREE, calibration={"method": "ideal"}, render={"samples": 16})
     stack, model, _ = chain(described)
     blind = restore(stack, model)
-    description = run_json.describe(stack, model, blind)
-    assert "mse" not in description["error"]
-    assert run_table.rows(description)
-    assert description["error"]["predicted_mse"] > 0
+    report = report_of(stack, model, blind)
+    assert "mse" not in report.plain()["error"]
+    assert run_table.rows(report)
+    assert report.error.predicted_mse > 0

@@ -1,4 +1,4 @@
-"""Misalignment as noise: moments against random cameras, and an estimator that keeps what it promises over them."""
+"""Misalignment as noise: moments against random cameras, and the error of the robust estimator over them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
@@ -24,6 +23,7 @@ from ommatid.reconstruct.misalignment.robust_noise import (
 )
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
@@ -33,9 +33,6 @@ from ommatid.scenes.tables.camera import Surface, ToleranceTable
 
 from ..examples import THREE, Lenses, scene
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-
 NOISE = 1e-2
 SIGNIFICANCE = 0.01
 SIDE = 12
@@ -44,7 +41,7 @@ SMALL = {"position": "40 nm"}
 ALL = {"position": "40 nm", "tilt": "1 deg", "rotation": "3 mrad", "focal_length": 2e-3}
 
 
-def crooked(side: int = SIDE, tolerance: dict[str, Any] = SMALL, lenses: Lenses = TWO) -> Camera:
+def misaligned_camera(side: int = SIDE, tolerance: dict[str, Any] = SMALL, lenses: Lenses = TWO) -> Camera:
     return replace(derive(scene((side, side), lenses)), tolerance=ToleranceTable.model_validate(tolerance))
 
 
@@ -55,7 +52,7 @@ def priors(side: int = SIDE) -> dict[str, Prior]:
     }
 
 
-def drawn(prior: Prior, rng: np.random.Generator) -> Vector:
+def drawn(prior: Prior, rng: np.random.Generator) -> FloatArray:
     return prior.mean + prior.spread(rng.standard_normal(prior.freedoms))
 
 
@@ -64,18 +61,18 @@ def drawn_matrix(camera: Camera, rng: np.random.Generator) -> Any:
     return misaligned_matrix(camera, spread * rng.standard_normal(spread.shape))
 
 
-def test_points_of_the_half_normal_give_its_moments() -> None:
+def test_gauss_points_of_the_half_normal_give_its_moments() -> None:
     nodes, weights = half_normal(3)
     assert [weights @ nodes**power for power in range(6)] == pytest.approx(
         [stats.halfnorm.moment(power) if power else 1.0 for power in range(6)], rel=1e-10
     )
 
 
-def test_tables_hold_what_was_drawn() -> None:
-    camera = crooked(tolerance=ALL)
-    wrong = misalignments(camera)
-    assert as_misalignments(as_table(wrong)) == wrong
-    scores = as_table(wrong) / tolerances(camera)
+def test_tables_hold_the_drawn_misalignments() -> None:
+    camera = misaligned_camera(tolerance=ALL)
+    drawn = misalignments(camera)
+    assert as_misalignments(as_table(drawn)) == drawn
+    scores = as_table(drawn) / tolerances(camera)
     assert stats.kstest(scores.ravel(), "norm").pvalue > SIGNIFICANCE
 
 
@@ -84,30 +81,30 @@ def test_tables_hold_what_was_drawn() -> None:
     [("independent", SMALL), ("exponential", {"position": "600 nm"}), ("exponential", ALL)],
     ids=["0.03 pixels", "0.4 pixels", "all"],
 )
-def test_moments_are_those_of_random_cameras_and_images(name: str, tolerance: dict[str, Any]) -> None:
-    camera, rng, prior = crooked(tolerance=tolerance), np.random.default_rng(1), priors()[name]
-    told, draws = robust_noise(camera, prior), 300
+def test_moments_agree_with_random_cameras_and_images(name: str, tolerance: dict[str, Any]) -> None:
+    camera, rng, prior = misaligned_camera(tolerance=tolerance), np.random.default_rng(1), priors()[name]
+    misaligned, draws = robust_noise(camera, prior), 300
     residuals = np.empty((draws, camera.measurements))
     for draw in range(draws):
-        residuals[draw] = (drawn_matrix(camera, rng) - told.matrix) @ drawn(prior, rng)
-    for place, covariance in zip(camera.slices(), told.covariances, strict=True):
-        some = residuals[:, place]
-        # In directions of their own, so that what is compared are independent numbers of expected square 1.
+        residuals[draw] = (drawn_matrix(camera, rng) - misaligned.matrix) @ drawn(prior, rng)
+    for rows, covariance in zip(camera.slices(), misaligned.covariances, strict=True):
+        of_sub = residuals[:, rows]
+        # Along the eigenvectors, so that independent numbers of expected square 1 are compared.
         values, vectors = np.linalg.eigh(covariance)
         strong = values > 1e-3 * values[-1]
-        squares = np.square(some @ vectors[:, strong]) / values[strong]
+        squares = np.square(of_sub @ vectors[:, strong]) / values[strong]
         assert abs(squares.mean() - 1) < 5 * squares.mean(axis=1).std() / draws**0.5 + 0.05
     z = residuals.mean(axis=0) / (residuals.std(axis=0) / draws**0.5)
     assert np.abs(z).max() < 5
 
 
 @pytest.mark.parametrize("name", ["independent", "exponential"])
-def test_over_images_and_cameras_the_error_is_the_promised_one_and_below_that_of_trust(name: str) -> None:
-    camera, rng, prior = crooked(), np.random.default_rng(2), priors()[name]
+def test_error_over_images_and_cameras_is_as_expected_and_below_that_of_trust(name: str) -> None:
+    camera, rng, prior = misaligned_camera(), np.random.default_rng(2), priors()[name]
     noise = np.full(camera.measurements, NOISE)
-    told = robust_noise(camera, prior)
-    white = whitening(camera, told, noise)
-    robust = estimate(white.problem(told.matrix, prior), white.vector(noise)).form
+    misaligned = robust_noise(camera, prior)
+    white = whitening(camera, misaligned, noise)
+    robust = estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form
     ideal = misaligned_matrix(camera, np.zeros_like(tolerances(camera)))
     trust = estimate(Problem(ideal, prior, noise), noise).form
     expected = robust_error(robust, white, {"noise": noise})
@@ -115,25 +112,25 @@ def test_over_images_and_cameras_the_error_is_the_promised_one_and_below_that_of
     for _ in range(120):
         image = drawn(prior, rng)
         values = drawn_matrix(camera, rng) @ image + NOISE**0.5 * rng.standard_normal(noise.size)
-        by_robust = prior.mean + robust.gain(white.vector(values - told.matrix @ prior.mean))
+        by_robust = prior.mean + robust.gain(white.vector(values - misaligned.matrix @ prior.mean))
         by_trust = prior.mean + trust.gain(values - ideal @ prior.mean)
         errors.append((float(np.mean((by_robust - image) ** 2)), float(np.mean((by_trust - image) ** 2))))
-    mine, others = np.array(errors).T
-    z = (mine.mean() - expected.mse) / (mine.std() / mine.size**0.5)
+    robust_mse, trust_mse = np.array(errors).T
+    z = (robust_mse.mean() - expected.mse) / (robust_mse.std() / robust_mse.size**0.5)
     assert abs(z) < stats.norm.isf(SIGNIFICANCE / 2)
-    assert mine.mean() < others.mean()
+    assert robust_mse.mean() < trust_mse.mean()
     assert expected.missing + sum(expected.parts.values()) == pytest.approx(expected.mse, rel=1e-9)
 
 
-def test_parts_of_the_error_are_those_of_a_dense_matrix() -> None:
-    camera, prior = crooked(), priors()["exponential"]
+def test_parts_of_the_error_agree_with_dense_matrices() -> None:
+    camera, prior = misaligned_camera(), priors()["exponential"]
     noise = np.random.default_rng(3).uniform(0.01, 0.1, camera.measurements)
-    told = robust_noise(camera, prior)
-    white = whitening(camera, told, noise)
+    misaligned = robust_noise(camera, prior)
+    white = whitening(camera, misaligned, noise)
     expected = robust_error(
-        estimate(white.problem(told.matrix, prior), white.vector(noise)).form, white, {"noise": noise}
+        estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form, white, {"noise": noise}
     )
-    block, h = linalg.block_diag(*told.covariances), told.matrix.toarray()
+    block, h = linalg.block_diag(*misaligned.covariances), misaligned.matrix.toarray()
     p = prior.root @ prior.root.T
     a = np.linalg.solve(h @ p @ h.T + block + np.diag(noise), h @ p).T
     assert expected.parts["noise"] == pytest.approx(np.trace(a @ np.diag(noise) @ a.T) / len(p), rel=1e-6)
@@ -141,54 +138,54 @@ def test_parts_of_the_error_are_those_of_a_dense_matrix() -> None:
     assert expected.degrees_of_freedom == pytest.approx(np.trace(a @ h), rel=1e-6)
 
 
-def test_a_photograph_gains_where_neighbours_are_expected_to_be_alike() -> None:
+def test_a_photograph_gains_with_a_correlated_prior() -> None:
     side = 19
-    camera, rng, prior = crooked(side, lenses=THREE), np.random.default_rng(4), priors(side)["exponential"]
+    camera, rng, prior = misaligned_camera(side, lenses=THREE), np.random.default_rng(4), priors(side)["exponential"]
     image = load(scene((side, side), THREE)).astype(np.float64).ravel()
     noise = np.full(camera.measurements, NOISE)
-    told = robust_noise(camera, prior)
-    white = whitening(camera, told, noise)
-    robust = estimate(white.problem(told.matrix, prior), white.vector(noise)).form
+    misaligned = robust_noise(camera, prior)
+    white = whitening(camera, misaligned, noise)
+    robust = estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form
     ideal = misaligned_matrix(camera, np.zeros_like(tolerances(camera)))
     trust = estimate(Problem(ideal, prior, noise), noise).form
     gains: list[float] = []
     for _ in range(8):
         values = drawn_matrix(camera, rng) @ image + NOISE**0.5 * rng.standard_normal(noise.size)
-        by_robust = prior.mean + robust.gain(white.vector(values - told.matrix @ prior.mean))
+        by_robust = prior.mean + robust.gain(white.vector(values - misaligned.matrix @ prior.mean))
         by_trust = prior.mean + trust.gain(values - ideal @ prior.mean)
         gains.append(float(np.mean((by_trust - image) ** 2) - np.mean((by_robust - image) ** 2)))
     assert np.mean(gains) > 3 * np.std(gains) / len(gains) ** 0.5
 
 
 def test_pixels_left_out_are_left_out_of_the_blocks() -> None:
-    camera, prior = crooked(), priors()["independent"]
+    camera, prior = misaligned_camera(), priors()["independent"]
     used = np.random.default_rng(5).random(camera.measurements) < 0.8
     noise = np.full(int(used.sum()), NOISE)
-    told = robust_noise(camera, prior)
-    white = whitening(camera, told, noise, used)
-    whole = linalg.block_diag(*told.covariances)[np.ix_(used, used)] + np.diag(noise)
+    misaligned = robust_noise(camera, prior)
+    white = whitening(camera, misaligned, noise, used)
+    whole = linalg.block_diag(*misaligned.covariances)[np.ix_(used, used)] + np.diag(noise)
     values = np.random.default_rng(6).standard_normal(noise.size)
     assert white.vector(values) @ white.vector(values) == pytest.approx(values @ np.linalg.solve(whole, values))
     np.testing.assert_allclose(white.multipliers(white.vector(values)), np.linalg.solve(whole, values))
 
 
 def test_without_tolerance_nothing_is_added() -> None:
-    camera = replace(crooked(), tolerance=None)
-    told = robust_noise(camera, priors()["independent"])
-    assert not told.variance.any()
+    camera = replace(misaligned_camera(), tolerance=None)
+    misaligned = robust_noise(camera, priors()["independent"])
+    assert not any(block.any() for block in misaligned.covariances)
 
 
-def test_what_it_cannot_do_is_refused() -> None:
-    camera = crooked()
-    told = robust_noise(camera, priors()["independent"])
+def test_missing_noise_and_blurred_lenses_are_refused() -> None:
+    camera = misaligned_camera()
+    misaligned = robust_noise(camera, priors()["independent"])
     with pytest.raises(InputError, match="needs noise in every measurement"):
         whitening(
             camera,
-            MisalignmentNoise(told.matrix, tuple(0 * block for block in told.covariances)),
+            MisalignmentNoise(misaligned.matrix, tuple(0 * block for block in misaligned.covariances)),
             np.zeros(camera.measurements),
         )
     real = Surface.model_validate({"radius": "1 mm", "semi_diameter": "0.1 mm"})
-    for glass in (LensOptics(surfaces=(real,)), LensOptics(aperture=0.1, focus=500.0)):
-        kind = replace(camera.types[0], optics=glass)
+    for optics in (LensOptics(surfaces=(real,)), LensOptics(aperture=0.1, focus=500.0)):
+        lens_type = replace(camera.types[0], optics=optics)
         with pytest.raises(InputError, match=r"camera\.lens\.A: .* take estimator\.misalignment = 'trust'"):
-            tolerances(replace(camera, types=(kind, *camera.types[1:])))
+            tolerances(replace(camera, types=(lens_type, *camera.types[1:])))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ommatid.analysis import run_table
 from ommatid.reconstruct.noise import usable_pixels
-from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks
@@ -28,9 +28,9 @@ from ommatid.scenes.tables.sensor import NoiseTable
 from ommatid.simulate.ideal import ideal_model
 from ommatid.simulate.sensor.gaussian import expose, generators
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import THREE, scene
+from ..runs import document
 
 SENSOR = {"variance": 1.0}
 
@@ -51,7 +51,7 @@ def restored(described: Scene) -> Reconstruction:
 
 
 def rows(restoration: Reconstruction, stack: Stack, model: Model) -> dict[str, str]:
-    return dict(run_table.rows(run_json.describe(stack, model, restoration)))
+    return dict(run_table.rows(report_of(stack, model, restoration)))
 
 
 def test_dead_pixels_are_left_out_and_counted() -> None:
@@ -111,7 +111,7 @@ def test_a_stack_of_which_nothing_is_left_gives_the_prior_and_says_so() -> None:
         assert found.estimate == pytest.approx(np.full(361, 99.0))
         assert found.expected.variance == pytest.approx(np.full(361, 16.0))
         assert found.usable.dead == 706
-        assert "no sensor pixel is left" in rows(found, nothing, model)["do not look for the image here"]
+        assert "no sensor pixel is left" in rows(found, nothing, model)["this is the prior, not an image"]
 
 
 def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:
@@ -146,7 +146,7 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     assert found.fit is not None
     assert found.fit.noise_variance == pytest.approx(1.0, rel=4 * found.fit.spread[2])
     lines = rows(found, stack, model)
-    assert {"found: variance", "found: correlation length", "found: noise variance"} <= set(lines)
+    assert {"fitted variance", "fitted correlation length", "fitted noise variance"} <= set(lines)
     known = restored(scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}))
     assert known.fit is not None
     assert known.fit.noise_variance is None

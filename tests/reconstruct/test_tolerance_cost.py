@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from ommatid.reconstruct.estimator.estimate import factorise
-from ommatid.reconstruct.misalignment.tolerance_cost import cost
+from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
 from ommatid.reconstruct.prior import exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import GALLERY, scene
+from ..runs import document
 
 NOISE = 0.1
 DRAWS = 300
@@ -36,7 +36,7 @@ def test_it_is_the_mean_error_over_cameras_and_images(smooth: bool) -> None:
     paper = exponential(127.5, 5461.25, (12, 12), 6.0) if smooth else independent(127.5, 5461.25, 144)
     matrix = ideal_matrix(camera)
     form, _ = factorise(Problem(matrix, paper, np.full(camera.measurements, NOISE)), "auto", 1e-8)
-    added = float(cost(form, ALL[: camera.measurements], camera, paper).mean())
+    added = float(misalignment_variance(form, ALL[: camera.measurements], camera, paper).mean())
     rng = np.random.default_rng(0)
     more: list[float] = []
     for seed in range(DRAWS):
@@ -55,7 +55,7 @@ def test_half_the_tolerance_costs_less_and_none_nothing() -> None:
     for position in ("80 nm", "40 nm", "1e-6 nm"):
         camera, prior = drawn_to(position), independent(127.5, 5461.25, 144)
         form, _ = factorise(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, NOISE)), "auto", 1e-8)
-        costs.append(float(cost(form, ALL[: camera.measurements], camera, prior).mean()))
+        costs.append(float(misalignment_variance(form, ALL[: camera.measurements], camera, prior).mean()))
     assert 2 < costs[0] / costs[1] < 4.5, "squares, less what kinks make of them"
     assert costs[2] < 1e-6
 

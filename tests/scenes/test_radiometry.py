@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy import constants, integrate
 
-from ommatid.reconstruct.frame_prediction import predict_frame
+from ommatid.analysis.light_table import rows
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.prediction import predict
+from ommatid.reconstruct.prediction import predict, predict_frame
 from ommatid.reconstruct.prior import independent
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.optics import radiometry
-from ommatid.scenes.optics.radiometry import electrons, expected_noise, predicted_noise, rows, solid_angle, summary
-from ommatid.scenes.pose import NONE, Misalignment, pose_of
+from ommatid.scenes.optics.radiometry import electrons, expected_noise, predicted_noise, solid_angle, summary
+from ommatid.scenes.pose import NO_MISALIGNMENT, Misalignment, pose_of
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.scenes.tables.estimation import EstimatorTable
@@ -95,7 +95,9 @@ def test_illumination_falls_with_the_fourth_power_of_the_cosine() -> None:
         y = sub.patch[1] - sub.lens[1] + (np.arange(rows_) - (rows_ - 1) / 2) * camera.pixel_pitch
         cosine = np.cos(np.arctan(np.hypot(x[None, :], y[:, None]) / sub.depth))
         np.testing.assert_allclose(
-            radiometry.relative_illumination(camera, sub, pose_of(sub, NONE)), (cosine**4).ravel(), rtol=1e-12
+            radiometry.relative_illumination(camera, sub, pose_of(sub, NO_MISALIGNMENT)),
+            (cosine**4).ravel(),
+            rtol=1e-12,
         )
 
 
@@ -108,7 +110,7 @@ def test_misaligned_sensors() -> None:
     def light(wrong: Misalignment) -> float:
         return float(radiometry.relative_illumination(camera, sub, pose_of(sub, wrong))[0])
 
-    assert light(NONE) == pytest.approx(1, rel=1e-12)
+    assert light(NO_MISALIGNMENT) == pytest.approx(1, rel=1e-12)
     assert light(Misalignment(focal_length=0.02)) == pytest.approx(1.02**-2, rel=1e-12)
     assert light(Misalignment(rotation=0.4)) == pytest.approx(1, rel=1e-12)
     assert light(Misalignment(tilt=(0.0, 0.1))) == pytest.approx(np.cos(0.1), rel=1e-12)
@@ -159,7 +161,7 @@ def test_the_summary_says_what_each_type_collects() -> None:
     assert found["cut_off"]
     assert {"without light", "warning"} <= {line[0] for line in rows(found)}
     dark = summary(one, camera, np.zeros_like(response))
-    assert "no light" in rows(dark)[0][1]
+    assert "too little light" in rows(dark)[0][1]
 
 
 def test_a_prediction_with_noise_of_its_own_for_every_pixel() -> None:

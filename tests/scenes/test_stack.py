@@ -12,7 +12,7 @@ from ommatid.scenes import stack
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats import exr
 from ommatid.scenes.recording import Recording
-from ommatid.scenes.stack import Stack, recorded
+from ommatid.scenes.stack import Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
 from ..examples import THREE, camera, scene
@@ -40,7 +40,9 @@ def of_a_sensor(seed: int = 0) -> Stack:
     level = np.repeat([1000 / 7, 1000 / 3, np.pi], [kind.measurements for kind in one.types])
     digital = rng.integers(0, 4096, one.measurements).astype(np.float64)
     flat = flat.astype(np.float32).astype(np.float64)
-    return recorded(described, one, Recording(told, digital, dark, flat, level), first.variance, first.record)
+    return stack_from_recording(
+        described, one, Recording(told, digital, dark, flat, level), first.variance, first.record
+    )
 
 
 def test_write_then_read_is_the_identity(tmp_path: Path) -> None:

@@ -670,8 +670,8 @@ def test_a_colour_array_is_one_picture(tmp_path: Path) -> None:
 def test_points_that_shine_together_are_not_told_apart_by_footprints_that_are_not_theirs() -> None:
     camera = paper_camera()
     several = [np.array([[0, 0], [9, 9]])]
-    point_sources._refuse_several(camera, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]
+    point_sources._check_separable(camera, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]
     glass = replace(camera.types[0].optics, distortion=(0.1, 0.0))
     bent = replace(camera, types=(replace(camera.types[0], optics=glass),))
     with pytest.raises(InputError, match="record one point an image"):
-        point_sources._refuse_several(bent, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]
+        point_sources._check_separable(bent, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]

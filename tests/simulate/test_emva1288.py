@@ -21,7 +21,7 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.recording import Recording, expected_recording
 from ommatid.scenes.scene import Scene
-from ommatid.scenes.stack import Stack, recorded
+from ommatid.scenes.stack import Stack, stack_from_recording
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.scenes.tables.sensor import SensorTable
 from ommatid.simulate.ideal import ideal_model
@@ -175,7 +175,7 @@ def test_averaging_does_not_help_against_rounding_without_noise() -> None:
     found = exposed(told, field(28), 0.0, 0)
     exact = 20 + 0.01 * np.concatenate([_offsets(told, field(28))])
     measured = float(np.var(found.dark - exact))
-    said = float(found._of_mean(np.zeros(1))[0])  # pyright: ignore[reportPrivateUsage]
+    said = float(found._mean_variance(np.zeros(1))[0])  # pyright: ignore[reportPrivateUsage]
     assert measured == pytest.approx(1 / 12, rel=0.1)
     assert said == pytest.approx(measured, rel=0.1)
 
@@ -222,14 +222,14 @@ def test_a_first_idea_of_the_light() -> None:
     """Of a uniform target the target, one electron more in nine pixels, less uncertain by as many; never nothing."""
     camera, told = field(60), sensor(dsnu=0.0, prnu=0.0)
     found = exposed(told, camera, 5.0, 0)
-    nearby, own = (one.reshape(60, 60)[1:-1, 1:-1] for one in (found.light_nearby(camera), found.values))
+    nearby, own = (one.reshape(60, 60)[1:-1, 1:-1] for one in (found.smoothed_light(camera), found.values))
     chance = 3 * float(own.std()) / own.size**0.5
     assert float(nearby.mean() - own.mean()) == pytest.approx(1 / 9 / 20, abs=chance / 3)
     assert float(nearby.var() / own.var()) == pytest.approx(1 / 9, rel=0.15)
     silent = exposed(sensor(read_noise=0.0, dark_current=0.0, dsnu=0.0), camera, 0.0, 0)
-    assert float(silent.light_nearby(camera).min()) > 0
+    assert float(silent.smoothed_light(camera).min()) > 0
     holes = replace(found, digital=np.where(np.arange(3600) % 3 == 0, np.nan, found.digital))
-    assert float(np.nanmean(holes.light_nearby(camera))) == pytest.approx(5.0, abs=2 * chance + 1 / 4 / 20)
+    assert float(np.nanmean(holes.smoothed_light(camera))) == pytest.approx(5.0, abs=2 * chance + 1 / 4 / 20)
 
 
 def test_pixels_that_see_nothing_are_dead_and_negative_light_is_refused() -> None:
@@ -256,7 +256,7 @@ def taken(lux: float, seed: int = 0, lenses: Lenses = THREE, response: float = 1
     everywhere = np.full(camera.measurements, response * lux / 100)
     found = record(model.forward(truth), everywhere, described.sensor or sensor(), camera, seed)
     told: dict[str, Any] = {"seconds": 0.0, "versions": {}, "seed": seed, "first_seed": seed}
-    return recorded(described, camera, found, np.zeros(camera.measurements), told), model
+    return stack_from_recording(described, camera, found, np.zeros(camera.measurements), told), model
 
 
 def inside(found: Reconstruction) -> bool:
@@ -310,7 +310,7 @@ def test_saturated_and_dead_pixels_are_left_out() -> None:
     recording = stack.recording
     assert recording is not None
     broken = replace(recording, digital=np.where(np.arange(stack.values.size) % 50 == 0, np.nan, recording.digital))
-    stack = recorded(stack.scene, stack.camera, broken, stack.variance, stack.record)
+    stack = stack_from_recording(stack.scene, stack.camera, broken, stack.variance, stack.record)
     usable = usable_pixels(stack)
     assert usable.dead == -(-stack.values.size // 50)
     assert 20 < usable.saturated < 500

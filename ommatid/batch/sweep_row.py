@@ -1,0 +1,126 @@
+"""Rows of a sweep's table, and sweep.json, which holds them.
+
+Squared errors are in squared units of f; seconds are those of the stages.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import write_text
+from ommatid.scenes.tables.overrides import value_of
+
+NUMBERS = "sweep.json"
+GROUPS = ("budget", "seconds")  # in the files a key per part, such as `budget.rendering`
+
+
+class SweepRow(BaseModel):
+    """Result of one scene of a sweep. Numbers that its command does not give are None; `failed` is the reason.
+
+    values : of the swept keys; in memory as they were written, in sweep.json as the scene file has them
+    expected_mse, expected_low, expected_high : expectation given the true image, and its 99 % interval
+    predicted_mse : Eq. 5
+    The order of the fields is that of the columns of sweep.csv.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: str
+    folder: str | None = None
+    values: dict[str, Any]
+    mse: float | None = None
+    expected_mse: float | None = None
+    expected_low: float | None = None
+    expected_high: float | None = None
+    predicted_mse: float | None = None
+    psnr: float | None = None
+    ssim: float | None = None
+    budget: dict[str, float] = Field(default_factory=dict[str, float])
+    rank: int | None = None
+    null_space: int | None = None
+    condition: float | None = None
+    seconds: dict[str, float] = Field(default_factory=dict[str, float])
+    measurements: int | None = None
+    unknowns: int | None = None
+    failed: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _grouped(cls, row: Any) -> Any:
+        """Collect `budget.*` and `seconds.*` of a row of the file."""
+        if not isinstance(row, dict):
+            return row
+        grouped: dict[str, Any] = {}
+        for name, value in row.items():  # pyright: ignore[reportUnknownVariableType]
+            group, dot, part = str(name).partition(".")  # pyright: ignore[reportUnknownArgumentType]
+            if dot and group in GROUPS:
+                grouped.setdefault(group, {})[part] = value
+            else:
+                grouped[name] = value
+        return grouped
+
+    def flat(self) -> dict[str, Any]:
+        """The row as in the files: `budget.*` and `seconds.*` are keys of their own, None is left out."""
+        row: dict[str, Any] = {}
+        for name, value in self.model_dump(exclude_none=True).items():
+            row |= {f"{name}.{part}": number for part, number in value.items()} if name in GROUPS else {name: value}
+        return row
+
+
+def summary(document: Mapping[str, Any]) -> SweepRow:
+    """Row of a scene from what `run`, `render` or `predict` prints as JSON, or from its failure.
+
+    document : with `scene`, `values` as they were written, and `folder` if there is one
+    """
+    where: dict[str, Any] = {name: document[name] for name in ("scene", "folder", "values") if name in document}
+    error: Any = document.get("error", {})
+    if isinstance(error, str):
+        return SweepRow(**where, failed=error)
+    if "rank" in document:  # a prediction, whose `mse` is the one of Eq. 5
+        error = {"predicted_mse": document["mse"]}
+    seconds = {name: stage.get("seconds") for name, stage in document.get("stages", {}).items()}
+    if "seconds" in document:
+        seconds["render"] = document["seconds"]
+    numbers: dict[str, Any] = {
+        **{name: error.get(name) for name in ("mse", "predicted_mse", "psnr", "ssim")},
+        **{f"expected_{name}": value for name, value in error.get("expected_given_truth", {}).items()},
+        **{name: document.get(name) for name in ("rank", "null_space", "condition", "measurements", "unknowns")},
+    }
+    return SweepRow(
+        **where,
+        **numbers,
+        budget=error.get("budget", {}),
+        seconds={name: value for name, value in seconds.items() if value is not None},
+    )
+
+
+def write_rows(path: Path, rows: Sequence[SweepRow]) -> None:
+    """Write sweep.json. Raises MachineError."""
+    typed = [{**row.flat(), "values": {key: _for_json(text) for key, text in row.values.items()}} for row in rows]
+    write_text(path, json.dumps(typed, indent=2, allow_nan=False) + "\n")
+
+
+def read_rows(path: Path) -> list[SweepRow]:
+    """Read sweep.json. Raises InputError if it is missing, damaged or another file."""
+    try:
+        return TypeAdapter(list[SweepRow]).validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: could not be read ({error.strerror}); `ommatid run --sweep` writes it") from error
+    except ValidationError as error:
+        raise InputError(f"{path}: expected the table of a sweep, got something else; repeat the sweep") from error
+
+
+def _for_json(text: str) -> Any:
+    """A value as the scene file has it; one that JSON has no type for, such as nan or a date, as text."""
+    value = value_of(text)
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return text
+    return value

@@ -1,0 +1,140 @@
+"""Assemble the content of run.json from a stack, a model and their reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from ommatid.runtime.versions import versions
+from ommatid.scenes.model import Model
+from ommatid.scenes.optics.negligible import SkippedEffect
+from ommatid.scenes.skipped import skipped_effects
+from ommatid.scenes.stack import STRAIGHT, Stack
+
+from ..estimator.estimate import Solver
+from ..restore import Reconstruction
+from .run_json import (
+    DiagnosticsReport,
+    ErrorReport,
+    FittedNumber,
+    IntervalReport,
+    ModelReport,
+    RejectedForm,
+    ResidualReport,
+    RunReport,
+    SeedReport,
+    SkippedReport,
+    SolverReport,
+    StageReport,
+)
+from .time_spent import time_spent
+
+
+def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunReport:
+    """Return the content of run.json, without a fingerprint."""
+    stages = {
+        "render": _stage(stack.record),
+        "calibrate": _stage(model.record),
+        "reconstruct": StageReport(seconds=restoration.seconds),
+    }
+    error = _error(restoration)
+    as_run = stack.scene.model_copy(update={"calibration": model.scene.calibration})
+    return RunReport(
+        title=stack.scene.title,
+        measurements=model.measurements,
+        unknowns=model.unknowns,
+        stages=stages,
+        error=error,
+        solver=_solver(restoration.choice.method, restoration.solver),
+        diagnostics=_diagnostics(restoration),
+        model=_model(model, restoration.spurious_information),
+        skipped=tuple(
+            SkippedReport(**skipped.describe())
+            for skipped in (*skipped_effects(as_run, model.camera), *_skipped_in_world(stack))
+        ),
+        versions={
+            **model.record.get("versions", {}),
+            **stack.record.get("versions", {}),
+            **versions("scipy", "scikit-image"),
+        },
+        seeds=SeedReport(
+            scene=stack.record.get("seed"),  # recorded frames have none
+            data=stack.record.get("first_seed"),
+            calibration=model.record.get("first_seed"),
+        ),
+        spent=time_spent(stages, error, calibrated=model.record["method"] != "ideal"),
+    )
+
+
+def _stage(record: dict[str, Any]) -> StageReport:
+    return StageReport(**{key: record[key] for key in StageReport.model_fields if key in record})
+
+
+def _error(restoration: Reconstruction) -> ErrorReport:
+    measured = {} if restoration.error is None else asdict(restoration.error)
+    if restoration.interval is not None:
+        measured["expected_given_truth"] = IntervalReport.model_validate(restoration.interval)
+    return ErrorReport(
+        **measured,
+        predicted_mse=restoration.expected.mse,
+        predicted_trimmed_mse=restoration.trimmed_mse,
+        budget=restoration.budget(),
+    )
+
+
+def _solver(method: str, solver: Solver) -> SolverReport:
+    return SolverReport(
+        way=method,
+        method=solver.method,
+        why=solver.why,
+        condition=solver.condition if isfinite(solver.condition) else None,
+        digits=solver.digits,
+        bound=solver.bound,
+        unit=solver.unit,
+        variance_bound=solver.variance_bound,
+        refinements=solver.refinements,
+        tried=tuple(RejectedForm(method=name, why_not=reason) for name, reason in solver.tried),
+    )
+
+
+def _diagnostics(restoration: Reconstruction) -> DiagnosticsReport:
+    width = float(np.median(restoration.expected.resolution))
+    fit, residual = restoration.fit, restoration.residual
+    fitted: dict[str, Any] = {}
+    if fit is not None:
+        numbers = {"variance": fit.variance, "correlation_length": fit.length, "noise_variance": fit.noise_variance}
+        known = [(name, value) for name, value in numbers.items() if value is not None]
+        fitted = {
+            "fit": {
+                name: FittedNumber(value=value, log_deviation=deviation if isfinite(deviation) else None)
+                for (name, value), deviation in zip(known, fit.spread, strict=True)
+            },
+            "fit_measurements": fit.measurements,
+            "fit_doubtful": fit.doubtful,
+        }
+    return DiagnosticsReport(
+        pixels_used=int(restoration.usable.used.sum()),
+        pixels_dead=restoration.usable.dead,
+        pixels_saturated=restoration.usable.saturated,
+        degrees_of_freedom=restoration.expected.degrees_of_freedom,
+        resolution=width if isfinite(width) else None,
+        chi_squared=None if residual is None else ResidualReport.model_validate(residual),
+        **fitted,
+    )
+
+
+def _model(model: Model, spurious_information: float) -> ModelReport:
+    known = 0.0 if model.record["method"] == "ideal" else None
+    unknown = {"rms_difference_from_ideal": known, "max_z": None, "p_value": None}
+    fit = {"fit": model.record["fit"]} if "fit" in model.record else {}
+    return ModelReport(**model.record.get("agreement", unknown), spurious_information=spurious_information, **fit)
+
+
+def _skipped_in_world(stack: Stack) -> tuple[SkippedEffect, ...]:
+    """Return the effects that rendering skipped after it had examined the world."""
+    if not stack.record.get(STRAIGHT):
+        return ()
+    return (SkippedEffect("interreflection", "nothing in the world reflects light: paths have one segment"),)

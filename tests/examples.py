@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import sparse, stats
 
+from ommatid.reconstruct.forms.form import Form
+from ommatid.reconstruct.prior import Prior, independent
+from ommatid.reconstruct.problem import Problem
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
+from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
 from ommatid.simulate.sampling.seeds import sampler_seeds
 
@@ -80,11 +85,31 @@ def with_optics(
     return described, derive(described)
 
 
+def random_problem(seed: int = 0, m: int = 7, n: int = 5, *, correlated: bool = False) -> Problem:
+    """A dense problem of M random measurements of N pixels with random noise variances."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n)) if correlated else np.sqrt(rng.uniform(1, 50, n))
+    matrix = sparse.csr_array(rng.normal(size=(m, n)))
+    return Problem(matrix, Prior(rng.normal(size=n), root), rng.uniform(0.1, 2, m))
+
+
+def tile_problem(lens_types: int, noise: float) -> Problem:
+    """The problem of a 19 x 19 tile with up to three lens types and the paper's prior."""
+    tile = camera(lenses=THREE[:lens_types])
+    return Problem(ideal_matrix(tile), independent(127.5, 5461.25, 361), np.full(tile.measurements, noise))
+
+
 def needs(variant: str) -> None:
     """Skip the test if a variant does not work on this machine."""
     reason = unusable_reason(variant)
     if reason:
         pytest.skip(reason)
+
+
+def posterior_covariance(form: Form, pixels: Sequence[int] = ()) -> NDArray[np.float64]:
+    """Columns of the posterior covariance, (N, pixels); all of them, (N, N), if no pixels are named."""
+    u, _ = form.pixel_solutions(np.array(pixels or range(form.problem.unknowns), dtype=np.intp))
+    return form.problem.prior.apply_root(u)
 
 
 def familywise(tests: int, significance: float = 0.01) -> float:

@@ -1,17 +1,22 @@
-"""Small scenes for the tests, and what many of them ask of statistics."""
+"""Small scenes for the tests, and their common statistics."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import sparse, stats
 
+from ommatid.reconstruct.forms.form import Form
+from ommatid.reconstruct.prior import Prior, independent
+from ommatid.reconstruct.problem import Problem
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
+from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
 
 GALLERY = Path(__file__).parent.parent / "scenes"
@@ -51,25 +56,64 @@ def scene(
 THREE = (("1/3", [3, 3], [5, 5]), ("1/5", [5, 5], [3, 3]), ("1/4", [4, 4], [4, 4]))
 
 
+TWO = THREE[:2]
+
+
 def camera(shape: tuple[int, int] = (19, 19), lenses: Lenses = THREE) -> Camera:
     """The camera of such a scene."""
     return derive(scene(shape, lenses))
 
 
+def with_optics(
+    lens: dict[str, Any],
+    camera_table: dict[str, Any],
+    lenses: Lenses = TWO,
+    shape: tuple[int, int] = (19, 19),
+    **tables: Any,
+) -> tuple[Scene, Camera]:
+    """A scene with more keys in every lens type and in the table [camera], and its camera."""
+    data = scene(shape, lenses, **tables).plain()
+    for table in data["camera"]["lens"]:
+        table.update(lens)
+    data["camera"].update(camera_table)
+    described = parse(data, Path("test.toml"))
+    return described, derive(described)
+
+
+def random_problem(seed: int = 0, m: int = 7, n: int = 5, *, correlated: bool = False) -> Problem:
+    """A dense problem of M random measurements of N pixels with random noise variances."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n)) if correlated else np.sqrt(rng.uniform(1, 50, n))
+    matrix = sparse.csr_array(rng.normal(size=(m, n)))
+    return Problem(matrix, Prior(rng.normal(size=n), root), rng.uniform(0.1, 2, m))
+
+
+def tile_problem(lens_types: int, noise: float) -> Problem:
+    """The problem of a 19 x 19 tile with up to three lens types and the paper's prior."""
+    tile = camera(lenses=THREE[:lens_types])
+    return Problem(ideal_matrix(tile), independent(127.5, 5461.25, 361), np.full(tile.measurements, noise))
+
+
 def needs(variant: str) -> None:
-    """Skip where a variant does not work on this machine."""
+    """Skip the test if a variant does not work on this machine."""
     reason = unusable_reason(variant)
     if reason:
         pytest.skip(reason)
 
 
+def posterior_covariance(form: Form, pixels: Sequence[int] = ()) -> NDArray[np.float64]:
+    """Columns of the posterior covariance, (N, pixels); all of them, (N, N), if no pixels are named."""
+    u, _ = form.pixel_solutions(np.array(pixels or range(form.problem.unknowns), dtype=np.intp))
+    return form.problem.prior.apply_root(u)
+
+
 def familywise(tests: int, significance: float = 0.01) -> float:
-    """Two-sided significance of each of many tests, so that all pass together with 1 - significance (Sidak)."""
+    """Significance of each of many tests such that all pass with probability 1 - significance (Sidak)."""
     return float(-np.expm1(np.log1p(-significance) / tests))
 
 
 def assert_student(difference: NDArray[np.float64], variance: NDArray[np.float64], passes: int) -> None:
-    """Each difference is compatible with its variance, estimated from `passes` passes, all of them at 1 %."""
+    """Assert that differences agree with variances from `passes` passes, at a familywise significance of 1 %."""
     limit = float(stats.t.isf(familywise(difference.size) / 2, passes - 1))
     score = np.abs(difference) / np.sqrt(variance)
     assert score.max() < limit, f"t = {score.max():.1f} at {int(score.argmax())}, the limit is {limit:.1f}"

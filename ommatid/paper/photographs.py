@@ -139,7 +139,7 @@ def measure(
     found: list[tuple[Any, ...]] = []
     for level, noise in enumerate(noises):
         variance = noise.variance + noise.quantisation_variance
-        form = tile.form.at(variance)
+        form = tile.form.with_noise_scaled(variance)
         recorded = np.stack(
             [record(tile.camera, light[:, number], noise, stream(level, number)) for number in range(len(images))], 1
         )

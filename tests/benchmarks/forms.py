@@ -88,10 +88,10 @@ def _case(path: Path, lenses: tuple[str, ...], words: str) -> list[FormRow]:
         start = perf_counter()
         refined = refine(built[name], exactly, shift, exactly.recorded(recorded))
         certified = perf_counter() - start
-        size = float(np.linalg.norm(right.freedoms))
+        size = float(np.linalg.norm(right.coefficients))
         digits = (
-            _digits(float(np.linalg.norm(alone - right.freedoms)) / size),
-            _digits(float(np.linalg.norm(refined.freedoms - right.freedoms)) / size),
+            _digits(float(np.linalg.norm(alone - right.coefficients)) / size),
+            _digits(float(np.linalg.norm(refined.coefficients - right.coefficients)) / size),
             np.nan if name == REFERENCE else _digits(float(np.max(np.abs(built[name].variance() / variance - 1)))),
         )
         seconds = (float(np.median(times[name])), solved, certified)

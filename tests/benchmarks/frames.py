@@ -62,7 +62,7 @@ def frame_rows() -> tuple[list[FrameRow], float]:
     errors.reference = whole.estimate(REFERENCE).image
     counts = _counts(whole, matrix, errors)
     frame, factor = whole.frame(), factorised(matrix)
-    right = frame.collected(whole.unexpected)
+    right = frame.right_hand_side(whole.unexpected)
     apart = errors.of(factor(right))
     direct = frame.solve(right).steps
     ways = [

@@ -67,7 +67,7 @@ def by_boxes(whole: Whole, matrix: sparse.csr_array, steps: int, watch: Watch = 
 
     del matrix
     frame = whole.frame()
-    right = frame.collected(whole.unexpected)
+    right = frame.right_hand_side(whole.unexpected)
     return cg(
         FunctionOperator(frame.apply, right.size), right, np.zeros(right.size), niter=steps, tol=0, callback=watch
     )[0]

@@ -59,7 +59,7 @@ class Whole:
     def estimate(self, accuracy: float = ACCURACY) -> Solution:
         """f^ - f0, from nothing prepared."""
         frame = self.frame()
-        return frame.solve(frame.collected(self.unexpected), accuracy)
+        return frame.solve(frame.right_hand_side(self.unexpected), accuracy)
 
 
 def whole_camera(size: int) -> Camera:

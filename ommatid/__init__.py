@@ -1,1 +1,77 @@
-"""Simulate, calibrate and reconstruct the images of flat compound-eye cameras, with error bars."""
+"""Simulate, calibrate and reconstruct the images of flat compound-eye cameras, with error bars.
+
+The functions of this module do what the commands of the same names do, and return arrays:
+
+    import ommatid
+    scene = ommatid.read_scene("tile19", set=["noise.variance=1e-2"])
+    stack, model = ommatid.render(scene), ommatid.calibrate(scene)
+    result = ommatid.reconstruct(stack, model)
+
+Nothing heavy is loaded before the first of them is used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .interface import (
+        InputError,
+        MachineError,
+        Model,
+        Result,
+        Scene,
+        Stack,
+        calibrate,
+        predict,
+        read_model,
+        read_run,
+        read_scene,
+        read_stack,
+        reconstruct,
+        render,
+        run,
+        target_image,
+    )
+
+__all__ = [
+    "InputError",
+    "MachineError",
+    "Model",
+    "Result",
+    "Scene",
+    "Stack",
+    "calibrate",
+    "predict",
+    "read_model",
+    "read_run",
+    "read_scene",
+    "read_stack",
+    "reconstruct",
+    "render",
+    "run",
+    "target_image",
+]
+
+
+class _CallablePackage(ModuleType):
+    """The package ommatid.reconstruct, which is also the function of that name."""
+
+    def __call__(self, stack: Stack, model: Model, truth: Any = None) -> Result:
+        """Reconstruct a stack with a model; see ommatid.interface.reconstruct."""
+        return import_module(".interface", __name__).reconstruct(stack, model, truth)
+
+
+import_module(".reconstruct", __name__).__class__ = _CallablePackage  # a docstring: this loads nothing else
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(import_module(".interface", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

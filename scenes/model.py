@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
@@ -91,6 +92,17 @@ class Model:
         if self.stored is None:
             return self.boxes.adjoint(measurements)
         return self.stored.T @ np.asarray(measurements, dtype=np.float64)
+
+    def as_linear_operator(self) -> LinearOperator:
+        """Return H as a SciPy linear operator, (M, N), for iterative solvers; H need not be stored."""
+        if self.stored is not None:
+            return aslinearoperator(self.stored)
+        return LinearOperator(
+            (self.measurements, self.unknowns),
+            matvec=lambda image: self.forward(image.ravel()),
+            rmatvec=lambda measurements: self.adjoint(measurements.ravel()),
+            dtype=np.float64,
+        )
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Indices of the measurements that see nothing outside a window of f: (m,)."""

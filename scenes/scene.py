@@ -19,6 +19,7 @@ from ommatid.runtime.files import write_text
 from .tables import toml
 from .tables.camera import CameraTable
 from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
+from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.overrides import apply_overrides, keep_lenses
 from .tables.sensor import NoiseTable, SensorTable
@@ -187,13 +188,15 @@ def _with_source(scene: Scene, source: Path) -> Scene:
 def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) -> Scene:
     """Read a scene file, apply `--set` overrides and keep only the named lens types, if any are named.
 
-    Relative paths of the target's picture and of the world start at the scene file's folder.
+    `path` may be the name of a gallery scene. Relative paths of the target's picture and of the world start at the
+    scene file's folder.
     Raises InputError that names the file, the key, what was expected and what came.
     """
+    path = find_scene(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such scene file; `ommatid init {path.name}` writes one to start from") from error
+        raise InputError(missing_scene(path)) from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: could not be read as a scene file ({error})") from error
     try:

@@ -1,4 +1,4 @@
-"""A tiny scene, one finished run of it, and the command line as a user meets it."""
+"""A tiny scene, one finished run of it, and the command line."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
 
 from ommatid.cli import app as program
 
-settings.register_profile("any machine", deadline=None)  # no test depends on how fast a machine is
+settings.register_profile("any machine", deadline=None)  # no test depends on the speed of the machine
 settings.load_profile("any machine")
 
 TINY = """
@@ -52,7 +53,7 @@ samples = 16
 
 @dataclass(frozen=True)
 class Ended:
-    """What a command left behind: its exit code, stdout and stderr."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -62,19 +63,24 @@ class Ended:
 Command = Callable[..., Ended]
 
 
-def shell(*arguments: str | Path, cwd: Path, before: str = "") -> Ended:
-    """Run a command in a process of its own; `before` is Python that runs there first."""
+def interpreter(before: str = "") -> list[str]:
+    """Command of a new interpreter that runs ommatid; `before` is Python code that runs first."""
     start = ["-c", f"{before}\nfrom ommatid.cli.app import main\nmain()"] if before else ["-m", "ommatid"]
-    command = [sys.executable, *start, *map(str, arguments)]
-    # Unbuffered, output cannot come late, and so not where it does not belong: users have it buffered.
+    return [sys.executable, *start]
+
+
+def shell(*arguments: str | Path, cwd: Path, before: str = "") -> Ended:
+    """Run a command in a new process."""
+    # Without buffering, output could not appear late, and so not in the wrong place: users have it buffered.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command = [*interpreter(before), *map(str, arguments)]
     ended = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
     return Ended(ended.returncode, ended.stdout, ended.stderr)
 
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of one finished run of the tiny scene; it is shared, so nobody writes to it."""
+    """Folder of a finished run of the tiny scene. It is shared: tests must not write to it."""
     folder = tmp_path_factory.mktemp("finished")
     (folder / "tiny.toml").write_text(TINY, encoding="utf-8")
     ended = shell("run", "tiny.toml", "-o", "out", cwd=folder)
@@ -84,7 +90,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with tiny.toml in it and nothing else."""
+    """The current folder, which holds only tiny.toml."""
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -92,13 +98,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def kept(here: Path, finished: Path) -> Path:
-    """A copy of the finished run at out/tiny of the current folder, where a run of tiny.toml would have put it."""
+    """A copy of the finished run in out/tiny of the current folder, the output folder of `run tiny.toml -o out`."""
     return shutil.copytree(finished, here / "out" / "tiny")
 
 
 @pytest.fixture
 def ommatid(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
-    """Run a command in this process: a second of imports less than in a new one, and warnings become failures."""
+    """Run a command in this process, which saves the imports and turns warnings into failures."""
 
     def call(*arguments: str | Path) -> Ended:
         monkeypatch.setattr(sys, "argv", ["ommatid", *map(str, arguments)])
@@ -110,3 +116,24 @@ def ommatid(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) 
         return Ended(ended.value.code, out, err)
 
     return call
+
+
+@pytest.fixture(scope="session")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Generator[str]:
+    """Address of a cluster of two workers."""
+    from distributed import LocalCluster
+
+    from ommatid.runtime.dask_cluster import SILENT
+
+    start: Any = LocalCluster
+    with start(
+        n_workers=2,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        scheduler_kwargs={"dashboard": False},
+        local_directory=str(tmp_path_factory.mktemp("dask")),
+        memory_limit=0,
+        silence_logs=SILENT,
+    ) as cluster:
+        yield cluster.scheduler_address

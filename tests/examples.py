@@ -1,4 +1,4 @@
-"""Small scenes for the tests, and what many of them ask of statistics."""
+"""Small scenes for the tests, and their common statistics."""
 
 from __future__ import annotations
 
@@ -56,9 +56,28 @@ def scene(
 THREE = (("1/3", [3, 3], [5, 5]), ("1/5", [5, 5], [3, 3]), ("1/4", [4, 4], [4, 4]))
 
 
+TWO = THREE[:2]
+
+
 def camera(shape: tuple[int, int] = (19, 19), lenses: Lenses = THREE) -> Camera:
     """The camera of such a scene."""
     return derive(scene(shape, lenses))
+
+
+def with_optics(
+    lens: dict[str, Any],
+    camera_table: dict[str, Any],
+    lenses: Lenses = TWO,
+    shape: tuple[int, int] = (19, 19),
+    **tables: Any,
+) -> tuple[Scene, Camera]:
+    """A scene with more keys in every lens type and in the table [camera], and its camera."""
+    data = scene(shape, lenses, **tables).plain()
+    for table in data["camera"]["lens"]:
+        table.update(lens)
+    data["camera"].update(camera_table)
+    described = parse(data, Path("test.toml"))
+    return described, derive(described)
 
 
 def random_problem(seed: int = 0, m: int = 7, n: int = 5, *, correlated: bool = False) -> Problem:
@@ -76,7 +95,7 @@ def tile_problem(lens_types: int, noise: float) -> Problem:
 
 
 def needs(variant: str) -> None:
-    """Skip where a variant does not work on this machine."""
+    """Skip the test if a variant does not work on this machine."""
     reason = unusable_reason(variant)
     if reason:
         pytest.skip(reason)
@@ -89,12 +108,12 @@ def posterior_covariance(form: Form, pixels: Sequence[int] = ()) -> NDArray[np.f
 
 
 def familywise(tests: int, significance: float = 0.01) -> float:
-    """Two-sided significance of each of many tests, so that all pass together with 1 - significance (Sidak)."""
+    """Significance of each of many tests such that all pass with probability 1 - significance (Sidak)."""
     return float(-np.expm1(np.log1p(-significance) / tests))
 
 
 def assert_student(difference: NDArray[np.float64], variance: NDArray[np.float64], passes: int) -> None:
-    """Each difference is compatible with its variance, estimated from `passes` passes, all of them at 1 %."""
+    """Assert that differences agree with variances from `passes` passes, at a familywise significance of 1 %."""
     limit = float(stats.t.isf(familywise(difference.size) / 2, passes - 1))
     score = np.abs(difference) / np.sqrt(variance)
     assert score.max() < limit, f"t = {score.max():.1f} at {int(score.argmax())}, the limit is {limit:.1f}"

@@ -1,4 +1,4 @@
-"""Frames for the tests: larger cameras, what they record of an image, and the dense answer to compare with."""
+"""Larger cameras for the tests, their recordings of an image, and the dense solution for comparison."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -17,15 +17,14 @@ from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 from .examples import Lenses, scene
 
-Vector = NDArray[np.float64]
 FITTED: Lenses = (("1/3", [3, 3], "fit"), ("1/5", [5, 5], "fit"), ("1/4", [4, 4], "fit"))
 P0 = 5461.25
 
 
 def wide(shape: tuple[int, int], lenses: Lenses = FITTED, **tables: Any) -> Scene:
-    """A scene whose lens pitch leaves room for large sub-images."""
-    one = scene(shape, lenses, **tables)
-    return one.model_copy(update={"camera": one.camera.model_copy(update={"lens_pitch": 50.0})})
+    """A scene with a lens pitch that leaves room for large sub-images."""
+    described = scene(shape, lenses, **tables)
+    return described.model_copy(update={"camera": described.camera.model_copy(update={"lens_pitch": 50.0})})
 
 
 def frame_camera(shape: tuple[int, int], lenses: Lenses = FITTED) -> Camera:
@@ -33,29 +32,31 @@ def frame_camera(shape: tuple[int, int], lenses: Lenses = FITTED) -> Camera:
     return derive(wide(shape, lenses))
 
 
-def precision(matrix: sparse.csr_array, weights: Vector, prior: float) -> Vector:
+def precision(matrix: sparse.csr_array, weights: FloatArray, prior: float) -> FloatArray:
     """K = H^T Rv^-1 H + 1 / P0 as a dense matrix: (N, N)."""
     return (matrix.T @ (matrix.multiply(weights[:, None]))).toarray() + prior * np.eye(matrix.shape[1])
 
 
-def recorded(one: Scene, truth: Vector, variance: float | Vector, seed: int = 0, matrix: Any = None) -> Stack:
-    """The stack of a perfect camera, or of one with another H: noise by a seed, no variance of a rendering."""
-    camera = derive(one)
+def recorded(
+    described: Scene, truth: FloatArray, variance: float | FloatArray, seed: int = 0, matrix: Any = None
+) -> Stack:
+    """The stack of an ideal camera, or of one with another H, with noise of a seed and no rendering variance."""
+    camera = derive(described)
     rng = np.random.default_rng(seed)
     light = (ideal_matrix(camera) if matrix is None else matrix) @ truth
     values = light + rng.normal(size=light.size) * np.sqrt(variance)
-    return Stack(one, camera, values, np.zeros(light.size), {"seed": seed, "first_seed": seed})
+    return Stack(described, camera, values, np.zeros(light.size), {"seed": seed, "first_seed": seed})
 
 
-def blurred(one: Scene, spread: float, seed: int = 5) -> tuple[Model, sparse.csr_array]:
-    """A model whose entries are uncertain by `spread`, errors of a row cancelling in its sum, and the true H."""
-    camera = derive(one)
+def blurred(described: Scene, spread: float, seed: int = 5) -> tuple[Model, sparse.csr_array]:
+    """A model with errors of standard deviation `spread` that cancel in the sum of each row, and the true H."""
+    camera = derive(described)
     true = ideal_matrix(camera)
-    model = ideal_model(one, camera)
+    model = ideal_model(described, camera)
     rng = np.random.default_rng(seed)
     rows = np.repeat(np.arange(true.shape[0]), np.diff(true.indptr))
     noise = rng.normal(0, spread, true.nnz)
     noise -= (np.bincount(rows, noise) / np.diff(true.indptr))[rows]
-    found = sparse.csr_array((true.data + noise, true.indices, true.indptr), shape=true.shape)
+    noisy = sparse.csr_array((true.data + noise, true.indices, true.indptr), shape=true.shape)
     record = {"method": "points", "versions": {}}
-    return replace(model, stored=found, variance=np.full(true.nnz, spread**2), record=record), true
+    return replace(model, stored=noisy, variance=np.full(true.nnz, spread**2), record=record), true

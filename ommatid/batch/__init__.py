@@ -1,1 +1,1 @@
-"""Many scenes at once: batches, sweeps, and how they are shared among processes."""
+"""Many scenes at once: batches, sweeps, and their distribution over processes and machines."""

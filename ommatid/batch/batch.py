@@ -1,6 +1,6 @@
-"""Many scenes, side by side in processes or on a cluster, each independent of what becomes of the others.
+"""Batches of scenes, in this process, in several, or on a cluster; failures of scenes are independent.
 
-Numbers do not depend on where a scene is done, nor beside which others.
+The numbers do not depend on where a scene is run, nor on the scenes beside it.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.processors import processors
 from ommatid.runtime.workers import Completed
 from ommatid.scenes.formats.picture import write_truth
-from ommatid.scenes.scene import TRUTH, Scene, write
+from ommatid.scenes.scene import TRUTH, write
 from ommatid.scenes.setup import Setup
 
-from .remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, done_of, packed, unpack
+from .remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, outcome_of, packed, unpack
 
 Description = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Member:
-    """A scene file of a batch, what is changed in it, and the folder of its results."""
+    """A scene file of a batch, the changes to it (KEY=VALUE), and the folder of its results."""
 
     scene: Path
     folder: Path
@@ -35,20 +35,24 @@ class Member:
 
     @property
     def values(self) -> dict[str, str]:
-        """What is changed, key by key, as it was written."""
+        """The changed values by key, as they were written."""
         return {key: value for key, _, value in (change.partition("=") for change in self.changes)}
 
 
+# Each scene with a function that runs it, or collects its results, and returns the description or raises the error.
 Works = Generator[tuple[Member, Callable[[], Description]]]
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What is asked of every scene.
+    """The functions that run the scenes of a batch.
 
-    opened : reads and checks it;  stages : what is done, and the description of it;  watch : who hears of a folder
-    tell : passes on what became of it;  facts : what has to be the same on all machines, given whether the variant is
-        left to them;  fitting : how many memory holds side by side
+    opened : reads and checks a scene
+    stages : runs it and returns its description
+    watch : creates the observer for a folder
+    tell : reports a description to the user, and returns it
+    facts : versions that have to agree on all machines; True as argument adds the variant that `auto` stands for
+    fitting : number of scenes that are best run at once
     """
 
     opened: Callable[[Member], Setup]
@@ -59,111 +63,112 @@ class Batch:
     fitting: Callable[[Sequence[Member]], int]
 
     def works(self, members: Sequence[Member], scheduler: str = "", count: int | None = None) -> Works:
-        """Every scene with what does it or tells why it failed: in `count` processes, or on a cluster.
+        """Yield every scene with a function that returns its description or raises its error.
 
-        Without either, in as many processes as there are scenes, processors and memory for them.
-        Where that is one, it is this one, which tells more while it works.
+        Scenes run in `count` processes or on the cluster at `scheduler`; without either, in as many processes as
+        finish soonest, given the scenes, processors and memory. A single process is this one, which shows progress.
         """
         check_options(scheduler, count)
         if scheduler:
-            return self._sent(members, scheduler)
-        count = min(self._side_by_side(members) if count is None else count, len(members))
-        return self._beside(members, count) if count > 1 else self._here(members)
+            return self._on_cluster(members, scheduler)
+        count = min(self._best_count(members) if count is None else count, len(members))
+        return self._in_processes(members, count) if count > 1 else self._in_this_process(members)
 
-    def _side_by_side(self, members: Sequence[Member]) -> int:
+    def _best_count(self, members: Sequence[Member]) -> int:
         most = min(len(members), processors())
         return min(most, self.fitting(members)) if most > 1 else 1
 
-    def _here(self, members: Sequence[Member]) -> Works:
+    def _in_this_process(self, members: Sequence[Member]) -> Works:
         for member in members:
-            yield member, partial(self._work, member)
+            yield member, partial(self._run, member)
 
-    def _work(self, member: Member) -> Description:
+    def _run(self, member: Member) -> Description:
         description = self.stages(self.opened(member), member.folder, self.watch(member.folder))
         return self.tell(member, description)
 
-    def _beside(self, members: Sequence[Member], count: int) -> Works:
-        """Each as it ends; the processes work in the scenes' own folders."""
+    def _in_processes(self, members: Sequence[Member], count: int) -> Works:
+        """Yield scenes as they end; the processes write to the scenes' own folders."""
         with worker_pool(count=count) as pool:
-            for ended in pool.each(partial(_in_process, self.opened, self.stages), members):
+            for ended in pool.each(partial(_run_in_process, self.opened, self.stages), members):
                 member = members[ended.index]
-                yield member, partial(self._finished, member, ended)
+                yield member, partial(self._collect, member, ended)
 
-    def _sent(self, members: Sequence[Member], scheduler: str) -> Works:
-        """Each as it ends, what is wrong with it already here first of all."""
-        scenes: dict[Member, Scene] = {}
+    def _on_cluster(self, members: Sequence[Member], scheduler: str) -> Works:
+        """Yield scenes with errors that show already here, then the others as they end."""
+        waiting: list[Member] = []
+        auto_variant = False
         for member in members:
             try:
                 setup = self.opened(member)
-                scene = setup.scene
-                if scene.world is not None:
+                if setup.scene.world is not None:
                     raise InputError(
-                        f"{member.scene}: the files of a [world] do not travel to other machines; leave out --scheduler"
+                        f"{member.scene}: the files of a [world] are not sent to other machines; leave out --scheduler"
                     )
                 prepare(setup, member.folder)
-                scenes[member] = scene
             except Exception as error:
                 yield member, partial(_raise, error)
-        if not scenes:
+                continue
+            waiting.append(member)
+            auto_variant |= setup.scene.render.variant == "auto"
+        if not waiting:
             return
         with worker_pool(scheduler) as pool:
-            left_to_them = any(scene.render.variant == "auto" for scene in scenes.values())
-            pool.check_versions(partial(self.facts, left_to_them))
-            parcels = _ScenePackages(self, list(scenes))
+            pool.check_versions(partial(self.facts, auto_variant))
+            packages = _ScenePackages(self.opened, tuple(waiting))
             try:
-                for ended in pool.each(partial(carry_out, self.stages), parcels):
-                    member = parcels.sent[ended.index]
-                    scenes.pop(member)
-                    yield member, partial(self._finished, member, ended)
+                for ended in pool.each(partial(carry_out, self.stages), packages):
+                    member = packages.sent[ended.index]
+                    waiting.remove(member)
+                    yield member, partial(self._collect, member, ended)
             except MachineError as error:
-                parcels.failed |= {member: MachineError(f"{member.scene}: {error}") for member in scenes}
-        for member in scenes:
-            yield member, partial(_raise, parcels.failed[member])
+                packages.failed |= {member: MachineError(f"{member.scene}: {error}") for member in waiting}
+        for member in waiting:
+            yield member, partial(_raise, packages.failed[member])
 
-    def _finished(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
-        """Take in what a worker made of a scene. Raises what stopped it there."""
+    def _collect(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
+        """Write the files that a worker returned, and report its stages. Raises the worker's error."""
         try:
             outcome = ended.result()
         except MachineError as error:
             raise MachineError(f"{member.scene}: {error}") from error
         unpack(outcome, member.folder)
-        watch = self.watch(member.folder)
-        for stage, made in outcome.done.items():
-            watch.done(stage, made)
+        observer = self.watch(member.folder)
+        for stage, executed in outcome.done.items():
+            observer.done(stage, executed)
         if outcome.error is not None:
             raise outcome.error
         return self.tell(member, outcome.description)
 
 
-def _in_process(opened: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:
-    """What becomes of a scene in a process on this machine, which finds the scene's files and writes its folder."""
-    return done_of(lambda watch: stages(opened(member), member.folder, watch))
+def _run_in_process(opened: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:
+    """Run a scene in another process of this machine, which reads its files and writes to its folder."""
+    return outcome_of(lambda observer: stages(opened(member), member.folder, observer))
 
 
 class _ScenePackages:
-    """The scenes of a batch, opened again one by one as workers are free: the pictures of all might be too many."""
+    """Packages of a batch, made one by one as workers become free: all target images might not fit into memory."""
 
-    def __init__(self, batch: Batch, members: list[Member]) -> None:
+    def __init__(self, opened: Callable[[Member], Setup], members: Sequence[Member]) -> None:
         self.sent: list[Member] = []
         self.failed: dict[Member, Exception] = {}
-        self._batch = batch
+        self._opened = opened
         self._members = members
 
     def __iter__(self) -> Iterator[ScenePackage]:
         for member in self._members:
             try:
-                parcel = packed(self._batch.opened(member), member.folder)
-            except Exception as error:  # removed meanwhile
+                package = packed(self._opened(member), member.folder)
+            except Exception as error:  # a file was removed since it was checked
                 self.failed[member] = error
                 continue
             self.sent.append(member)
-            yield parcel
+            yield package
 
 
 def prepare(setup: Setup, folder: Path) -> None:
-    """Make the folder of a scene, with the scene and its target in it. Raises InputError or DeniedError.
+    """Make the folder of a scene and write the scene and its target image. Raises InputError or MachineError.
 
-    What a world truly looks like is rendered later.
+    The true image of a world is rendered later.
     """
     scene = setup.scene
     make_folder(folder)

@@ -1,4 +1,4 @@
-"""About what a scene takes, and in how many processes a batch of them is done soonest."""
+"""Estimated cost of scenes, and the number of processes that finishes a batch soonest."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ from itertools import accumulate
 
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, choose_method
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.scene import IN_PLACE_OF_AUTO, Scene, read
+from ommatid.scenes.scene import IN_PLACE_OF_AUTO, read
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.point_sources import RENDERINGS
 
 from .batch import Member
 
-# Measured on two cores of 2026, to within a factor of two or so; only ratios between scenes matter much.
-RAYS = 3e7  # a second
-LEAST = 2.0  # seconds: what every scene takes for its pictures and its page
-START = 2.0  # seconds until a process can begin
-ALIKE = 0.6  # of the work of a scene by itself: what all processors share; the rest keeps one of them busy
+# Measured on two cores of 2026, to within a factor of about two; mostly the ratios between scenes matter.
+RAYS = 3e7  # per second
+FIXED = 2.0  # seconds that every scene takes for its pictures and its page
+START = 2.0  # seconds to start a process
+PARALLEL = 0.6  # fraction of a scene's work that uses all processors; the rest uses one (Amdahl)
 
 
 @dataclass(frozen=True)
@@ -31,46 +30,41 @@ class CostEstimate:
 
 
 def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str]) -> CostEstimate:
-    """Of a scene of a batch; none of one that is refused, which will be told in its turn."""
+    """Estimate the cost of a scene of a batch; 0 for one with errors, which are reported when it is run."""
     try:
         setup = Setup.from_scene(read(member.scene, (*changes, *member.changes), lenses))
         choice = choose_method(setup.scene, setup.camera, setup.has_structured_matrix)
     except InputError:
         return CostEstimate(0.0, 0)
-    rays = _rays(setup.scene, setup.camera) / RAYS
-    return CostEstimate(LEAST + rays + choice.seconds, PROGRAM_MEMORY + choice.memory)
-
-
-def _rays(scene: Scene, camera: Camera) -> float:
-    method, asked = scene.calibration.method, scene.calibration.samples
-    several = {"points": RENDERINGS, "transport": 1.0, "ideal": 0.0}[method]
-    return camera.measurements * (
-        scene.render.sample_count + several * (IN_PLACE_OF_AUTO if asked == "auto" else asked)
-    )
+    calibration, samples = setup.scene.calibration, setup.scene.calibration.samples
+    rays_per_sample = {"points": RENDERINGS, "transport": 1.0, "ideal": 0.0}[calibration.method]
+    calibration_rays = rays_per_sample * (IN_PLACE_OF_AUTO if samples == "auto" else samples)
+    rays = setup.camera.measurements * (setup.scene.render.sample_count + calibration_rays)
+    return CostEstimate(FIXED + rays / RAYS + choice.seconds, PROGRAM_MEMORY + choice.memory)
 
 
 def concurrent_by_memory(memory: Sequence[int]) -> int:
-    """How many pieces of work that need these bytes can be done side by side, whichever they are; at least one."""
+    """Return how many tasks that need these bytes fit into memory together, whichever they are; at least 1."""
     allowed = allowed_memory(None)
-    return max(1, sum(together <= allowed for together in accumulate(sorted(memory, reverse=True))))
+    return max(1, sum(total <= allowed for total in accumulate(sorted(memory, reverse=True))))
 
 
 def fastest_process_count(seconds: Sequence[float], most: int, shared: int) -> int:
-    """How many processes, 1 to `most`, do pieces of work that take so long on one of `shared` processors.
+    """Return the number of processes, 1 or `most`, that finishes tasks soonest.
 
-    One process has all processors, but is alone for the part of a piece that they cannot share (Amdahl); several have
-    a share each, and wait for the last of them, which a piece much larger than the others makes long.
+    seconds : of each task on one of the `shared` processors
+    A single process has all processors, but uses them only for the parallel part of a task. Several have a share each,
+    and the batch takes as long as the last of them, which is long if one task is much larger than the others.
     """
     if most < 2:
         return 1
-    alone = sum(seconds) * (1 - ALIKE + ALIKE / shared)
-    return most if START + _until_the_last(seconds, most) < alone else 1
+    one_process = sum(seconds) * (1 - PARALLEL + PARALLEL / shared)
+    return most if START + _makespan(seconds, most) < one_process else 1
 
 
-def _until_the_last(seconds: Sequence[float], count: int) -> float:
-    """When the last process ends, each taking the next piece as soon as it is free."""
+def _makespan(seconds: Sequence[float], count: int) -> float:
+    """Return the time at which the last process ends, if each takes the next task as soon as it is free."""
     busy = [0.0] * count
-    for piece in seconds:
-        first = busy.index(min(busy))
-        busy[first] += piece
+    for task in seconds:
+        busy[busy.index(min(busy))] += task
     return max(busy)

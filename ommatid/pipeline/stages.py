@@ -10,14 +10,14 @@ from typing import Any
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
 from ommatid.reconstruct.output.run_json import RunReport, StudyCase
-from ommatid.runtime.errors import naming_source
+from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.cache import cached_model, cached_stack
@@ -29,7 +29,11 @@ from ommatid.simulate.validation import check_scene, check_scene_memory
 
 def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
     """A scene, its camera and its target, all checked before anything is written."""
-    scene = read(path, changes, lenses)
+    return checked(read(path, changes, lenses))
+
+
+def checked(scene: Scene) -> Setup:
+    """Derive the camera of a scene and load its image. Raises InputError if either cannot be done."""
     camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
     if scene.world is not None:
         from ommatid.simulate.renderer.world import files
@@ -131,6 +135,22 @@ def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, boo
 
         judge = for_prior(setup)
     return cached_model(path, setup, progress, judge)
+
+
+def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
+    """Write the scene in `path` as a plain Mitsuba scene, and describe its files and sensors.
+
+    Raises InputError for a scene with a world or with lenses that are more than pinholes.
+    """
+    from ommatid.runtime.files import check_output
+    from ommatid.simulate.renderer.export import export
+
+    check_output(output, path)
+    setup = opened(path, changes, lenses)
+    if setup.scene.world is not None:
+        raise InputError(f"{path}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
+    picture = export(setup, output)
+    return {"file": str(output), "picture": str(picture), "sensors": [sub.name for sub in setup.camera.sub_imagers]}
 
 
 def facts(chosen: bool) -> dict[str, str]:

@@ -1,11 +1,11 @@
-"""Dividing a time over the stages of a run.
+"""Allocation of a time to the stages of a run.
 
-The expected error of a run with n samples a pixel for rendering and k for calibration is taken as
+The expected mean squared error of a run with n samples per pixel for rendering and k for calibration is modelled as
 
     floor + R n^-a + C k^-b,
 
-what the sensor's noise and the prior leave, and what each stage adds; the time as fixed + n r + k c. R, C and the times
-come from runs with few samples, the exponents from how the parts fall between two of them.
+the floor set by the prior and the sensor's noise, plus what each stage adds; its time as fixed + r n + c k. R, C and
+the times come from runs with few samples, the exponents from the decrease of each part between two such runs.
 """
 
 from __future__ import annotations
@@ -15,19 +15,23 @@ from math import log
 from typing import TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
-Number = TypeVar("Number", float, NDArray[np.float64])
+from ommatid.runtime.arrays import FloatArray
 
-FALLS = (0.5, 2.0)  # what is believed of a measured one
-NEGLIGIBLE = 0.005  # of the expected error: what is not worth any time
-STEPS = 16  # sample numbers tried, for every factor of 2
+Number = TypeVar("Number", float, FloatArray)
+
+EXPONENTS = (0.5, 2.0)  # to which a measured exponent is clipped
+NEGLIGIBLE = 0.005  # increase of the expected error that is accepted to save time
+STEPS = 16  # numbers of samples tried per factor of 2
 
 
 @dataclass(frozen=True)
 class ErrorCurve:
-    """One stage: it adds `part` to the expected error at `samples` a pixel, and takes fixed + each * samples s."""
+    """Model of one stage: it adds `part` to the expected error at `samples` samples per pixel.
+
+    exponent : of the decrease with the number of samples
+    fixed, each : seconds, independent of the number of samples and per sample
+    """
 
     part: float
     samples: int
@@ -36,22 +40,22 @@ class ErrorCurve:
     each: float
 
     def error(self, samples: Number) -> Number:
-        """What it adds to the expected error."""
+        """Return what the stage adds to the expected error."""
         return cast(Number, self.part * (self.samples / samples) ** self.exponent)
 
     def seconds(self, samples: Number) -> Number:
-        """What it takes."""
+        """Return the time of the stage."""
         return cast(Number, self.fixed + self.each * samples)
 
-    def from_on(self, samples: int) -> ErrorCurve:
-        """The same, which begins at so many samples at least."""
+    def starting_at(self, samples: int) -> ErrorCurve:
+        """Return the same curve with its first point at `samples` or later."""
         first = max(self.samples, samples)
         return replace(self, part=float(self.error(first)), samples=first)
 
 
 @dataclass(frozen=True)
 class TimeAllocation:
-    """Samples a pixel for rendering and calibration, and the error and the seconds that they are expected to bring."""
+    """Samples per pixel for rendering and calibration, and the expected error and time of a run with them."""
 
     render: int
     calibrate: int
@@ -62,42 +66,41 @@ class TimeAllocation:
 def allocate_time(
     render: ErrorCurve, calibrate: ErrorCurve, floor: float, seconds: float, most: tuple[int, int]
 ) -> TimeAllocation | None:
-    """The samples of the least expected error within `seconds`, none more than `most`; None where nothing fits.
+    """Choose the samples with the least expected error within `seconds`, from the curves' first points to `most`.
 
-    Of those whose error is as good as the least, to within 0.5 %, the cheapest. No less is tried than was measured.
+    Among those within 0.5 % of the least error, the fastest is taken. Returns None if nothing fits.
     """
-    n, k = _numbers(render.samples, most[0])[:, None], _numbers(calibrate.samples, most[1])[None, :]
+    n, k = _sample_counts(render.samples, most[0])[:, None], _sample_counts(calibrate.samples, most[1])[None, :]
     error = floor + render.error(n) + calibrate.error(k)
-    taken = render.seconds(n) + calibrate.seconds(k)
-    fits = taken <= seconds
+    time = render.seconds(n) + calibrate.seconds(k)
+    fits = time <= seconds
     if not fits.any():
         return None
     good = fits & (error <= error[fits].min() * (1 + NEGLIGIBLE))
-    row, column = np.unravel_index(np.argmin(np.where(good, taken, np.inf)), taken.shape)
-    place = int(row), int(column)
-    return TimeAllocation(int(n[place[0], 0]), int(k[0, place[1]]), float(error[place]), float(taken[place]))
+    row, column = map(int, np.unravel_index(np.argmin(np.where(good, time, np.inf)), time.shape))
+    return TimeAllocation(int(n[row, 0]), int(k[0, column]), float(error[row, column]), float(time[row, column]))
 
 
-def _numbers(first: int, most: int) -> Numbers:
-    """Sample numbers that rise by the same factor from `first` to `most`."""
+def _sample_counts(first: int, most: int) -> FloatArray:
+    """Return whole numbers from `first` to `most` with constant ratios, up to rounding."""
     count = int(STEPS * log(max(most / first, 1.0), 2)) + 1
     rising = np.rint(first * 2 ** (np.arange(count) / STEPS))
     return np.unique(np.append(rising, max(most, first)))
 
 
-def error_curve(
-    few: tuple[int, float, float], more: tuple[int, float, float], part: float, exponent: float | None = None
-) -> ErrorCurve:
-    """From two runs of a stage: samples, seconds, and a variance that its part of the error is proportional to.
+def error_curve(few: tuple[int, float, float], more: tuple[int, float, float], part: float) -> ErrorCurve:
+    """Fit a curve to two runs of a stage.
 
-    part : of the error in the second;  exponent : where it is known
-    Where the second took less time than the first, all its time counts as that of its samples.
+    few, more : number of samples, seconds, and a variance proportional to the stage's part of the error
+    part : part of the error in the second run
+    If the second run was not slower, all of its time is attributed to its samples.
     """
-    (n, before, wide), (m, after, narrow) = few, more
-    each = (after - before) / (m - n)
+    (few_samples, few_seconds, few_variance), (samples, seconds, variance) = few, more
+    each = (seconds - few_seconds) / (samples - few_samples)
     if each <= 0:
-        each = after / m
-    if exponent is None:
-        measured = log(wide / narrow) / log(m / n) if wide > 0 and narrow > 0 else FALLS[1]
-        exponent = min(max(measured, FALLS[0]), FALLS[1])
-    return ErrorCurve(part, m, exponent, max(after - each * m, 0.0), each)
+        each = seconds / samples
+    exponent = EXPONENTS[1]
+    if few_variance > 0 and variance > 0:
+        exponent = log(few_variance / variance) / log(samples / few_samples)
+    exponent = min(max(exponent, EXPONENTS[0]), EXPONENTS[1])
+    return ErrorCurve(part, samples, exponent, max(seconds - each * samples, 0.0), each)

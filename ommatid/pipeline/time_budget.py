@@ -1,6 +1,6 @@
-"""The best result that fits into a time: two runs with few samples, then one with as many as the rest of it holds.
+"""Runs within a given time: two runs with few samples, then one with as many as the rest of the time allows.
 
-All of them are ordinary runs in the scene's own folder, so that a whole result stands there whatever happens.
+All of them are ordinary runs in the scene's own folder, so that it holds complete results whatever happens.
 """
 
 from __future__ import annotations
@@ -14,32 +14,59 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ommatid.batch.batch import Member
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.run_json import ErrorReport, RequestedTime, RunReport, TimeReport
 from ommatid.reconstruct.output.time_spent import STAGES
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file, stack
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.scene import Scene, with_tables
+from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.units import duration
 
-from . import bench_curves, stages, time_allocation
+from . import stages
+from .bench_curves import bench_error_curves
+from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, error_curve
 
-FEW = (256, 1024)  # samples of the runs that measure
-MOST = 2**20  # samples of either stage
-SPARE = 0.15  # of the time that is left: kept back, since measured times vary
+FEW, MORE = 256, 1024  # samples per pixel of the two measuring runs
+MOST = 2**20  # samples per pixel of either stage
+RESERVE = 0.15  # fraction of the remaining time that is kept back, since times vary
+FIRST_ROUND = 3.0  # cost of the first round of 'auto', in runs with FEW samples
+COMPILATION = 1.0  # seconds that Mitsuba takes for a number of samples that it has not met
 KEYS = ("render.samples", "calibration.samples")
-ROUND = 3.0  # times the least samples: what a first round of 'auto' takes
-COMPILED = 1.0  # seconds for a number of samples that Mitsuba has not met
 
 Clock = Callable[[], float]
 Samples = int | Literal["auto"]
+Curves = tuple[ErrorCurve, ErrorCurve]
+
+
+def stages_within(
+    time: str,
+    members: Sequence[Member],
+    started: float,
+    say: Callable[[str], None],
+    scheduler: str = "",
+    workers: int | None = None,
+) -> tuple[Stages, int | None]:
+    """Choose the stages of `run` and the number of processes for scenes that have a `time` together, such as "30 s".
+
+    Without a time these are the ordinary stages and `workers`. Raises InputError if `time` is no duration, or if
+    `scheduler` or `workers` are given with it.
+    """
+    if not time:
+        return stages.run, workers
+    if scheduler or workers is not None:
+        raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
+    try:
+        return shared_time(duration(time), [member.folder for member in members], started, say), 1
+    except ValueError as error:
+        raise InputError(f"--within: {error}") from error
 
 
 @dataclass(frozen=True)
 class TimeRequest:
-    """Seconds that several scenes have together, and how many these are."""
+    """Seconds for a number of scenes together."""
 
     seconds: float
     scenes: int = 1
@@ -48,18 +75,19 @@ class TimeRequest:
 def shared_time(
     seconds: float, folders: Sequence[Path], started: float, say: Callable[[str], None], clock: Clock = perf_counter
 ) -> Stages:
-    """What is done of each of several scenes that have `seconds` together from `started` on: alike of what is left.
+    """Create the stages of scenes that have `seconds` together, counted from `started`.
 
-    folders : of the scenes, in the order in which they are done; one that fails leaves its share to the others
+    folders : of the scenes, in the order in which they are run
+    Each scene has an equal share of the time that is left, so that a scene that fails leaves its share to the others.
     """
-    asked = TimeRequest(seconds, len(folders))
+    request = TimeRequest(seconds, len(folders))
 
-    def does(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
-        begun = started if asked.scenes == 1 else clock()
-        rest = (seconds - (begun - started)) / (asked.scenes - folders.index(folder))
-        return run_within(setup, folder, watch, rest, say, clock, begun, asked)
+    def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
+        begun = started if request.scenes == 1 else clock()
+        share = (seconds - (begun - started)) / (request.scenes - folders.index(folder))
+        return run_within(setup, folder, watch, share, say, clock, begun, request)
 
-    return does
+    return run
 
 
 def run_within(
@@ -70,148 +98,164 @@ def run_within(
     say: Callable[[str], None],
     clock: Clock = perf_counter,
     begun: float | None = None,
-    asked: TimeRequest | None = None,
+    request: TimeRequest | None = None,
 ) -> dict[str, Any]:
-    """What `run` does of a scene with the samples that bring most within `seconds`, and says of it.
+    """Run a scene with the samples that give the least expected error within `seconds`, and return its description.
 
-    say : hears where even the least did not fit;  begun : when the time began to count, absent: now
-    asked : what these seconds are a share of, which differs from run to run; absent: of nothing else
+    say : takes a message if the run took longer
+    begun : when the time began to count; None: now
+    request : the request that `seconds` are a share of; it identifies a repeated run, as shares vary
     """
-    scene, camera = setup.scene, setup.camera
     begun = clock() if begun is None else begun
-    told = asdict(TimeRequest(seconds) if asked is None else asked)
-    again = _again(folder, setup, told)
-    if again is not None:
-        repeated = with_samples(setup, again.chosen[KEYS[0]], again.chosen[KEYS[1]])
-        description = stages.results(repeated, folder, watch)
-        same = again.model_dump(include={"within", "asked", "seconds", "chosen"})
-        return _told(camera, folder, watch, description, same)
-    few = _measured(with_samples(setup, FEW[0], FEW[0]), folder, watch, clock)
-    chosen: tuple[Samples, Samples] = (FEW[0], FEW[0])
-    page = _page(camera, folder, watch, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
-    description, left = few.description, (1 - SPARE) * (seconds - (clock() - begun)) - page
-    sampled = sum(few.seconds(stage) for stage in STAGES)
-    rest = max(few.wall - sampled, few.seconds("reconstruct"))
-    if _needs_little(scene, camera):
-        if left > ROUND * sampled + few.seconds("reconstruct") + rest:
-            chosen = "auto", "auto"
-            description = stages.results(with_samples(setup, *chosen), folder, watch)
-    elif (curves := _of_bench(folder, scene, camera)) is not None or left > 2 * few.wall:
+    requested = asdict(TimeRequest(seconds) if request is None else request)
+    earlier = _earlier_run(folder, setup, requested)
+    if earlier is not None:
+        report = stages.results(_with_samples(setup, *(earlier.chosen[key] for key in KEYS)), folder, watch)
+        same = earlier.model_dump(include={"within", "asked", "seconds", "chosen"})
+        return _finish(setup, folder, watch, report, same)
+
+    few = _measured_run(setup, FEW, folder, watch, clock)
+    report, chosen = few.report, (FEW, FEW)
+    page = _page_seconds(setup, folder, watch, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
+
+    def left() -> float:
+        return (1 - RESERVE) * (seconds - (clock() - begun)) - page
+
+    remaining = left()
+    if _needs_few_samples(setup):
+        chosen, report = _adaptive_run(setup, folder, watch, few, remaining)
+    elif (curves := _bench_curves(folder, setup)) is not None or remaining > 2 * few.wall:
         if curves is None:
-            more = _measured(with_samples(setup, FEW[1], FEW[1]), folder, watch, clock)
-            chosen, description, curves = (FEW[1], FEW[1]), more.description, _curves(scene, few, more)
-            left = (1 - SPARE) * (seconds - (clock() - begun)) - page
-        division = _better(description.error, curves, left - rest - COMPILED)
-        if division is not None:
-            chosen = division.render, division.calibrate
-            description = stages.results(with_samples(setup, *chosen), folder, watch)
-    total = clock() - begun + page  # the last one is still to come
+            more = _measured_run(setup, MORE, folder, watch, clock)
+            report, chosen, curves = more.report, (MORE, MORE), _fitted_curves(setup, few, more)
+            remaining = left()
+        allocation = _better(report.error, curves, remaining - few.other - COMPILATION)
+        if allocation is not None:
+            chosen = allocation.render, allocation.calibrate
+            report = stages.results(_with_samples(setup, *chosen), folder, watch)
+    total = clock() - begun + page  # the final page is still to be written
     if total > seconds:
-        what = "even the least" if chosen[0] == FEW[0] else "this"
-        say(f"{folder}: {what}, {chosen[0]} and {chosen[1]} samples a pixel, took {total:.1f} s of {seconds:g} s")
-    spent = {"within": seconds, "asked": told, "seconds": total, "chosen": dict(zip(KEYS, chosen, strict=True))}
-    return _told(camera, folder, watch, description, spent)
+        fewest = ", the fewest possible" if chosen[0] == FEW else ""
+        samples = f"{chosen[0]} and {chosen[1]} samples per pixel{fewest}"
+        say(f"{folder}: took {total:.1f} s of {seconds:g} s with {samples}")
+    spent = {"within": seconds, "asked": requested, "seconds": total, "chosen": dict(zip(KEYS, chosen, strict=True))}
+    return _finish(setup, folder, watch, report, spent)
 
 
-def with_samples(setup: Setup, rendering: Samples, calibration: Samples) -> Setup:
-    """The setup with these numbers of samples, and no time that would end a stage."""
-    scene = setup.scene
-    render = scene.render.model_copy(update={"samples": rendering, "time": None})
-    calibrate = scene.calibration.model_copy(update={"samples": calibration})
-    return replace(setup, scene=with_tables(scene, render=render, calibration=calibrate))
+def _with_samples(setup: Setup, rendering: Samples, calibration: Samples) -> Setup:
+    """Set the numbers of samples, and remove the time limit of rendering."""
+    render = setup.scene.render.model_copy(update={"samples": rendering, "time": None})
+    calibrate = setup.scene.calibration.model_copy(update={"samples": calibration})
+    return replace(setup, scene=with_tables(setup.scene, render=render, calibration=calibrate))
 
 
-def _needs_little(scene: Scene, camera: Camera) -> bool:
-    """Whether grids of samples fit the edges of pixels of f, so that 'auto' comes to the noise floor at once."""
-    noise = scene.noise
-    silent = noise is None or noise.variance + noise.quantisation_variance == 0
-    return camera.has_box_footprints and scene.world is None and scene.render.sampler == "multijitter" and not silent
+def _needs_few_samples(setup: Setup) -> bool:
+    """Return True if grids of samples fit the pixels' edges, so that 'auto' reaches the noise floor at once."""
+    scene, noise = setup.scene, setup.scene.noise
+    noisy = noise is not None and noise.variance + noise.quantisation_variance != 0
+    return setup.camera.has_box_footprints and scene.world is None and scene.render.sampler == "multijitter" and noisy
 
 
 @dataclass(frozen=True)
 class MeasuredRun:
-    """A run: what it says of itself, what it took, and variances that the stages' parts of the error go with."""
+    """A run and its duration.
 
-    description: RunReport
+    wall : seconds;  variance : of each stage's result, proportional to its part of the error
+    """
+
+    report: RunReport
     wall: float
     variance: dict[str, float]
 
     def seconds(self, stage: str) -> float:
-        """What a stage took, when it was done."""
-        return self.description.stages[stage].seconds
+        """Return the time of a stage."""
+        return self.report.stages[stage].seconds
 
     @property
-    def beside(self) -> float:
-        """What it took beside its stages, seconds."""
-        return max(self.wall - sum(self.seconds(stage) for stage in (*STAGES, "reconstruct")), 0.0)
+    def sampled(self) -> float:
+        """Seconds of the stages that take samples."""
+        return sum(self.seconds(stage) for stage in STAGES)
+
+    @property
+    def other(self) -> float:
+        """Seconds that do not depend on the number of samples."""
+        return max(self.wall - self.sampled, self.seconds("reconstruct"))
+
+    @property
+    def outside_stages(self) -> float:
+        """Seconds outside all stages."""
+        return max(self.wall - self.sampled - self.seconds("reconstruct"), 0.0)
 
 
-def _measured(setup: Setup, folder: Path, watch: RunObserver, clock: Clock) -> MeasuredRun:
+def _measured_run(setup: Setup, samples: int, folder: Path, watch: RunObserver, clock: Clock) -> MeasuredRun:
     start = clock()
-    description = stages.results(setup, folder, watch)
+    report = stages.results(_with_samples(setup, samples, samples), folder, watch)
     wall = clock() - start
-    found = model_file.read(folder / "model.npz")
-    spread = found.prior_variance_from_model(np.ones(found.unknowns)) if found.variance.any() else np.zeros(1)
+    model = model_file.read(folder / "model.npz")
+    from_model = model.prior_variance_from_model(np.ones(model.unknowns)) if model.variance.any() else np.zeros(1)
     light = stack.read(folder / "stack.exr").variance
-    return MeasuredRun(description, wall, {"render": float(np.nanmean(light)), "calibrate": float(np.nanmean(spread))})
+    return MeasuredRun(report, wall, {"render": float(np.nanmean(light)), "calibrate": float(np.nanmean(from_model))})
 
 
-def _better(
-    error: ErrorReport, curves: tuple[time_allocation.ErrorCurve, time_allocation.ErrorCurve], seconds: float
-) -> time_allocation.TimeAllocation | None:
-    """The best division of these seconds, if it promises less than this error."""
+def _adaptive_run(
+    setup: Setup, folder: Path, watch: RunObserver, few: MeasuredRun, remaining: float
+) -> tuple[tuple[Samples, Samples], RunReport]:
+    """Run with 'auto' if its first round fits into the remaining seconds, else keep the run with few samples."""
+    if remaining <= FIRST_ROUND * few.sampled + few.seconds("reconstruct") + few.other:
+        return (FEW, FEW), few.report
+    return ("auto", "auto"), stages.results(_with_samples(setup, "auto", "auto"), folder, watch)
+
+
+def _better(error: ErrorReport, curves: Curves, seconds: float) -> TimeAllocation | None:
+    """Return the best allocation of these seconds if it promises less than the present error."""
     floor = error.predicted_mse - sum(error.budget[part] for part in STAGES.values())
-    found = time_allocation.allocate_time(*curves, floor, seconds, (MOST, MOST))
-    return found if found is not None and found.predicted_mse < error.predicted_mse else None
+    allocation = allocate_time(*curves, floor, seconds, (MOST, MOST))
+    return allocation if allocation is not None and allocation.predicted_mse < error.predicted_mse else None
 
 
-def _page(camera: Camera, folder: Path, watch: RunObserver, clock: Clock) -> float:
-    """Show what stands there, and the seconds that it took, as it will in the end."""
+def _page_seconds(setup: Setup, folder: Path, watch: RunObserver, clock: Clock) -> float:
+    """Write the page of the present results, and return the seconds that it took, as the final one will."""
     start = clock()
-    stages.write_page(camera, folder, watch)
+    stages.write_page(setup.camera, folder, watch)
     return clock() - start
 
 
-def _of_bench(
-    folder: Path, scene: Scene, camera: Camera
-) -> tuple[time_allocation.ErrorCurve, time_allocation.ErrorCurve] | None:
-    """Curves from the samples on that have been taken: `bench` begins with fewer than a scene can ask for."""
-    found = bench_curves.bench_error_curves(folder, scene, camera)
-    return None if found is None else (found[0].from_on(FEW[0]), found[1].from_on(FEW[0]))
+def _bench_curves(folder: Path, setup: Setup) -> Curves | None:
+    """Return the curves of `bench` from FEW samples on; `bench` begins with fewer than a scene can ask for."""
+    curves = bench_error_curves(folder, setup)
+    return None if curves is None else (curves[0].starting_at(FEW), curves[1].starting_at(FEW))
 
 
-def _curves(
-    scene: Scene, few: MeasuredRun, more: MeasuredRun
-) -> tuple[time_allocation.ErrorCurve, time_allocation.ErrorCurve]:
-    found: list[time_allocation.ErrorCurve] = []
+def _fitted_curves(setup: Setup, few: MeasuredRun, more: MeasuredRun) -> Curves:
+    curves: list[ErrorCurve] = []
     for stage, part in STAGES.items():
-        if stage == "calibrate" and scene.calibration.method == "ideal":
-            found.append(time_allocation.ErrorCurve(0.0, FEW[0], 1.0, 0.0, 0.0))
+        if stage == "calibrate" and setup.scene.calibration.method == "ideal":
+            curves.append(ErrorCurve(part=0.0, samples=FEW, exponent=1.0, fixed=0.0, each=0.0))
             continue
-        # What a world truly looks like is rendered with more samples when its sub-images are.
-        truth = stage == "render" and scene.world is not None
-        taken = [one.seconds(stage) + (one.beside if truth else 0.0) for one in (few, more)]
-        ends = [(n, s, one.variance[stage]) for n, s, one in zip(FEW, taken, (few, more), strict=True)]
-        found.append(time_allocation.error_curve(ends[0], ends[1], more.description.error.budget[part]))
-    return found[0], found[1]
+        # The true image of a world is rendered outside the stages, with samples in proportion to those of rendering.
+        with_truth = stage == "render" and setup.scene.world is not None
+        points = [
+            (samples, run.seconds(stage) + (run.outside_stages if with_truth else 0.0), run.variance[stage])
+            for samples, run in ((FEW, few), (MORE, more))
+        ]
+        curves.append(error_curve(points[0], points[1], more.report.error.budget[part]))
+    return curves[0], curves[1]
 
 
-def _again(folder: Path, setup: Setup, asked: dict[str, Any]) -> TimeReport | None:
-    """What an earlier run within the same time spent, if it was of the same scene among as many."""
+def _earlier_run(folder: Path, setup: Setup, requested: dict[str, Any]) -> TimeReport | None:
+    """Return the times of the run in `folder` if it was of the same scene with the same request."""
     try:
-        old = run_json.read(folder).spent
-        now = with_samples(setup, old.chosen[KEYS[0]], old.chosen[KEYS[1]]).resolved.plain()
-        same = old.asked == RequestedTime(**asked) and tomllib.loads((folder / "scene.toml").read_text("utf-8")) == now
+        earlier = run_json.read(folder).spent
+        scene = _with_samples(setup, *(earlier.chosen[key] for key in KEYS)).resolved.plain()
+        same_scene = tomllib.loads((folder / "scene.toml").read_text("utf-8")) == scene
     except (InputError, OSError, ValueError, KeyError):
         return None
-    return old if same else None
+    return earlier if same_scene and earlier.asked == RequestedTime(**requested) else None
 
 
-def _told(
-    camera: Camera, folder: Path, watch: RunObserver, report: RunReport, within: dict[str, Any]
-) -> dict[str, Any]:
-    """The description with what was spent, in run.json and on the run's page as well."""
-    report = report.with_changes(spent=TimeReport.model_validate({**report.spent.plain(), **within}))
+def _finish(setup: Setup, folder: Path, watch: RunObserver, report: RunReport, spent: dict[str, Any]) -> dict[str, Any]:
+    """Add the request and the times to run.json and to the page, and return the description."""
+    report = report.with_changes(spent=TimeReport.model_validate({**report.spent.plain(), **spent}))
     run_json.write(folder, report)
-    stages.write_page(camera, folder, watch)
+    stages.write_page(setup.camera, folder, watch)
     return report.plain()

@@ -1,1 +1,1 @@
-"""Files, processes, memory and failures: what runs beneath the program, without knowledge of cameras."""
+"""Files, processes, memory and errors: the parts of the program that know nothing of cameras."""

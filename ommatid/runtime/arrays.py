@@ -1,4 +1,4 @@
-"""Types of arrays; shapes stand in the docstrings of what takes them."""
+"""Array types; shapes are given in the docstrings of the functions that take or return them."""
 
 from __future__ import annotations
 

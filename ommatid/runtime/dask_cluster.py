@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster that somebody else started, on this machine or elsewhere."""
+"""Workers of a running Dask cluster, on this machine or others."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Generator
-from concurrent.futures import Executor
 from contextlib import closing, contextmanager
 from typing import Any
 
@@ -16,46 +15,54 @@ from . import workers
 from .errors import InputError, MachineError
 from .workers import LOST, Workers
 
-NEVER = logging.CRITICAL + 1
-_LOGS = ("distributed", "distributed.client", "distributed.gc", "tornado", "tornado.application", "asyncio")
+SILENT = logging.CRITICAL + 1
+_LOGGERS = ("distributed", "distributed.client", "distributed.gc", "tornado", "tornado.application", "asyncio")
 
 
 @contextmanager
 def cluster_workers(address: str) -> Generator[Workers]:
-    """The workers of the cluster whose scheduler is at `address`. Raises InputError if there are none."""
+    """Connect to the cluster whose scheduler is at `address`. Raises InputError if it does not answer or is empty."""
     with _settings(), _connected(address) as client:
         yield _ClusterWorkers(client, address)
 
 
 class _ClusterWorkers(Workers):
-    """Those of a cluster somewhere else, whose libraries may be other ones."""
+    """Workers whose installations may differ from this one."""
 
     def __init__(self, client: Any, address: str) -> None:
-        super().__init__(*_employed(client))
+        super().__init__(client.get_executor(pure=False), self._count_threads)
         self._client = client
         self._address = address
 
+    def _count_threads(self) -> int:
+        try:
+            return sum(self._client.nthreads().values())
+        except OSError as error:
+            raise MachineError(LOST) from error
+
     def check_versions(self, facts: Callable[[], dict[str, str]]) -> None:
-        ours = facts()
-        found: dict[str, dict[str, str] | Exception] = self._client.run(facts, on_error="return")
-        for worker, theirs in found.items():
-            if isinstance(theirs, Exception):
+        expected = facts()
+        answers: dict[str, dict[str, str] | Exception] = self._client.run(facts, on_error="return")
+        for worker, answer in answers.items():
+            if isinstance(answer, Exception):
                 raise InputError(
                     f"--scheduler {self._address}: the worker {worker} cannot work for this program"
-                    f" ({type(theirs).__name__}: {theirs}); install the same version of ommatid there"
+                    f" ({type(answer).__name__}: {answer}); install the same version of ommatid there"
                 )
-            wrong = [
-                f"{name} {theirs.get(name)}, here {value}" for name, value in ours.items() if theirs.get(name) != value
+            different = [
+                f"{name} {answer.get(name)}, here {value}"
+                for name, value in expected.items()
+                if answer.get(name) != value
             ]
-            if wrong:
+            if different:
                 raise InputError(
-                    f"--scheduler {self._address}: results would differ, for the worker {worker} has"
-                    f" {'; '.join(wrong)}; make them the same on all machines"
+                    f"--scheduler {self._address}: results would differ, because the worker {worker} has"
+                    f" {'; '.join(different)}; install the same versions on all machines"
                 )
 
 
 def scratch_folder() -> str | None:
-    """On a worker, its own folder, which Dask clears even after the worker was killed; elsewhere None."""
+    """Return a Dask worker's own folder, which Dask clears even if the worker is killed; elsewhere None."""
     if "distributed" not in sys.modules:
         return None
     from distributed import get_worker
@@ -66,27 +73,18 @@ def scratch_folder() -> str | None:
         return None
 
 
-def _employed(client: Any) -> tuple[Executor, Callable[[], int]]:
-    def hands() -> int:
-        try:
-            return sum(client.nthreads().values())
-        except OSError as error:
-            raise MachineError(LOST) from error
-
-    return client.get_executor(pure=False), hands
-
-
 @contextmanager
 def _connected(address: str) -> Generator[Any]:
-    """A client of the cluster at `address`, which has at least one worker. Raises InputError."""
+    """Connect a client to a cluster with at least one worker. Raises InputError."""
     from distributed import Client
 
     try:
-        asyncio.run(_answered(address))
+        asyncio.run(_check_scheduler(address))
         client = Client(address, timeout=workers.PATIENCE, set_as_default=False)
-    except Exception as error:  # what else listens there may answer anything
+    except Exception as error:  # another server at this address may answer anything
         raise InputError(
-            f"--scheduler {address}: no scheduler answers there; start one with `dask scheduler`, or mend the address"
+            f"--scheduler {address}: no scheduler answers there; start one with `dask scheduler`,"
+            " or correct the address"
         ) from error
     with closing(client):
         try:
@@ -98,42 +96,37 @@ def _connected(address: str) -> Generator[Any]:
         yield client
 
 
-async def _answered(address: str) -> None:
-    """Return if a Dask scheduler answers; the client itself would wait forever for whatever else listens there."""
+async def _check_scheduler(address: str) -> None:
+    """Return if a Dask scheduler answers; at another server's address the client itself would wait forever."""
     from distributed import Security
     from distributed.comm.core import connect  # pyright: ignore[reportUnknownVariableType]
 
-    security: Any = Security()  # with the certificates that Dask's configuration names, for tls://
+    security: Any = Security()  # for tls://, with the certificates of Dask's configuration
     options = security.get_connection_args("client")
-    reached: Any = connect(address, timeout=workers.PATIENCE, **options)  # pyright: ignore[reportUnknownVariableType]
-    comm: Any = await asyncio.wait_for(reached, workers.PATIENCE + 1)
+    connecting: Any = connect(address, timeout=workers.PATIENCE, **options)  # pyright: ignore[reportUnknownVariableType]
+    comm: Any = await asyncio.wait_for(connecting, workers.PATIENCE + 1)
     await comm.close()
 
 
 @contextmanager
 def _settings() -> Generator[None]:
-    """Dask as we need it, and nothing of it on stderr: what goes wrong reaches the user as one sentence."""
+    """Silence Dask's logs and warnings, since errors are reported by exceptions; restore everything afterwards."""
     from dask import config
 
-    environment = dict(os.environ)  # to which Dask adds what its workers shall find there
-    whole = {"distributed.admin.large-graph-warning-threshold": "1 PiB"}  # a piece travels with all that it needs
-    with config.set(whole), warnings.catch_warnings():
+    environment = dict(os.environ)  # Dask adds variables for its workers
+    no_warning = {"distributed.admin.large-graph-warning-threshold": "1 PiB"}  # tasks are sent with all their data
+    with config.set(no_warning), warnings.catch_warnings():
         from distributed.versions import VersionMismatchWarning
 
         warnings.simplefilter("ignore", VersionMismatchWarning)
-        levels = _silence()
+        loggers = [logging.getLogger(name) for name in _LOGGERS]
+        levels = [logger.level for logger in loggers]
+        for logger in loggers:
+            logger.setLevel(SILENT)
         try:
             yield
         finally:
-            for name, level in levels.items():
-                logging.getLogger(name).setLevel(level)
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
             for name in os.environ.keys() - environment.keys():
                 del os.environ[name]
-
-
-def _silence() -> dict[str, int]:
-    """Make the libraries' logs say nothing; their levels before."""
-    levels = {name: logging.getLogger(name).level for name in _LOGS}
-    for name in levels:
-        logging.getLogger(name).setLevel(NEVER)
-    return levels

@@ -1,4 +1,4 @@
-"""The two ways in which a command can fail that are not the program's fault."""
+"""Exceptions for failures that are not errors of the program, and values shortened for their messages."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """A scene, option or file that the user can mend; the command line answers with exit code 2."""
+    """Error in a scene, option or file that the user can correct; exit code 2 of the command line."""
 
 
 class MachineError(OSError):
-    """What the machine refuses, such as space on the disk; the command line answers with exit code 1."""
+    """Failure of the machine, such as a full disk or a lost worker; exit code 1 of the command line."""
 
 
 _SHORT = reprlib.Repr()
@@ -22,18 +22,18 @@ _SHORT.maxlevel = 3
 
 
 def shortened_repr(value: object) -> str:
-    """What came, as Python writes it, shortened to what a sentence can hold."""
+    """Return the repr of a value, shortened to fit into a message."""
     return _SHORT.repr(value)
 
 
 def shortened(text: str) -> str:
-    """A text, shortened to what a sentence can hold."""
+    """Return a text, shortened to fit into a message."""
     return shortened_repr(text)[1:-1] if len(text) > _SHORT.maxstring else text
 
 
 @contextmanager
 def naming_source(source: Path) -> Generator[None]:
-    """Let what is wrong with a scene name its file, where whoever noticed did not know that."""
+    """Prefix the scene file to an InputError raised inside, unless its message names the file already."""
     try:
         yield
     except InputError as error:

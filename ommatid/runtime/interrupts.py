@@ -1,7 +1,7 @@
-"""Ctrl-C that is not lost.
+"""Reliable Ctrl-C.
 
-Python raises KeyboardInterrupt wherever it happens to be. Where that is a callback of the garbage collector or the end
-of an object, it is printed and dropped, and the command would go on as if nothing had been pressed.
+Python raises KeyboardInterrupt in whatever code the main thread is running. In a callback of the garbage collector or
+in a `__del__` method the exception is printed and dropped, and the command would continue.
 """
 
 from __future__ import annotations
@@ -14,30 +14,27 @@ from contextlib import contextmanager
 
 @contextmanager
 def interrupts_remembered() -> Generator[Callable[[], None]]:
-    """A function that raises KeyboardInterrupt if there was one since, whoever swallowed it.
+    """Yield a function that raises KeyboardInterrupt if Ctrl-C was pressed inside, even if the exception was dropped.
 
-    Only the main thread is interrupted, so elsewhere the function never raises.
+    Signals reach the main thread only; in other threads the function does nothing.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield _nothing
+    previous = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(previous):
+        yield lambda: None
         return
-    pressed: list[int] = []
+    interrupted = False
 
     def remember(number: int, frame: object) -> None:
-        pressed.append(number)
-        before(number, frame)  # type: ignore[arg-type]
+        nonlocal interrupted
+        interrupted = True
+        previous(number, frame)  # type: ignore[arg-type]
 
-    def look() -> None:
-        if pressed:
+    def check() -> None:
+        if interrupted:
             raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, remember)
     try:
-        yield look
+        yield check
     finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _nothing() -> None:
-    """Nobody is interrupted here."""
+        signal.signal(signal.SIGINT, previous)

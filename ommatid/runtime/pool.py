@@ -1,10 +1,10 @@
-"""Where work is done, as the options ask: in this process, in threads or processes of this machine, or on a cluster."""
+"""Choice of workers: this process, its threads, processes of this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 
 
 class _SerialExecutor(Executor):
-    """Does what is submitted there and then."""
+    """Executes a task when it is submitted."""
 
     def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
         future: Future[Result] = Future()
@@ -29,29 +29,28 @@ class _SerialExecutor(Executor):
 
 @contextmanager
 def worker_pool(scheduler: str = "", count: int | None = None, threads: int = 1) -> Generator[Workers]:
-    """Workers of the cluster at `scheduler`, or `count` processes on this machine, or `threads` in this process.
+    """Start or connect to workers: the cluster at `scheduler`, or `count` processes, or `threads` of this process.
 
-    One process is this one.
-    Raises InputError that names the option if there is no such cluster.
+    A count of 1 is this process. Raises InputError, which names the option, if there is no such cluster.
     """
     check_options(scheduler, count)
-    with ExitStack() as stack:
-        if scheduler:
-            from .dask_cluster import cluster_workers
+    if scheduler:
+        from .dask_cluster import cluster_workers
 
-            yield stack.enter_context(cluster_workers(scheduler))
-        elif count is not None and count > 1:
-            from .process_pool import processes
+        with cluster_workers(scheduler) as workers:
+            yield workers
+    elif count is not None and count > 1:
+        from .process_pool import ProcessPool
 
-            yield Workers(stack.enter_context(processes(count)), lambda: count)
-        else:
-            yield Workers(
-                stack.enter_context(_SerialExecutor() if threads == 1 else ThreadPoolExecutor(threads)), lambda: threads
-            )
+        with ProcessPool(count) as pool:
+            yield Workers(pool, lambda: count)
+    else:
+        with _SerialExecutor() if threads == 1 else ThreadPoolExecutor(threads) as executor:
+            yield Workers(executor, lambda: threads)
 
 
 def check_options(scheduler: str, count: int | None) -> None:
-    """Raise InputError if the options contradict each other, are no address, or need what is not installed."""
+    """Raise InputError if --scheduler contradicts --workers, is not an address, or needs Dask to be installed."""
     if not scheduler:
         return
     if count is not None:

@@ -1,8 +1,12 @@
-"""Workers on this machine: processes that take one piece of work at a time and are replaced when one dies.
+"""Process pool that replaces dead workers and repeats their tasks.
 
-Each is a fresh interpreter (a fork would have one thread left of the renderer's) and talks through a pipe with a
-thread of this process, which therefore knows of which piece a worker died. None outlives this process. Ctrl-C, which
-may reach all of them or this process alone, stops each once, and what is done of its piece is kept.
+Each worker is a fresh interpreter (a fork would keep only one of the renderer's threads) that runs one task at a time
+on its own share of the processors. A thread of this process talks to it through a pipe, and so knows which task a
+worker died of. Ctrl-C may reach all processes or only this one; it interrupts every worker once, and unfinished tasks
+save their checkpoints. No worker outlives this process.
+
+Executors of libraries do not fit: concurrent.futures and loky abort all tasks when one worker dies; pebble ignores
+Ctrl-C in workers, ends them with SIGTERM, repeats no task, and gives a worker no number to choose its processors by.
 """
 
 from __future__ import annotations
@@ -12,9 +16,9 @@ import os
 import pickle
 import signal
 import traceback
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
@@ -26,90 +30,85 @@ from .errors import MachineError
 
 Result = TypeVar("Result")
 
-DEATHS = 2  # of workers: so many may die of one piece of work before it is given up
-PATIENCE = 10.0  # seconds for a worker that is asked to stop
+ATTEMPTS = 3  # workers that may die of a task before it is given up
+PATIENCE = 10.0  # seconds for a worker to stop after it was interrupted
 GIVEN_UP = "every worker that tried it died; it may need more memory than there is"
 
-_FRESH = multiprocessing.get_context("spawn")
+_SPAWN = multiprocessing.get_context("spawn")
 
 
-@contextmanager
-def processes(count: int) -> Generator[Executor]:
-    """`count` processes, each on its share of the processors; whoever leaves stops what they are doing."""
-    workers = _Workers(count)
-    try:
-        yield workers
-    finally:
-        workers.stop()
+class ProcessPool(Executor):
+    """Executor with `count` worker processes, each started for its first task. Shutting down interrupts running tasks.
 
-
-class _Workers(Executor):
-    """A thread a process: it hands over one piece, and waits for what comes of it."""
+    Each thread takes an idle worker, gives it one task, and waits for the answer.
+    """
 
     def __init__(self, count: int) -> None:
-        self._threads = ThreadPoolExecutor(count, initializer=_leave_interrupts)
+        """Start the threads; processes are started when they are needed."""
+        self._threads = ThreadPoolExecutor(count, initializer=_block_interrupts)
+        self._workers = [_Worker(index, count) for index in range(count)]
         self._idle: SimpleQueue[_Worker] = SimpleQueue()
-        self._all = [_Worker(place, count) for place in range(count)]
-        for worker in self._all:
+        for worker in self._workers:
             self._idle.put(worker)
 
     def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
-        return self._threads.submit(self._done, partial(fn, *args, **kwargs))
+        """Execute `fn` in an idle process; its future fails with MachineError if no process survives the task."""
+        return self._threads.submit(self._execute, partial(fn, *args, **kwargs))
 
-    def _done(self, piece: Callable[[], Result]) -> Result:
+    def _execute(self, task: Callable[[], Result]) -> Result:
         worker = self._idle.get()
         try:
-            return worker.do(piece)
+            return worker.execute(task)
         finally:
             self._idle.put(worker)
 
-    def stop(self) -> None:
-        """Ask every process to stop, and kill those that do not in time."""
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Interrupt every process, and kill those that do not stop in time."""
+        del wait, cancel_futures
         until = monotonic() + PATIENCE
-        for worker in self._all:
-            worker.ask_to_stop()
-        for worker in self._all:
-            worker.end(until)
+        for worker in self._workers:
+            worker.interrupt()
+        for worker in self._workers:
+            worker.join(until)
         self._threads.shutdown(cancel_futures=True)
 
 
 class _Worker:
-    """A process, started when there is something to do for it."""
+    """Worker `index` of `count`: a process that is started when there is a task for it."""
 
-    def __init__(self, place: int, count: int) -> None:
-        """The one in this `place` of `count`."""
-        self._share = place, count
-        self._lock = Lock()  # on starting and on stopping, which two threads may want at once
+    def __init__(self, index: int, count: int) -> None:
+        self._share = index, count
+        self._lock = Lock()  # for starting and stopping, which two threads may request at once
         self._process: Any = None
         self._pipe: Any = None
         self._stopped = False
 
-    def do(self, piece: Callable[[], Result]) -> Result:
-        """What the piece returns, or raises. Raises DeniedError if it kills every process that tries it."""
-        message = pickle.dumps(piece)
-        for _ in range(DEATHS + 1):
+    def execute(self, task: Callable[[], Result]) -> Result:
+        """Return the task's result, or raise its exception. Raises MachineError if it kills every process."""
+        message = pickle.dumps(task)
+        for _ in range(ATTEMPTS):
             pipe = self._started()
             try:
                 pipe.send_bytes(message)
                 answer = pipe.recv_bytes()
             except (EOFError, OSError):
-                self._bury()
+                self._discard()
                 continue
-            fine, outcome = pickle.loads(answer)
-            if fine:
+            succeeded, outcome = pickle.loads(answer)
+            if succeeded:
                 return outcome
             raise outcome
         raise MachineError(GIVEN_UP)
 
-    def ask_to_stop(self) -> None:
-        """Let the process break off what it is doing; no other is started."""
+    def interrupt(self) -> None:
+        """Interrupt the running task; start no other process."""
         with self._lock:
             self._stopped = True
             if self._process is not None and self._process.is_alive():
                 os.kill(self._process.pid, signal.SIGINT)
 
-    def end(self, until: float) -> None:
-        """Return when the process has ended, which it does by force after `until`."""
+    def join(self, until: float) -> None:
+        """Wait for the process to end; kill it after `until`."""
         with self._lock:
             if self._process is not None:
                 self._process.join(max(0.0, until - monotonic()))
@@ -121,14 +120,14 @@ class _Worker:
             if self._stopped:
                 raise CancelledError
             if self._process is None:
-                self._pipe, theirs = _FRESH.Pipe()
-                self._process = _FRESH.Process(target=_serve, args=(theirs, *self._share), daemon=True)
+                self._pipe, other_end = _SPAWN.Pipe()
+                self._process = _SPAWN.Process(target=_serve, args=(other_end, *self._share), daemon=True)
                 self._process.start()
-                theirs.close()  # the process has its own, whose closing is how its death is seen
+                other_end.close()  # leaves the worker's own copy, whose closing shows its death
             return self._pipe
 
-    def _bury(self) -> None:
-        """Forget a process that has hung up."""
+    def _discard(self) -> None:
+        """Forget a process that has closed its pipe."""
         with self._lock:
             self._pipe.close()
             self._process.kill()
@@ -136,51 +135,51 @@ class _Worker:
             self._process = None
 
 
-def _leave_interrupts() -> None:
-    """Leave Ctrl-C to the main thread; a process started by this one does not hear it before it can answer."""
+def _block_interrupts() -> None:
+    """Leave Ctrl-C to the main thread; a process started by this thread ignores it until its handler is installed."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
-def _serve(pipe: Connection, place: int, count: int) -> None:
-    """Do piece after piece until nobody asks any more, or until asked to stop."""
+def _serve(pipe: Connection, index: int, count: int) -> None:
+    """Run the worker process: execute tasks until the pipe is closed or Ctrl-C arrives."""
     try:
-        signal.signal(signal.SIGINT, _break_off)
+        signal.signal(signal.SIGINT, _interrupt_once)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        _share_processors(place, count)
-        Thread(target=_end_with_parent, daemon=True).start()
+        _restrict_processors(index, count)
+        Thread(target=_exit_with_parent, daemon=True).start()
         while True:
-            signal.signal(signal.SIGINT, _break_off)  # Mitsuba puts it back such that it ends no waiting any more
+            signal.signal(signal.SIGINT, _interrupt_once)  # Mitsuba resets it to a handler that interrupts no waiting
             pipe.send_bytes(_answer(pipe.recv_bytes()))
     except (EOFError, OSError, KeyboardInterrupt):
-        os._exit(0)  # what is worth keeping is kept, and whoever could hear more has left
+        os._exit(0)  # checkpoints are saved, and the pipe has no reader
 
 
 def _answer(message: bytes) -> bytes:
     try:
         return pickle.dumps((True, pickle.loads(message)()))
     except Exception as error:
-        error.add_note("".join(traceback.format_exception(error)))  # where it was, which does not travel with it
+        error.add_note("".join(traceback.format_exception(error)))  # pickles lose the traceback
         with suppress(Exception):
             return pickle.dumps((False, error))
         return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))
 
 
-def _break_off(number: int, frame: object) -> None:
-    """Stop once: whoever is stopping already is not to be disturbed."""
+def _interrupt_once(number: int, frame: object) -> None:
+    """Raise KeyboardInterrupt, and ignore further signals while the task stops."""
     del frame
     signal.signal(number, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
-def _share_processors(place: int, count: int) -> None:
-    """Keep to a share of the processors, or the threads of all would wait for each other's."""
+def _restrict_processors(index: int, count: int) -> None:
+    """Restrict this process to its share of the processors, so that the threads of the workers do not compete."""
     if hasattr(os, "sched_setaffinity"):
-        ours = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, ours[place % len(ours) :: count])
+        available = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, available[index % len(available) :: count])
 
 
-def _end_with_parent() -> None:
-    """End when the process that asked for the work has been killed."""
+def _exit_with_parent() -> None:
+    """End this process when its parent has been killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

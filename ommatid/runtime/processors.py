@@ -1,4 +1,4 @@
-"""How many processors there are for this process, and linear algebra that does not depend on it."""
+"""Number of available processors, and linear algebra that does not depend on it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingType
 
 
 def processors() -> int:
-    """Those that this process may run on: all of the machine, or its share of them."""
+    """Return the number of processors that this process may run on (its CPU affinity)."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -18,11 +18,8 @@ def processors() -> int:
 
 @contextmanager
 def one_thread() -> Generator[None]:
-    """Linear algebra by one thread: with more of them last digits depend on how many there are.
-
-    Also as a decorator.
-    """
-    import scipy.linalg  # pyright: ignore[reportUnusedImport]  # noqa: F401  # only loaded libraries can be told
+    """Restrict BLAS to one thread: with several, the last digits depend on their number. Also usable as a decorator."""
+    import scipy.linalg  # pyright: ignore[reportUnusedImport]  # noqa: F401  # only loaded libraries can be limited
 
     with threadpool_limits(1, "blas"):
         yield

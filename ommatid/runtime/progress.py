@@ -1,11 +1,11 @@
-"""Who hears how far some work is."""
+"""Progress callbacks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-Progress = Callable[[float], None]
+Progress = Callable[[float], None]  # takes the finished fraction, 0 to 1
 
 
 def no_progress(fraction: float) -> None:
-    """Report to nobody."""
+    """Ignore the progress."""

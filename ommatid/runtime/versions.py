@@ -1,4 +1,4 @@
-"""Which releases of the libraries made a result."""
+"""Versions of the libraries that a result was made with."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from platform import python_version
 
 
 def versions(*names: str) -> dict[str, str]:
-    """Installed versions by distribution name, Python's and our own included."""
+    """Return installed versions by distribution name, always with those of Python, ommatid and numpy."""
     return {"python": python_version(), **{name: version(name) for name in ("ommatid", "numpy", *names)}}

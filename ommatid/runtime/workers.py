@@ -1,7 +1,7 @@
-"""Workers: an executor and how many pieces of work it takes at a time.
+"""Parallel execution of independent tasks.
 
-A piece of work is a function that a module defines, and one item; both are sent as pickles. Which worker does which
-piece, and how often one dies meanwhile, makes no difference to the results.
+A task is a function defined in a module, applied to one item; both are sent as pickles. Results do not depend on which
+worker executes a task, nor on how many workers die meanwhile.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from .progress import Progress
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-PATIENCE = 10.0  # seconds, for a scheduler that does not answer, and for a cluster that has no workers
-GLANCE = 0.5  # seconds between two looks for a Ctrl-C that was lost
-LOST = "the connection to the scheduler was lost; see whether it still runs, and repeat the command"
+PATIENCE = 10.0  # seconds to wait for a scheduler that does not answer, or for a cluster without workers
+POLL = 0.5  # seconds between two checks for a dropped Ctrl-C
+LOST = "the connection to the scheduler was lost; check that it is running, and repeat the command"
 
 
 @dataclass(frozen=True)
 class Completed(Generic[Result]):
-    """A piece of work that has ended: the place of its item, and what came of it."""
+    """A task that has ended, with the index of its item."""
 
     index: int
     _future: Future[Result]
 
     def result(self) -> Result:
-        """What the function returned, or raised. Raises DeniedError if it could not be done."""
+        """Return the function's result, or raise its exception. Raises MachineError if no worker survived the task."""
         try:
             return self._future.result()
         except CancelledError as error:
             raise MachineError(LOST) from error
         except Exception as error:
-            if type(error).__name__ != "KilledWorker":  # whose module is not there without a cluster
+            if type(error).__name__ != "KilledWorker":  # of distributed, which need not be installed
                 raise
             raise MachineError(
                 "every worker that tried it died; it may need more memory than they have, their logs say more"
@@ -48,57 +48,57 @@ class Completed(Generic[Result]):
 
 
 class Workers:
-    """Those who do the work: what takes in pieces of it, and how many it does at a time."""
+    """An executor, and the number of tasks that it can run at once."""
 
-    def __init__(self, executor: Executor, hands: Callable[[], int]) -> None:
-        """Hand out pieces to `executor`, as many at a time as there are `hands` just then."""
+    def __init__(self, executor: Executor, size: Callable[[], int]) -> None:
+        """Send tasks to `executor`, as many at a time as the current `size`, which may change on a cluster."""
         self._executor = executor
-        self._hands = hands
+        self._size = size
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Completed[Result]]:
-        """Do every item, and yield each as it ends, whatever happens to the others.
+        """Apply `function` to every item, and yield each task as it ends, whether it succeeded or failed.
 
-        An item is asked for when somebody is free for it, so that few are held at a time; and since nobody has a
-        piece in reserve, a worker that dies is held against the one piece that it was doing.
-        Raises DeniedError when no workers are left. Whoever stops listening cancels what has not begun.
+        Items are requested only when a worker is free, so that few are in memory. No task waits in a worker's queue:
+        the death of a worker counts only against the task that it was running.
+        Raises MachineError when no workers are left. Closing the generator cancels the tasks that have not begun.
         """
-        waiting = enumerate(items)
+        remaining = enumerate(items)
         pending: dict[Future[Result], int] = {}
-        alone = 0
-        with interrupts_remembered() as interrupted, _cancelled_at_last(pending):
+        waits_without_workers = 0
+        with interrupts_remembered() as check_interrupt, _cancelling(pending):
             while True:
-                for place, item in islice(waiting, max(0, max(1, self._hands()) - len(pending))):
-                    pending[self._executor.submit(function, item)] = place
+                for index, item in islice(remaining, max(0, max(1, self._size()) - len(pending))):
+                    pending[self._executor.submit(function, item)] = index
                 if not pending:
                     return
-                ended = _first_of(pending, interrupted)
-                alone = 0 if ended or self._hands() else alone + 1  # a worker that died may be back in a moment
-                if alone > 1:
+                ended = _first_completed(pending, check_interrupt)
+                waits_without_workers = 0 if ended or self._size() else waits_without_workers + 1
+                if waits_without_workers > 1:  # the first time, a worker that died may be restarting
                     raise MachineError("no workers are left; start some and repeat the command")
                 for future in sorted(ended, key=pending.__getitem__):
                     yield Completed(pending.pop(future), future)
 
     def check_versions(self, facts: Callable[[], dict[str, str]]) -> None:
-        """Raise InputError if a worker answers `facts`, such as versions, otherwise than this process does."""
-        del facts  # whoever works in this installation answers the same
+        """Raise InputError if `facts`, such as versions, differ on a worker; on this machine they never do."""
+        del facts
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], progress: Progress, count: int
     ) -> list[Result]:
-        """What the function makes of all `count` items, in their order.
+        """Apply `function` to all `count` items and return the results in their order.
 
-        Raises the first failure, and cancels the rest.
+        Raises the first failure and cancels the rest.
         """
         results: dict[int, Result] = {}
-        with closing(self.each(function, items)) as everything:
-            for ended in everything:
-                results[ended.index] = ended.result()
+        with closing(self.each(function, items)) as tasks:
+            for task in tasks:
+                results[task.index] = task.result()
                 progress(len(results) / count)
-        return [results[place] for place in range(count)]
+        return [results[index] for index in range(count)]
 
 
 @contextmanager
-def _cancelled_at_last(pending: Iterable[Future[Any]]) -> Generator[None]:
+def _cancelling(pending: Iterable[Future[Any]]) -> Generator[None]:
     try:
         yield
     finally:
@@ -106,11 +106,11 @@ def _cancelled_at_last(pending: Iterable[Future[Any]]) -> Generator[None]:
             future.cancel()
 
 
-def _first_of(pending: Iterable[Future[Result]], interrupted: Callable[[], None]) -> set[Future[Result]]:
-    """Those that ended first; none after some patience. Raises KeyboardInterrupt even where that was swallowed."""
+def _first_completed(pending: Iterable[Future[Result]], check_interrupt: Callable[[], None]) -> set[Future[Result]]:
+    """Wait for at least one future, at most PATIENCE seconds. Raises KeyboardInterrupt."""
     until = monotonic() + PATIENCE
     while True:
-        ended, _ = wait(pending, max(0.0, min(GLANCE, until - monotonic())), FIRST_COMPLETED)
-        interrupted()
+        ended, _ = wait(pending, max(0.0, min(POLL, until - monotonic())), FIRST_COMPLETED)
+        check_interrupt()
         if ended or monotonic() >= until:
             return ended

@@ -14,9 +14,9 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.tables.estimation import EstimatorTable
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import GALLERY, scene
+from ..runs import document
 
 
 def test_candidates_are_read_as_the_usage_shows_them() -> None:

@@ -22,9 +22,9 @@ from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import needs, scene
+from ..runs import document
 
 ONE = (("1/2", [3, 3], [8, 8]),)
 SMOOTH = {"kind": "exponential", "correlation_length": "25 mm"}

@@ -28,9 +28,8 @@ from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files
 from ommatid.runtime.processors import one_thread, processors
 
-from ..cli.test_commands import FILES, MADE
 from ..conftest import TINY, Command, shell
-from ..runtime.test_workers import content
+from ..runs import FILES, MADE, content
 
 COMMAND = ("run", "tiny.toml", "-o", "out", "--sweep", "render.seed=1,2", "--json")
 SCENES = ("tiny+render.seed=1", "tiny+render.seed=2")

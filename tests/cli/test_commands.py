@@ -18,47 +18,10 @@ from ommatid.scenes import stack
 from ommatid.scenes.formats import exr
 
 from ..conftest import TINY, Command, Ended, shell
+from ..runs import FILES, FORBIDDEN, MADE, document, numbers, without
 
 GALLERY = Path(__file__).parents[2] / "scenes"
 COMMANDS = ("run", "render", "calibrate", "reconstruct", "predict", "show", "export", "init", "schema", "doctor")
-FILES = {
-    "scene.toml",
-    "truth.exr",
-    "stack.exr",
-    "model.npz",
-    "estimate.exr",
-    "estimate.png",
-    "overview.png",
-    "run.json",
-    "report.html",
-}
-MADE = ("stack.exr", "model.npz", "estimate.exr", "estimate.png", "overview.png", "run.json", "report.html")
-ASKED_FOR = 77
-
-
-def without(*packages: str) -> str:
-    """Python that ends the process as soon as anybody imports one of these packages, even inside a `try`."""
-    return f"""
-import os, sys
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {packages!r}:
-            os._exit({ASKED_FOR})
-sys.meta_path.insert(0, Refuse())
-"""
-
-
-def document(ended: Ended) -> Any:
-    """The one JSON document on stdout; anything before or after it is a failure."""
-    assert ended.code == 0, ended.err
-    return json.loads(ended.out)
-
-
-def numbers(description: dict[str, Any]) -> dict[str, Any]:
-    """What a reconstruction found, without what it was called and how long it took."""
-    told = {key: value for key, value in description.items() if key not in ("fingerprint", "scene", "file", "spent")}
-    stages = {name: {**stage, "seconds": None} for name, stage in description["stages"].items()}
-    return {**told, "stages": stages}
 
 
 def channels(path: Path) -> dict[str, Any]:
@@ -178,7 +141,7 @@ def test_works_where_mitsuba_is_not_installed(command: str, here: Path, finished
 
 def test_the_trap_for_imports_works(here: Path) -> None:
     ended = shell("render", "tiny.toml", "-o", "out", cwd=here, before=without("mitsuba", "drjit"))
-    assert ended.code == ASKED_FOR
+    assert ended.code == FORBIDDEN
 
 
 # --- the files of a run

@@ -205,14 +205,14 @@ def test_curves_of_bench_serve_the_same_camera_alone(tmp_path: Path) -> None:
         "calibrate": ErrorCurve(2.0, 256, 1.5, 0.4, 1e-3),
     }
     benched(tmp_path, one, laws, (256, 2**24))
-    found = bench_curves.bench_error_curves(tmp_path / "x", one, derive(one))
+    found = bench_curves.bench_error_curves(tmp_path / "x", Setup.from_scene(one))
     assert found is not None
     for law, read_again in zip(laws.values(), found, strict=True):
         assert read_again.exponent == law.exponent
         assert read_again.seconds(5000) == pytest.approx(law.seconds(5000))
         assert read_again.error(5000) == pytest.approx(law.error(5000), rel=1e-3)
     other = scene((14, 14), (("1/3", [3, 3], [3, 3]),))
-    assert bench_curves.bench_error_curves(tmp_path / "x", other, derive(other)) is None
+    assert bench_curves.bench_error_curves(tmp_path / "x", Setup.from_scene(other)) is None
 
 
 def test_curves_that_begin_at_few_samples_ask_for_no_fewer_than_have_been_taken(tmp_path: Path) -> None:

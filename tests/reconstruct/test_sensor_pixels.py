@@ -28,9 +28,9 @@ from ommatid.scenes.tables.sensor import NoiseTable
 from ommatid.simulate.ideal import ideal_model
 from ommatid.simulate.sensor.gaussian import expose, generators
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import THREE, scene
+from ..runs import document
 
 SENSOR = {"variance": 1.0}
 

@@ -16,9 +16,9 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 
-from ..cli.test_commands import document
 from ..conftest import Command
 from ..examples import GALLERY, scene
+from ..runs import document
 
 NOISE = 0.1
 DRAWS = 300

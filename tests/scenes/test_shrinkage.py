@@ -1,55 +1,68 @@
-"""Moderated variances against simulations in which the truth is known."""
+"""Shrunk variances against simulations with known true variances."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import special
 
 from ommatid.scenes.shrinkage import shrink_variances
 
 
 @pytest.mark.parametrize("freedom", [3, 15, 63])
 @pytest.mark.parametrize("prior_freedom", [3.0, 8.0, 40.0])
-def test_sums_come_out_right_even_under_weights_from_the_same_variances(freedom: int, prior_freedom: float) -> None:
-    """Inverse-variance weights favour what was underestimated; the moderated variances allow for it, plain ones not."""
+def test_sums_are_unbiased_under_weights_from_the_same_variances(freedom: int, prior_freedom: float) -> None:
+    """Inverse-variance weights favour underestimates; shrunk variances compensate for that, plain ones do not.
+
+    The tolerance is five standard errors of the ratio of the two sums, plus twice the prior's fitted parameters' own
+    error, of relative order sqrt(2 / n).
+    """
     rng = np.random.default_rng(3)
     true = prior_freedom / rng.chisquare(prior_freedom, 20_000)
-    seen = true * rng.chisquare(freedom, true.size) / freedom
-    moderated = shrink_variances(seen, freedom + 1)
-    weights = 1 / moderated**2
-    assert np.sum(weights * moderated) / np.sum(weights * true) == pytest.approx(1, abs=0.05)
-    naive = 1 / seen**2
-    assert np.sum(naive * seen) / np.sum(naive * true) < 0.9 or freedom == 63
+    sample = true * rng.chisquare(freedom, true.size) / freedom
+    shrunk = shrink_variances(sample, freedom + 1)
+    weights = 1 / shrunk**2
+    ratio = np.sum(weights * shrunk) / np.sum(weights * true)
+    standard_error = np.sqrt(np.sum((weights * (shrunk - ratio * true)) ** 2)) / np.sum(weights * true)
+    assert ratio == pytest.approx(1, abs=5 * standard_error + 2 * np.sqrt(2 / true.size))
+    plain = 1 / sample**2
+    assert np.sum(plain * sample) / np.sum(plain * true) < 0.9 or freedom == 63
 
 
-def test_they_are_closer_to_the_truth_than_the_plain_ones() -> None:
+def test_shrunk_variances_are_closer_to_the_true_ones() -> None:
     rng = np.random.default_rng(4)
     true = 10 / rng.chisquare(10, 5000)
-    seen = true * rng.chisquare(15, true.size) / 15
-    assert np.mean(np.log(shrink_variances(seen, 16) / true) ** 2) < 0.8 * np.mean(np.log(seen / true) ** 2)
+    sample = true * rng.chisquare(15, true.size) / 15
+    before, after = (
+        float(np.mean(np.log(variance / true) ** 2)) for variance in (sample, shrink_variances(sample, 16))
+    )
+    expected = special.polygamma(1, 25 / 2) / special.polygamma(1, 15 / 2)
+    assert after / before == pytest.approx(expected, rel=5 * np.sqrt(2 * 2 / true.size))
 
 
-def test_equal_things_get_one_variance_and_scale_goes_through() -> None:
+def test_equal_variances_become_one_value_that_scales_with_them() -> None:
+    """The mean of n variances of 15 degrees of freedom has the relative standard error sqrt(2 / 15 n)."""
     rng = np.random.default_rng(5)
-    seen = 7 * rng.chisquare(15, 4000) / 15
-    moderated = shrink_variances(seen, 16)
-    assert moderated.std() < 0.1 * seen.std()
-    assert moderated.mean() == pytest.approx(7, rel=0.03)
-    np.testing.assert_allclose(shrink_variances(1e-12 * seen, 16), 1e-12 * moderated, rtol=1e-6)
+    sample = 7 * rng.chisquare(15, 4000) / 15
+    shrunk = shrink_variances(sample, 16)
+    assert shrunk.std() < 0.1 * sample.std()
+    assert shrunk.mean() == pytest.approx(7, rel=5 * np.sqrt(2 / 15 / sample.size))
+    np.testing.assert_allclose(shrink_variances(1e-12 * sample, 16), 1e-12 * shrunk, rtol=1e-6)
 
 
-def test_too_few_or_no_variances_pass_unchanged() -> None:
+def test_too_few_or_zero_variances_are_unchanged() -> None:
     np.testing.assert_array_equal(shrink_variances(np.array([3.0]), 16), [3.0])
     np.testing.assert_array_equal(shrink_variances(np.zeros(5), 16), np.zeros(5))
 
 
-@pytest.mark.parametrize(("spread", "much"), [(0.5, 1.05), (1.0, 1.1), (2.0, 1.25)])
-def test_populations_that_are_no_inverse_chi_squared(spread: float, much: float) -> None:
-    """Lognormal true variances: sums may come out too large, by a stated much, but not too small."""
+@pytest.mark.parametrize(("spread", "bound"), [(0.5, 1.05), (1.0, 1.1), (2.0, 1.25)])
+def test_lognormal_variances_are_not_underestimated(spread: float, bound: float) -> None:
+    """Of another distribution than the assumed one, sums may be too large, up to a bound, but not too small."""
     rng = np.random.default_rng(6)
     ratios: list[float] = []
     for _ in range(50):
         true = np.exp(spread * rng.normal(size=225))
-        seen = true * rng.chisquare(15, true.size) / 15
-        ratios.append(float(shrink_variances(seen, 16).sum() / true.sum()))
-    assert 0.97 < np.mean(ratios) < much
+        sample = true * rng.chisquare(15, true.size) / 15
+        ratios.append(float(shrink_variances(sample, 16).sum() / true.sum()))
+    standard_error = np.std(ratios) / np.sqrt(len(ratios))
+    assert 1 - 3 * standard_error < np.mean(ratios) < bound

@@ -1,0 +1,71 @@
+"""How a command ends: every failure becomes one sentence on stderr and an exit code.
+
+Exit codes are 0, 2 for a scene, option or file to correct, and 1 for what the machine refuses.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, cast
+
+from ommatid.runtime.errors import InputError, MachineError
+
+from .output import say
+
+INTERRUPTED = 130  # exit code of a command stopped by Ctrl-C
+
+
+class BatchError(Exception):
+    """Scenes of a batch failed, as has been reported for each; `exit_code` is the worst of theirs."""
+
+    def __init__(self, exit_code: int) -> None:
+        """Stop a command with an exit code after its failures have been reported."""
+        super().__init__(exit_code)
+        self.exit_code = exit_code
+
+
+def exit_code_of(command: Callable[[], object]) -> int:
+    """Run a command line, report what stops it, and return the exit code."""
+    try:
+        code = command()
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
+    except Exception as error:
+        code = report(error)
+    except KeyboardInterrupt:
+        say("ommatid: stopped; finished files stay, the next run carries on from them")
+        code = 1
+    return _delivered(code if isinstance(code, int) else 0)
+
+
+def report(error: Exception) -> int:
+    """Say in one sentence what went wrong, and return the exit code."""
+    if isinstance(error, BatchError):
+        return error.exit_code
+    if hasattr(error, "format_message"):  # raised by the parser of the command line
+        say(f"ommatid: {cast(Any, error).format_message()}")
+        return 2
+    if isinstance(error, InputError | MachineError):
+        say("ommatid: " + " ".join(str(error).splitlines()))
+        return 2 if isinstance(error, InputError) else 1
+    if os.environ.get("OMMATID_TRACEBACK"):
+        raise error
+    if isinstance(error, MemoryError):
+        say("ommatid: not enough memory; crop the target or close other programs")
+    elif isinstance(error, OSError):
+        say(f"ommatid: {error.filename or 'the machine'}: {error.strerror or error}")
+    else:
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        say(f"ommatid: unexpected {what}; set OMMATID_TRACEBACK=1 to see where, and report it")
+    return 1
+
+
+def _delivered(code: int) -> int:
+    """Flush stdout and return the exit code. Python itself would report an error of it with a traceback."""
+    try:
+        print(end="", flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python flushes again when it ends
+        return code or report(error)
+    return code

@@ -1,0 +1,157 @@
+"""Options that several commands share, and the values that follow from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.tables.gallery import gallery_names
+
+if TYPE_CHECKING:
+    from ommatid.scenes.hardware.frames import AcquisitionSettings
+
+_SCENE = f"A scene file, or a scene of the gallery by name: {', '.join(gallery_names())}."
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help=_SCENE)]
+SceneFiles = Annotated[list[Path], typer.Argument(metavar="SCENE...", help=_SCENE)]
+Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
+Output = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a key, as in noise.variance=1e-6; empty removes it."),
+]
+Lenses = Annotated[
+    str, typer.Option("--lens", metavar="NAME,...", help="Keep these lens types; one named twice counts twice.")
+]
+Complete = Annotated[
+    bool, typer.Option("--complete", help="Simulate every effect, however small: render.complete=true.")
+]
+Sweeps = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sweep",
+        metavar="KEY=VALUE,...",
+        help="A scene for each of these values, as in noise.variance=1e-6,1e-4; several options: every combination.",
+    ),
+]
+Scheduler = Annotated[
+    str, typer.Option("--scheduler", metavar="ADDRESS", help="Send the scenes to this Dask cluster: tcp://host:port.")
+]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", metavar="N", min=1, help="Number of processes (default: chosen automatically)."),
+]
+Within = Annotated[
+    str, typer.Option("--within", metavar="TIME", help='Find the best result within a time, such as "30 s".')
+]
+
+# Recorded frames
+Dark = Annotated[
+    list[Path] | None,
+    typer.Option("--dark", metavar="FILE", help="Frame without light, or a folder; several are averaged."),
+]
+Flat = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--flat",
+        metavar="FILE",
+        help="Frame of a uniform target, or a folder: values become (image - dark)/(flat - dark).",
+    ),
+]
+FlatValue = Annotated[
+    float, typer.Option("--flat-value", metavar="VALUE", help="Value of the target of --flat, in units of f.")
+]
+Origin = Annotated[
+    str,
+    typer.Option(
+        "--origin",
+        metavar="ROW,COLUMN",
+        help="Pixel of the mosaic, from 0, at the top left corner of the first sub-image's patch"
+        " (default: the middle of the mosaic is the camera's axis).",
+    ),
+]
+Upright = Annotated[
+    bool | None,
+    typer.Option(
+        "--upright/--turned",
+        help="Sub-images are upright, or turned by 180 degrees as lenses turn them"
+        " (default: turned in a mosaic, upright in one picture per sub-imager).",
+        show_default=False,
+    ),
+]
+MoreImages = Annotated[
+    list[Path] | None, typer.Argument(metavar="IMAGE...", help="More images of --points.", show_default=False)
+]
+Points = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--points",
+        metavar="IMAGE",
+        help="Recorded point sources: mosaics, a folder of them, or an NPY file of (count, rows, columns).",
+    ),
+]
+Places = Annotated[
+    Path | None,
+    typer.Option(
+        "--places",
+        metavar="FILE",
+        help="CSV of image,row,column: the lit pixels of f, from 0 (default: one image per pixel, by rows).",
+    ),
+]
+PointValue = Annotated[
+    float, typer.Option("--point-value", metavar="VALUE", help="Value of the point sources, in units of f.")
+]
+
+
+def lens_names(lens: str) -> tuple[str, ...]:
+    """Split the names of `--lens`; empty without the option."""
+    return tuple(name.strip() for name in lens.split(",")) if lens else ()
+
+
+def changes(sets: list[str] | None, complete: bool = False) -> tuple[str, ...]:
+    """Collect the changes of `--set` and `--complete`, in the order in which they apply."""
+    return (*(sets or ()), *(("render.complete=true",) if complete else ()))
+
+
+def region(text: str) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Read the corner and the size of `--region`; None without the option. Raises InputError."""
+    if not text:
+        return None
+    row, column, rows, columns = _integers("--region", text, "ROW,COLUMN,ROWS,COLUMNS", "8,8,4,4")
+    return (row, column), (rows, columns)
+
+
+def acquisition(
+    dark: list[Path] | None, flat: list[Path] | None, flat_value: float, origin: str, upright: bool | None
+) -> AcquisitionSettings:
+    """Collect how frames were recorded. Raises InputError for an origin or a value that cannot be."""
+    from ommatid.scenes.hardware.frames import AcquisitionSettings
+
+    corner = None
+    if origin:
+        row, column = _integers("--origin", origin, "ROW,COLUMN", "12,8")
+        corner = row, column
+    return AcquisitionSettings(
+        tuple(dark or ()), tuple(flat or ()), positive("--flat-value", flat_value), corner, upright
+    )
+
+
+def positive(option: str, value: float) -> float:
+    """Return the value of an option if it is finite and above 0. Raises InputError otherwise."""
+    if not 0 < value < float("inf"):
+        raise InputError(f"{option}: expected a value above 0, such as 255, got {value:g}")
+    return value
+
+
+def _integers(option: str, text: str, expected: str, example: str) -> list[int]:
+    try:
+        numbers = [int(number) for number in text.split(",")]
+        if len(numbers) != len(expected.split(",")):
+            raise ValueError(text)
+    except ValueError as error:
+        raise InputError(f"{option}: expected {expected}, such as {example}, got '{text}'") from error
+    return numbers

@@ -1,0 +1,84 @@
+"""Commands that render nothing and expect errors from Eq. 5 alone: predict and design."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ommatid.runtime.errors import InputError
+
+from . import failures, options, output
+from .options import Json, Lenses, SceneFile, Sets, Sweeps
+from .run import finish_batch
+
+SweepFolder = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the table and the plot of --sweep.")
+]
+Candidates = Annotated[
+    str, typer.Option("--candidates", metavar="1/M,...", help="Magnifications; dots continue the step before.")
+]
+
+
+def predict(
+    scene: SceneFile,
+    sets: Sets = None,
+    lens: Lenses = "",
+    sweep: Sweeps = None,
+    folder: SweepFolder = None,
+    as_json: Json = False,
+) -> None:
+    """Predict the error, the rank and the null space of H.
+
+    From Eq. 5 and the ideal model: nothing is rendered.
+    """
+    asked = options.changes(sets), options.lens_names(lens)
+    if sweep:
+        _predict_sweep(scene, sweep, folder, *asked, as_json)
+        return
+    if folder is not None:
+        raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
+    from ommatid.pipeline.descriptions import describe_prediction, predict_with_light
+    from ommatid.pipeline.sections import prediction_sections
+    from ommatid.scenes.scene import read
+
+    described = read(scene, *asked)
+    prediction, light = predict_with_light(described)
+    sections = prediction_sections(described, prediction, light)
+    output.print_result(describe_prediction(prediction, light), sections, as_json)
+
+
+def design(
+    scene: SceneFile,
+    candidates: Candidates = "1/2,1/3,...,1/9",
+    sets: Sets = None,
+    lens: Lenses = "",
+    as_json: Json = False,
+) -> None:
+    """Rank lens types that could be added.
+
+    Ranks magnifications by the expected error (Eq. 5) with each.
+    """
+    from ommatid.analysis.design import magnifications
+    from ommatid.pipeline.descriptions import compare_lens_types
+    from ommatid.scenes.scene import read
+
+    wanted = magnifications(candidates)
+    described = read(scene, options.changes(sets), options.lens_names(lens))
+    with output.progress_bar("design") as progress:
+        comparison = compare_lens_types(described, wanted, progress)
+    title = f"{described.title or scene.stem}: the expected error with one more lens type"
+    output.print_result(comparison.describe(), [(title, comparison.rows())], as_json)
+
+
+def _predict_sweep(
+    scene: Path, sweep: list[str], folder: Path | None, changes: tuple[str, ...], lenses: tuple[str, ...], as_json: bool
+) -> None:
+    from ommatid.pipeline import stages
+    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
+
+    members = batch_members([scene], Path(), sweep, changes, lenses)
+    batch = scene_batch(changes, lenses, stages.predict_scene, output.observer, lambda _, description: description)
+    outcome = run_batch(batch, members, failures.report, sweep_folder=folder, with_folders=False)
+    finish_batch(outcome, as_json)

@@ -1,0 +1,89 @@
+"""Commands on whole scenes, one or many: run and render."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from . import failures, output
+from .options import (
+    Complete,
+    Folder,
+    Json,
+    Lenses,
+    SceneFiles,
+    Scheduler,
+    Sets,
+    Sweeps,
+    Within,
+    Workers,
+    changes,
+    lens_names,
+)
+
+if TYPE_CHECKING:
+    from ommatid.batch.batch import Member
+    from ommatid.pipeline.batches import BatchOutcome
+
+STARTED = perf_counter()  # from which --within counts
+
+
+def run(
+    scenes: SceneFiles,
+    folder: Folder = Path("out"),
+    sets: Sets = None,
+    lens: Lenses = "",
+    sweep: Sweeps = None,
+    scheduler: Scheduler = "",
+    workers: Workers = None,
+    complete: Complete = False,
+    within: Within = "",
+    as_json: Json = False,
+) -> None:
+    """Render, calibrate, reconstruct and report."""
+    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
+    from ommatid.pipeline.sections import run_sections
+    from ommatid.pipeline.time_budget import stages_within
+
+    def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
+        output.print_tables([] if as_json else run_sections(member.folder, description))
+        return description
+
+    asked = changes(sets, complete), lens_names(lens)
+    members = batch_members(scenes, folder, sweep, *asked)
+    stages, workers = stages_within(within, members, STARTED, output.say, scheduler, workers)
+    batch = scene_batch(*asked, stages, output.observer, report)
+    pool = scheduler, workers
+    finish_batch(run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder), as_json)
+
+
+def render(
+    scenes: SceneFiles,
+    folder: Folder = Path("out"),
+    sets: Sets = None,
+    lens: Lenses = "",
+    sweep: Sweeps = None,
+    scheduler: Scheduler = "",
+    workers: Workers = None,
+    complete: Complete = False,
+    as_json: Json = False,
+) -> None:
+    """Render the sub-images alone."""
+    from ommatid.pipeline import stages
+    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
+
+    def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
+        return {"file": str(member.folder / "stack.exr"), **description}
+
+    asked = changes(sets, complete), lens_names(lens)
+    members = batch_members(scenes, folder, sweep, *asked)
+    batch = scene_batch(*asked, stages.render, output.observer, report)
+    finish_batch(run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder), as_json)
+
+
+def finish_batch(outcome: BatchOutcome, as_json: bool) -> None:
+    """Print the documents of a batch, or the table of a sweep. Raises BatchError if a scene failed."""
+    output.print_result(outcome.documents, outcome.sections, as_json)
+    if outcome.exit_code:
+        raise failures.BatchError(outcome.exit_code)

@@ -1,0 +1,79 @@
+"""Commands on the program's own numbers: the paper's claims, numerical stability, error against run time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from . import options, output
+from .options import Folder, Json, Lenses, SceneFile, Sets
+
+if TYPE_CHECKING:
+    from ommatid.scenes.camera import Camera
+    from ommatid.scenes.tables.sensor import NoiseTable
+
+Photograph = Annotated[str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the noise in Figure 7.")]
+Seconds = Annotated[
+    float,
+    typer.Option("--seconds", metavar="N", min=1, help="Time for all measurements; those that do not fit are skipped."),
+]
+
+
+def paper(
+    folder: Folder = Path("paper"), image: Photograph = "photo:camera", seed: Seed = 0, as_json: Json = False
+) -> None:
+    """Compute the paper's figures and claims anew."""
+    from ommatid.paper.paper import rows, write_paper
+    from ommatid.simulate.ideal import ideal_matrix
+
+    with output.progress_bar("paper") as progress:
+        description = write_paper(folder, ideal_matrix, _record, image, seed, progress)
+    output.print_result(description, [(f"The paper's claims: {folder / 'claims.csv'}", rows(description))], as_json)
+
+
+def stability(folder: Folder = Path("stability"), as_json: Json = False) -> None:
+    """Count correct digits on stiff and extreme cases, against exact arithmetic."""
+    from ommatid.scenes.camera import derive
+    from ommatid.scenes.scene import read
+    from ommatid.scenes.tables.gallery import GALLERY
+    from ommatid.simulate.ideal import ideal_matrix
+    from ommatid.stability.cases import CHANGES, LENSES
+    from ommatid.stability.stability import rows, write_stability
+
+    tile = GALLERY / "tile19.toml"
+    matrices = {name: ideal_matrix(derive(read(tile, CHANGES, lenses))) for name, lenses in LENSES.items()}
+    with output.progress_bar("stability") as progress:
+        summary = write_stability(folder, matrices, progress)
+    output.print_result(summary, [("Stiff and extreme cases", rows(summary))], as_json)
+
+
+def bench(
+    scene: SceneFile,
+    folder: Folder = Path("out"),
+    seconds: Seconds = 240,
+    sets: Sets = None,
+    lens: Lenses = "",
+    as_json: Json = False,
+) -> None:
+    """Measure error against run time of every stage.
+
+    Takes samplers, methods and algorithms with more and more samples, and recommends the cheapest that reach the noise.
+    """
+    from ommatid.bench.bench import bench as measure
+    from ommatid.bench.bench import rows
+    from ommatid.pipeline.stages import opened
+
+    setup = opened(scene, options.changes(sets), options.lens_names(lens))
+    with output.progress_bar("bench") as progress:
+        table, made = measure(setup, folder, seconds, progress)
+    output.say_done("bench", made, folder / "bench.json")
+    output.print_result(table.describe(), [(f"Error against run time: {table.title}", rows(table))], as_json)
+
+
+def _record(camera: Camera, light: Any, noise: NoiseTable, number: int) -> Any:
+    from ommatid.simulate.sensor.gaussian import expose, generators
+
+    return expose(light, noise, generators(camera, number), camera.slices())

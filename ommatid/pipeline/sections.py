@@ -1,0 +1,60 @@
+"""The tables that commands print: which there are of each result, in their order.
+
+A section is a title and rows of a name and a value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ommatid.analysis import depth_error, light_table, prediction_table, run_table, study, summary
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.prediction import Prediction
+from ommatid.scenes.scene import Scene
+from ommatid.simulate.lenses import sharpness
+
+Section = tuple[str, list[tuple[str, str]]]
+
+
+def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
+    """Tabulate the description of a finished run in `folder`."""
+    report = RunReport.model_validate(description)
+    sections = [(f"{report.title or folder.name}: {folder}", run_table.rows(report))]
+    if report.depth:
+        sections.append(("Error against distance", depth_error.rows(report.depth)))
+    if report.study:
+        sections.append(("The same stack with other models of H", study.rows(report.study)))
+    return sections
+
+
+def scene_sections(description: dict[str, Any]) -> list[Section]:
+    """Tabulate the description of a scene: geometry, optics, electrons, plan, skipped effects."""
+    geometry, *others = summary.sections(description)
+    return [geometry, *_optics_sections(description.get("optics", ())), *_light_sections(description), *others]
+
+
+def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:
+    """Tabulate a prediction, and the electrons that the pixels collect where the scene has a sensor."""
+    lines, tolerance = prediction_table.rows(prediction), scene.camera.tolerance
+    if tolerance is not None and prediction.misalignment is None and scene.estimator.misalignment == "trust":
+        lines.append(("misalignment", "not included; it is predicted for small targets and sharp lenses only"))
+    return [(scene.title or scene.source.stem, lines), *_light_sections({"light": light} if light else {})]
+
+
+def backend_sections(description: dict[str, Any]) -> list[Section]:
+    """Tabulate the rendering backends and the versions of the libraries."""
+    backends = [
+        (backend["variant"], backend["reason"] or f"works, {backend['samples_per_second'] / 1e6:.0f} million samples/s")
+        for backend in description["backends"]
+    ]
+    return [("Backends", backends), ("Versions", list(description["versions"].items()))]
+
+
+def _optics_sections(optics: Sequence[dict[str, Any]]) -> list[Section]:
+    return [("Optics", [(f"lens type {lens['lens']}", sharpness.words(lens)) for lens in optics])] if optics else []
+
+
+def _light_sections(description: dict[str, Any]) -> list[Section]:
+    return [("Electrons", light_table.rows(description["light"]))] if "light" in description else []

@@ -119,9 +119,9 @@ def test_the_error_of_a_run_comes_from_its_files(tmp_path: Path) -> None:
     write_truth(tmp_path / TRUTH, truth)
     assert depth_error_of_run(tmp_path, CAMERA) == ()
     write_truth(tmp_path / TRUTH, truth, depth)
-    found, expected = depth_error_of_run(tmp_path, CAMERA), error_by_depth(CAMERA, depth, error, variance)
-    assert [depth_bin.pixels for depth_bin in found] == [depth_bin.pixels for depth_bin in expected]
-    assert [depth_bin.rms_error for depth_bin in found] == pytest.approx(
+    bins, expected = depth_error_of_run(tmp_path, CAMERA), error_by_depth(CAMERA, depth, error, variance)
+    assert [depth_bin.pixels for depth_bin in bins] == [depth_bin.pixels for depth_bin in expected]
+    assert [depth_bin.rms_error for depth_bin in bins] == pytest.approx(
         [depth_bin.rms_error for depth_bin in expected], rel=1e-5
     )
     assert (tmp_path / PICTURE).is_file()

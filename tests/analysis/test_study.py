@@ -163,9 +163,9 @@ def test_a_study_from_the_command_line(tmp_path: Path, ommatid: Command, monkeyp
     from ommatid.scenes.scene import write
 
     write(tmp_path / "lens.toml", parse(data, tmp_path / "lens.toml"))
-    found = document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]
-    by_name = {case["model"]: case for case in found["study"]}
+    report = document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]
+    by_name = {case["model"]: case for case in report["study"]}
     assert by_name["points"]["mse"] == pytest.approx(by_name["transport"]["mse"], rel=1e-9)
     kept = json.loads((tmp_path / "out" / "lens" / "run.json").read_text(encoding="utf-8"))
-    assert kept["study"] == found["study"]
-    assert document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]["study"] == found["study"]
+    assert kept["study"] == report["study"]
+    assert document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]["study"] == report["study"]

@@ -120,9 +120,9 @@ def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:
     values = stack.values.copy()
     values[5] = np.nan
     stacks.write(kept / "stack.exr", replace(stack, values=values))
-    found = document(ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "dead.exr", "--json"))
-    assert found["diagnostics"]["pixels_dead"] == 1
-    assert found["diagnostics"]["pixels_used"] == found["measurements"] - 1
+    report = document(ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "dead.exr", "--json"))
+    assert report["diagnostics"]["pixels_dead"] == 1
+    assert report["diagnostics"]["pixels_used"] == report["measurements"] - 1
 
 
 def test_chi_squared_of_the_residual_detects_a_wrong_noise() -> None:
@@ -186,9 +186,9 @@ def test_the_mean_of_a_region() -> None:
 
 def test_a_region_from_the_command_line(kept: Path, ommatid: Command) -> None:
     files = (kept / "stack.exr", kept / "model.npz", "-o", "region.exr", "--region")
-    found = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["region"]
-    assert (found["corner"], found["size"]) == ([2, 3], [4, 5])
-    assert found["deviation"] > 0
+    report = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["region"]
+    assert (report["corner"], report["size"]) == ([2, 3], [4, 5])
+    assert report["deviation"] > 0
     assert "mean of 4 x 5 pixels at 2, 3" in ommatid("reconstruct", *files, "2,3,4,5").out
     for wrong in ("2,3", "a,b,c,d", "0,0,99,99"):
         assert ommatid("reconstruct", *files, wrong).code == 2

@@ -76,7 +76,7 @@ def test_a_grid_that_fits_the_pixels_of_f_leaves_no_error(variant: str) -> None:
     described = auto(variant=variant)
     camera, image = derive(described), load(described)
     found = render_until(Setup(described, camera, image))
-    assert found.how["samples"] < 1024, "where a fixed number takes ten thousand"
+    assert found.details["samples"] < 1024, "where a fixed number takes ten thousand"
     away = np.abs(found.mean - ideal_matrix(camera) @ image.ravel())
     assert np.median(away) < 1e-4
     assert away.max() < 1.0
@@ -124,30 +124,30 @@ def test_threads_change_no_numbers(variant: str) -> None:
         dr.set_thread_count(before)
     assert found[0].mean.tobytes() == found[1].mean.tobytes()
     assert found[0].variance.tobytes() == found[1].variance.tobytes()
-    assert found[0].how == found[1].how
+    assert found[0].details == found[1].details
 
 
 def test_time_ends_it_after_a_round_for_every_pixel() -> None:
     ticks = iter(range(10**6))
     described = auto(sampler="independent", time="3 s")
     found = lit(described, clock=lambda: float(next(ticks)))
-    assert not found.how["reached"]
-    assert set(found.how["not_reached"].values()) == {TIME}
+    assert not found.details["reached"]
+    assert set(found.details["not_reached"].values()) == {TIME}
     assert (found.variance > 0).all()
-    assert found.how["fewest_samples"] >= LEAST
+    assert found.details["fewest_samples"] >= LEAST
     endless = lit(auto(lenses=THREE[:1], time="1e9 s"), clock=lambda: 0.0)
     assert endless.mean.tobytes() == lit(auto(lenses=THREE[:1])).mean.tobytes(), "time that is not over does nothing"
 
 
 def test_what_cannot_be_reached_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     silent = scene((14, 14), ODD[:1], render={"samples": "auto", "variant": "scalar_rgb"}, noise={"variance": 1e-12})
-    assert set(lit(silent).how["not_reached"].values()) <= {FLOAT32, SAMPLES}
-    assert lit(silent).how["not_reached"], "float32 does not tell 1e-6 of 255"
+    assert set(lit(silent).details["not_reached"].values()) <= {FLOAT32, SAMPLES}
+    assert lit(silent).details["not_reached"], "float32 does not tell 1e-6 of 255"
     monkeypatch.setattr("ommatid.simulate.adaptive_render.MOST", 2048)
     few = auto((14, 14), ODD[:1], sampler="independent")
     found = lit(few)
-    assert set(found.how["not_reached"].values()) == {SAMPLES}
-    assert found.how["samples"] <= 2 * 2048 + LEAST
+    assert set(found.details["not_reached"].values()) == {SAMPLES}
+    assert found.details["samples"] <= 2 * 2048 + LEAST
 
 
 @pytest.mark.parametrize("sets", [["noise.variance="], ["noise.variance=0"]], ids=["no noise", "noise of 0"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -18,6 +18,11 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
+from ommatid.simulate.sampling.seeds import sampler_seeds
+
+if TYPE_CHECKING:  # a test asserts that scenes of pinholes load no module of lenses
+    from ommatid.simulate.lenses.prescription import Prescription
+    from ommatid.simulate.renderer.renderer import Renderer
 
 GALLERY = Path(__file__).parent.parent / "scenes"
 Lenses = tuple[tuple[Any, Any, Any], ...]
@@ -117,3 +122,26 @@ def assert_student(difference: NDArray[np.float64], variance: NDArray[np.float64
     limit = float(stats.t.isf(familywise(difference.size) / 2, passes - 1))
     score = np.abs(difference) / np.sqrt(variance)
     assert score.max() < limit, f"t = {score.max():.1f} at {int(score.argmax())}, the limit is {limit:.1f}"
+
+
+def turned_round(lens: Prescription) -> Prescription:
+    """Return a lens whose surfaces are in reverse order."""
+    from ommatid.simulate.lenses.prescription import Prescription
+
+    return Prescription(
+        radius=-lens.radius[::-1],
+        thickness=np.append(lens.thickness[-2::-1], 0.0),
+        index=lens.index_before[::-1],
+        semi_diameter=lens.semi_diameter[::-1],
+        conic=lens.conic[::-1],
+        stop=lens.radius.size - 1 - lens.stop,
+    )
+
+
+def mean_weights(renderer: Renderer, group: str, samples: int) -> NDArray[np.float64]:
+    """Return the mean weight of each pixel's rays, (pixels,): its relative light from a uniform world."""
+    weights = [
+        renderer.hits(group, samples, sampler_seeds(0, "data", 0, 1), block)[1]
+        for block in renderer.blocks(group, samples)
+    ]
+    return np.concatenate([weight.mean(axis=1) for weight in weights if weight is not None])

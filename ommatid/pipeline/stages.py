@@ -1,4 +1,4 @@
-"""The stages of a scene, one after the other: they meet in the files of its folder, and what is up to date stays."""
+"""The stages of a scene. Each reads and writes files in the scene's folder; those up to date are not made again."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from ommatid.simulate.renderer.variant import choose as choose_variant
 from ommatid.simulate.validation import check_scene, check_scene_memory
 
 
-def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
-    """A scene, its camera and its target, all checked before anything is written."""
-    return checked(read(path, changes, lenses))
+def open_scene(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
+    """Read a scene, and check it, its camera and its target image, before anything is written. Raises InputError."""
+    return checked_setup(read(path, changes, lenses))
 
 
-def checked(scene: Scene) -> Setup:
+def checked_setup(scene: Scene) -> Setup:
     """Derive the camera of a scene and load its image. Raises InputError if either cannot be done."""
-    camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
+    camera = derive(scene)  # first, since it is fast and finds most errors
     if scene.world is not None:
         from ommatid.simulate.renderer.world import files
 
@@ -42,30 +42,30 @@ def checked(scene: Scene) -> Setup:
     return Setup(scene, camera, load(scene))
 
 
-def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:
-    """A scene of a batch, with its own changes after those of all."""
-    return opened(member.scene, (*changes, *member.changes), lenses)
+def open_member(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:
+    """Open a scene of a batch, with the changes of all scenes and then its own."""
+    return open_scene(member.scene, (*changes, *member.changes), lenses)
 
 
-def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
-    """In how many processes a batch is done soonest, of as many as memory holds."""
+def process_count(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
+    """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
     from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
 
-    efforts = [estimate_cost(member, changes, lenses) for member in members]
-    most = min(concurrent_by_memory([one.memory for one in efforts]), len(members), processors())
-    return fastest_process_count([one.seconds for one in efforts], most, processors())
+    costs = [estimate_cost(member, changes, lenses) for member in members]
+    most = min(concurrent_by_memory([cost.memory for cost in costs]), len(members), processors())
+    return fastest_process_count([cost.seconds for cost in costs], most, processors())
 
 
-def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
-    """What `run` does of a scene, here or on a worker, and says of it."""
-    report = results(setup, folder, watch)
-    write_page(setup.camera, folder, watch)
+def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+    """Execute all stages of a scene, here or on a worker, and return the content of run.json."""
+    report = results(setup, folder, observer)
+    write_page(setup.camera, folder, observer)
     return report.plain()
 
 
 @one_thread()
-def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
-    """All of a run but its page, and what run.json says of it."""
+def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
+    """Execute all stages of a scene except the page."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.method_choice import choose_method
@@ -77,67 +77,70 @@ def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
     if scene.study is not None and "transport" in scene.study.models:
         with naming_source(scene.source):
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
-    choose_method(scene, camera, setup.has_structured_matrix)  # what memory does not hold is refused before any work
+    choose_method(scene, camera, setup.has_structured_matrix)  # checks the memory before any work
     study.check_study(scene, camera)
-    stack = _rendered(setup, folder, watch)
-    with watch.progress("calibrate") as progress:
+    stack = _rendered(setup, folder, observer)
+    with observer.progress("calibrate") as progress:
         model, made = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
-    watch.done("calibrate", made)
-    with watch.progress("reconstruct") as progress:
+    observer.done("calibrate", made)
+    with observer.progress("reconstruct") as progress:
         report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
-    watch.done("reconstruct", made)
+    observer.done("reconstruct", made)
     complete = report
     if scene.world is not None:
         from ommatid.analysis.depth_error import depth_error_of_run
 
         complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        complete = complete.with_changes(study=_studied(setup, stack, folder, watch))
+        complete = complete.with_changes(study=_studied(setup, stack, folder, observer))
     if complete.plain() != report.plain():
         run_json.write(folder, complete)
     return complete
 
 
-def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
-    """Show the run whose results stand in a folder on a page."""
+def write_page(camera: Camera, folder: Path, observer: RunObserver) -> None:
+    """Write report.html of the results in a folder, unless it is up to date."""
     from ommatid.page.cached import cached_page
     from ommatid.simulate.ideal import matrix_as_designed
 
-    with watch.progress("report"):
+    with observer.progress("report"):
         made = cached_page(folder, partial(matrix_as_designed, camera))
-    watch.done("report", made)
+    observer.done("report", made)
 
 
-def render(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
-    """What `render` does of a scene, here or on a worker, and says of it."""
-    stack = _rendered(setup, folder, watch)
+def render(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+    """Render a scene, here or on a worker, and describe its stack."""
+    stack = _rendered(setup, folder, observer)
     return {"sub_images": len(setup.camera.sub_imagers), **stack.record}
 
 
-def predict_scene(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
-    """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
+def predict_scene(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+    """Predict the error of a scene of a sweep, without rendering or writing anything."""
     from ommatid.analysis.predict import predict_scene
     from ommatid.analysis.prediction_table import json_of
 
-    del folder, watch
+    del folder, observer
     with naming_source(setup.scene.source):
         return json_of(predict_scene(setup.scene))
 
 
-def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
-    """H alone, kept at `path`, and whether it had to be made; its samples are judged by images of the prior."""
+def calibrated_model(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
+    """Return the model at `path` and False if it is up to date; else calibrate it, and True.
+
+    An adaptive calibration stops by the expected error of images drawn from the prior.
+    """
     if setup.scene.calibration.method != "ideal":
         check_scene(setup)
     check_scene_memory(setup)
-    judge = None
+    stopping_rule = None
     if is_adaptive(setup.scene):
         from ommatid.analysis.calibration_goal import for_prior
 
-        judge = for_prior(setup)
-    return cached_model(path, setup, progress, judge)
+        stopping_rule = for_prior(setup)
+    return cached_model(path, setup, progress, stopping_rule)
 
 
-def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
+def export_scene(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
     """Write the scene in `path` as a plain Mitsuba scene, and describe its files and sensors.
 
     Raises InputError for a scene with a world or with lenses that are more than pinholes.
@@ -146,39 +149,42 @@ def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequ
     from ommatid.simulate.renderer.export import export
 
     check_output(output, path)
-    setup = opened(path, changes, lenses)
+    setup = open_scene(path, changes, lenses)
     if setup.scene.world is not None:
         raise InputError(f"{path}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
     picture = export(setup, output)
     return {"file": str(output), "picture": str(picture), "sensors": [sub.name for sub in setup.camera.sub_imagers]}
 
 
-def facts(chosen: bool) -> dict[str, str]:
-    """What has to be the same on all machines for results to be the same; `chosen`: the variant is left to them."""
+def library_versions(with_variant: bool) -> dict[str, str]:
+    """Return the versions that have to agree on all machines for equal results.
+
+    with_variant : True adds the variant that 'auto' stands for
+    """
     found = versions("mitsuba", "drjit", "scipy")
-    if chosen:
+    if with_variant:
         found["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
     return found
 
 
-def _rendered(setup: Setup, folder: Path, watch: RunObserver) -> Stack:
+def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> Stack:
     check_scene(setup, calibrates=False)
     prepare(setup, folder)
-    with watch.progress("render") as progress:
+    with observer.progress("render") as progress:
         stack, made = cached_stack(folder / "stack.exr", setup, progress)
-    watch.done("render", made)
+    observer.done("render", made)
     return stack
 
 
-def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> tuple[StudyCase, ...]:
-    """The same stack with every idea of H that the scene's study names."""
+def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> tuple[StudyCase, ...]:
+    """Reconstruct the stack with every model of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models
     from ommatid.analysis.study import cached_study
     from ommatid.reconstruct.output.result_files import truth_beside
 
-    with watch.progress("study") as progress:
+    with observer.progress("study") as progress:
         known = study_models(setup, folder, no_progress, for_stack(stack))
         cases, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
-    watch.done("study", made)
+    observer.done("study", made)
     return cases

@@ -1,4 +1,4 @@
-"""Blurred footprints against limits, moments, Fourier's integral, an integral along lines, and counted rays."""
+"""Blurred footprints against limits, moments, Fourier integrals, integrals along lines, and counted rays."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.optics.blur import Blur, blur_of, entries, matrix, steepness, transfer
 from ommatid.scenes.optics.blur_moments import QUANTILES, TAIL, airy_end, encircled
@@ -28,40 +29,42 @@ Numbers = NDArray[np.float64]
 BLURS = [Blur(disk=1.3), Blur(disk=1.3, weight=0.04), Blur(airy=0.44), Blur(1.3, 0.44), Blur(1.3, 0.1, weight=0.04)]
 
 
-def whole(one: Camera, blur: Blur) -> Numbers:
-    return np.concatenate([matrix(one, kind, blur).toarray() for kind in one.types])
+def whole(cam: Camera, blur: Blur) -> Numbers:
+    return np.concatenate([matrix(cam, lens_type, blur).toarray() for lens_type in cam.types])
 
 
-def of_glass(glass: LensOptics, wavelength: float | None = None) -> Camera:
-    one = camera((19, 19), (("1/3", [3, 3], [5, 5]),))
-    return replace(one, types=(replace(one.types[0], optics=glass),), wavelength=wavelength)
+def with_lens_optics(optics: LensOptics, wavelength: float | None = None) -> Camera:
+    cam = camera((19, 19), (("1/3", [3, 3], [5, 5]),))
+    return replace(cam, types=(replace(cam.types[0], optics=optics),), wavelength=wavelength)
 
 
 # ---- the blur of a camera
 
 
-def test_a_ray_through_the_lens_lands_in_the_disk_and_at_the_rim_of_it() -> None:
-    """The ray from s through a meets -s focus / d in the plane in focus; seen on the target, beside the chief ray."""
-    one = of_glass(LensOptics(aperture=0.4, focus=800.0))
-    blur, s, depth = blur_of(one, one.types[0]), 0.07, one.depth(one.types[0])
-    landed = [a + (-s * 800 / depth - a) * one.distance / 800 for a in (-0.2, 0.2)]
-    assert blur.disk == pytest.approx(abs(landed[1] - landed[0]) / one.target_pitch, rel=1e-12)
+def test_rays_through_the_rim_of_the_lens_land_on_the_rim_of_the_disk() -> None:
+    """The ray from s through the lens point a meets -s focus / depth in the plane in focus."""
+    cam = with_lens_optics(LensOptics(aperture=0.4, focus=800.0))
+    blur, s, depth = blur_of(cam, cam.types[0]), 0.07, cam.depth(cam.types[0])
+    landed = [a + (-s * 800 / depth - a) * cam.distance / 800 for a in (-0.2, 0.2)]
+    assert blur.disk == pytest.approx(abs(landed[1] - landed[0]) / cam.target_pitch, rel=1e-12)
     at_rim, on_axis = (depth / np.hypot(depth, a) for a in (0.2, 0.0))
     assert (1 + blur.weight) ** -2 == pytest.approx((at_rim / on_axis) ** 4, rel=1e-12)
     assert blur.airy == 0
 
 
-def test_the_first_dark_ring_stands_at_1_22_wavelengths_over_the_aperture() -> None:
-    one = of_glass(LensOptics(aperture=0.4), wavelength=550e-6)
-    blur = blur_of(one, one.types[0])
-    assert special.jn_zeros(1, 1)[0] * blur.airy * one.target_pitch == pytest.approx(1.21967 * 550e-6 / 0.4 * 1000)
+def test_the_first_dark_ring_is_at_1_22_wavelengths_over_the_aperture() -> None:
+    cam = with_lens_optics(LensOptics(aperture=0.4), wavelength=550e-6)
+    blur = blur_of(cam, cam.types[0])
+    assert special.jn_zeros(1, 1)[0] * blur.airy * cam.target_pitch == pytest.approx(
+        AIRY_FIRST_ZERO * GREEN / 0.4 * 1000, rel=1e-6
+    )
     assert blur.disk == 0
 
 
-def test_pinholes_are_sharp_and_surfaces_are_refused() -> None:
-    one = of_glass(LensOptics(), wavelength=550e-6)
-    assert blur_of(one, one.types[0]).is_zero
-    real = of_glass(LensOptics(surfaces=(Surface(semi_diameter="1 mm"),)))  # pyright: ignore[reportArgumentType]
+def test_pinholes_have_no_blur_and_surfaces_are_refused() -> None:
+    cam = with_lens_optics(LensOptics(), wavelength=550e-6)
+    assert blur_of(cam, cam.types[0]).is_zero
+    real = with_lens_optics(LensOptics(surfaces=(Surface(semi_diameter="1 mm"),)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="thin lens"):
         blur_of(real, real.types[0])
 
@@ -85,40 +88,40 @@ def test_the_first_dark_ring_encircles_84_percent() -> None:
 
 
 def test_a_table_in_float32_has_the_pattern_s_shares() -> None:
-    """Linear between points that lie true on the curve, so no share is wrong by more than a step of the table."""
+    """Linear between points on the curve, so that no share has an error above a step of the table."""
     blur = Blur(airy=0.44)
     table = blur.radii.astype(np.float32)
     share = np.concatenate([np.geomspace(1e-12, 1, 500), np.linspace(0, 1, 5000)]).astype(np.float32)
-    place = np.sqrt(share) * np.float32(table.size - 1)
-    cell = np.minimum(place.astype(np.int64), table.size - 2)
-    found = table[cell] + (place - cell.astype(np.float32)) * (table[cell + 1] - table[cell])
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(encircled(found.astype(float) / 0.44), share * (1 - TAIL), atol=3 / table.size)
+    position = np.sqrt(share) * np.float32(table.size - 1)
+    cell = np.minimum(position.astype(np.int64), table.size - 2)
+    result = table[cell] + (position - cell.astype(np.float32)) * (table[cell + 1] - table[cell])
+    assert result.dtype == np.float32
+    np.testing.assert_allclose(encircled(result.astype(float) / 0.44), share * (1 - TAIL), atol=3 / table.size)
     small = slice(0, 300)
-    np.testing.assert_allclose(found[small], 2 * 0.44 * np.sqrt(share[small] * (1 - TAIL)), rtol=1e-4)
+    np.testing.assert_allclose(result[small], 2 * 0.44 * np.sqrt(share[small] * (1 - TAIL)), rtol=1e-4)
     assert blur.radii[-1] == pytest.approx(blur.reach)
 
 
 def test_displacements_have_the_modulation_transfer_of_a_round_aperture() -> None:
-    """What is cut off changes it by no more than TAIL times the largest |J0(2 q v)| there, 1 / sqrt(pi q v)."""
+    """The truncated tail changes it by at most TAIL times the largest |J0(2 q v)| there, 1 / sqrt(pi q v)."""
     n = 400_000
     v = radius_of(Blur(airy=1.0), (np.arange(n) + 0.5) / n)
     for q in (0.05, 0.2, 0.5, 0.8, 1.0, 1.3):
-        found = special.j0(2 * q * v).mean() * (1 - TAIL)
-        assert found == pytest.approx(mtf(np.array(q)), abs=TAIL / np.sqrt(np.pi * q * airy_end()) + 1e-5)
+        result = special.j0(2 * q * v).mean() * (1 - TAIL)
+        assert result == pytest.approx(mtf(np.array(q)), abs=TAIL / np.sqrt(np.pi * q * airy_end()) + 1e-5)
 
 
 # ---- limits, sums and symmetries of H
 
 
-def test_no_blur_is_the_boxes_overlap_and_little_blur_nearly() -> None:
-    for one in (camera(), camera((11, 12), (("3/10", [2, 1], [2, 3]), ("2/5", [2, 2], [3, 3])))):
-        ideal = ideal_matrix(one)
-        sharp = np.concatenate([matrix(one, kind, Blur()).toarray() for kind in one.types])
+def test_without_blur_entries_are_overlaps_of_boxes() -> None:
+    for cam in (camera(), camera((11, 12), (("3/10", [2, 1], [2, 3]), ("2/5", [2, 2], [3, 3])))):
+        ideal = ideal_matrix(cam)
+        sharp = np.concatenate([matrix(cam, lens_type, Blur()).toarray() for lens_type in cam.types])
         np.testing.assert_allclose(sharp, ideal.toarray(), rtol=0, atol=1e-15)
-        assert sum(matrix(one, kind, Blur()).nnz for kind in one.types) == ideal.nnz
+        assert sum(matrix(cam, lens_type, Blur()).nnz for lens_type in cam.types) == ideal.nnz
         for blur in (Blur(disk=1e-6), Blur(airy=1e-6), Blur(1e-6, 1e-7)):
-            np.testing.assert_allclose(whole(one, blur), ideal.toarray(), rtol=0, atol=blur.disk + 5 * blur.airy)
+            np.testing.assert_allclose(whole(cam, blur), ideal.toarray(), rtol=0, atol=blur.disk + 5 * blur.airy)
 
 
 def test_a_disk_wider_than_everything_spreads_light_evenly() -> None:
@@ -129,29 +132,31 @@ def test_a_disk_wider_than_everything_spreads_light_evenly() -> None:
 def test_light_is_conserved_and_lost_only_at_the_edges(blur: Blur) -> None:
     wide = camera((139, 139), (("1/3", [1, 1], [3, 3]), ("2/5", [1, 1], [2, 2])))
     np.testing.assert_allclose(whole(wide, blur).sum(axis=1), 1.0, rtol=0, atol=1e-12)
-    found = whole(camera(), blur)
-    assert found.min() >= 0
-    assert found.sum(axis=1).max() <= 1 + 1e-12
-    assert found.sum(axis=1).min() < 0.99
+    result = whole(camera(), blur)
+    assert result.min() >= 0
+    assert result.sum(axis=1).max() <= 1 + 1e-12
+    assert result.sum(axis=1).min() < 0.99
 
 
 @pytest.mark.parametrize("blur", BLURS)
 def test_mirrored_and_transposed_cameras_are_the_same(blur: Blur) -> None:
-    one = of_glass(LensOptics(aperture=0.4, focus=800.0))  # so that disks are lopsided where rays have weights
-    h = matrix(one, one.types[0], blur).toarray().reshape(3, 3, 5, 5, 19, 19)
+    cam = with_lens_optics(
+        LensOptics(aperture=0.4, focus=800.0)
+    )  # weights make the disks of off-axis pixels asymmetric
+    h = matrix(cam, cam.types[0], blur).toarray().reshape(3, 3, 5, 5, 19, 19)
     np.testing.assert_allclose(h, h.transpose(1, 0, 3, 2, 5, 4), rtol=0, atol=1e-15)
     np.testing.assert_allclose(h, np.flip(h, (0, 2, 4)), rtol=0, atol=1e-15)
     np.testing.assert_allclose(h, np.flip(h, (1, 3, 5)), rtol=0, atol=1e-15)
 
 
-def test_entries_that_no_light_reaches_are_not_stored() -> None:
-    one = camera()
-    for kind in one.types:
+def test_zero_entries_are_not_stored() -> None:
+    cam = camera()
+    for lens_type in cam.types:
         for blur in BLURS[:2]:
-            found = matrix(one, kind, blur)
-            assert found.nnz <= entries(one, kind, blur) < found.nnz * 4
-            assert found.data.min() > 0
-            assert found.has_sorted_indices
+            result = matrix(cam, lens_type, blur)
+            assert result.nnz <= entries(cam, lens_type, blur) < result.nnz * 4
+            assert result.data.min() > 0
+            assert result.has_sorted_indices
 
 
 def lattice(ratio: Fraction, unit: int, reach: float) -> NDArray[np.int64]:
@@ -164,9 +169,9 @@ def lattice(ratio: Fraction, unit: int, reach: float) -> NDArray[np.int64]:
 def test_second_moments_add(ratio: Fraction, blur: Blur) -> None:
     """Of a texel and a footprint, 1/12 and m^2/12, and of the disk, c^2/16, along each axis."""
     unit = 16
-    places = lattice(ratio, unit, blur.reach)
-    density = transfer(float(ratio), places, unit, blur).sum(axis=0) / unit**2
-    x = places / (2 * unit)
+    positions = lattice(ratio, unit, blur.reach)
+    density = transfer(float(ratio), positions, unit, blur).sum(axis=0) / unit**2
+    x = positions / (2 * unit)
     assert density.sum() == pytest.approx(1, rel=1e-12)
     # A sum over i / unit instead of the integral errs by the spectrum at `unit` waves a pixel.
     assert density @ x**2 == pytest.approx((1 + float(ratio) ** 2) / 12 + blur.disk**2 / 16, abs=1 / unit**3)
@@ -180,17 +185,17 @@ def test_second_moments_add(ratio: Fraction, blur: Blur) -> None:
     start=st.integers(0, 100),
 )
 @settings(max_examples=12, deadline=None)
-def test_texels_share_all_light_wherever_a_footprint_begins(
+def test_texels_share_all_light_of_any_footprint(
     ratio: Fraction, disk: float, airy: float, weight: float, start: int
 ) -> None:
     blur, unit = Blur(disk, airy, weight), ratio.denominator
     length = int(ratio * unit)
     wide = int(ratio + blur.reach) + 2
-    known = 2 * (np.arange(-wide, wide + 1) * unit + start % unit) + unit - length
-    found = transfer(float(ratio), known, unit, blur)
-    assert found.min() > -1e-13
-    assert found.sum() == pytest.approx(1, abs=1e-11)
-    np.testing.assert_allclose(found, found.T, rtol=0, atol=1e-14)
+    offsets = 2 * (np.arange(-wide, wide + 1) * unit + start % unit) + unit - length
+    result = transfer(float(ratio), offsets, unit, blur)
+    assert result.min() > -1e-13
+    assert result.sum() == pytest.approx(1, abs=1e-11)
+    np.testing.assert_allclose(result, result.T, rtol=0, atol=1e-14)
 
 
 # ---- second methods
@@ -237,7 +242,7 @@ def spectrum(blur: Blur, rho: Numbers) -> Numbers:
 
 
 def by_fourier(y: float, x: float, ratio: float, blur: Blur, count: int = 160) -> float:
-    """T without a cut off: the integral of its spectrum, which ends where the aperture's does, in polar coordinates."""
+    """T without truncation: the integral of its spectrum, which ends with the aperture's, in polar coordinates."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     angle = np.pi / 2 * (1 + nodes)
     rho = np.sin(angle / 2) ** 2 / (np.pi * blur.airy)
@@ -251,68 +256,68 @@ def by_fourier(y: float, x: float, ratio: float, blur: Blur, count: int = 160) -
 
 
 def compare(
-    ratio: float, known: list[int], unit: int, blur: Blur, second: Callable[[float, float], float]
+    ratio: float, offsets: list[int], unit: int, blur: Blur, second: Callable[[float, float], float]
 ) -> tuple[Numbers, Numbers]:
-    """T of a few places, and by a second method of (y, x)."""
-    found = transfer(ratio, np.array(known), unit, blur)
-    start = [(place / unit - 1 + ratio) / 2 for place in known]
-    return found, np.array([[second(y, x) for x in start] for y in start])
+    """T at pairs of offsets, and by a second method of (y, x)."""
+    result = transfer(ratio, np.array(offsets), unit, blur)
+    start = [(position / unit - 1 + ratio) / 2 for position in offsets]
+    return result, np.array([[second(y, x) for x in start] for y in start])
 
 
 RATIOS = [(3.0, [0, 2, 4, 6], 1), (2.5, [1, 5, 9, 15], 2), (1e6 / 333333, [7, 650001, 1320001, 1433331], 333333)]
 
 
 @pytest.mark.parametrize("disk", [1e-2, 0.7, 2.0, 7.3])
-@pytest.mark.parametrize(("ratio", "known", "unit"), RATIOS)
-def test_disk_against_an_integral_along_lines(ratio: float, known: list[int], unit: int, disk: float) -> None:
-    found, expected = compare(ratio, known, unit, Blur(disk), lambda y, x: along_lines(y, x, ratio, disk))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+@pytest.mark.parametrize(("ratio", "offsets", "unit"), RATIOS)
+def test_disk_against_an_integral_along_lines(ratio: float, offsets: list[int], unit: int, disk: float) -> None:
+    result, expected = compare(ratio, offsets, unit, Blur(disk), lambda y, x: along_lines(y, x, ratio, disk))
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     "blur",
     [Blur(airy=0.44), Blur(1.0, 0.44), Blur(2.0, 0.2, weight=0.05), Blur(1e-3, 0.5, weight=0.05)],
 )
-@pytest.mark.parametrize(("ratio", "known", "unit"), RATIOS)
-def test_airy_against_fourier(ratio: float, known: list[int], unit: int, blur: Blur) -> None:
-    """So near to a footprint nothing of what was cut off lands, so there H is the uncut one over 1 - TAIL."""
-    assert known[-1] / unit / 2 + ratio / 2 + 1 + blur.disk / 2 < blur.airy * airy_end() / np.sqrt(2)
-    found, expected = compare(ratio, known, unit, blur, lambda y, x: by_fourier(y, x, ratio, blur))
-    np.testing.assert_allclose(found * (1 - TAIL), expected, rtol=0, atol=1e-12)
+@pytest.mark.parametrize(("ratio", "offsets", "unit"), RATIOS)
+def test_airy_against_fourier(ratio: float, offsets: list[int], unit: int, blur: Blur) -> None:
+    """So near to a footprint the truncated tail contributes nothing, so that T is that of the whole over 1 - TAIL."""
+    assert offsets[-1] / unit / 2 + ratio / 2 + 1 + blur.disk / 2 < blur.airy * airy_end() / np.sqrt(2)
+    result, expected = compare(ratio, offsets, unit, blur, lambda y, x: by_fourier(y, x, ratio, blur))
+    np.testing.assert_allclose(result * (1 - TAIL), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("blur", [Blur(1.3), Blur(0.7, 0.3), Blur(airy=0.3), Blur(2.0, 0.3, 0.05)])
-def test_steepness_is_the_slope(blur: Blur) -> None:
-    unit, places = 1000, np.array([0, 400, 2000, 2600, 3999, 5200])
-    known = np.concatenate([places, places + 2, np.abs(places - 2)])  # h = 1 / unit; both sides look alike
-    after, before = np.split(transfer(3.0, known, unit, blur)[:, : places.size], 3)[1:]
-    found = steepness(3.0, places, unit, blur)
-    np.testing.assert_allclose(found, (after - before) * unit / 2, rtol=0, atol=1e-5)
+def test_steepness_is_the_derivative_of_transfer(blur: Blur) -> None:
+    unit, positions = 1000, np.array([0, 400, 2000, 2600, 3999, 5200])
+    offsets = np.concatenate([positions, positions + 2, np.abs(positions - 2)])  # h = 1 / unit; T is symmetric
+    after, before = np.split(transfer(3.0, offsets, unit, blur)[:, : positions.size], 3)[1:]
+    result = steepness(3.0, positions, unit, blur)
+    np.testing.assert_allclose(result, (after - before) * unit / 2, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("focus", [1000 / 6, 400.0, 1300.0])
-def test_pixels_off_the_axis_see_the_lens_by_the_cos4_law(focus: float) -> None:
-    """Rays from the middle of a sensor pixel through 200 x 200 points of the lens, each weighed by its own angle."""
-    one = of_glass(LensOptics(aperture=0.4, focus=focus))
-    kind, blur = one.types[0], blur_of(one, one.types[0])
-    even = matrix(one, kind, replace(blur, weight=0.0)).toarray()
-    found = (matrix(one, kind, blur).toarray() - even).reshape(3, 3, 5, 5, 19, 19)
+def test_pixels_off_the_axis_follow_the_cos4_law(focus: float) -> None:
+    """Rays from the middle of a sensor pixel through 200 x 200 points of the lens, weighted by their angles."""
+    cam = with_lens_optics(LensOptics(aperture=0.4, focus=focus))
+    lens_type, blur = cam.types[0], blur_of(cam, cam.types[0])
+    uniform = matrix(cam, lens_type, replace(blur, weight=0.0)).toarray()
+    result = (matrix(cam, lens_type, blur).toarray() - uniform).reshape(3, 3, 5, 5, 19, 19)
     share, angle = (np.arange(200) + 0.5) / 200, 2 * np.pi * (np.arange(200) + 0.5) / 200
     lens = [0.2 * np.outer(np.sqrt(share), turn(angle)).ravel() for turn in (np.cos, np.sin)]
     largest = 0.0
     for k, l, i, j in ((0, 0, 0, 0), (1, 2, 1, 4), (2, 1, 3, 2)):  # noqa: E741
-        sub = one.sub_imager(0, k, l)
-        s = [sub.patch[a] - sub.lens[a] + ((j, i)[a] - 2) * one.pixel_pitch for a in (0, 1)]
+        sub = cam.sub_imager(0, k, l)
+        s = [sub.patch[a] - sub.lens[a] + ((j, i)[a] - 2) * cam.pixel_pitch for a in (0, 1)]
         weights = (1 + sum((a - b) ** 2 for a, b in zip(lens, s, strict=True)) / sub.depth**2) ** -2
         excess = weights / weights.sum() - 1 / weights.size
         axes: list[Numbers] = []
-        for a, size in ((1, one.rows), (0, one.columns)):
-            landed = sub.lens[a] + lens[a] + (-s[a] * focus / sub.depth - lens[a]) * one.distance / focus
-            corner = size / 2 - landed / one.target_pitch - 1.5
+        for a, size in ((1, cam.rows), (0, cam.columns)):
+            landed = sub.lens[a] + lens[a] + (-s[a] * focus / sub.depth - lens[a]) * cam.distance / focus
+            corner = size / 2 - landed / cam.target_pitch - 1.5
             axes.append(trapezoid(np.arange(size)[:, None] - corner, 3.0))
         expected = (axes[0] * excess) @ axes[1].T
         # The second order is s / aperture of the first, times a number of about 1 / 50.
-        np.testing.assert_allclose(found[k, l, i, j], expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+        np.testing.assert_allclose(result[k, l, i, j], expected, rtol=0, atol=1e-3 * np.abs(expected).max())
         largest = max(largest, float(np.abs(expected).max()))
     assert largest > 1e-6
 
@@ -333,18 +338,18 @@ def displaced(blur: Blur, count: int, rng: np.random.Generator) -> Numbers:
 
 @pytest.mark.parametrize("blur", [*BLURS, Blur(9.0, weight=0.2)])
 def test_counted_rays(blur: Blur) -> None:
-    one = camera((8, 9), (("2/5", [2, 1], [2, 3]),))
-    kind, count, rng = one.types[0], 60_000, np.random.default_rng(5)
-    expected = matrix(one, kind, blur).toarray()
+    cam = camera((8, 9), (("2/5", [2, 1], [2, 3]),))
+    lens_type, count, rng = cam.types[0], 60_000, np.random.default_rng(5)
+    expected = matrix(cam, lens_type, blur).toarray()
     seen = np.zeros_like(expected)
-    ratio, size = float(kind.ratio), np.array([[one.rows], [one.columns]])
-    places = [(sub.window, i, j) for sub in one.sub_imagers for i in range(2) for j in range(3)]
-    for row, (window, i, j) in enumerate(places):
+    ratio, size = float(lens_type.ratio), np.array([[cam.rows], [cam.columns]])
+    positions = [(sub.window, i, j) for sub in cam.sub_imagers for i in range(2) for j in range(3)]
+    for row, (window, i, j) in enumerate(positions):
         corner = np.array([[float(window[0]) + ratio * i], [float(window[1]) + ratio * j]])
         landed = np.floor(corner + ratio * rng.random((2, count)) + displaced(blur, count, rng)).astype(int)
         inside = ((landed >= 0) & (landed < size)).all(axis=0)
-        seen[row] = np.bincount(landed[0, inside] * one.columns + landed[1, inside], minlength=one.unknowns)
-    thick = expected * count > 100  # fewer are no matter of a normal distribution
+        seen[row] = np.bincount(landed[0, inside] * cam.columns + landed[1, inside], minlength=cam.unknowns)
+    thick = expected * count > 100  # smaller counts are not normal
     assert seen[expected == 0].sum() == 0
     score = (seen / count - expected)[thick] / np.sqrt((expected * (1 - expected) / count)[thick])
     assert np.abs(score).max() < stats.norm.isf(familywise(score.size) / 2)

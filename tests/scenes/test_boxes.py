@@ -1,4 +1,4 @@
-"""Averages over boxes against the stored matrix, which tests/test_ideal.py holds against counting points."""
+"""Averages over boxes against the stored matrix, which tests/simulate/test_ideal.py compares with counted points."""
 
 from __future__ import annotations
 
@@ -24,50 +24,50 @@ CAMERAS: list[tuple[tuple[int, int], Lenses]] = [
 
 @pytest.mark.parametrize(("shape", "lenses"), CAMERAS)
 def test_against_the_stored_matrix(shape: tuple[int, int], lenses: Lenses) -> None:
-    one = camera(shape, lenses)
-    matrix, found, rng = ideal_matrix(one), BoxFootprints(one), np.random.default_rng(0)
-    image, readings = rng.normal(size=one.unknowns), rng.normal(size=one.measurements)
-    np.testing.assert_allclose(found.forward(image), matrix @ image, atol=1e-14)
-    np.testing.assert_allclose(found.adjoint(readings), matrix.T @ readings, atol=1e-13)
-    assert found.entries == matrix.nnz
+    cam = camera(shape, lenses)
+    matrix, applied, rng = ideal_matrix(cam), BoxFootprints(cam), np.random.default_rng(0)
+    image, readings = rng.normal(size=cam.unknowns), rng.normal(size=cam.measurements)
+    np.testing.assert_allclose(applied.forward(image), matrix @ image, atol=1e-14)
+    np.testing.assert_allclose(applied.adjoint(readings), matrix.T @ readings, atol=1e-13)
+    assert applied.entries == matrix.nnz
 
 
 @pytest.mark.parametrize(("shape", "lenses"), CAMERAS[1:3])
 @pytest.mark.parametrize("corner", [(0, 0), (2, 3), (4, 5)])
-def test_windows_have_the_measurements_that_see_nothing_else(
+def test_windows_have_the_measurements_inside_them(
     shape: tuple[int, int], lenses: Lenses, corner: tuple[int, int]
 ) -> None:
-    one = camera(shape, lenses)
+    cam = camera(shape, lenses)
     rows, columns = (slice(start, start + min(size - start, 30) - 1) for start, size in zip(corner, shape, strict=True))
-    dense = ideal_matrix(one).toarray().reshape(-1, *shape)
+    dense = ideal_matrix(cam).toarray().reshape(-1, *shape)
     outside = dense.copy()
     outside[:, rows, columns] = 0
     expected = np.flatnonzero(~outside.any(axis=(1, 2)))
-    whole = ideal_matrix(one)
-    stored = Model(scene(), one, whole, np.zeros(whole.nnz), np.zeros((0, whole.nnz), np.float32), {"method": "points"})
-    for found in (BoxFootprints(one), stored):
-        numbers = found.measurements_inside(rows, columns)
-        np.testing.assert_array_equal(np.sort(numbers), expected)
+    whole = ideal_matrix(cam)
+    stored = Model(scene(), cam, whole, np.zeros(whole.nnz), np.zeros((0, whole.nnz), np.float32), {"method": "points"})
+    for h in (BoxFootprints(cam), stored):
+        inside = h.measurements_inside(rows, columns)
+        np.testing.assert_array_equal(np.sort(inside), expected)
         np.testing.assert_allclose(
-            found.submatrix(rows, columns).toarray(),
-            dense[numbers][:, rows, columns].reshape(numbers.size, -1),
+            h.submatrix(rows, columns).toarray(),
+            dense[inside][:, rows, columns].reshape(inside.size, -1),
             atol=1e-15,
         )
 
 
 def test_windows_of_one_signature_have_the_same_h() -> None:
-    one = BoxFootprints(camera((70, 61), CAMERAS[1][1]))
+    cam = BoxFootprints(camera((70, 61), CAMERAS[1][1]))
     first, second, edge = (slice(10, 40), slice(12, 42)), (slice(11, 41), slice(19, 49)), (slice(0, 30), slice(12, 42))
-    assert one.signature(*first) == one.signature(*second)
-    assert (one.submatrix(*first) - one.submatrix(*second)).nnz == 0
-    assert one.signature(*first) != one.signature(*edge)
+    assert cam.signature(*first) == cam.signature(*second)
+    assert (cam.submatrix(*first) - cam.submatrix(*second)).nnz == 0
+    assert cam.signature(*first) != cam.signature(*edge)
 
 
 def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    one = camera((150, 140), CAMERAS[1][1])
-    image, readings = np.random.default_rng(1).normal(size=one.unknowns), np.ones(one.measurements)
-    found = BoxFootprints(one).forward(image), BoxFootprints(one).adjoint(readings)
+    cam = camera((150, 140), CAMERAS[1][1])
+    image, readings = np.random.default_rng(1).normal(size=cam.unknowns), np.ones(cam.measurements)
+    forward, adjoint = BoxFootprints(cam).forward(image), BoxFootprints(cam).adjoint(readings)
     monkeypatch.setattr(boxes, "processors", lambda: 1)
-    np.testing.assert_array_equal(BoxFootprints(one).forward(image), found[0])
-    np.testing.assert_array_equal(BoxFootprints(one).adjoint(readings), found[1])
-    assert boxes.ROWS_AT_ONCE < 150, "else there is one piece of work only"
+    np.testing.assert_array_equal(BoxFootprints(cam).forward(image), forward)
+    np.testing.assert_array_equal(BoxFootprints(cam).adjoint(readings), adjoint)
+    assert boxes.ROWS_AT_ONCE < 150, "otherwise there is only one task"

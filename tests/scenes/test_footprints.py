@@ -1,4 +1,4 @@
-"""H of distorted and misaligned pinholes against closed forms, polygons, points and the boxes of perfect ones."""
+"""H of distorted and misaligned pinholes against closed forms, polygons, points and the boxes of ideal pinholes."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ NUDGED = Misalignment(position=(2e-3, -1e-3), tilt=(0.04, -0.03), rotation=0.05,
 TWO_FIFTHS: Lenses = (("2/5", [2, 3], "fit"), ("5/7", [1, 2], "fit"))
 
 
-def distorted(perfect: Camera, k1: float, k2: float) -> Camera:
-    glass = LensOptics(distortion=(k1, k2))
-    return replace(perfect, types=tuple(replace(kind, optics=glass) for kind in perfect.types))
+def distorted(ideal: Camera, k1: float, k2: float) -> Camera:
+    optics = LensOptics(distortion=(k1, k2))
+    return replace(ideal, types=tuple(replace(lens_type, optics=optics) for lens_type in ideal.types))
 
 
 def expected_error(h: sparse.csr_array, noise: float = 1e-2, prior: float = 5461.25) -> float:
@@ -42,33 +42,33 @@ def expected_error(h: sparse.csr_array, noise: float = 1e-2, prior: float = 5461
     return float(np.trace(np.linalg.inv(information))) / h.shape[1]
 
 
-def image_on_patch(sight: Pose, tangents: Vector) -> Vector:
-    """(n, 2): (u, v) where chief rays of image tangents (n, 2) meet the patch, found on its plane."""
+def image_on_patch(pose: Pose, tangents: Vector) -> Vector:
+    """(u, v) where chief rays of image tangents, (n, 2), meet the plane of the patch: (n, 2)."""
     rays = np.column_stack([tangents, np.ones(len(tangents))])
-    normal = np.cross(sight.axes[:, 0], sight.axes[:, 1])
-    points = rays * (normal @ sight.middle / (rays @ normal))[:, None]
-    return (points - sight.middle) @ sight.axes
+    normal = np.cross(pose.axes[:, 0], pose.axes[:, 1])
+    points = rays * (normal @ pose.middle / (rays @ normal))[:, None]
+    return (points - pose.middle) @ pose.axes
 
 
-def image_tangents(cam: Camera, sub: SubImager, sight: Pose, row: Vector, column: Vector) -> Vector:
-    """(n, 2): of points of the target, in pixels of f."""
+def image_tangents(cam: Camera, sub: SubImager, pose: Pose, row: Vector, column: Vector) -> Vector:
+    """Image tangents of points of the target, in pixels of f: (n, 2)."""
     x, y = cam.position(row, column)  # pyright: ignore[reportArgumentType]
     k = sub.type.optics.distortion or (0.0, 0.0)
-    tangents = (x - sight.lens[0]) / cam.distance, (y - sight.lens[1]) / cam.distance
+    tangents = (x - pose.lens[0]) / cam.distance, (y - pose.lens[1]) / cam.distance
     return np.column_stack(distort(*tangents, *k, cam.distance / cam.half_diagonal))
 
 
-def footprint(cam: Camera, sub: SubImager, sight: Pose, u: Vector, v: Vector) -> tuple[Vector, Vector]:
+def footprint(cam: Camera, sub: SubImager, pose: Pose, u: Vector, v: Vector) -> tuple[Vector, Vector]:
     """Row and column of f, as real numbers, where chief rays of points (u, v) of the patch come from."""
-    point = [at + along[0] * u + along[1] * v for at, along in zip(sight.middle, sight.axes, strict=True)]
+    point = [at + along[0] * u + along[1] * v for at, along in zip(pose.middle, pose.axes, strict=True)]
     tangents = point[0] / point[2], point[1] / point[2]
     scale = cam.distance / cam.half_diagonal
-    x, y = undistort(*tangents, *coefficients(sub), scale, field(cam, sub, sight))
-    row = cam.rows / 2 - (sight.lens[1] + y * cam.distance) / cam.target_pitch
-    return row, cam.columns / 2 - (sight.lens[0] + x * cam.distance) / cam.target_pitch
+    x, y = undistort(*tangents, *coefficients(sub), scale, field(cam, sub, pose))
+    row = cam.rows / 2 - (pose.lens[1] + y * cam.distance) / cam.target_pitch
+    return row, cam.columns / 2 - (pose.lens[0] + x * cam.distance) / cam.target_pitch
 
 
-def reach(cam: Camera, sub: SubImager, sight: Pose) -> tuple[Vector, Vector, Vector, Vector]:
+def reach(cam: Camera, sub: SubImager, pose: Pose) -> tuple[Vector, Vector, Vector, Vector]:
     """Bounds of each pixel's footprint: first row and last + 1, first column and last + 1, from points on its sides.
 
     Between points a curve rises above both by at most 1/8 of its second difference there; twice that is added.
@@ -81,25 +81,25 @@ def reach(cam: Camera, sub: SubImager, sight: Pose) -> tuple[Vector, Vector, Vec
     i, j = np.divmod(np.arange(rows * columns), columns)
     u, v = left + (j[:, None] + du) * cam.pixel_pitch, top + (i[:, None] + dv) * cam.pixel_pitch
     bounds: list[Vector] = []
-    for at in footprint(cam, sub, sight, u, v):
+    for at in footprint(cam, sub, pose, u, v):
         bulge = np.abs(np.diff(at.reshape(at.shape[0], 4, -1), 2, axis=2)).max(axis=(1, 2)) / 4 + 1e-9
         bounds += [np.floor(at.min(axis=1) - bulge), np.ceil(at.max(axis=1) + bulge)]
     return bounds[0], bounds[1], bounds[2], bounds[3]
 
 
 @pytest.mark.parametrize(("shape", "lenses"), [((19, 19), THREE), ((23, 17), TWO_FIFTHS)])
-@pytest.mark.parametrize("glass", [LensOptics(), LensOptics(distortion=(0.0, 0.0))])
+@pytest.mark.parametrize("optics", [LensOptics(), LensOptics(distortion=(0.0, 0.0))])
 def test_without_distortion_it_is_a_product_of_intervals(
-    shape: tuple[int, int], lenses: Lenses, glass: LensOptics
+    shape: tuple[int, int], lenses: Lenses, optics: LensOptics
 ) -> None:
-    perfect = camera(shape, lenses)
-    cam = replace(perfect, types=tuple(replace(kind, optics=glass) for kind in perfect.types))
-    for sub, place in zip(cam.sub_imagers, cam.slices(), strict=True):
-        kind = sub.type
-        down = overlap(kind.ratio, kind.pixels[0], sub.window[0], cam.rows)
-        across = overlap(kind.ratio, kind.pixels[1], sub.window[1], cam.columns)
+    ideal = camera(shape, lenses)
+    cam = replace(ideal, types=tuple(replace(lens_type, optics=optics) for lens_type in ideal.types))
+    for sub, pixels in zip(cam.sub_imagers, cam.slices(), strict=True):
+        lens_type = sub.type
+        down = overlap(lens_type.ratio, lens_type.pixels[0], sub.window[0], cam.rows)
+        across = overlap(lens_type.ratio, lens_type.pixels[1], sub.window[1], cam.columns)
         found = sub_matrix(cam, sub, pose_of(sub))
-        assert found.shape == (place.stop - place.start, cam.unknowns)
+        assert found.shape == (pixels.stop - pixels.start, cam.unknowns)
         assert abs(found - sparse.kron(down, across)).max() < 1e-13
         assert found.nnz == down.nnz * across.nnz
 
@@ -107,13 +107,13 @@ def test_without_distortion_it_is_a_product_of_intervals(
 def test_a_moved_and_lengthened_pinhole_sees_moved_and_smaller_boxes() -> None:
     """The lens moves by p: the point of the target behind a sensor point moves by p (1 + Z/d)."""
     cam = camera(lenses=THREE[:1])
-    wrong = Misalignment(position=(3e-3, -2e-3), focal_length=0.03)
+    misalignment = Misalignment(position=(3e-3, -2e-3), focal_length=0.03)
     for sub in cam.sub_imagers:
-        found = sub_matrix(cam, sub, pose_of(sub, wrong)).toarray()
+        found = sub_matrix(cam, sub, pose_of(sub, misalignment)).toarray()
         depth = sub.depth * 1.03
         axes: list[Vector] = []
         for axis, size in ((1, cam.rows), (0, cam.columns)):
-            lens = sub.lens[axis] + wrong.position[axis]
+            lens = sub.lens[axis] + misalignment.position[axis]
             count = sub.type.pixels[1 - axis]
             sides = sub.patch[axis] + (np.arange(count + 1) - count / 2) * cam.pixel_pitch
             seen = size / 2 - (lens - (sides - lens) * cam.distance / depth) / cam.target_pitch
@@ -123,8 +123,8 @@ def test_a_moved_and_lengthened_pinhole_sees_moved_and_smaller_boxes() -> None:
         np.testing.assert_allclose(found, np.kron(*axes), rtol=0, atol=1e-13)
 
 
-def test_a_unit_square_turned_by_45_degrees() -> None:
-    """It shares an octagon of 2 sqrt(2) - 2 with the square that it was, and a quarter of the rest with neighbours."""
+def test_a_unit_square_rotated_by_45_degrees() -> None:
+    """It shares an octagon of area 2 sqrt(2) - 2 with the original, and a quarter of the rest with each neighbour."""
     cam = camera((3, 3), ((1, [1, 1], [1, 1]),))
     sub = cam.sub_imagers[0]
     found = sub_matrix(cam, sub, pose_of(sub, Misalignment(rotation=np.pi / 4))).toarray().reshape(3, 3)
@@ -135,7 +135,7 @@ def test_a_unit_square_turned_by_45_degrees() -> None:
 
 
 @pytest.mark.parametrize("k", [(0.0, 0.0), (-0.2, 0.05)])
-def test_a_quarter_turn_of_the_patch_turns_its_pixels(k: tuple[float, float]) -> None:
+def test_a_quarter_turn_of_the_patch_rotates_its_pixels(k: tuple[float, float]) -> None:
     cam = distorted(camera(lenses=THREE[1:2]), *k)
     for sub in cam.sub_imagers[::6]:
         n = sub.type.pixels[0]
@@ -152,7 +152,7 @@ def test_mirrored_cameras_have_mirrored_matrices() -> None:
 
 
 def clipped(polygon: Vector, axis: int, side: float, sign: int) -> Vector:
-    """What of a polygon, (n, 2), lies where sign (coordinate - side) > 0 (Sutherland and Hodgman)."""
+    """The part of a polygon, (n, 2), where sign (coordinate - side) > 0 (Sutherland and Hodgman)."""
     kept: list[Vector] = []
     for one, two in pairwise([*polygon, polygon[0]]) if len(polygon) else ():
         a, b = sign * (one[axis] - side), sign * (two[axis] - side)
@@ -174,10 +174,10 @@ def test_a_misaligned_pinhole_against_clipped_polygons() -> None:
     """Without distortion a texel's image is a quadrilateral, on a tilted patch too."""
     cam = camera((9, 9), (("1/3", [1, 1], [3, 3]),))
     sub = cam.sub_imagers[0]
-    sight = pose_of(sub, replace(NUDGED, tilt=(0.3, -0.2), rotation=0.4))
-    found = sub_matrix(cam, sub, sight).toarray()
+    pose = pose_of(sub, replace(NUDGED, tilt=(0.3, -0.2), rotation=0.4))
+    found = sub_matrix(cam, sub, pose).toarray()
     corner, row, column = np.array(corner_offset(cam, sub)), *np.divmod(np.arange(100), 10)
-    nodes = image_on_patch(sight, image_tangents(cam, sub, sight, row * 1.0, column * 1.0)) - corner
+    nodes = image_on_patch(pose, image_tangents(cam, sub, pose, row * 1.0, column * 1.0)) - corner
     nodes = (nodes / cam.pixel_pitch).reshape(10, 10, 2)
     expected = np.zeros((3, 3, 9, 9))
     for r, c in np.ndindex(9, 9):
@@ -191,72 +191,76 @@ def test_a_misaligned_pinhole_against_clipped_polygons() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lenses", "k", "wrong"),
+    ("lenses", "k", "misalignment"),
     [
         (THREE[:1], (0.3, 0.2), Misalignment()),
         (THREE[:1], (-0.2, 0.1), NUDGED),
         ((("1/2", [1, 1], "fit"),), (0.8, 0.5), NUDGED),  # one texel's image across many pixels
     ],
 )
-def test_a_texels_column_is_the_area_of_its_image(lenses: Lenses, k: tuple[float, float], wrong: Misalignment) -> None:
+def test_a_texels_column_is_the_area_of_its_image(
+    lenses: Lenses, k: tuple[float, float], misalignment: Misalignment
+) -> None:
     """Conservation of area, by quadrature over the texel of the patch's area per area of the target."""
     cam = distorted(camera(lenses=lenses), *k)
     for sub in cam.sub_imagers[::4]:
-        sight = pose_of(sub, wrong)
-        columns = np.asarray(sub_matrix(cam, sub, sight).sum(axis=0)).reshape(cam.shape)
+        pose = pose_of(sub, misalignment)
+        columns = np.asarray(sub_matrix(cam, sub, pose).sum(axis=0)).reshape(cam.shape)
         grid = np.arange(cam.rows * 10)
         at = grid // 10 + (GAUSS[0][grid % 10] + 1) / 2
         row, column = (axis.ravel() for axis in np.meshgrid(at, at, indexing="ij"))
-        tangents = image_tangents(cam, sub, sight, row, column)
+        tangents = image_tangents(cam, sub, pose, row, column)
         x, y = cam.position(row, column)  # pyright: ignore[reportArgumentType]
-        square = ((x - sight.lens[0]) ** 2 + (y - sight.lens[1]) ** 2) / cam.half_diagonal**2
+        square = ((x - pose.lens[0]) ** 2 + (y - pose.lens[1]) ** 2) / cam.half_diagonal**2
         bent = (1 + k[0] * square + k[1] * square**2) * (1 + 3 * k[0] * square + 5 * k[1] * square**2)
         rays = np.column_stack([tangents, np.ones(row.size)])
-        normal = np.cross(sight.axes[:, 0], sight.axes[:, 1])
-        # A patch shows |s|^3 / (n s) of area a solid angle, a plane of tangents 1 / (1 + t^2)^(3/2) of it.
-        patch = (normal @ sight.middle) ** 2 / np.abs(rays @ normal) ** 3
+        normal = np.cross(pose.axes[:, 0], pose.axes[:, 1])
+        # Area per solid angle is |s|^3 / (n s) on a patch, and (1 + t^2)^(3/2) on the plane of tangents.
+        patch = (normal @ pose.middle) ** 2 / np.abs(rays @ normal) ** 3
         density = (patch * bent * (cam.target_pitch / cam.distance / cam.pixel_pitch) ** 2).reshape(19, 10, 19, 10)
         area = np.einsum("ranb,a,b->rn", density, GAUSS[1] / 2, GAUSS[1] / 2)
-        uv = np.abs(image_on_patch(sight, tangents)).reshape(19, 10, 19, 10, 2).max(axis=(1, 3))
+        uv = np.abs(image_on_patch(pose, tangents)).reshape(19, 10, 19, 10, 2).max(axis=(1, 3))
         inside = (uv < np.array(sub.type.pixels[::-1]) / 2 * cam.pixel_pitch - 0.5 * cam.pixel_pitch).all(axis=2)
         assert inside.sum() >= 9
         np.testing.assert_allclose(columns[inside], area[inside], rtol=1e-12)
 
 
-def shares_by_points(cam: Camera, sub: SubImager, sight: Pose, pixel: tuple[int, int], count: int) -> Vector:
-    """One row of H from count x count points of the pixel, sent out by Newton's method."""
+def shares_by_points(cam: Camera, sub: SubImager, pose: Pose, pixel: tuple[int, int], count: int) -> Vector:
+    """One row of H from count x count points of the pixel, traced by Newton's method."""
     at = (np.arange(count) + 0.5) / count
     left, top = corner_offset(cam, sub)
     v, u = np.meshgrid(top + (pixel[0] + at) * cam.pixel_pitch, left + (pixel[1] + at) * cam.pixel_pitch, indexing="ij")
-    row, column = (np.floor(axis).astype(int) for axis in footprint(cam, sub, sight, u, v))
+    row, column = (np.floor(axis).astype(int) for axis in footprint(cam, sub, pose, u, v))
     hit = (row >= 0) & (row < cam.rows) & (column >= 0) & (column < cam.columns)
     return np.bincount((row * cam.columns + column)[hit], minlength=cam.unknowns) / count**2
 
 
 @pytest.mark.parametrize("k", [(-0.15, 0.02), (0.3, 0.3)])
 def test_distortion_against_points(k: tuple[float, float]) -> None:
-    """An edge crosses at most 2 n of n x n cells, each of which is then counted wrong by at most 1/n^2."""
+    """An edge crosses at most 2 n of n x n cells, each of which is then counted misalignment by at most 1/n^2."""
     cam = distorted(camera(), *k)
-    for place, pixel in ((0, (0, 0)), (20, (2, 1)), (49, (3, 0))):
-        sub = cam.sub_imagers[place]
-        sight = pose_of(sub, NUDGED)
-        exact = sub_matrix(cam, sub, sight).toarray()[pixel[0] * sub.type.pixels[1] + pixel[1]]
-        coarse, fine = (shares_by_points(cam, sub, sight, pixel, count) - exact for count in (50, 1000))
+    for pixels, pixel in ((0, (0, 0)), (20, (2, 1)), (49, (3, 0))):
+        sub = cam.sub_imagers[pixels]
+        pose = pose_of(sub, NUDGED)
+        exact = sub_matrix(cam, sub, pose).toarray()[pixel[0] * sub.type.pixels[1] + pixel[1]]
+        coarse, fine = (shares_by_points(cam, sub, pose, pixel, count) - exact for count in (50, 1000))
         assert np.abs(fine).max() < 4 * 2 / 1000
-        assert np.linalg.norm(fine) < np.linalg.norm(coarse) / 20  # at least as 1/n
+        assert np.linalg.norm(fine) < np.linalg.norm(coarse) / 20  # at least in proportion to 1/n
 
 
 small = st.floats(-1, 1, allow_nan=False)
 
 
 @given(st.lists(small, min_size=8, max_size=8))
-def test_shares_are_shares_and_lie_within_reach(drawn: list[float]) -> None:
+def test_entries_are_shares_within_the_bounds_of_footprints(drawn: list[float]) -> None:
     cam = distorted(camera(lenses=(("1/3", [2, 2], [5, 5]), ("2/5", [1, 1], [6, 6]))), 0.12 * drawn[0], 0.06 * drawn[1])
     for sub in cam.sub_imagers[::4]:
-        wrong = Misalignment((drawn[2] / 100, drawn[3] / 100), (drawn[4] / 5, drawn[5] / 5), drawn[6], drawn[7] / 10)
-        sight = pose_of(sub, wrong)
-        h = sub_matrix(cam, sub, sight)
-        top, bottom, left, right = reach(cam, sub, sight)
+        misalignment = Misalignment(
+            (drawn[2] / 100, drawn[3] / 100), (drawn[4] / 5, drawn[5] / 5), drawn[6], drawn[7] / 10
+        )
+        pose = pose_of(sub, misalignment)
+        h = sub_matrix(cam, sub, pose)
+        top, bottom, left, right = reach(cam, sub, pose)
         row, column = np.divmod(h.indices, cam.columns)
         pixel = np.repeat(np.arange(h.shape[0]), np.diff(h.indptr))
         sums = np.asarray(h.sum(axis=1))
@@ -268,8 +272,8 @@ def test_shares_are_shares_and_lie_within_reach(drawn: list[float]) -> None:
         np.testing.assert_allclose(sums[inside], 1, atol=1e-12)
 
 
-def test_a_steep_patch_has_shares_still() -> None:
-    """Some of the target is behind its plane, and shows on no point of it."""
+def test_a_steep_patch_has_valid_shares() -> None:
+    """Part of the target is behind the plane of the patch, and is imaged nowhere on it."""
     cam = camera((5, 5), (("1/2", [1, 1], [2, 2]),))
     cam = replace(cam, distance=5.0, pixel_pitch=1.0)
     sub = cam.sub_imagers[0]
@@ -291,7 +295,7 @@ def test_a_distortion_that_cannot_be_traced_is_refused() -> None:
         matrix(cam, poses(cam))
 
 
-def test_surfaces_are_not_for_this() -> None:
+def test_lenses_with_surfaces_are_refused() -> None:
     cam = camera(lenses=THREE[:1])
     sub = cam.sub_imagers[0]
     real = replace(sub, type=replace(sub.type, optics=LensOptics(surfaces=(Surface(index=1.5, semi_diameter="1 mm"),))))  # pyright: ignore
@@ -317,7 +321,7 @@ def test_undistort_inverts_distort(dtype: type) -> None:
             assert error.max() < 0.1 * 20 * np.finfo(dtype).eps
 
 
-def test_beyond_its_limit_undistort_stays_beyond() -> None:
+def test_undistort_maps_points_beyond_its_limit_beyond_it() -> None:
     x = np.linspace(0, 5, 101)
     found = undistort(x, 0 * x, -0.3, 0.0, 1.0, 1.0)[0]  # folds at r = 1.05, an image of 0.70
     assert (np.diff(found) > 0).all()
@@ -325,7 +329,7 @@ def test_beyond_its_limit_undistort_stays_beyond() -> None:
     assert (found[x < 0.7] < 1).all()
 
 
-def test_one_distorted_type_needs_no_second_one() -> None:
+def test_one_distorted_type_replaces_three_types() -> None:
     cam = derive(read(GALLERY / "distorted.toml"))
     straight = replace(cam, types=(replace(cam.types[0], optics=LensOptics()),))
     three = camera()

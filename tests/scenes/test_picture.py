@@ -1,4 +1,4 @@
-"""Pictures become values from 0 to 255, whatever they were stored as."""
+"""Pictures of all formats become values from 0 to 255."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_colour_becomes_luminance() -> None:
         luminance(opaque, "here")
 
 
-def test_the_crop_is_the_one_asked_for(tmp_path: Path) -> None:
+def test_crops_follow_origin_and_shape(tmp_path: Path) -> None:
     path = save(tmp_path / "grey.png", GREY)
     np.testing.assert_array_equal(load(looking_at(path, origin=[3, 5], shape=[10, 12])), GREY[3:13, 5:17])
     np.testing.assert_array_equal(load(looking_at(path, origin=[3, 5])), GREY[3:, 5:])
@@ -88,7 +88,7 @@ def test_crops_outside_the_picture_are_refused(tmp_path: Path, target: dict[str,
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e39])
-def test_nan_is_refused_where_it_is_seen_and_only_there(tmp_path: Path, bad: float) -> None:
+def test_nan_is_refused_only_inside_the_crop(tmp_path: Path, bad: float) -> None:
     pixels = GREY.astype(np.float64)
     pixels[0, 0] = bad
     path = save(tmp_path / "a.npy", pixels)
@@ -98,7 +98,7 @@ def test_nan_is_refused_where_it_is_seen_and_only_there(tmp_path: Path, bad: flo
 
 
 @pytest.mark.parametrize(
-    ("name", "mode", "said"),
+    ("name", "mode", "words"),
     [
         ("a.tif", "P", "a palette's colours"),
         ("a.tif", "CMYK", r"inks \(CMYK\)"),
@@ -106,13 +106,15 @@ def test_nan_is_refused_where_it_is_seen_and_only_there(tmp_path: Path, bad: flo
         ("white.tif", "L", "0 is white"),
     ],
 )
-def test_numbers_that_are_no_light_are_refused(name: str, mode: str, said: str, tmp_path: Path) -> None:
+def test_values_that_are_not_light_are_refused(name: str, mode: str, words: str, tmp_path: Path) -> None:
     from PIL import Image
 
     colour = Image.fromarray(np.dstack([GREY, GREY[::-1], GREY[:, ::-1]]))
-    more: dict[str, Any] = {"tiffinfo": {262: 0}} if name == "white.tif" else {}  # its photometric interpretation
-    colour.convert(mode).save(tmp_path / name, **more)
-    with pytest.raises(InputError, match=f"{name}: expected grey or RGB, got .*{said}"):
+    options: dict[str, Any] = (
+        {"tiffinfo": {262: 0}} if name == "white.tif" else {}
+    )  # photometric interpretation: 0 is white
+    colour.convert(mode).save(tmp_path / name, **options)
+    with pytest.raises(InputError, match=f"{name}: expected grey or RGB, got .*{words}"):
         load(looking_at(tmp_path / name))
 
 
@@ -123,8 +125,8 @@ def test_the_palette_of_a_png_is_looked_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(load(looking_at(tmp_path / "a.png")), GREY, rtol=1e-6)
 
 
-@pytest.mark.skipif(find_spec("imagecodecs") is not None, reason="with this package it is read")
-def test_a_compression_that_is_not_known_is_named(tmp_path: Path) -> None:
+@pytest.mark.skipif(find_spec("imagecodecs") is not None, reason="imagecodecs reads this compression")
+def test_an_unknown_compression_is_named(tmp_path: Path) -> None:
     from PIL import Image
 
     Image.fromarray(GREY).save(tmp_path / "a.tif", compression="tiff_lzw")

@@ -1,4 +1,4 @@
-"""The scene file: units, strictness, overrides, and what is written is what was read."""
+"""The scene file: units, strictness, overrides, and the identity of writing then reading."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stacks on disk: write then read is the identity, and damage is noticed."""
+"""Files of stacks: write then read is the identity, and damage is detected."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from ..examples import THREE, camera, scene
 
 def example(seed: int = 0) -> Stack:
     rng = np.random.default_rng(seed)
-    one = camera()
-    values = rng.normal(100, 50, one.measurements).astype(np.float32).astype(np.float64)
-    variance = rng.uniform(1e-9, 1, one.measurements).astype(np.float32).astype(np.float64)
-    return Stack(scene(lenses=THREE), one, values, variance, {"seed": seed, "note": 'ü "quoted"'})
+    cam = camera()
+    values = rng.normal(100, 50, cam.measurements).astype(np.float32).astype(np.float64)
+    variance = rng.uniform(1e-9, 1, cam.measurements).astype(np.float32).astype(np.float64)
+    return Stack(scene(lenses=THREE), cam, values, variance, {"seed": seed, "note": 'ü "quoted"'})
 
 
-def of_a_sensor(seed: int = 0) -> Stack:
-    """Digital numbers of a real sensor, one of its pixels dead."""
+def sensor_example(seed: int = 0) -> Stack:
+    """A recording of a real sensor with cam dead pixel."""
     rng, first = np.random.default_rng(seed), example(seed)
     thin = tuple(lens.model_copy(update={"aperture": 0.1}) for lens in first.scene.camera.lens)
-    told = SensorTable.model_validate({"illuminance": "500 lux", "exposure": "1 ms", "black_level": 10.0})
-    changes = {"sensor": told, "camera": first.scene.camera.model_copy(update={"lens": thin})}
+    sensor = SensorTable.model_validate({"illuminance": "500 lux", "exposure": "1 ms", "black_level": 10.0})
+    changes = {"sensor": sensor, "camera": first.scene.camera.model_copy(update={"lens": thin})}
     described = first.scene.model_copy(update=changes)
-    one = derive(described)
-    dark = rng.normal(10, 1, one.measurements).astype(np.float32).astype(np.float64)
-    flat = dark + np.repeat([1000.0, 2000.0, 1500.0], [kind.measurements for kind in one.types])
+    cam = derive(described)
+    dark = rng.normal(10, 1, cam.measurements).astype(np.float32).astype(np.float64)
+    flat = dark + np.repeat([1000.0, 2000.0, 1500.0], [lens_type.measurements for lens_type in cam.types])
     flat[5] = dark[5]
-    level = np.repeat([1000 / 7, 1000 / 3, np.pi], [kind.measurements for kind in one.types])
-    digital = rng.integers(0, 4096, one.measurements).astype(np.float64)
+    level = np.repeat([1000 / 7, 1000 / 3, np.pi], [lens_type.measurements for lens_type in cam.types])
+    digital = rng.integers(0, 4096, cam.measurements).astype(np.float64)
     flat = flat.astype(np.float32).astype(np.float64)
     return stack_from_recording(
-        described, one, Recording(told, digital, dark, flat, level), first.variance, first.record
+        described, cam, Recording(sensor, digital, dark, flat, level), first.variance, first.record
     )
 
 
@@ -54,11 +54,11 @@ def test_write_then_read_is_the_identity(tmp_path: Path) -> None:
     assert again.record == first.record
     assert again.camera == first.camera
     assert again.scene.plain() == first.scene.plain()
-    assert [path.name for path in tmp_path.iterdir()] == ["stack.exr"], "nothing else is left behind"
+    assert [path.name for path in tmp_path.iterdir()] == ["stack.exr"], "no other file remains"
 
 
-def test_the_file_is_what_the_contract_says(tmp_path: Path) -> None:
-    """Read by OpenEXR itself: a part a sub-imager, its name, its channels, upright float32."""
+def test_the_file_has_the_documented_format(tmp_path: Path) -> None:
+    """Read by OpenEXR alone: one part per sub-imager, its name, its channels, upright float32."""
     import json
 
     import OpenEXR
@@ -76,39 +76,39 @@ def test_the_file_is_what_the_contract_says(tmp_path: Path) -> None:
     assert {"type", "k", "l", "sha256"} <= json.loads(part.header["ommatid"]).keys()
 
 
-def test_any_flipped_byte_or_missing_end_is_noticed_or_harmless(tmp_path: Path) -> None:
+def test_any_flipped_bit_or_missing_end_is_detected_or_harmless(tmp_path: Path) -> None:
     path = tmp_path / "stack.exr"
     first = example()
     stack.write(path, first)
     whole = path.read_bytes()
     rng = np.random.default_rng(1)
-    noticed = 0
-    for place in rng.integers(0, len(whole), 60):
+    detected = 0
+    for position in rng.integers(0, len(whole), 60):
         damaged = bytearray(whole)
-        damaged[place] ^= 1 << int(rng.integers(8))
+        damaged[position] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
         try:
             again = stack.read(path)
         except InputError:
-            noticed += 1
+            detected += 1
         else:
             np.testing.assert_array_equal(again.values, first.values)
             np.testing.assert_array_equal(again.variance, first.variance)
-    assert noticed > 30
+    assert detected > 30
     for length in (0, 5, 100, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])
         with pytest.raises(InputError):
             stack.read(path)
 
 
-def test_a_part_that_is_missing_is_noticed(tmp_path: Path) -> None:
+def test_another_kind_of_exr_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     exr.write(path, [exr.Part("a", {"Y": np.ones((2, 3), np.float32)}, {})])
     with pytest.raises(InputError, match="another kind"):
         stack.read(path)
 
 
-def test_non_contiguous_pixels_are_stored_as_they_are(tmp_path: Path) -> None:
+def test_non_contiguous_pixels_are_stored_correctly(tmp_path: Path) -> None:
     pixels = np.arange(24, dtype=np.float32).reshape(4, 6)
     for view in (pixels.T, pixels[::-1], pixels[:, ::2]):
         exr.write(tmp_path / "a.exr", [exr.Part("a", {"Y": view}, {})])
@@ -124,9 +124,9 @@ def test_restrict_keeps_the_pixels_of_the_named_types() -> None:
         first.restrict(("D",))
 
 
-def test_a_sensors_recording_survives_being_stored(tmp_path: Path) -> None:
-    """What is read is what was written, values included; writing that gives the same file again."""
-    first = of_a_sensor()
+def test_a_recording_is_read_as_written(tmp_path: Path) -> None:
+    """Values included; writing it again gives the same file."""
+    first = sensor_example()
     stack.write(tmp_path / "stack.exr", first)
     again = stack.read(tmp_path / "stack.exr")
     assert first.recording is not None
@@ -150,8 +150,8 @@ def test_a_sensors_recording_survives_being_stored(tmp_path: Path) -> None:
     np.testing.assert_array_equal(kept.recording.values, kept.values)
 
 
-def test_a_sensors_stack_without_its_frames_is_refused(tmp_path: Path) -> None:
-    path, first = tmp_path / "stack.exr", of_a_sensor()
+def test_a_sensor_s_stack_without_frames_is_refused(tmp_path: Path) -> None:
+    path, first = tmp_path / "stack.exr", sensor_example()
     stack.write(path, Stack(first.scene, first.camera, first.values, first.variance, first.record))
     with pytest.raises(InputError, match="should hold Y, variance, dark and flat"):
         stack.read(path)

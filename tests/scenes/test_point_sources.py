@@ -1,0 +1,246 @@
+"""Recorded point sources become H, with the variance of each entry."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import sparse, stats
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes import model_file
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.hardware import point_sources
+from ommatid.scenes.model import RECORDED, Model
+from ommatid.scenes.scene import read
+from ommatid.simulate.ideal import ideal_matrix
+
+from ..conftest import Command
+from ..examples import camera, familywise
+from .mosaics import SCENE, SENSOR, SHAPE, Array, as_mosaic, assert_error_as_expected, save
+
+GAIN, READ = 0.02, 0.3  # units of f: of one electron, and of the read noise
+
+
+def lit(matrix: sparse.csr_array, sources: Array, rng: np.random.Generator) -> Array:
+    """Readings, in units of f, of an image of sources with photon and read noise."""
+    light = matrix @ sources
+    return rng.poisson(light / GAIN) * GAIN + rng.normal(0, READ, light.size)
+
+
+def sweep(camera: Camera, matrix: sparse.csr_array, times: int, rng: np.random.Generator) -> Array:
+    """Mosaics of a point source on each pixel of f in turn, `times` times."""
+    points = [
+        as_mosaic(camera, lit(matrix, 255.0 * source, rng)) for _ in range(times) for source in np.eye(camera.unknowns)
+    ]
+    return np.array(points, dtype=np.float32)
+
+
+def blurred_matrix(camera: Camera) -> sparse.csr_array:
+    """An H that differs from the ideal one by a slight blur of the target, within the margin."""
+    sizes = camera.rows, camera.columns
+    kernel = [sparse.diags_array([0.2, 0.6, 0.2], offsets=[-1, 0, 1], shape=(size, size)) for size in sizes]
+    return sparse.csr_array(ideal_matrix(camera) @ sparse.kron(*kernel, format="csr"))
+
+
+def assert_model_is(found: Model, truth: sparse.csr_array, known: Array | slice = slice(None)) -> None:
+    """Assert that entries agree with `truth` to their variances, that these are exact, and that no entry is missing.
+
+    The mean of z^2 has the standard error sqrt(3 / n), from the excess kurtosis of few photons.
+    """
+    rows = np.repeat(np.arange(found.measurements), np.diff(found.matrix.indptr))
+    missing = truth.toarray()
+    missing[rows, found.matrix.indices] = 0.0
+    assert not missing.any()
+    expected = np.asarray(truth[rows, found.matrix.indices]).ravel()
+    z = (found.matrix.data - expected) / np.sqrt(found.variance)
+    z = z[known]
+    # Few photons are not normal: the tails of a Poisson distribution are longer, by up to 30 % here.
+    assert np.abs(z).max() < 1.3 * stats.norm.isf(familywise(z.size) / 2)
+    assert np.mean(z**2) == pytest.approx(1, abs=5 * (3 / z.size) ** 0.5)
+
+
+@pytest.mark.parametrize("times", [1, 2, 5])
+def test_swept_points_give_h_within_its_variance(imaging_camera: Camera, ommatid: Command, times: int) -> None:
+    """With one sweep only the background shows noise, not that of photons; so that case has no photon noise."""
+    rng = np.random.default_rng(times)
+    truth = blurred_matrix(imaging_camera)
+    if times == 1:
+        light = [truth @ (255 * source) for source in np.eye(imaging_camera.unknowns)]
+        frames = np.array([as_mosaic(imaging_camera, values + rng.normal(0, READ, values.size)) for values in light])
+    else:
+        frames = sweep(imaging_camera, truth, times, rng)
+    np.save("points.npy", frames)
+    ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz", "--json")
+    assert ended.code == 0, ended.err
+    found = model_file.read(Path("h.npz"))
+    assert_model_is(found, truth)
+    assert ("recorded once" in ended.err) == (times == 1)
+    described = json.loads(ended.out)
+    assert (described["method"], described["exposures"]) == ("recorded points", times * imaging_camera.unknowns)
+
+
+def test_an_image_is_reconstructed_with_the_recorded_h(imaging_camera: Camera, ommatid: Command) -> None:
+    rng = np.random.default_rng(7)
+    truth = blurred_matrix(imaging_camera)
+    image = rng.normal(127.5, 5461.25**0.5, imaging_camera.unknowns)
+    save(Path("m.npy"), as_mosaic(imaging_camera, truth @ image + rng.normal(0, 0.5, imaging_camera.measurements)))
+    np.save("points.npy", sweep(imaging_camera, truth, 3, rng))
+    assert ommatid("import", "scene.toml", "m.npy", "-o", "s.exr").code == 0
+    assert ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz").code == 0
+    ended = ommatid("reconstruct", "s.exr", "h.npz", "-o", "e.exr", "--json")
+    assert ended.code == 0, ended.err
+    described = json.loads(ended.out)
+    assert described["stages"]["calibrate"]["method"] == "recorded points"
+    assert described["error"]["budget"]["calibration"] > 0
+    assert_error_as_expected(image, Path("e.exr"), described["error"]["predicted_mse"])
+
+
+def test_variance_from_a_recorded_model_is_the_scatter_of_h_f(imaging_camera: Camera, tmp_path: Path) -> None:
+    """Over 200 simulated calibrations, to five standard errors of their mean square."""
+    rng = np.random.default_rng(8)
+    truth, image = ideal_matrix(imaging_camera), rng.uniform(0, 255, imaging_camera.unknowns)
+    entries = truth.copy()
+    deviation: NDArray[np.float64] = np.linspace(0.01, 0.03, entries.nnz)
+    squares: list[Array] = []
+    for _ in range(200):
+        entries.data = truth.data + rng.normal(0, deviation)
+        squares.append((entries @ image - truth @ image) ** 2)
+    batches = np.zeros((0, truth.nnz), dtype=np.float32)
+    scene = read(tmp_path / "scene.toml")
+    recorded = Model(scene, imaging_camera, truth, deviation**2, batches, {"method": RECORDED})
+    ratio = np.mean(squares, axis=0) / recorded.variance_from_model(image)
+    assert ratio.mean() == pytest.approx(1, abs=5 * (2 / 200 / ratio.size) ** 0.5)
+
+
+def grids(camera: Camera, apart: int) -> list[Array]:
+    """Rows and columns of sources lit together, on grids `apart` pixels wide."""
+    return [
+        np.array([(i, j) for i in range(row, camera.rows, apart) for j in range(column, camera.columns, apart)])
+        for row in range(apart)
+        for column in range(apart)
+    ]
+
+
+def write_positions(path: str, positions: list[Array], names: list[str]) -> None:
+    pairs = zip(names, positions, strict=True)
+    lines = [f"{name},{row},{column}" for name, of_image in pairs for row, column in of_image]
+    Path(path).write_text("\n".join(["image,row,column", *lines, ""]), encoding="utf-8")
+
+
+def record_grids(camera: Camera, matrix: sparse.csr_array, positions: list[Array], name: str, seed: int) -> list[str]:
+    rng = np.random.default_rng(seed)
+    names: list[str] = []
+    for number, of_image in enumerate(positions):
+        sources = np.zeros(camera.shape)
+        sources[of_image[:, 0], of_image[:, 1]] = 255.0
+        light = lit(matrix, sources.ravel(), rng)
+        names.append(save(Path(f"{name}{number:02d}.exr"), as_mosaic(camera, light)).name)
+    return names
+
+
+def test_several_points_can_be_lit_at_once(imaging_camera: Camera, ommatid: Command) -> None:
+    truth, positions = blurred_matrix(imaging_camera), grids(imaging_camera, 6)
+    names = record_grids(imaging_camera, truth, positions, "a", 5) + record_grids(
+        imaging_camera, truth, positions, "b", 6
+    )
+    write_positions("p.csv", [*positions, *positions], names)
+    ended = ommatid("calibrate", "scene.toml", "--points", *names, "--places", "p.csv", "-o", "h.npz")
+    assert ended.code == 0, ended.err
+    assert_model_is(model_file.read(Path("h.npz")), truth)
+
+
+def with_ghost(camera: Camera) -> sparse.csr_array:
+    """The ideal H, except that the first sensor pixel also sees the target's last pixel, far away."""
+    last = sparse.csr_array(([0.05], ([0], [camera.unknowns - 1])), shape=(camera.measurements, camera.unknowns))
+    return sparse.csr_array(ideal_matrix(camera) + last)
+
+
+def test_light_far_from_its_footprint_is_found_for_single_points(imaging_camera: Camera, ommatid: Command) -> None:
+    truth = with_ghost(imaging_camera)
+    np.save("points.npy", sweep(imaging_camera, truth, 2, np.random.default_rng(3)))
+    assert ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz").code == 0
+    assert_model_is(model_file.read(Path("h.npz")), truth)
+
+
+def test_stray_light_of_several_points_gives_a_warning(imaging_camera: Camera, ommatid: Command) -> None:
+    positions = [np.array([(row, column), (row, column + 7)]) for row in range(12) for column in range(7)]
+    names = record_grids(imaging_camera, with_ghost(imaging_camera), positions, "a", 5)
+    write_positions("p.csv", positions, names)
+    ended = ommatid("calibrate", "scene.toml", "--points", *names, "--places", "p.csv", "-o", "h.npz")
+    assert ended.code == 0, ended.err
+    assert "1 readings beyond the footprints" in ended.err
+
+
+def test_entries_of_a_dead_pixel_are_unknown(imaging_camera: Camera, ommatid: Command) -> None:
+    frames = sweep(imaging_camera, ideal_matrix(imaging_camera), 2, np.random.default_rng(4))
+    values = np.zeros(imaging_camera.measurements)
+    values[17] = np.nan
+    np.save("points.npy", frames + as_mosaic(imaging_camera, values).astype(np.float32))
+    assert ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz").code == 0
+    found = model_file.read(Path("h.npz"))
+    dead = slice(*found.matrix.indptr[17:19])
+    assert not found.matrix.data[dead].any()
+    assert (found.variance[dead] == 1).all()
+
+
+def test_calibration_accounts_for_dark_flat_and_rounding(imaging_camera: Camera, ommatid: Command) -> None:
+    """Readings rounded to coarse steps without other noise: the variance is 1/12 of a step squared."""
+    truth = ideal_matrix(imaging_camera)
+    rng = np.random.default_rng(6)
+    gain, offset = rng.uniform(0.3, 0.5, imaging_camera.measurements), rng.integers(10, 20, imaging_camera.measurements)
+    light = (
+        as_mosaic(imaging_camera, offset + gain * (truth @ (255.0 * source)))
+        for source in np.eye(imaging_camera.unknowns)
+    )
+    np.save("points.npy", np.array([np.rint(values) for values in light]).astype(np.uint8))
+    frames = [save(Path("dark.npy"), as_mosaic(imaging_camera, offset))]
+    frames.append(save(Path("flat.npy"), as_mosaic(imaging_camera, offset + 255 * gain)))
+    ended = ommatid(
+        *("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz", "--dark", frames[0], "--flat", frames[1])
+    )
+    assert ended.code == 0, ended.err
+    found = model_file.read(Path("h.npz"))
+    rows = np.repeat(np.arange(found.measurements), np.diff(found.matrix.indptr))
+    np.testing.assert_allclose(found.variance, (1 / (255 * gain[rows])) ** 2 / 12, rtol=1e-6)
+    error = np.asarray(truth[rows, found.matrix.indices]).ravel() - found.matrix.data
+    assert np.abs(error * 255 * gain[rows]).max() <= 0.5 + 1e-9
+
+
+def test_with_a_sensor_one_sweep_has_photon_noise(imaging_camera: Camera, ommatid: Command) -> None:
+    """Saturated readings are ignored: one frame exceeds the sensor's range."""
+    text = SCENE.replace("pixels =", 'aperture = "0.1 mm"\npixels =') + SENSOR + "gain = 0.1\n"
+    Path("scene.toml").write_text(text, encoding="utf-8")
+    truth, rng = ideal_matrix(imaging_camera), np.random.default_rng(9)
+    frames: list[Array] = []
+    for source in np.eye(imaging_camera.unknowns):
+        light = truth @ (2550 * source)  # electrons, of which a digital number has 10
+        digital = rng.poisson(light) * 0.1 + rng.normal(10, 0.7, light.size)
+        frames.append(as_mosaic(imaging_camera, np.rint(np.maximum(digital, 0)), outside=10))
+    full = imaging_camera.unknowns // 2
+    frames[full] = np.where(frames[full] > 30, 4095, frames[full])
+    np.save("points.npy", np.array(frames).astype(np.uint16))
+    save(Path("dark.npy"), np.full(SHAPE, 10.0))
+    save(Path("flat.npy"), np.full(SHAPE, 265.0))
+    ended = ommatid(
+        *("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz", "--dark", "dark.npy"),
+        *("--flat", "flat.npy"),
+    )
+    assert (ended.code, "recorded once" in ended.err) == (0, False), ended.err
+    found = model_file.read(Path("h.npz"))
+    assert_model_is(found, truth, found.variance < 1)
+    assert set(found.matrix.indices[found.variance == 1]) == {full}
+
+
+def test_several_points_need_the_footprints_of_pinholes() -> None:
+    paper_camera = camera()
+    several = [np.array([[0, 0], [9, 9]])]
+    point_sources._check_separable(paper_camera, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]
+    optics = replace(paper_camera.types[0].optics, distortion=(0.1, 0.0))
+    distorted = replace(paper_camera, types=(replace(paper_camera.types[0], optics=optics),))
+    with pytest.raises(InputError, match="record one point an image"):
+        point_sources._check_separable(distorted, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]

@@ -19,7 +19,7 @@ from ommatid.scenes.tables.estimation import PriorTable
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
-from .methods.method import EstimationTask, Execution, Method, total
+from .methods.method import EstimationTask, Execution, Method, total_variance
 from .noise import (
     Noise,
     UsablePixels,
@@ -103,7 +103,7 @@ def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution:
 
 def _expected_noise(stack: Stack, usable: UsablePixels, noise: Noise) -> FloatArray:
     setting = stack.scene.estimator.noise_variance
-    return uniform(setting, int(usable.used.sum())) if isinstance(setting, float) else total(noise)
+    return uniform(setting, int(usable.used.sum())) if isinstance(setting, float) else total_variance(noise)
 
 
 def _task(
@@ -123,7 +123,7 @@ def _fit(stack: Stack, model: Model, usable: UsablePixels, prior: PriorTable, no
     noise_known = stack.scene.estimator.noise_variance != "fit"
     if not usable.used.any() or (noise_known and prior_known):
         return None
-    known = _expected_noise(stack, usable, noise) if noise_known else total(_certain(noise))
+    known = _expected_noise(stack, usable, noise) if noise_known else total_variance(_certain(noise))
     task = _task(stack, model, usable, prior, known)
     return fit_prior(*evidence_of(task, prior_known=prior_known, noise_known=noise_known))
 

@@ -134,7 +134,7 @@ def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray)
 def _parts_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> tuple[float, float]:
     """Return w^T (I - A H) P0 (I - A H)^T w and w^T A Rvm A^T w."""
     problem = form.problem
-    u, negative = form.solve(problem.prior.gather(weights[:, None]), np.zeros((problem.measurements, 1)))
+    u, negative = form.solve(problem.prior.apply_root_transposed(weights[:, None]), np.zeros((problem.measurements, 1)))
     return float(np.square(u).sum()), float(noise_variance @ np.square(negative[:, 0]))
 
 
@@ -142,5 +142,5 @@ def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, 
     """Yield for chunks of pixels their range, indices, u, (K, q), whose squares are the prior's part, and -A^T e_i."""
     for start in range(0, pixels.size, CHUNK):
         chunk = slice(start, min(start + CHUNK, pixels.size))
-        u, negative = form.columns(pixels[chunk])
+        u, negative = form.pixel_solutions(pixels[chunk])
         yield chunk, pixels[chunk], u, negative

@@ -17,7 +17,7 @@ from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .methods.method import is_one_number
+from .methods.method import is_uniform
 
 Noise = dict[str, FloatArray]  # variances by cause
 
@@ -104,4 +104,4 @@ def at_used(values: FloatArray, used: BoolArray) -> FloatArray:
     """Return the values, of (M,), at the pixels used."""
     if used.all():
         return values
-    return uniform(float(values[0]), int(used.sum())) if is_one_number(values) else values[used]
+    return uniform(float(values[0]), int(used.sum())) if is_uniform(values) else values[used]

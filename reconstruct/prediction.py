@@ -171,7 +171,7 @@ def _noiseless_limit(limit: Svd, noise: FloatArray) -> FloatArray:
     """Return Eq. 5, (N,), of an estimator that expects no noise; limit : form for noise 1;  noise : actual, (M,)."""
     if not np.ptp(noise):
         return limit.expected_variance(0.0, float(noise.max(initial=0.0)))
-    spread, rank = limit.problem.prior.spread, limit.rank
+    spread, rank = limit.problem.prior.apply_root, limit.rank
     unseen = np.square(spread(limit.right[:, rank:])).sum(axis=1)
     gain = spread(limit.right[:, :rank] / limit.values[:rank]) @ limit.left.T
     return np.asarray(unseen + np.square(gain) @ noise)

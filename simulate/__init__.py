@@ -1,1 +1,1 @@
-"""Light to sub-images: the camera in Mitsuba, its ideal model, its calibration and its noise."""
+"""Simulation of sub-images: the camera in Mitsuba, its ideal model, its calibration and its sensor."""

@@ -1,4 +1,4 @@
-"""Stacks and models on disk: kept while what they were made from has not changed, made again when it has."""
+"""Stacks and models on disk, reused while their fingerprint matches the scene and made again otherwise."""
 
 from __future__ import annotations
 
@@ -22,55 +22,53 @@ from .sampling.checkpoint import open_checkpoint
 
 
 def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:
-    """The stack at `path` as it is on disk, and whether it had to be rendered. Raises what rendering raises.
+    """Return the stack at `path` as it is on disk, and True if it had to be rendered.
 
-    Where there is a world, what it truly looks like is kept beside the stack.
+    The ground truth of a world is stored beside the stack. Raises what `render` raises.
     """
     truth = setup.image
     if setup.scene.world is not None:
         from .ground_truth import cached_truth
 
         truth = cached_truth(path.with_name(TRUTH), setup)
-    wanted = render.made_from(setup)
-    with open_checkpoint(path, wanted) as partial:
-        current, made = cached(
-            path,
-            wanted,
-            _read_stack,
-            lambda: render.render(setup, progress, partial, truth),
-            stack.write,
+    made_from = render.made_from(setup)
+    with open_checkpoint(path, made_from) as checkpoint:
+        result, made = cached(
+            path, made_from, _read_stack, lambda: render.render(setup, progress, checkpoint, truth), stack.write
         )
-    now = setup.resolved
-    record = {**current.record, "truth": digest(truth.astype(np.float32))}
-    if current.scene.plain() != now.plain() or current.record != record:
-        # What the estimator assumes, or what it is compared with, may have changed; the values have not.
-        stack.write(path, replace(current, scene=now, record=record))
-        current = stack.read(path)
-    return current, made
+    record = {**result.record, "truth": digest(truth.astype(np.float32))}
+    if result.scene.plain() != setup.resolved.plain() or result.record != record:
+        # The estimator's tables or the ground truth may have changed; the values have not.
+        stack.write(path, replace(result, scene=setup.resolved, record=record))
+        result = stack.read(path)
+    return result, made
 
 
 def _read_stack(path: Path) -> tuple[Stack, str | None]:
-    found = stack.read(path)
-    return found, found.record.get("fingerprint")
-
-
-def _read_model(path: Path) -> tuple[Model, str | None]:
-    found = model_file.read(path)
-    return found, found.record.get("fingerprint")
+    result = stack.read(path)
+    return result, result.record.get("fingerprint")
 
 
 @one_thread()
-def cached_model(path: Path, setup: Setup, progress: Progress, judge: StoppingRule | None = None) -> tuple[Model, bool]:
-    """The model at `path` as it is on disk, and whether it had to be calibrated. Raises what calibration raises.
+def cached_model(
+    path: Path, setup: Setup, progress: Progress, stopping_rule: StoppingRule | None = None
+) -> tuple[Model, bool]:
+    """Return the model at `path` as it is on disk, and True if it had to be calibrated.
 
-    judge : says when to stop where the scene leaves the number of samples open
+    stopping_rule : needed where the scene leaves the number of samples open
+    Raises what `calibrate` raises.
     """
-    wanted = calibrate.made_from(setup, judge)
-    with open_checkpoint(path, wanted) as partial:
+    made_from = calibrate.made_from(setup, stopping_rule)
+    with open_checkpoint(path, made_from) as checkpoint:
         return cached(
             path,
-            wanted,
+            made_from,
             _read_model,
-            lambda: calibrate.calibrate(setup, progress, partial, judge),
+            lambda: calibrate.calibrate(setup, progress, checkpoint, stopping_rule),
             model_file.write,
         )
+
+
+def _read_model(path: Path) -> tuple[Model, str | None]:
+    model = model_file.read(path)
+    return model, model.record.get("fingerprint")

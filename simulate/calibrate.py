@@ -1,4 +1,4 @@
-"""H with the uncertainty of its every entry, from rendered point sources or in closed form."""
+"""H with the variance of each of its entries, from point sources, from rays or in closed form."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from .ideal import ideal_model
 from .sampling.checkpoint import Checkpoint
 
 
-def made_from(setup: Setup, judge: StoppingRule | None = None) -> str:
-    """Fingerprint of everything that H depends on; `judge` where it says when to stop."""
+def made_from(setup: Setup, stopping_rule: StoppingRule | None = None) -> str:
+    """Return the fingerprint of everything that H depends on."""
     scene = setup.scene
     description: dict[str, Any] = {"camera": setup.camera.describe(), "calibration": scene.calibration.model_dump()}
-    if judge is not None and is_adaptive(scene):
-        description["judged"] = judge.fingerprint
+    if stopping_rule is not None and is_adaptive(scene):
+        description["judged"] = stopping_rule.fingerprint
     if scene.calibration.method != "ideal":
         description["simulated"] = setup.simulated.describe()
         description["versions"] = versions("mitsuba")
@@ -36,16 +36,16 @@ def made_from(setup: Setup, judge: StoppingRule | None = None) -> str:
 def calibrate(
     setup: Setup,
     progress: Progress = no_progress,
-    partial: Checkpoint | None = None,
-    judge: StoppingRule | None = None,
+    checkpoint: Checkpoint | None = None,
+    stopping_rule: StoppingRule | None = None,
 ) -> Model:
-    """H as the scene's `calibration.method` finds it, with the variance of every entry and its record.
+    """Determine H by the scene's `calibration.method`, with the variance of every entry and a record.
 
-    judge : says when to stop where the scene leaves the number of samples open
-    Raises InputError if the variant asked for does not work here, DeniedError if a row fails its check.
+    stopping_rule : needed where the scene leaves the number of samples open
+    Raises InputError if the requested variant does not work here, MachineError if a row fails its check.
     """
     scene, start = setup.scene, perf_counter()
-    record: dict[str, Any] = {"fingerprint": made_from(setup, judge), "method": scene.calibration.method}
+    record: dict[str, Any] = {"fingerprint": made_from(setup, stopping_rule), "method": scene.calibration.method}
     if scene.calibration.method == "ideal":
         model = ideal_model(setup.resolved, setup.camera)
         record |= {"seconds": perf_counter() - start, "versions": versions("scipy")}
@@ -53,12 +53,12 @@ def calibrate(
     if is_adaptive(scene):
         from .calibration.adaptive_rounds import calibrate_until
 
-        model = calibrate_until(setup, judge, progress, partial)
+        model = calibrate_until(setup, stopping_rule, progress, checkpoint)
         return replace(model, record=model.record | record | {"seconds": perf_counter() - start})
-    model = rendered_model(setup, progress, partial)
+    model = rendered_model(setup, progress, checkpoint)
     return replace(model, record=record | model.record)
 
 
 def is_adaptive(scene: Scene) -> bool:
-    """Whether the number of samples is left open."""
+    """Return True if the scene leaves the number of samples of its calibration open."""
     return scene.calibration.samples == "auto" and scene.calibration.method != "ideal"

@@ -1,16 +1,16 @@
-"""H in closed form: what share of a sensor pixel's footprint each pixel of f covers.
+"""H in closed form: the share of a sensor pixel's footprint that each pixel of f covers.
 
 Through a pinhole a footprint is a rectangle of m x m pixels of f, so H is a Kronecker product of two overlaps along one
-axis for every sub-imager (Wood et al., section 2). Distorted and misaligned footprints come by exact area overlap,
+axis for every sub-imager (Wood et al., section 2). Distorted and misaligned footprints follow by exact area overlap,
 those blurred by defocus and diffraction from the blur's own transform.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType, SubImager
@@ -19,58 +19,58 @@ from ommatid.scenes.optics.boxes import BoxFootprints, overlap
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
 
-MOST_STORED = 2**24  # entries of H; more follow from the scene each time
+MOST_STORED = 2**24  # entries of H; more are computed from the scene each time
 
 
 def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
-    """H of one sub-imager: (its pixels, N)."""
+    """Return H of one sub-imager behind a pinhole: (its pixels, N)."""
     down = overlap(sub.type.ratio, sub.type.pixels[0], sub.window[0], camera.rows)
     across = overlap(sub.type.ratio, sub.type.pixels[1], sub.window[1], camera.columns)
     return sparse.csr_array(sparse.kron(down, across, format="csr"))
 
 
 def ideal_matrix(camera: Camera) -> sparse.csr_array:
-    """H of all sub-imagers as designed: (M, N).
+    """Return H of all sub-imagers as designed: (M, N).
 
     Lenses of surfaces count as perfect ones in focus. Raises InputError for a lens type that is both distorted and
     blurred, which has no closed form.
     """
-    return sparse.csr_array(sparse.vstack([_type_matrix(camera, kind) for kind in camera.types], format="csr"))
+    return sparse.csr_array(sparse.vstack([_type_matrix(camera, lens) for lens in camera.types], format="csr"))
 
 
-def _type_matrix(camera: Camera, kind: LensType) -> sparse.csr_array:
-    subs = [sub for sub in camera.sub_imagers if sub.type == kind]
-    blurred = camera.is_blurred(kind)
-    if kind.optics.distortion is not None:
+def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
+    subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
+    blurred = camera.is_blurred(lens_type)
+    if lens_type.optics.distortion is not None:
         from ommatid.scenes.optics import footprints
 
         if blurred:
             raise InputError(
-                f"camera.lens.{kind.name}: distortion with defocus or diffraction has no closed form; run with"
+                f"camera.lens.{lens_type.name}: distortion with defocus or diffraction has no closed form; run with"
                 " calibration.method 'transport', or remove one of them"
             )
         parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
     elif blurred:
         from ommatid.scenes.optics import blur
 
-        return blur.matrix(camera, kind, blur.blur_of(camera, kind))
+        return blur.matrix(camera, lens_type, blur.blur_of(camera, lens_type))
     else:
         parts = [sub_matrix(camera, sub) for sub in subs]
     return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
 
 def matrix_as_designed(camera: Camera, sub: SubImager) -> sparse.csr_array:
-    """H of one sub-imager, whatever its lens is: (its pixels, N). Raises as `ideal_matrix` does."""
-    kind = sub.type
-    if kind.optics.distortion is None and not camera.is_blurred(kind):
+    """Return H of one sub-imager, for every kind of lens: (its pixels, N). Raises as `ideal_matrix` does."""
+    lens_type = sub.type
+    if lens_type.optics.distortion is None and not camera.is_blurred(lens_type):
         return sub_matrix(camera, sub)
-    size = kind.pixels[0] * kind.pixels[1]
-    first = (sub.k * kind.array[1] + sub.l) * size
-    return _type_matrix(camera, kind)[first : first + size]
+    size = lens_type.pixels[0] * lens_type.pixels[1]
+    first = (sub.k * lens_type.array[1] + sub.l) * size
+    return _type_matrix(camera, lens_type)[first : first + size]
 
 
 def true_matrix(camera: Camera) -> sparse.csr_array:
-    """H of all sub-imagers as the camera was put together, misaligned as its tolerance draws it: (M, N).
+    """Return H of all sub-imagers misaligned as the camera's tolerance draws them: (M, N).
 
     Raises InputError for blurred lenses, whose misaligned H has no closed form.
     """
@@ -84,13 +84,13 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
 
 
 def ideal_model(scene: Scene, camera: Camera) -> Model:
-    """The ideal H as a model without uncertainty; of a perfect camera stored only while it is small."""
-    small = not camera.has_box_footprints or BoxFootprints(camera).entries <= MOST_STORED
-    return exact_model(scene, camera, ideal_matrix(camera) if small else None, "ideal")
+    """Return the ideal H as a model without uncertainty; with box footprints it is stored only while it is small."""
+    stored = not camera.has_box_footprints or BoxFootprints(camera).entries <= MOST_STORED
+    return exact_model(scene, camera, ideal_matrix(camera) if stored else None, "ideal")
 
 
 def exact_model(scene: Scene, camera: Camera, matrix: sparse.csr_array | None, method: str) -> Model:
-    """A model without uncertainty."""
+    """Return a model without uncertainty."""
     entries = 0 if matrix is None else int(matrix.nnz)
-    none: NDArray[np.float32] = np.zeros((0, entries), dtype=np.float32)
-    return Model(scene, camera, matrix, np.zeros(entries), none, {"method": method})
+    batches: Float32Array = np.zeros((0, entries), dtype=np.float32)
+    return Model(scene, camera, matrix, np.zeros(entries), batches, {"method": method})

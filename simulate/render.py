@@ -1,4 +1,4 @@
-"""Render what every sub-imager sees: passes with seeds of their own, their mean, its variance, then the sensor."""
+"""Rendering of all sub-images: the mean of passes with seeds of their own, its variance, and the sensor's recording."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
@@ -30,21 +30,21 @@ from .sampling.seeds import sampler_seeds
 class Rendering(OverPasses):
     """Light on every sensor pixel, (M,): the mean of the passes, and the variance of that mean from their scatter.
 
-    straight : whether light that bounces in a world was left out, since nothing there reflects any
+    direct_only : True if interreflections in a world were left out, since nothing there reflects
     """
 
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    straight: bool
+    mean: FloatArray
+    variance: FloatArray
+    direct_only: bool
 
-    def stated(self, camera: Camera) -> NDArray[np.float64]:
-        """The variance, (M,), drawn towards its sub-image's and never below float32's rounding."""
-        settled = np.concatenate([shrink_variances(self.variance[place], self.passes) for place in camera.slices()])
-        return np.maximum(settled, rounding_variance(self.mean, self.samples))
+    def stated_variance(self, camera: Camera) -> FloatArray:
+        """Return the variance, (M,), shrunk towards its sub-image's mean and never below float32's rounding."""
+        shrunk = np.concatenate([shrink_variances(self.variance[rows], self.passes) for rows in camera.slices()])
+        return np.maximum(shrunk, rounding_variance(self.mean, self.samples))
 
 
 def made_from(setup: Setup) -> str:
-    """Fingerprint of everything that the values of a stack depend on."""
+    """Return the fingerprint of everything that the values of a stack depend on."""
     scene, world = setup.scene, dict[str, Any]()
     if scene.world is not None:
         from .renderer.world import describe
@@ -67,35 +67,35 @@ def made_from(setup: Setup) -> str:
 def light(
     setup: Setup,
     progress: Progress = no_progress,
-    partial: Checkpoint | None = None,
+    checkpoint: Checkpoint | None = None,
     work: Plan | None = None,
 ) -> Rendering:
-    """Render the light alone, before the sensor. Raises InputError if the variant asked for does not work here.
+    """Render the light alone, before the sensor, with the given number of samples.
 
-    partial : where passes that are done are kept and found again
-    work : passes and their samples; absent: as the scene's samples ask
+    work : passes and their samples; None: as the scene's `render.samples` asks
+    Raises InputError if the requested variant does not work here, ValueError if the samples are "auto".
     """
     from .renderer.renderer import Renderer
 
     scene, camera = setup.scene, setup.camera
     if scene.render.samples == "auto":
-        raise ValueError("expected a number of samples, got 'auto', which `light_until` renders")
+        raise ValueError("expected a number of samples, got 'auto', which `render_until` renders")
     variant = choose(scene.render.variant)
     work = plan(scene.render.samples, scene.render.sampler) if work is None else work
-    around = None if scene.world is None else scene
-    rig = Renderer(setup.simulated, variant, scene.render.sampler, around=around)
-    rig.set_target(setup.image)
+    world = None if scene.world is None else scene
+    renderer = Renderer(setup.simulated, variant, scene.render.sampler, world=world)
+    renderer.set_target(setup.image)
     tally = Tally(camera.measurements)
-    if partial is not None:
-        tally.resume("light", partial.state())
+    if checkpoint is not None:
+        tally.resume("light", checkpoint.state())
     for number in range(tally.count, work.passes):
         values = np.empty(camera.measurements)
-        for group in rig.groups:
+        for group in renderer.groups:
             seed = sampler_seeds(scene.render.seed, "data", number, work.passes)
-            values[rig.places(group)] = rig.expose(group, work.samples, seed)[0]
+            values[renderer.rows(group)] = renderer.expose(group, work.samples, seed)[0]
         tally.add(values)
-        if partial is not None:
-            partial.offer(lambda: tally.state("light"))
+        if checkpoint is not None:
+            checkpoint.offer(lambda: tally.state("light"))
         progress((number + 1) / work.passes)
     return Rendering(
         passes=work.passes,
@@ -104,29 +104,28 @@ def light(
         first_seed=sampler_seeds(scene.render.seed, "data", 0, work.passes)(0),
         mean=tally.mean,
         variance=tally.variance,
-        straight=rig.straight,
+        direct_only=renderer.direct_only,
     )
 
 
 def render(
     setup: Setup,
     progress: Progress = no_progress,
-    partial: Checkpoint | None = None,
-    truth: NDArray[np.float64] | None = None,
+    checkpoint: Checkpoint | None = None,
+    truth: FloatArray | None = None,
 ) -> Stack:
     """Render and record the sub-images of the setup's image on its target.
 
-    truth : what the estimate is compared with; absent: the image
-    The variance of each pixel's mean is drawn towards its sub-image's and never below float32's rounding.
-    Raises InputError if the variant asked for does not work here.
+    truth : image that the estimate is compared with; None: the image on the target
+    Raises InputError if the requested variant does not work here.
     """
     scene, start = setup.scene, perf_counter()
     if scene.render.samples == "auto":
         from .adaptive_render import render_until
 
-        rendering = render_until(setup, progress, partial)
+        rendering = render_until(setup, progress, checkpoint)
     else:
-        rendering = light(setup, progress, partial)
+        rendering = light(setup, progress, checkpoint)
     record: dict[str, Any] = {
         "fingerprint": made_from(setup),
         "truth": digest((setup.image if truth is None else truth).astype(np.float32)),
@@ -134,17 +133,18 @@ def render(
         "seed": scene.render.seed,
         "sampler": scene.render.sampler,
         **rendering.record(),
-        **({STRAIGHT: True} if rendering.straight else {}),
+        **({STRAIGHT: True} if rendering.direct_only else {}),
         "versions": versions("mitsuba", "drjit", "OpenEXR"),
     }
-    return exposed(setup, rendering.mean, rendering.stated(setup.camera), record)
+    return exposed(setup, rendering.mean, rendering.stated_variance(setup.camera), record)
 
 
-def exposed(setup: Setup, light: NDArray[np.float64], variance: NDArray[np.float64], record: dict[str, Any]) -> Stack:
-    """What the scene's sensor records of light, (M,), whose variances are known; noise by the scene's seed."""
+def exposed(setup: Setup, light: FloatArray, variance: FloatArray, record: dict[str, Any]) -> Stack:
+    """Record light, (M,), of known variance by the scene's sensor; its noise follows from the scene's seed."""
     scene, camera, values = setup.scene, setup.camera, light
     if scene.sensor is not None:
-        return stack_from_recording(setup.resolved, camera, _exposed(setup, scene.sensor, light), variance, record)
+        recording = _recording(setup, scene.sensor, light)
+        return stack_from_recording(setup.resolved, camera, recording, variance, record)
     if scene.noise is not None:
         from .sensor.gaussian import expose, generators
 
@@ -152,11 +152,11 @@ def exposed(setup: Setup, light: NDArray[np.float64], variance: NDArray[np.float
     return Stack(setup.resolved, camera, values, variance, record)
 
 
-def _exposed(setup: Setup, sensor: SensorTable, light: NDArray[np.float64]) -> Recording:
+def _recording(setup: Setup, sensor: SensorTable, light: FloatArray) -> Recording:
     from .sensor.emva1288 import record
     from .sensor.response import response
 
-    dark = np.isnan(light)  # no light can reach these pixels; so they are dead, and known by their flat
-    freed = np.where(dark, 0.0, response(setup))
+    dark = np.isnan(light)  # no light can reach these pixels, so their flat frame marks them as dead
+    electrons = np.where(dark, 0.0, response(setup))
     shot = negligible_shot_noise(setup.scene, setup.camera) is None
-    return record(np.where(dark, 0.0, light), freed, sensor, setup.camera, setup.scene.render.seed, shot)
+    return record(np.where(dark, 0.0, light), electrons, sensor, setup.camera, setup.scene.render.seed, shot)

@@ -1,4 +1,4 @@
-"""What cannot be rendered or calibrated here, said before anything is: lenses, backends, and how they go together."""
+"""Checks, before any work is done, that a scene can be rendered and calibrated here."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ommatid.scenes.setup import Setup
 from .noise_target import check_noise_target
 from .renderer.variant import check_fast_variant, check_transport_variant, choose
 
-SENSOR, TARGET = 12 * 8, 6 * 8  # bytes a measurement and a pixel of f that a rendering takes
-ENTRY = 12 + 8 + 8 * 4  # bytes an entry of H: itself, its variance, its batches
-SWEPT = 3 * 8 + 8 * 4 + 10 * 8  # bytes a reading of a sensor pixel: tallies, batches, and sorting into entries
+SENSOR, TARGET = 12 * 8, 6 * 8  # bytes that a rendering takes per measurement and per pixel of f
+ENTRY = 12 + 8 + 8 * 4  # bytes per entry of H: the entry, its variance, its batches
+SWEPT = 3 * 8 + 8 * 4 + 10 * 8  # bytes per reading of a sensor pixel: tallies, batches, and sorting into entries
 BESIDE = 2  # pixels of f around a footprint
 
 
 def check_scene(setup: Setup, calibrates: bool = True) -> None:
-    """Raise InputError, which names the scene file, for what would fail only after some work.
+    """Raise InputError, which names the scene file, for errors that would otherwise appear after some work.
 
-    calibrates : whether H is to be found, not the light alone
+    calibrates : True if H is to be determined as well as the light
     """
     scene = setup.scene
     with naming_source(scene.source):
@@ -37,38 +37,40 @@ def check_scene(setup: Setup, calibrates: bool = True) -> None:
 
 
 def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
-    """Raise InputError where memory does not hold a rendering or, if it `calibrates`, H with its uncertainty."""
+    """Raise InputError if memory does not hold a rendering or, if it `calibrates`, H with its uncertainty."""
     scene, camera = setup.scene, setup.camera
     rendering = SENSOR * camera.measurements + TARGET * camera.unknowns
     check_memory(rendering, "rendering", "make target.shape or the lens arrays smaller")
     if not calibrates or setup.has_structured_matrix:
         return
-    seen = [kind.measurements * min(_seen(camera, kind), camera.unknowns) for kind in camera.types]
-    needed = ENTRY * sum(seen) + (SWEPT * max(seen) if scene.calibration.method == "points" else 0)
+    entries = [
+        lens_type.measurements * min(_visible_pixels(camera, lens_type), camera.unknowns) for lens_type in camera.types
+    ]
+    needed = ENTRY * sum(entries) + (SWEPT * max(entries) if scene.calibration.method == "points" else 0)
     check_memory(needed, f"H of {camera.measurements} x {camera.unknowns}", "crop the target or use fewer sub-imagers")
 
 
-def _seen(camera: Camera, kind: LensType) -> int:
-    """Pixels of f that a sensor pixel may see, about."""
-    across = ceil(kind.ratio) + BESIDE
-    if kind.optics.surfaces is None and camera.is_blurred(kind):
+def _visible_pixels(camera: Camera, lens_type: LensType) -> int:
+    """Approximate number of pixels of f that a sensor pixel may see."""
+    side = ceil(lens_type.ratio) + BESIDE
+    if lens_type.optics.surfaces is None and camera.is_blurred(lens_type):
         from ommatid.scenes.optics.blur import blur_of
 
-        across += 2 * ceil(blur_of(camera, kind).reach)
-    return across**2
+        side += 2 * ceil(blur_of(camera, lens_type).reach)
+    return side**2
 
 
 def check_lenses(camera: Camera) -> None:
-    """Raise InputError for surfaces that show no image, and for distortion that folds the image."""
-    for kind in camera.types:
-        if kind.optics.surfaces is not None:
+    """Raise InputError for surfaces that form no image, and for distortion that folds the image."""
+    for lens_type in camera.types:
+        if lens_type.optics.surfaces is not None:
             from .lenses.prescription import prescription_of
 
-            prescription_of(camera, kind)
-        if kind.optics.distortion is not None:
+            prescription_of(camera, lens_type)
+        if lens_type.optics.distortion is not None:
             from ommatid.scenes.optics.distortion import field
             from ommatid.scenes.pose import poses
 
             for sub, pose in zip(camera.sub_imagers, poses(camera), strict=True):
-                if sub.type == kind:
+                if sub.type == lens_type:
                     field(camera, sub, pose)

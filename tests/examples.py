@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import sparse, stats
 
+from ommatid.reconstruct.forms.form import Form
+from ommatid.reconstruct.prior import Prior, independent
+from ommatid.reconstruct.problem import Problem
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
+from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
+from ommatid.simulate.sampling.seeds import sampler_seeds
+
+if TYPE_CHECKING:  # a test asserts that scenes of pinholes load no module of lenses
+    from ommatid.simulate.lenses.prescription import Prescription
+    from ommatid.simulate.renderer.renderer import Renderer
 
 GALLERY = Path(__file__).parent.parent / "scenes"
 Lenses = tuple[tuple[Any, Any, Any], ...]
@@ -75,11 +85,31 @@ def with_optics(
     return described, derive(described)
 
 
+def random_problem(seed: int = 0, m: int = 7, n: int = 5, *, correlated: bool = False) -> Problem:
+    """A dense problem of M random measurements of N pixels with random noise variances."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n)) if correlated else np.sqrt(rng.uniform(1, 50, n))
+    matrix = sparse.csr_array(rng.normal(size=(m, n)))
+    return Problem(matrix, Prior(rng.normal(size=n), root), rng.uniform(0.1, 2, m))
+
+
+def tile_problem(lens_types: int, noise: float) -> Problem:
+    """The problem of a 19 x 19 tile with up to three lens types and the paper's prior."""
+    tile = camera(lenses=THREE[:lens_types])
+    return Problem(ideal_matrix(tile), independent(127.5, 5461.25, 361), np.full(tile.measurements, noise))
+
+
 def needs(variant: str) -> None:
     """Skip the test if a variant does not work on this machine."""
     reason = unusable_reason(variant)
     if reason:
         pytest.skip(reason)
+
+
+def posterior_covariance(form: Form, pixels: Sequence[int] = ()) -> NDArray[np.float64]:
+    """Columns of the posterior covariance, (N, pixels); all of them, (N, N), if no pixels are named."""
+    u, _ = form.pixel_solutions(np.array(pixels or range(form.problem.unknowns), dtype=np.intp))
+    return form.problem.prior.apply_root(u)
 
 
 def familywise(tests: int, significance: float = 0.01) -> float:
@@ -92,3 +122,26 @@ def assert_student(difference: NDArray[np.float64], variance: NDArray[np.float64
     limit = float(stats.t.isf(familywise(difference.size) / 2, passes - 1))
     score = np.abs(difference) / np.sqrt(variance)
     assert score.max() < limit, f"t = {score.max():.1f} at {int(score.argmax())}, the limit is {limit:.1f}"
+
+
+def turned_round(lens: Prescription) -> Prescription:
+    """Return a lens whose surfaces are in reverse order."""
+    from ommatid.simulate.lenses.prescription import Prescription
+
+    return Prescription(
+        radius=-lens.radius[::-1],
+        thickness=np.append(lens.thickness[-2::-1], 0.0),
+        index=lens.index_before[::-1],
+        semi_diameter=lens.semi_diameter[::-1],
+        conic=lens.conic[::-1],
+        stop=lens.radius.size - 1 - lens.stop,
+    )
+
+
+def mean_weights(renderer: Renderer, group: str, samples: int) -> NDArray[np.float64]:
+    """Return the mean weight of each pixel's rays, (pixels,): its relative light from a uniform world."""
+    weights = [
+        renderer.hits(group, samples, sampler_seeds(0, "data", 0, 1), block)[1]
+        for block in renderer.blocks(group, samples)
+    ]
+    return np.concatenate([weight.mean(axis=1) for weight in weights if weight is not None])

@@ -1,4 +1,4 @@
-"""The program's modules by name, and what each of them imports, read from their source."""
+"""The program's modules and their imports, read from the source."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-LINKED = ("scenes", "simulate", "reconstruct")  # folders at the top, which links in ommatid/ make part of it
+LINKED = ("scenes", "simulate", "reconstruct")  # top-level folders that symbolic links make part of ommatid
 
 
 @cache
 def modules() -> dict[str, Path]:
-    """Every module of the program, by the name under which it is imported."""
+    """Paths of all modules by the name under which they are imported."""
     own = {_name(path): path for path in sorted((ROOT / "ommatid").glob("**/*.py")) if not _linked(path)}
     linked = [path for package in LINKED for path in sorted((ROOT / package).glob("**/*.py"))]
     return own | {f"ommatid.{_name(path)}": path for path in linked}
 
 
 def existing(*names: str) -> set[str]:
-    """These names of modules. Raises ModuleNotFoundError for one that does not exist, for instance since a renaming."""
+    """The names themselves. Raises ModuleNotFoundError if one does not exist, for instance after a renaming."""
     for name in names:
         if find_spec(name) is None:
             raise ModuleNotFoundError(name)
@@ -29,17 +29,17 @@ def existing(*names: str) -> set[str]:
 
 @cache
 def imports(name: str) -> frozenset[str]:
-    """All that a module imports, anywhere in it: our modules by whole names, others as they are written."""
+    """Everything that a module imports, also inside functions: own modules by full name, others as written."""
     path = modules()[name]
-    found: set[str] = set()
+    imported: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            imported |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = _absolute(name, path, node)
-            whole = {f"{base}.{alias.name}" for alias in node.names}
-            found |= {one if one in modules() else base for one in whole}
-    return frozenset(found - {name})
+            full_names = {f"{base}.{alias.name}" for alias in node.names}
+            imported |= {full if full in modules() else base for full in full_names}
+    return frozenset(imported - {name})
 
 
 def circles() -> list[list[str]]:
@@ -47,7 +47,7 @@ def circles() -> list[list[str]]:
     index: dict[str, int] = {}
     lowest: dict[str, int] = {}
     stack: list[str] = []
-    found: list[list[str]] = []
+    groups: list[list[str]] = []
 
     def visit(name: str) -> None:
         index[name] = lowest[name] = len(index)
@@ -60,12 +60,12 @@ def circles() -> list[list[str]]:
         if lowest[name] == index[name]:
             start = stack.index(name)
             group, stack[start:] = stack[start:], []
-            found.extend([group] if len(group) > 1 else [])
+            groups.extend([group] if len(group) > 1 else [])
 
     for name in modules():
         if name not in index:
             visit(name)
-    return found
+    return groups
 
 
 def _absolute(name: str, path: Path, node: ast.ImportFrom) -> str:

@@ -1,4 +1,4 @@
-"""Who may import what: the four floors of the house, no circles, and nothing heavy in front."""
+"""Imports between packages, sizes of modules and folders, and names of classes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .modules import LINKED, ROOT, circles, existing, imports, modules
 RENDERER = {"mitsuba", "drjit"}
 LONGEST = 300  # lines of a module
 LARGEST = 12  # modules of a folder, `__init__` not counted
-# The floors, the lowest first. A module imports its own package and those below; above these three, all rooms are one.
+# The packages that a package may import beside itself; those not listed may import all but `cli`.
 BELOW = {
     "runtime": set[str](),
     "scenes": {"runtime"},
@@ -26,13 +26,13 @@ BELOW = {
 
 
 def room(module: str) -> str:
-    """The package of ours that a module stands in; empty for the front door and for what is not ours."""
+    """The package inside ommatid; empty for `ommatid` itself and for other distributions."""
     parts = module.split(".")
     return parts[1] if parts[0] == "ommatid" and len(parts) > 1 else ""
 
 
 def package(module: str) -> str:
-    """The distribution that a module belongs to, as it is imported."""
+    """The top-level package of a module."""
     return module.partition(".")[0]
 
 
@@ -61,8 +61,8 @@ def test_no_modules_import_one_another_in_a_circle() -> None:
 
 
 @pytest.mark.parametrize("path", sorted({*modules().values(), *ROOT.glob("tests/**/*.py")}), ids=str)
-def test_nothing_is_imported_by_the_bare_name_of_a_folder(path: Path) -> None:
-    """`import scenes` works in a checkout, and would load every class twice."""
+def test_linked_folders_are_imported_as_part_of_ommatid(path: Path) -> None:
+    """`import scenes` works in a checkout, but would load every class twice."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             assert not {package(alias.name) for alias in node.names} & {*LINKED}
@@ -75,7 +75,7 @@ def test_no_module_is_long(module: str) -> None:
     assert len(modules()[module].read_text(encoding="utf-8").splitlines()) <= LONGEST
 
 
-def test_no_class_name_stands_for_two_things() -> None:
+def test_no_class_name_is_defined_twice() -> None:
     defined: dict[str, list[str]] = {}
     for module, path in modules().items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -84,12 +84,12 @@ def test_no_class_name_stands_for_two_things() -> None:
     assert {name: where for name, where in defined.items() if len(where) > 1} == {}
 
 
-def test_no_folder_is_crowded() -> None:
+def test_no_folder_has_many_modules() -> None:
     inside = Counter(path.parent for path in modules().values() if path.stem != "__init__")
     assert {folder: count for folder, count in inside.items() if count > LARGEST} == {}
 
 
-def test_a_module_that_does_not_exist_is_noticed() -> None:
+def test_names_of_modules_that_do_not_exist_are_errors() -> None:
     with pytest.raises(ModuleNotFoundError):
         existing("ommatid.scenes.camera", "ommatid.scenes.no_such_module")
 
@@ -97,7 +97,7 @@ def test_a_module_that_does_not_exist_is_noticed() -> None:
 @pytest.mark.parametrize("name", [name for name, path in modules().items() if path.stem == "__init__"])
 def test_packages_export_nothing(name: str) -> None:
     module = importlib.import_module(name)
-    assert Path(str(module.__file__)).resolve() == modules()[name], "another package of this name is in the way"
+    assert Path(str(module.__file__)).resolve() == modules()[name], "another package of this name is found first"
     body = ast.parse(modules()[name].read_text(encoding="utf-8")).body
     assert len(body) == 1 or name == "ommatid", "a docstring and nothing else"
 
@@ -114,7 +114,7 @@ def test_reconstruct_works_where_mitsuba_does_not_exist() -> None:
 
 
 def test_the_command_line_imports_nothing_heavy() -> None:
-    """`ommatid --help` in under 0.3 s: what it loads decides, and that can be tested on any machine."""
+    """`ommatid --help` takes under 0.3 s if it loads none of these, which can be tested on any machine."""
     script = "import sys, ommatid.__main__; print(*sys.modules)"
     ended = subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT, capture_output=True, text=True)
     heavy = {"numpy", "scipy", "mitsuba", "drjit", "pydantic", "pint", "skimage", "matplotlib", "OpenEXR", "psutil"}

@@ -9,7 +9,7 @@ import numpy as np
 
 from ommatid.reconstruct.expected_error import ExpectedError
 from ommatid.reconstruct.method_choice import METHODS, choose_method
-from ommatid.reconstruct.methods.method import EstimationTask, Execution, total
+from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance
 from ommatid.reconstruct.noise import Noise, known_noise, uniform, usable_pixels
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
@@ -68,7 +68,7 @@ def for_prior(setup: Setup) -> StoppingRule:
         method = METHODS[choose_method(scene, camera, exact=False).method]
 
         def expected(noise: Noise) -> ExpectedError:
-            assumed = uniform(setting, int(used.sum())) if isinstance(setting, float) else total(noise)
+            assumed = uniform(setting, int(used.sum())) if isinstance(setting, float) else total_variance(noise)
             task = EstimationTask(model, recorded, used, assumed, prior, scene.estimator, scene.tiles)
             return method(task, Execution()).result(noise, None).expected
 
@@ -84,7 +84,7 @@ def _negligible_bound(stack: Stack, model: Model) -> float | None:
     the maximum where it is negligible everywhere, by the mean where a few rows are spoilt by stray rays.
     """
     used = usable_pixels(stack, model).used
-    others = total(known_noise(stack))[used]
+    others = total_variance(known_noise(stack))[used]
     relative = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))[used] / np.maximum(others, TINY)
     if not relative.size or float(relative.max()) <= NEGLIGIBLE:
         return float(relative.max(initial=0.0))
@@ -103,7 +103,7 @@ def _added(noise: Noise, expected: ExpectedError, mse_without: Callable[[], floa
     rest = expected.mse - part
     if "calibration" not in noise or part == 0:
         return 0.0
-    others = total({name: values for name, values in noise.items() if name != "calibration"})
+    others = total_variance({name: values for name, values in noise.items() if name != "calibration"})
     relative = part / max(rest, TINY)
     if float(np.max(noise["calibration"] / np.maximum(others, TINY), initial=0.0)) <= NEGLIGIBLE:
         return relative

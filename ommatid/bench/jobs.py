@@ -256,7 +256,7 @@ def _calibration(
         seed = subject.seed(name, repeat)
         scene = reference.with_calibration(subject.scene, method, sampler, variant, samples, seed)
         rule = for_stack(subject.stack(repeat)) if samples == AUTO else None
-        model, cost = _measured(lambda: calibrate(subject.changed(scene), judge=rule))
+        model, cost = _measured(lambda: calibrate(subject.changed(scene), stopping_rule=rule))
         error = reference.model_error(model, subject.reference)
         mse = subject.model_mse(model, repeat) if repeat < FEWER_REPEATS else None
         return Repeat(error, cost, mse, int(model.record["samples"]))

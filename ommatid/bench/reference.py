@@ -129,7 +129,7 @@ def model_error(model: Model, right: Reference) -> float:
 
 def record_rendering(setup: Setup, rendering: Rendering | AdaptiveRendering) -> Stack:
     """Return a rendering of several passes as the scene's sensor records it, with noise from the scene's seed."""
-    return exposed(setup, rendering.mean, rendering.stated(setup.camera), {})
+    return exposed(setup, rendering.mean, rendering.stated_variance(setup.camera), {})
 
 
 def record_light(setup: Setup, light: FloatArray, right: Reference) -> Stack:

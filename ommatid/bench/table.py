@@ -185,7 +185,7 @@ def write(folder: Path, table: BenchTable) -> None:
 
     Raises InputError or MachineError.
     """
-    rows = [_row(cell) for cell in table.cells]
+    rows = [row_of(cell) for cell in table.cells]
     columns = list(rows[0]) if rows else list(Cell.model_fields)
     write_csv(folder / CSV, columns, (row.values() for row in rows))
     write_text(folder / JSON, json.dumps(table.describe(), indent=2, allow_nan=False) + "\n")
@@ -220,8 +220,8 @@ def bench_tables(folder: Path, camera: Mapping[str, Any]) -> Iterator[BenchTable
             yield table
 
 
-def _row(cell: Cell) -> dict[str, Any]:
-    """Return the columns by name; quantities with quantiles take three, absent values are None."""
+def row_of(cell: Cell) -> dict[str, Any]:
+    """Return a cell as a row of bench.csv by column; quantities with quantiles take three columns."""
     row: dict[str, Any] = {}
     for name, value in cell:
         if name not in ("error", "seconds", "mse"):

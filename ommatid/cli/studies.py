@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from . import options, output
 from .options import Folder, Json, Lenses, SceneFile, Sets
-
-if TYPE_CHECKING:
-    from ommatid.scenes.camera import Camera
-    from ommatid.scenes.tables.sensor import NoiseTable
 
 Photograph = Annotated[str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the noise in Figure 7.")]
@@ -27,10 +23,9 @@ def paper(
 ) -> None:
     """Compute the paper's figures and claims anew."""
     from ommatid.paper.paper import rows, write_paper
-    from ommatid.simulate.ideal import ideal_matrix
 
     with output.progress_bar("paper") as progress:
-        description = write_paper(folder, ideal_matrix, _record, image, seed, progress)
+        description = write_paper(folder, image, seed, progress)
     output.print_result(description, [(f"The paper's claims: {folder / 'claims.csv'}", rows(description))], as_json)
 
 
@@ -71,9 +66,3 @@ def bench(
         table, made = measure(setup, folder, seconds, progress)
     output.say_done("bench", made, folder / "bench.json")
     output.print_result(table.describe(), [(f"Error against run time: {table.title}", rows(table))], as_json)
-
-
-def _record(camera: Camera, light: Any, noise: NoiseTable, number: int) -> Any:
-    from ommatid.simulate.sensor.gaussian import expose, generators
-
-    return expose(light, noise, generators(camera, number), camera.slices())

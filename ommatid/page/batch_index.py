@@ -104,18 +104,18 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
 def read_sweep(path: Path) -> SweepTable | None:
     """Return the content of sweep.json, None if the file is missing or damaged."""
     try:
-        listed = read_rows(path)
+        scenes = read_rows(path)
     except InputError:
         return None
-    keys = tuple(dict.fromkeys(key for row in listed for key in row.values))
+    keys = tuple(dict.fromkeys(key for scene in scenes for key in scene.values))
     rows = [
         (
-            "" if row.failed is not None or row.folder is None else quote(f"{Path(row.folder).name}/{REPORT}"),
-            tuple(str(row.values.get(key, "")) for key in keys),
-            row.mse,
-            row.predicted_mse,
+            "" if scene.failed is not None or scene.folder is None else quote(f"{Path(scene.folder).name}/{REPORT}"),
+            tuple(str(scene.values.get(key, "")) for key in keys),
+            scene.mse,
+            scene.predicted_mse,
         )
-        for row in listed
+        for scene in scenes
     ]
     return SweepTable(keys, rows) if keys and rows else None
 

@@ -44,7 +44,7 @@ def cached_page(
 
 
 def read_stamp(path: Path) -> tuple[None, str | None]:
-    """Return None and the fingerprint of a page on disk, which is None for a foreign or truncated file."""
+    """Return the fingerprint of a page on disk; None for a foreign or truncated file."""
     text = path.read_text(encoding="utf-8")
     match = re.search(r'<meta name="ommatid" content="([0-9a-f]+)">', text[:HEAD])
     return None, match[1] if match and text.rstrip().endswith("</html>") else None

@@ -43,9 +43,8 @@ def panels(maps: ResultMaps) -> list[Panel]:
         limit = _limit(np.abs(maps.error))
         colours = ColourScale(plots.DIVERGING, -limit, limit, "estimate minus truth")
         shown.append(Panel("error", "Error", maps.error, colours, _error_words(maps.error, limit)))
-    colours = ColourScale(plots.SEQUENTIAL, 0.0, _limit(maps.deviation), "standard deviation of a pixel")
-    title = "Posterior standard deviation"
-    return [*shown, Panel("deviation", title, maps.deviation, colours, value_words(maps.deviation))]
+    colours = ColourScale(plots.SEQUENTIAL, 0.0, _limit(maps.deviation), "posterior standard deviation")
+    return [*shown, Panel("deviation", "Standard deviation", maps.deviation, colours, value_words(maps.deviation))]
 
 
 def figures(maps: ResultMaps, shown: list[Panel]) -> list[Any]:
@@ -75,7 +74,7 @@ def value_words(image: NDArray[Any]) -> str:
     if not known.size:
         return "no value is known"
     missing = image.size - known.size
-    words = f"{known.min():.4g} to {known.max():.4g}, mean {known.mean(dtype=np.float64):.4g}"
+    words = f"range {known.min():.4g} to {known.max():.4g}, mean {known.mean(dtype=np.float64):.4g}"
     return words + (f"; {missing} of {image.size} are missing" if missing else "")
 
 

@@ -210,6 +210,6 @@ def words(mosaic: Mosaic) -> str:
     low, high = mosaic.ends
     words = (
         f"{len(names)} sub-images ({', '.join(counts)}), inverted as the lenses project them, lens types from left to"
-        f" right; {mosaic.unit} from {low:.4g} to {high:.4g}"
+        f" right; range of the {mosaic.unit}: {low:.4g} to {high:.4g}"
     )
     return words + (f"; {mosaic.dead} sensor pixels are dead" if mosaic.dead else "")

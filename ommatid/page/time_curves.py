@@ -89,8 +89,8 @@ def words(curves: TimeCurves) -> str:
 
 def _comparison(own: TimePoint, others: list[TimePoint]) -> str:
     better = [point for point in others if point.seconds <= own.seconds and point.mse < own.mse]
-    took = f"{own.stage.capitalize()} took {own.seconds:.3g} s"
+    took = f"The {own.stage} stage took {own.seconds:.3g} s"
     if not better:
         return f"{took}; no measured setting is both faster and more accurate"
     best = min(better, key=lambda point: point.mse)
-    return f"{took}; the setting {best.setting} gives {best.mse:.4g} in {best.seconds:.3g} s"
+    return f'{took}; the setting "{best.setting}" gives {best.mse:.4g} in {best.seconds:.3g} s'

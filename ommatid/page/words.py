@@ -10,10 +10,7 @@ from ommatid.reconstruct.restore import MAX_SPURIOUS_INFORMATION
 SCALE = "on a scale of 0 to 255"
 # Cause of a part of the predicted error, and the remedy:
 CAUSES = {
-    "null_space": (
-        "the null space of H, which no lens type measures",
-        "another lens type would reduce it; `ommatid design` ranks candidates",
-    ),
+    "null_space": ("null space of H", "another lens type would reduce it (`ommatid design` ranks candidates)"),
     "noise": ("sensor noise", "only more light or a better sensor would reduce it"),
     "quantisation": ("quantisation", "more bits would reduce it"),
     "rendering": ("noise of the rendering", "a larger `render.samples` would reduce it"),
@@ -72,7 +69,7 @@ def _largest_cause(error: ErrorReport) -> str:
         return "The predicted error is zero."
     name, part = max(error.budget.items(), key=lambda item: item[1])
     cause, remedy = CAUSES.get(name, (name.replace("_", " "), "see the error budget"))
-    return f"The largest part of the predicted squared error, {100 * part / total:.0f} %, is due to {cause}: {remedy}."
+    return f"Largest part of the predicted squared error: {cause}, {100 * part / total:.0f} %; {remedy}."
 
 
 def cautions(report: RunReport) -> list[str]:
@@ -105,7 +102,7 @@ def key_numbers(report: RunReport) -> list[tuple[str, str, str]]:
         psnr = "exact" if error.psnr is None else f"{error.psnr:.2f} dB"
         numbers.append(("PSNR", psnr, "for a peak of 255"))
         if error.ssim is not None:
-            numbers.append(("Structural similarity", f"{error.ssim:.4f}", "identical images: 1"))
+            numbers.append(("Structural similarity", f"{error.ssim:.4f}", "1 for identical images"))
     seconds = sum(stage.seconds for stage in report.stages.values())
     sizes = f"{report.measurements} measurements, {report.unknowns} unknowns"
     return [*numbers, ("Run time", f"{seconds:.3g} s", sizes)]

@@ -1,7 +1,7 @@
-"""The paper's Figures 2, 3, 4, 5 and 7 as plots (Wood, Rajan and Christensen); their numbers are drawn as they come.
+"""The paper's Figures 2, 3, 4, 5 and 7 as plots (Wood, Rajan and Christensen).
 
 Errors and noise are in squared units of f, 0 to 255. Maps are upright, with pixels of the target along both axes.
-Lines that coincide are told apart by their marks, which stand at different places.
+Coinciding lines are distinguished by their markers, which are at different positions.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.reconstruct.forms.form import Vector
 from ommatid.reconstruct.measured_error import TRIM
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.constants import WHITE
 
@@ -20,43 +20,48 @@ from .photographs import Photograph, TileCrops, Trials
 from .tile_errors import ACTUAL, EXPECTED, THREE, PaperTile, TileError, inner
 
 RESOLUTION = 130
-KINDS = ("tab:blue", "tab:orange", "tab:green")  # of lens types
-MARKS = ("o", "s", "^", "D")  # of expected noise variances
-SHADES = ("#1b9e77", "#d95f02", "#7570b3", "#a6761d")  # the same
-COLOURS = ("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#a6761d")  # of tiles of a photograph
-APART = 8  # actual noise variances from mark to mark
-ERROR = "expected squared error a pixel (squared units of f)"
+LENS_COLOURS = ("tab:blue", "tab:orange", "tab:green")  # of lens types
+MARKERS = ("o", "s", "^", "D")  # of expected noise variances
+NOISE_COLOURS = ("#1b9e77", "#d95f02", "#7570b3", "#a6761d")  # the same
+TILE_COLOURS = ("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#a6761d")  # of tiles of a photograph
+MARKER_STEP = 8  # actual noise variances from marker to marker
+ERROR = "expected squared error per pixel (squared units of f)"
 NOISE = "actual noise variance (squared units of f)"
-EXPECTS = "noise variance that\nthe estimator expects"
+EXPECTED_NOISE = "noise variance that\nthe estimator expects"
 
 
 def draw_sweeps(path: Path, shown: list[PaperTile]) -> None:
-    """Fig. 2 and Fig. 4: mean error against actual noise, whole and trimmed, a line an estimator and combination."""
+    """Draw Fig. 2 or 4: mean error against actual noise, whole and trimmed, one line per estimator and combination."""
     figure = _figure(12.0, 6.0)
     side = shown[0].side
     panels = figure.subplots(1, 2, sharey=True)
     for axes, trim in zip(panels, (0, TRIM), strict=True):
-        for tile, colour in zip(shown, KINDS, strict=True):
+        for tile, colour in zip(shown, LENS_COLOURS, strict=True):
             for number, expected in enumerate(EXPECTED):
-                axes.loglog(ACTUAL, _means(tile.line(expected), side, trim), color=colour, **_marked(number))
+                axes.loglog(ACTUAL, _means(tile.line(expected), side, trim), color=colour, **_marker(number))
         within = f"trimmed by {trim} pixels" if trim else "full tile"
         _axes(axes, f"{side} x {side}, {within}", NOISE, f"average {ERROR}")
-    _legend(panels[0], "lens types", [({"color": one}, tile.name) for one, tile in zip(KINDS, shown, strict=True)])
-    marks = [({"color": "black", "marker": one}, _power(value)) for one, value in zip(MARKS, EXPECTED, strict=True)]
-    _legend(panels[1], EXPECTS, marks)
+    colours = [({"color": colour}, tile.name) for colour, tile in zip(LENS_COLOURS, shown, strict=True)]
+    _legend(panels[0], "lens types", colours)
+    markers = zip(MARKERS, EXPECTED, strict=True)
+    _legend(
+        panels[1],
+        EXPECTED_NOISE,
+        [({"color": "black", "marker": marker}, _power(value)) for marker, value in markers],
+    )
     figure.suptitle(f"Error of the {side} x {side} tile against noise, by lens types and by what the estimator expects")
     _save(figure, path)
 
 
 def draw_maps(path: Path, shown: list[PaperTile], noise: float) -> None:
-    """Fig. 3: the error within the tile for each combination of lens types, with the maximum over each."""
+    """Draw Fig. 3: the error within the tile for each combination of lens types, with its maximum."""
     figure = _figure(14.5, 4.6)
     figure.get_layout_engine().set(wspace=0.08)
     side = shown[0].side
     for axes, tile in zip(figure.subplots(1, len(shown)), shown, strict=True):
         error = tile.matched(noise)
         drawn = axes.imshow(error.reshape(side, side), cmap="viridis", vmin=0.0, vmax=error.max())
-        where = "" if tile.camera.types_seeing().all() else " where no lens looks"
+        where = "" if tile.camera.types_seeing().all() else " where no lens sees it"
         title = f"{tile.name}\nmaximum {error.max():.4g}{where}, average {error.mean():.4g}"
         _axes(axes, title, "column (target pixels)", "row (target pixels)")
         axes.grid(visible=False)
@@ -69,25 +74,25 @@ def draw_maps(path: Path, shown: list[PaperTile], noise: float) -> None:
 
 
 def draw_sides(path: Path, shown: list[PaperTile]) -> None:
-    """Fig. 5: three lens types on tiles of several sizes side by side, on the same axes."""
+    """Draw Fig. 5: tiles of several sizes with three lens types, on the same axes."""
     figure = _figure(15.0, 5.8)
     panels = figure.subplots(1, len(shown), sharey=True)
     for axes, tile in zip(panels, shown, strict=True):
-        for number, (expected, colour) in enumerate(zip(EXPECTED, SHADES, strict=True)):
+        for number, (expected, colour) in enumerate(zip(EXPECTED, NOISE_COLOURS, strict=True)):
             errors = _means(tile.line(expected), tile.side, 0)
-            axes.loglog(ACTUAL, errors, color=colour, label=_power(expected), **_marked(number))
+            axes.loglog(ACTUAL, errors, color=colour, label=_power(expected), **_marker(number))
         best = np.array([tile.mse(noise) for noise in map(float, ACTUAL)])
-        axes.loglog(ACTUAL, best, "--", color="black", lw=1.4, label="the actual one")
+        axes.loglog(ACTUAL, best, "--", color="black", lw=1.4, label="the actual noise")
         _error_of_one(axes, best)
-        lenses = ", ".join(f"1/{kind.ratio}" for kind in tile.camera.types)
+        lenses = ", ".join(f"1/{lens_type.ratio}" for lens_type in tile.camera.types)
         _axes(axes, f"{tile.side} x {tile.side}, lenses {lenses}", NOISE, f"average {ERROR}")
-    panels[0].legend(title=EXPECTS, fontsize=9, title_fontsize=9, loc="upper left")
+    panels[0].legend(title=EXPECTED_NOISE, fontsize=9, title_fontsize=9, loc="upper left")
     figure.suptitle(f"Error of tiles of three sizes with three lens types ({'+'.join(THREE)})")
     _save(figure, path)
 
 
-def _error_of_one(axes: Any, best: Vector) -> None:
-    """Say at which noise the best estimator's error is 1, so that tiles can be compared."""
+def _error_of_one(axes: Any, best: FloatArray) -> None:
+    """Mark the noise at which the best estimator's error is 1, so that tiles can be compared."""
     noise = float(np.exp(np.interp(0.0, np.log(best), np.log(ACTUAL))))
     axes.axhline(1.0, color="0.5", lw=1.0, ls=":")
     axes.plot([noise], [1.0], "*", color="black", ms=12)
@@ -97,17 +102,17 @@ def _error_of_one(axes: Any, best: Vector) -> None:
 
 
 def draw_distortion(path: Path, shown: list[PaperTile], noise: float) -> None:
-    """Error against noise of one lens type with and without distortion, beside three types; the error's maps."""
+    """Draw error against noise of one lens type with and without distortion and of three types, and maps of it."""
     figure = _figure(14.5, 5.2)
     axes, *panels = figure.subplots(1, 1 + len(shown), width_ratios=(1.9, *(1.0 for _ in shown)))
-    for tile, colour in zip(shown, KINDS, strict=True):
+    for tile, colour in zip(shown, LENS_COLOURS, strict=True):
         label = f"{tile.name}: {tile.camera.measurements} measurements"
         axes.loglog(ACTUAL, [tile.mse(float(actual)) for actual in ACTUAL], color=colour, label=label)
     axes.axvline(noise, color="0.5", lw=1.0, ls=":")
-    _axes(axes, "the estimator expects the noise that there is", NOISE, f"average {ERROR}")
+    _axes(axes, "the estimator expects the actual noise", NOISE, f"average {ERROR}")
     axes.legend(fontsize=9, loc="lower right")
     maps = [tile.matched(noise) for tile in shown]
-    scale = max(error.max() for error in maps if error.max() < 100 * maps[0].max())  # one, where they compare
+    scale = max(error.max() for error in maps if error.max() < 100 * maps[0].max())  # common, where comparable
     for panel, tile, error in zip(panels, shown, maps, strict=True):
         most = max(scale, error.max())
         drawn = panel.imshow(error.reshape(tile.side, tile.side), cmap="viridis", vmin=0.0, vmax=most)
@@ -119,26 +124,32 @@ def draw_distortion(path: Path, shown: list[PaperTile], noise: float) -> None:
     _save(figure, path)
 
 
-def draw_photograph(path: Path, found: Photograph, side: int) -> None:
-    """Fig. 7: measured errors of six tiles against noise and against bits, beside the prediction; the tiles above."""
+def draw_photograph(path: Path, photograph: Photograph, side: int) -> None:
+    """Draw Fig. 7: measured and predicted errors of six tiles against noise and bits, the tiles above."""
     figure = _figure(13.0, 10.2)
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 3.2))
-    name = f"Six tiles of {Path(found.name).name}, {side} x {side} pixels each, reconstructed from three lens types"
+    name = (
+        f"Six tiles of {Path(photograph.name).name}, {side} x {side} pixels each, reconstructed from three lens types"
+    )
     above.suptitle(name, parse_math=False)
-    _thumbnails(above, found.cut, side)
+    _thumbnails(above, photograph.crops, side)
     panels = below.subplots(2, 2, sharex="col", sharey="row", height_ratios=(2.4, 1.0))
     experiments = (
-        (found.noisy, [noise.variance for noise in found.noisy.noises], "Gaussian noise, as the estimator expects"),
         (
-            found.quantised,
-            [float(noise.bits or 0) for noise in found.quantised.noises],
+            photograph.noisy,
+            [noise.variance for noise in photograph.noisy.noises],
+            "Gaussian noise, as the estimator expects",
+        ),
+        (
+            photograph.quantised,
+            [float(noise.bits or 0) for noise in photograph.quantised.noises],
             r"Quantisation in steps of 256/$2^\mathrm{bits}$; the estimator expects noise of step$^2$/12",
         ),
     )
-    across = ("noise variance (squared units of f)", "bits a measurement")
-    for (errors, ratios), (trials, levels, title), label in zip(panels.T, experiments, across, strict=True):
-        _trials(errors, trials, levels, found.cut)
-        _axes(errors, title, label, "mean squared error a pixel (squared units of f)")
+    labels = ("noise variance (squared units of f)", "bits per measurement")
+    for (errors, ratios), (trials, levels, title), label in zip(panels.T, experiments, labels, strict=True):
+        _trials(errors, trials, levels, photograph.crops)
+        _axes(errors, title, label, "mean squared error per pixel (squared units of f)")
         _ratios(ratios, trials, levels)
         _axes(ratios, "", label, "measured over predicted")
     panels[0, 0].set_xscale("log")
@@ -147,8 +158,8 @@ def draw_photograph(path: Path, found: Photograph, side: int) -> None:
     _save(figure, path)
 
 
-def _trials(axes: Any, trials: Trials, levels: list[float], cut: TileCrops) -> None:
-    for number, (colour, (row, column)) in enumerate(zip(COLOURS, cut.places, strict=True)):
+def _trials(axes: Any, trials: Trials, levels: list[float], crops: TileCrops) -> None:
+    for number, (colour, (row, column)) in enumerate(zip(TILE_COLOURS, crops.corners, strict=True)):
         label = f"tile at row {row}, column {column}"
         axes.semilogy(levels, trials.measured[:, number], color=colour, lw=0.9, label=label)
     axes.semilogy(levels, trials.mean, color="black", lw=1.6, marker="o", ms=4, label="mean of the six")
@@ -156,31 +167,31 @@ def _trials(axes: Any, trials: Trials, levels: list[float], cut: TileCrops) -> N
 
 
 def _ratios(axes: Any, trials: Trials, levels: list[float]) -> None:
-    for number, colour in enumerate(COLOURS):
+    for number, colour in enumerate(TILE_COLOURS):
         axes.plot(levels, trials.measured[:, number] / trials.predicted, color=colour, lw=0.9)
     axes.plot(levels, trials.mean / trials.predicted, color="black", lw=1.6, marker="o", ms=4)
     axes.axhline(1.0, color="red", ls="--", lw=2.0)
     axes.set_ylim(bottom=0.0)
 
 
-def _thumbnails(figure: Any, cut: TileCrops, side: int) -> None:
-    panels = figure.subplots(1, len(cut.places))
-    for axes, image, colour, place in zip(panels, cut.images, COLOURS, cut.places, strict=True):
+def _thumbnails(figure: Any, crops: TileCrops, side: int) -> None:
+    panels = figure.subplots(1, len(crops.corners))
+    for axes, image, colour, (row, column) in zip(panels, crops.images, TILE_COLOURS, crops.corners, strict=True):
         axes.imshow(image.reshape(side, side), cmap="gray", vmin=0.0, vmax=WHITE)
-        axes.set_title(f"row {place[0]}, column {place[1]}", fontsize=9)
+        axes.set_title(f"row {row}, column {column}", fontsize=9)
         axes.set_xticks([])
         axes.set_yticks([])
         for spine in axes.spines.values():
             spine.set(color=colour, linewidth=3)
 
 
-def _means(line: TileError, side: int, trim: int) -> Vector:
+def _means(line: TileError, side: int, trim: int) -> FloatArray:
     return np.array([inner(line.at(actual), side, trim) for actual in map(float, ACTUAL)])
 
 
-def _marked(number: int) -> dict[str, Any]:
-    start = number * APART // len(MARKS)
-    return {"lw": 1.3, "marker": MARKS[number], "ms": 6, "markevery": (start, APART)}
+def _marker(number: int) -> dict[str, Any]:
+    start = number * MARKER_STEP // len(MARKERS)
+    return {"lw": 1.3, "marker": MARKERS[number], "ms": 6, "markevery": (start, MARKER_STEP)}
 
 
 def _power(value: float) -> str:
@@ -198,7 +209,6 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _axes(axes: Any, title: str, across: str, up: str) -> None:
-    """Name both axes."""
     axes.set_title(title, fontsize=11)
     axes.set_xlabel(across)
     axes.set_ylabel(up)

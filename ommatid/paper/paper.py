@@ -1,7 +1,4 @@
-"""The paper's figures and claims in one go (Wood, Rajan and Christensen), computed anew: plots, numbers and verdicts.
-
-H of a perfect camera and the recording of its light are passed in; everything else is Eq. 4 and Eq. 5.
-"""
+"""Compute the paper's figures and claims (Wood, Rajan and Christensen): plots, numbers and verdicts."""
 
 from __future__ import annotations
 
@@ -17,134 +14,128 @@ from ommatid.runtime.files import check_output, make_folder, write_csv
 from ommatid.runtime.progress import Progress, no_progress
 
 from . import figures
-from .claims import Claim, errors, ranks
-from .photograph_claims import pictures
-from .photographs import PHOTOGRAPH, Photograph, Record, Trials, cut, load, seeds, simulate_trials
-from .tile_errors import ACTUAL, COMBINATIONS, SIDES, THREE, MatrixOf, PaperTile, Tiles, distortion, sweep, tiles
+from .claims import Claim, error_claims, rank_claims
+from .photograph_claims import photograph_claims
+from .photographs import PHOTOGRAPH, Photograph, Trials, crop_tiles, load, seeds, simulate_trials
+from .tile_errors import ACTUAL, COMBINATIONS, SIDES, THREE, PaperTile, Tiles, distortion, sweep, tiles
 
 SIDE = 35  # of the photograph's tiles
-FRACTIONS = 3  # experiment by whose seed pixels get fractions
-SHOWN = 1e-4  # noise variance of the maps
-SMALLEST, BENT = 19, 1e-2  # side of the tile, and noise variance of the maps, of the figure of distortion
+FRACTIONS = 3  # number of the experiment whose seed draws the fractions of pixels
+MAP_NOISE = 1e-4  # variance
+DISTORTION_SIDE, DISTORTION_NOISE = 19, 1e-2  # of the figure of distortion: side of the tile, variance of the maps
 CLAIMS = "claims.csv"
 FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig7", "distortion")
+FILES = (*(f"{figure}.{suffix}" for figure in FIGURES for suffix in ("png", "csv")), CLAIMS)
 
 Row = Sequence[str | float]
 
 
 def write_paper(
-    folder: Path,
-    matrix_of: MatrixOf,
-    record: Record,
-    image: str = PHOTOGRAPH,
-    seed: int = 0,
-    progress: Progress = no_progress,
+    folder: Path, image: str = PHOTOGRAPH, seed: int = 0, progress: Progress = no_progress
 ) -> dict[str, Any]:
-    """Write figures 2, 3, 4, 5, 7 and one of distortion, each as PNG and CSV, and the claims; say what was found.
+    """Write figures 2, 3, 4, 5, 7 and one of distortion, each as PNG and CSV, and the claims; return a summary.
 
-    matrix_of : H, (M, N), of a perfect camera
-    record : from the light, (M,), of a camera, the noise and its seed to recorded values, (M,)
     image : the photograph of Fig. 7, a file or `photo:NAME`
-    Raises InputError for a picture or a folder that will not do, DeniedError where it cannot be written.
+    Raises InputError for an unsuitable image or folder, MachineError where it cannot be written.
     """
     started = perf_counter()
-    chosen = cut(load(image), SIDE, image, np.random.default_rng(seeds(seed, FRACTIONS)(0, 0)))
+    crops = crop_tiles(load(image), SIDE, image, np.random.default_rng(seeds(seed, FRACTIONS)(0, 0)))
     make_folder(folder)
-    for name in _names():
+    for name in FILES:
         check_output(folder / name, Path(image))
-    computed = tiles(matrix_of)
+    computed = tiles()
     progress(0.4)
-    found = simulate_trials(computed[SIDE, THREE], image, chosen, record, seed)
+    photograph = simulate_trials(computed[SIDE, THREE], image, crops, seed)
     progress(0.5)
-    judged = [*errors(computed), *ranks(matrix_of), *pictures(found)]
+    claims = [*error_claims(computed), *rank_claims(), *photograph_claims(photograph)]
     progress(0.8)
-    diverse = [computed[SMALLEST, THREE], *distortion(matrix_of)]
-    _write_numbers(folder, computed, found, judged)
-    write_csv(folder / "distortion.csv", ("lenses", "measurements", "noise_variance", "mse"), _diverse(diverse))
-    _write_figures(folder, computed, found)
-    figures.draw_distortion(folder / "distortion.png", diverse, BENT)
+    diverse = [computed[DISTORTION_SIDE, THREE], *distortion()]
+    _write_numbers(folder, computed, photograph, diverse)
+    write_csv(folder / CLAIMS, ("claim", "holds", "numbers", "remark"), map(_claim_row, claims))
+    _write_figures(folder, computed, photograph)
+    figures.draw_distortion(folder / "distortion.png", diverse, DISTORTION_NOISE)
     progress(1.0)
     return {
         "folder": str(folder),
-        "files": list(_names()),
-        "picture": {"image": image, "tile": SIDE, "places": [list(place) for place in chosen.places], "seed": seed},
-        "claims": [asdict(claim) for claim in judged],
+        "files": list(FILES),
+        "picture": {"image": image, "tile": SIDE, "places": [list(corner) for corner in crops.corners], "seed": seed},
+        "claims": [asdict(claim) for claim in claims],
         "seconds": perf_counter() - started,
     }
 
 
-def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
-    """The lines of the printed table: each claim, and whether it holds, with the catch."""
+def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the lines of the printed table: each claim with its verdict and qualification."""
     lines: list[tuple[str, str]] = []
-    for claim in description["claims"]:
-        catch = f": {claim['remark']}" if claim["remark"] else ""
-        lines.append((claim["claim"], claim["holds"] + catch))
+    for claim in summary["claims"]:
+        remark = f": {claim['remark']}" if claim["remark"] else ""
+        lines.append((claim["claim"], claim["holds"] + remark))
     return [
         *lines,
-        ("figures and numbers", ", ".join(description["files"])),
-        ("seconds", f"{description['seconds']:.1f}"),
+        ("figures and numbers", ", ".join(summary["files"])),
+        ("seconds", f"{summary['seconds']:.1f}"),
     ]
-
-
-def _names() -> tuple[str, ...]:
-    return *(f"{figure}.{kind}" for figure in FIGURES for kind in ("png", "csv")), CLAIMS
 
 
 def _combinations(computed: Tiles, side: int) -> list[PaperTile]:
     return [computed[side, lenses] for lenses in COMBINATIONS]
 
 
-def _write_figures(folder: Path, computed: Tiles, found: Photograph) -> None:
+def _write_figures(folder: Path, computed: Tiles, photograph: Photograph) -> None:
     figures.draw_sweeps(folder / "fig2.png", _combinations(computed, 19))
-    figures.draw_maps(folder / "fig3.png", _combinations(computed, 19), SHOWN)
+    figures.draw_maps(folder / "fig3.png", _combinations(computed, 19), MAP_NOISE)
     figures.draw_sweeps(folder / "fig4.png", _combinations(computed, 35))
     figures.draw_sides(folder / "fig5.png", [computed[side, THREE] for side in SIDES])
-    figures.draw_photograph(folder / "fig7.png", found, SIDE)
+    figures.draw_photograph(folder / "fig7.png", photograph, SIDE)
 
 
-def _write_numbers(folder: Path, computed: Tiles, found: Photograph, judged: list[Claim]) -> None:
+def _write_numbers(folder: Path, computed: Tiles, photograph: Photograph, diverse: list[PaperTile]) -> None:
     columns = ("lenses", "expected_noise_variance", "actual_noise_variance", "mse", "trimmed_mse")
     for name, side in (("fig2.csv", 19), ("fig4.csv", 35)):
-        write_csv(folder / name, columns, (row for tile in _combinations(computed, side) for row in sweep(tile)))
-    write_csv(folder / "fig3.csv", ("lenses", "row", "column", "expected_squared_error"), _maps(computed))
-    write_csv(folder / "fig5.csv", ("side", *columns[1:4]), _sides(computed))
-    numbered = [f"tile_{place[0]}_{place[1]}" for place in found.cut.places]
-    write_csv(folder / "fig7.csv", ("bits", "noise_variance", "predicted", "mean", *numbered), _measured(found))
-    write_csv(folder / CLAIMS, ("claim", "holds", "numbers", "remark"), map(_claim, judged))
+        _write_table(folder / name, columns, (row for tile in _combinations(computed, side) for row in sweep(tile)))
+    _write_table(folder / "fig3.csv", ("lenses", "row", "column", "expected_squared_error"), _map_rows(computed))
+    _write_table(folder / "fig5.csv", ("side", *columns[1:4]), _side_rows(computed))
+    numbered = [f"tile_{row}_{column}" for row, column in photograph.crops.corners]
+    trials = [row for trials in (photograph.noisy, photograph.quantised) for row in _trial_rows(trials)]
+    _write_table(folder / "fig7.csv", ("bits", "noise_variance", "predicted", "mean", *numbered), trials)
+    _write_table(
+        folder / "distortion.csv",
+        ("lenses", "measurements", "noise_variance", "mse"),
+        (
+            (tile.name, tile.camera.measurements, actual, tile.mse(actual))
+            for tile in diverse
+            for actual in map(float, ACTUAL)
+        ),
+    )
 
 
-def _maps(computed: Tiles) -> Iterable[Row]:
+def _map_rows(computed: Tiles) -> Iterable[Row]:
     for tile in _combinations(computed, 19):
-        for place, error in enumerate(tile.matched(SHOWN)):
-            yield (tile.name, *divmod(place, tile.side), error)
+        for pixel, error in enumerate(tile.matched(MAP_NOISE)):
+            yield (tile.name, *divmod(pixel, tile.side), error)
 
 
-def _sides(computed: Tiles) -> Iterable[Row]:
-    """Every estimator that expects a fixed variance, then the one that expects the actual one."""
+def _side_rows(computed: Tiles) -> Iterable[Row]:
+    """Yield rows of every estimator that expects a fixed variance, then of the one that expects the actual one."""
     for side in SIDES:
         tile = computed[side, THREE]
         yield from ((side, *row[1:4]) for row in sweep(tile))
         yield from ((side, actual, actual, tile.mse(actual)) for actual in map(float, ACTUAL))
 
 
-def _diverse(shown: list[PaperTile]) -> Iterable[Row]:
-    for tile in shown:
-        yield from ((tile.name, tile.camera.measurements, actual, tile.mse(actual)) for actual in map(float, ACTUAL))
-
-
-def _measured(found: Photograph) -> Iterable[Row]:
-    """Of noise first, with bits left empty, then of quantisation, with the variance that the estimator expects."""
-    for trials in (found.noisy, found.quantised):
-        yield from _levels(trials)
-
-
-def _levels(trials: Trials) -> Iterable[Row]:
+def _trial_rows(trials: Trials) -> Iterable[Row]:
+    """Yield a row per level: bits, empty for noise, and the variance that the estimator expects."""
     for level, noise in enumerate(trials.noises):
         bits = "" if noise.bits is None else noise.bits
         variance = noise.variance + noise.quantisation_variance
         yield (bits, variance, trials.predicted[level], trials.mean[level], *trials.measured[level])
 
 
-def _claim(claim: Claim) -> Row:
+def _claim_row(claim: Claim) -> Row:
     numbers = "; ".join(f"{name}: {number:.9g}" for name, number in claim.numbers.items())
     return claim.claim, claim.holds, numbers, claim.remark
+
+
+def _write_table(path: Path, columns: Sequence[str], lines: Iterable[Row]) -> None:
+    """Write a CSV file of numbers to their last digit."""
+    write_csv(path, columns, ([float(cell) if isinstance(cell, float) else cell for cell in line] for line in lines))

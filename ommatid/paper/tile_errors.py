@@ -1,39 +1,35 @@
-"""The expected error of the paper's tiles (Wood et al., Eq. 5), for every expected and every actual noise variance.
+"""Expected errors of the paper's tiles (Wood et al., Eq. 5) for every expected and every actual noise variance.
 
     error covariance = (I - A H) P0 (I - A H)^T + actual A A^T                    (Eq. 5)
 
-A depends on the expected noise variance alone, so for one estimator the error is a straight line in the actual noise
-variance. One singular value decomposition a tile gives them all. Errors are in squared units of f, 0 to 255.
+A depends on the expected noise variance alone, so the error of one estimator is a straight line in the actual noise
+variance. One singular value decomposition per tile gives all of them. Errors are in squared units of f, 0 to 255.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
-from scipy import sparse
 
-from ommatid.reconstruct.forms.form import Vector
 from ommatid.reconstruct.forms.svd import Svd, svd
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.reconstruct.prior import independent
 from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes import scene
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.tables import estimation
+from ommatid.scenes.tables.estimation import PriorTable
+from ommatid.scenes.tables.gallery import GALLERY
+from ommatid.simulate.ideal import ideal_matrix
 
-MatrixOf = Callable[[Camera], sparse.csr_array]  # H of a perfect camera, (M, N)
-
-GALLERY = Path(str(scene.__file__)).parent
 SIDES = (19, 35, 41)
-DRAWN = (19, 35)  # with every combination
+COMPLETE_SIDES = (19, 35)  # of tiles that are computed with every combination of lens types
 TWICE, TWO, THREE = ("I", "I"), ("I", "II"), ("I", "II", "III")
 COMBINATIONS = (TWICE, TWO, THREE)
 EXPECTED = (1e-6, 1e-4, 1e-2, 1.0)
-ACTUAL: Vector = np.logspace(-6, 2, 33)
+ACTUAL: FloatArray = np.logspace(-6, 2, 33)
 LEAST = 1e-6
 STRAIGHT = ("camera.lens.I.distortion=",)
 
@@ -42,22 +38,22 @@ STRAIGHT = ("camera.lens.I.distortion=",)
 class TileError:
     """The diagonal of Eq. 5 for one estimator: (N,) `prior` + actual noise variance times (N,) `noise`."""
 
-    prior: Vector
-    noise: Vector
+    prior: FloatArray
+    noise: FloatArray
 
-    def at(self, actual: float) -> Vector:
-        """Expected squared error of every pixel: (N,)."""
+    def at(self, actual: float) -> FloatArray:
+        """Return the expected squared error of every pixel: (N,)."""
         return self.prior + actual * self.noise
 
     def crossing(self, better: TileError) -> float:
-        """The actual noise variance at which a line that begins below this one reaches it; infinite if never."""
+        """Return the actual noise variance at which a line that starts below this one reaches it; infinite if never."""
         ahead = float(self.prior.mean() - better.prior.mean())
         steeper = float(better.noise.mean() - self.noise.mean())
         return ahead / steeper if steeper > 0 else float("inf")
 
     @property
     def knee(self) -> float:
-        """The actual noise variance at which noise and prior bring equal parts of the mean error."""
+        """The actual noise variance at which noise and prior contribute equal parts of the mean error."""
         return float(self.prior.mean() / self.noise.mean())
 
 
@@ -86,63 +82,63 @@ class PaperTile:
         return variance * (self.camera.unknowns - self.form.rank) / self.camera.unknowns
 
     def line(self, expected: float) -> TileError:
-        """Eq. 5 for the estimator that expects noise of this variance."""
+        """Return Eq. 5 for the estimator that expects noise of this variance."""
         prior = self.form.expected_variance(expected, 0.0)
         return TileError(prior, self.form.expected_variance(expected, 1.0) - prior)
 
-    def matched(self, variance: float) -> Vector:
-        """Eq. 5 where the estimator expects what the noise is: (N,)."""
+    def matched(self, variance: float) -> FloatArray:
+        """Return Eq. 5, (N,), for the estimator that expects the actual noise."""
         return self.form.expected_variance(variance, variance)
 
     def mse(self, variance: float) -> float:
-        """Its mean over the pixels."""
+        """Return its mean over the pixels."""
         return float(self.matched(variance).mean())
 
 
 Tiles = dict[tuple[int, tuple[str, ...]], PaperTile]  # by side and lens types
 
 
-def tile(side: int, lenses: tuple[str, ...], matrix_of: MatrixOf) -> PaperTile:
-    """A tile of the gallery with the named lens types; one named twice counts twice."""
-    return decomposed(lenses, gallery(side, lenses), matrix_of)
+def tile(side: int, lenses: tuple[str, ...]) -> PaperTile:
+    """Decompose a tile of the gallery with the named lens types; one named twice counts twice."""
+    return decomposed(lenses, gallery(side, lenses))
 
 
-def distortion(matrix_of: MatrixOf) -> tuple[PaperTile, PaperTile]:
-    """The gallery's one lens type with distortion, and without."""
+def distortion() -> tuple[PaperTile, PaperTile]:
+    """Decompose the gallery's single lens type with distortion, and without."""
     bent, straight = (derive(scene.read(GALLERY / "distorted.toml", changes)) for changes in ((), STRAIGHT))
-    return decomposed(("one type, distorted",), bent, matrix_of), decomposed(("one type",), straight, matrix_of)
+    return decomposed(("one type, distorted",), bent), decomposed(("one type",), straight)
 
 
-def decomposed(lenses: tuple[str, ...], camera: Camera, matrix_of: MatrixOf) -> PaperTile:
-    """The tile that a camera sees."""
-    paper = estimation.PriorTable()
+def decomposed(lenses: tuple[str, ...], camera: Camera) -> PaperTile:
+    """Decompose H of a camera, with the paper's prior."""
+    paper = PriorTable()
     prior = independent(paper.mean, paper.variance, camera.unknowns)
-    return PaperTile(lenses, camera, svd(Problem(matrix_of(camera), prior, np.ones(camera.measurements))))
+    return PaperTile(lenses, camera, svd(Problem(ideal_matrix(camera), prior, np.ones(camera.measurements))))
 
 
-def tiles(matrix_of: MatrixOf) -> Tiles:
-    """All that the figures show: 19 and 35 with every combination of lens types, 41 with three."""
-    shown = [(side, lenses) for side in SIDES for lenses in COMBINATIONS if side in DRAWN or lenses == THREE]
-    return {(side, lenses): tile(side, lenses, matrix_of) for side, lenses in shown}
+def tiles() -> Tiles:
+    """Decompose all tiles of the figures: 19 and 35 with every combination of lens types, 41 with three."""
+    keys = [(side, lenses) for side in SIDES for lenses in COMBINATIONS if side in COMPLETE_SIDES or lenses == THREE]
+    return {(side, lenses): tile(side, lenses) for side, lenses in keys}
 
 
 @cache
 def gallery(side: int, lenses: tuple[str, ...]) -> Camera:
-    """The camera of a tile of the gallery with the named lens types."""
+    """Return the camera of a tile of the gallery with the named lens types."""
     return derive(scene.read(GALLERY / f"tile{side}.toml", (), lenses))
 
 
-def inner(error: Vector, side: int, trim: int = TRIM) -> float:
-    """Mean of a map, (N,), of a square tile without its border of `trim` pixels."""
+def inner(error: FloatArray, side: int, trim: int = TRIM) -> float:
+    """Return the mean of a map, (N,), of a square tile without its border of `trim` pixels."""
     return float(error.reshape(side, side)[trim : side - trim, trim : side - trim].mean())
 
 
-def sweep(shown: PaperTile) -> list[tuple[str, float, float, float, float]]:
-    """Rows of Fig. 2 and 4: lens types, expected and actual noise variance, mean error, and that without the border."""
-    found: list[tuple[str, float, float, float, float]] = []
+def sweep(tile: PaperTile) -> list[tuple[str, float, float, float, float]]:
+    """Return the rows of Fig. 2 and 4: lens types, expected and actual noise variance, mean error, trimmed error."""
+    rows: list[tuple[str, float, float, float, float]] = []
     for expected in EXPECTED:
-        line = shown.line(expected)
+        line = tile.line(expected)
         for actual in map(float, ACTUAL):
             error = line.at(actual)
-            found.append((shown.name, expected, actual, float(error.mean()), inner(error, shown.side)))
-    return found
+            rows.append((tile.name, expected, actual, float(error.mean()), inner(error, tile.side)))
+    return rows

@@ -1,1 +1,1 @@
-"""The stages of a run in their order, and how a given time is divided among them."""
+"""Simulation, calibration and reconstruction in sequence, and runs within a given time."""

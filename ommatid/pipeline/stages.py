@@ -1,4 +1,4 @@
-"""The stages of a scene, one after the other: they meet in the files of its folder, and what is up to date stays."""
+"""The stages of a scene. Each reads and writes files in the scene's folder; those up to date are not made again."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from ommatid.simulate.validation import check_scene, check_scene_memory
 
 
 def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
-    """A scene, its camera and its target, all checked before anything is written."""
+    """Read a scene, and check it, its camera and its target image, before anything is written. Raises InputError."""
     return checked(read(path, changes, lenses))
 
 
 def checked(scene: Scene) -> Setup:
     """Derive the camera of a scene and load its image. Raises InputError if either cannot be done."""
-    camera = derive(scene)  # first: it is cheap, and refuses most of what is wrong
+    camera = derive(scene)  # first, since it is fast and finds most errors
     if scene.world is not None:
         from ommatid.simulate.renderer.world import files
 
@@ -43,21 +43,21 @@ def checked(scene: Scene) -> Setup:
 
 
 def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:
-    """A scene of a batch, with its own changes after those of all."""
+    """Open a scene of a batch, with the changes of all scenes and then its own."""
     return opened(member.scene, (*changes, *member.changes), lenses)
 
 
 def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
-    """In how many processes a batch is done soonest, of as many as memory holds."""
+    """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
     from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
 
-    efforts = [estimate_cost(member, changes, lenses) for member in members]
-    most = min(concurrent_by_memory([one.memory for one in efforts]), len(members), processors())
-    return fastest_process_count([one.seconds for one in efforts], most, processors())
+    costs = [estimate_cost(member, changes, lenses) for member in members]
+    most = min(concurrent_by_memory([cost.memory for cost in costs]), len(members), processors())
+    return fastest_process_count([cost.seconds for cost in costs], most, processors())
 
 
 def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
-    """What `run` does of a scene, here or on a worker, and says of it."""
+    """Execute all stages of a scene, here or on a worker, and return the content of run.json."""
     report = results(setup, folder, watch)
     write_page(setup.camera, folder, watch)
     return report.plain()
@@ -65,7 +65,7 @@ def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
 
 @one_thread()
 def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
-    """All of a run but its page, and what run.json says of it."""
+    """Execute all stages of a scene except the page."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.method_choice import choose_method
@@ -77,7 +77,7 @@ def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
     if scene.study is not None and "transport" in scene.study.models:
         with naming_source(scene.source):
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
-    choose_method(scene, camera, setup.has_structured_matrix)  # what memory does not hold is refused before any work
+    choose_method(scene, camera, setup.has_structured_matrix)  # checks the memory before any work
     study.check_study(scene, camera)
     stack = _rendered(setup, folder, watch)
     with watch.progress("calibrate") as progress:
@@ -99,7 +99,7 @@ def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
 
 
 def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
-    """Show the run whose results stand in a folder on a page."""
+    """Write report.html of the results in a folder, unless it is up to date."""
     from ommatid.page.cached import cached_page
     from ommatid.simulate.ideal import matrix_as_designed
 
@@ -109,13 +109,13 @@ def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
 
 
 def render(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
-    """What `render` does of a scene, here or on a worker, and says of it."""
+    """Render a scene, here or on a worker, and describe its stack."""
     stack = _rendered(setup, folder, watch)
     return {"sub_images": len(setup.camera.sub_imagers), **stack.record}
 
 
 def predict_scene(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
-    """What `predict` says of a scene of a sweep; nothing is rendered, and nothing written."""
+    """Predict the error of a scene of a sweep, without rendering or writing anything."""
     from ommatid.analysis.predict import predict_scene
     from ommatid.analysis.prediction_table import json_of
 
@@ -125,16 +125,19 @@ def predict_scene(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, A
 
 
 def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
-    """H alone, kept at `path`, and whether it had to be made; its samples are judged by images of the prior."""
+    """Return the model at `path` and False if it is up to date; else calibrate it, and True.
+
+    An adaptive calibration stops by the expected error of images drawn from the prior.
+    """
     if setup.scene.calibration.method != "ideal":
         check_scene(setup)
     check_scene_memory(setup)
-    judge = None
+    stopping_rule = None
     if is_adaptive(setup.scene):
         from ommatid.analysis.calibration_goal import for_prior
 
-        judge = for_prior(setup)
-    return cached_model(path, setup, progress, judge)
+        stopping_rule = for_prior(setup)
+    return cached_model(path, setup, progress, stopping_rule)
 
 
 def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
@@ -154,11 +157,14 @@ def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequ
 
 
 def facts(chosen: bool) -> dict[str, str]:
-    """What has to be the same on all machines for results to be the same; `chosen`: the variant is left to them."""
-    found = versions("mitsuba", "drjit", "scipy")
+    """Return the versions that have to agree on all machines for equal results.
+
+    chosen : True adds the variant that 'auto' stands for
+    """
+    facts = versions("mitsuba", "drjit", "scipy")
     if chosen:
-        found["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
-    return found
+        facts["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
+    return facts
 
 
 def _rendered(setup: Setup, folder: Path, watch: RunObserver) -> Stack:
@@ -171,7 +177,7 @@ def _rendered(setup: Setup, folder: Path, watch: RunObserver) -> Stack:
 
 
 def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> tuple[StudyCase, ...]:
-    """The same stack with every idea of H that the scene's study names."""
+    """Reconstruct the stack with every model of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models
     from ommatid.analysis.study import cached_study

@@ -1,4 +1,4 @@
-"""What a form of the estimator made of a stiff or extreme case."""
+"""Results of the stability survey."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class StabilityOutcome:
-    """What one form made of one case.
+    """Result of one form for one case.
 
-    alone, refined, variance : right digits of u as the form solves for it, of u once refined, of the worst variance
-    bound, variance_bound : relative errors that were promised;  reason : why it was refused
+    alone, refined, variance : correct digits of u from the form alone, of the refined u, of the worst variance
+    bound, variance_bound : relative error bounds stated by the estimator;  reason : why the case was refused
     """
 
     case: str
@@ -29,7 +29,7 @@ class StabilityOutcome:
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """An outcome of the sweep over noise: of which H, at which noise variance."""
+    """An outcome of the noise sweep: the name of H, the noise variance and the result."""
 
     lenses: str
     noise: float

@@ -1,1 +1,1 @@
-"""The estimate of Eq. 4 with a certificate of its numerical error."""
+"""The estimate of Eq. 4 with a certified bound on its numerical error."""

@@ -1,6 +1,6 @@
-"""Sums and products in twice the precision of float64: a number is a pair `high + low` (Ogita, Rump and Oishi 2005).
+"""Double-double arithmetic: a number is a pair `high + low` of float64 (Ogita, Rump and Oishi 2005).
 
-Residuals of an estimate cancel almost wholly; computed so, what is left of them can be believed.
+The residuals of an estimate cancel almost completely; twice the precision leaves significant digits in them.
 """
 
 from __future__ import annotations
@@ -11,106 +11,106 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-Array = NDArray[np.float64]
+from ommatid.runtime.arrays import FloatArray
 
-UPPER = np.int64(-(2**27))  # the bits of a number that its upper half keeps: sign, exponent and 26 digits
-ROUNDING = 2.0**-104  # relative, of one operation
+UPPER_BITS = np.int64(-(2**27))  # mask of a float64's upper half: sign, exponent and 26 digits
+ROUNDING = 2.0**-104  # relative rounding error of one operation
 
 
 @dataclass(frozen=True)
 class DoubleDouble:
-    """The unevaluated sum of two arrays of one shape; `low` is at most rounding of `high`."""
+    """The unevaluated sum of two arrays of the same shape; `low` is at most the rounding error of `high`."""
 
-    high: Array
-    low: Array
+    high: FloatArray
+    low: FloatArray
 
     def __add__(self, other: DoubleDouble) -> DoubleDouble:
-        """Sum, element by element."""
-        total, error = _sum(self.high, other.high)
-        return _normal(total, error + (self.low + other.low))
+        """Add element by element."""
+        total, error = _two_sum(self.high, other.high)
+        return _normalised(total, error + (self.low + other.low))
 
     def __sub__(self, other: DoubleDouble) -> DoubleDouble:
-        """Difference, element by element."""
+        """Subtract element by element."""
         return self + DoubleDouble(-other.high, -other.low)
 
-    def scaled(self, factor: Array) -> DoubleDouble:
-        """Product with an array that broadcasts, element by element."""
-        product, error = _product(self.high, factor)
-        return _normal(product, error + self.low * factor)
+    def scaled(self, factor: FloatArray) -> DoubleDouble:
+        """Multiply element by element by a float64 array that broadcasts."""
+        product, error = _two_product(self.high, factor)
+        return _normalised(product, error + self.low * factor)
 
 
-def exact(values: Array) -> DoubleDouble:
-    """A float64 array as it is."""
+def exact(values: FloatArray) -> DoubleDouble:
+    """Convert a float64 array without error."""
     return DoubleDouble(values, np.zeros_like(values))
 
 
 @dataclass(frozen=True)
 class SparseRows:
-    """A matrix laid out for `times`: (width, rows) `data`, and which element of the vector each of them meets."""
+    """A matrix stored for `times`: (width, rows) `data` and the column `index` of each entry."""
 
-    data: Array
+    data: FloatArray
     index: NDArray[np.intp]
 
     def times(self, vector: DoubleDouble) -> DoubleDouble:
-        """The matrix times (columns, q): (rows, q)."""
+        """Multiply by a (columns, q) block: (rows, q)."""
         shape = (self.data.shape[1], vector.high.shape[1])
         total, rest = np.zeros(shape), np.zeros(shape)
         for data, index in zip(self.data, self.index, strict=True):
             factor = data[:, None]
-            product, error = _product(vector.high[index], factor)
-            total, lost = _sum(total, product)
+            product, error = _two_product(vector.high[index], factor)
+            total, lost = _two_sum(total, product)
             rest += lost + (error + vector.low[index] * factor)
-        return _normal(total, rest)
+        return _normalised(total, rest)
 
 
-def dots(left: Array, right: DoubleDouble) -> DoubleDouble:
-    """Scalar products of columns, (n, q) each: (q,)."""
+def column_dots(left: FloatArray, right: DoubleDouble) -> DoubleDouble:
+    """Return the scalar products of the columns of two (n, q) blocks: (q,)."""
     total, rest = np.zeros((2, left.shape[1]))
     for a, high, low in zip(left, right.high, right.low, strict=True):
-        product, error = _product(high, a)
-        total, lost = _sum(total, product)
+        product, error = _two_product(high, a)
+        total, lost = _two_sum(total, product)
         rest += lost + (error + low * a)
-    return _normal(total, rest)
+    return _normalised(total, rest)
 
 
-def rows_of(matrix: sparse.csr_array) -> SparseRows:
-    """Lay out a sparse matrix; shorter rows are filled up with zeros."""
+def sparse_rows(matrix: sparse.csr_array) -> SparseRows:
+    """Store a sparse matrix; shorter rows are padded with zeros."""
     counts = np.diff(matrix.indptr)
     width = int(counts.max(initial=0))
     row = np.repeat(np.arange(counts.size), counts)
-    place = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], counts)
+    position = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], counts)
     data = np.zeros((width, counts.size))
     index = np.zeros((width, counts.size), dtype=np.intp)
-    data[place, row] = matrix.data
-    index[place, row] = matrix.indices
+    data[position, row] = matrix.data
+    index[position, row] = matrix.indices
     return SparseRows(data, index)
 
 
-def rows_of_dense(matrix: Array) -> SparseRows:
-    """Lay out a dense matrix."""
+def dense_rows(matrix: FloatArray) -> SparseRows:
+    """Store a dense matrix."""
     count = np.arange(matrix.shape[1], dtype=np.intp)
     columns = np.repeat(count[:, None], matrix.shape[0], axis=1)
     return SparseRows(np.ascontiguousarray(matrix.T), columns)
 
 
-def _sum(a: Array, b: Array) -> tuple[Array, Array]:
+def _two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     total = a + b
     shadow = total - a
     return total, (a - (total - shadow)) + (b - shadow)
 
 
-def _normal(high: Array, low: Array) -> DoubleDouble:
+def _normalised(high: FloatArray, low: FloatArray) -> DoubleDouble:
     total = high + low
     return DoubleDouble(total, low - (total - high))
 
 
-def _split(values: Array) -> tuple[Array, Array]:
-    # By its bits: the usual multiplication by 2^27 + 1 would overflow for numbers that do not.
-    high = (np.ascontiguousarray(values).view(np.int64) & UPPER).view(np.float64)
+def _split(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    # By bit mask: the usual multiplication by 2^27 + 1 overflows for the largest numbers.
+    high = (np.ascontiguousarray(values).view(np.int64) & UPPER_BITS).view(np.float64)
     return high, values - high
 
 
-def _product(a: Array, b: Array) -> tuple[Array, Array]:
+def _two_product(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     product = a * b
     a_high, a_low = _split(a)
     b_high, b_low = _split(b)

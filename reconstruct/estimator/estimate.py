@@ -1,11 +1,11 @@
-"""The minimum-variance estimate (Wood et al., Eq. 4): which form computes it, and how right it is.
+"""The minimum-variance estimate (Wood et al. 2005, Eq. 4): choice of a form and bound on its numerical error.
 
 With g = H f + v, prior mean f0 and covariance P0, and noise covariance Rv,
 
     f^ = f0 + A (g - H f0),   A = P0 H^T (H P0 H^T + Rv)^-1.                      (Eq. 4)
 
-Six forms compute it (`forms`). The cheapest that suits shape and noise runs first; when the bound on its error, or that
-on its variances, misses the tolerance, the next sturdier one runs. What no form can do is refused.
+Six forms compute it (`forms`). The cheapest one suited to the shape and the noise runs first; if the bound on its
+error or on its variances exceeds the tolerance, the next more robust one runs. If none succeeds, InputError is raised.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from math import log10
 
 import numpy as np
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import free_memory
 
 from ..forms.covariance import covariance
 from ..forms.dual import dual
-from ..forms.form import Form, NotSolvableError, Vector
+from ..forms.form import Form, NotSolvableError
 from ..forms.information import information
 from ..forms.square_root_covariance import square_root_covariance
 from ..forms.square_root_information import square_root_information
@@ -33,12 +34,12 @@ from .refined_form import RefinedForm
 from .residuals import ExactResiduals
 
 TOLERANCE = 1e-8
-LEAST_DIGITS = 1.0  # that the condition must leave for a form with squares to be worth a try
+LEAST_DIGITS = 1.0  # digits that the condition number must leave to a form that squares the matrix
 EPS = float(np.finfo(np.float64).eps)
-CONTRADICTION = 1e-6  # of the measurements: float32 files hold no more
-USEFUL = 1e-3  # bound of an estimate that tells whether measurements without noise are met
-SOMEHOW = 10.0  # a bound above it says that u is not known at all, and so not what contradicts what
-WIDE = 1e12  # ratio of the largest to the least noise variance from which on the SVD loses what the noisy rows say
+CONTRADICTION = 1e-6  # relative misfit of noise-free measurements; the precision of float32 files
+USEFUL_BOUND = 1e-3  # bound below which an estimate shows whether noise-free measurements are met
+UNKNOWN_BOUND = 10.0  # bound above which u is unknown, and with it which measurements contradict
+WIDE_NOISE = 1e12  # ratio of the largest to the least noise variance from which the SVD loses the noisy rows
 
 FORMS: dict[str, Callable[[Problem], Form]] = {
     "covariance": covariance,
@@ -52,11 +53,11 @@ FORMS: dict[str, Callable[[Problem], Form]] = {
 
 @dataclass(frozen=True)
 class Solver:
-    """Which form ran, why, and how right it is.
+    """The form that computed an estimate, the reason for it, and its numerical error.
 
-    bound : of the error of the estimate, in `unit`; None where nothing was estimated
-    variance_bound : of the relative error of posterior variances, on pixels chosen to show it
-    tried : forms that ran or were passed over before, with the reason
+    bound : on the error of the estimate, in `unit`; None if nothing was estimated
+    variance_bound : on the relative error of posterior variances, from a sample of pixels
+    tried : forms that were tried or skipped before, each with the reason
     """
 
     method: str
@@ -70,93 +71,93 @@ class Solver:
 
     @property
     def digits(self) -> float:
-        """Decimal digits of the estimate that the bound vouches for."""
+        """Correct decimal digits of the estimate according to the bound."""
         return -log10(max(self.bound if self.bound is not None else self.variance_bound, EPS))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The image f^, (N,), the multipliers l = Rv^-1 (g - H f^), (M,), and the form with which they were found.
+    """The image f^, (N,), the multipliers l = Rv^-1 (g - H f^), (M,), and the form that computed them.
 
-    freedoms : (K,) u of f^ = f0 + L u, which f^ itself does not show where L u is far below f0
+    coefficients : (K,) u of f^ = f0 + L u, which keeps digits that f^ loses if L u is far below f0
     """
 
-    image: Vector
-    freedoms: Vector
-    multipliers: Vector
+    image: FloatArray
+    coefficients: FloatArray
+    multipliers: FloatArray
     form: Form
     solver: Solver
 
 
-def candidates(problem: Problem, method: str = "auto") -> tuple[list[str], str]:
-    """Forms to try, the cheapest first, and in words why these."""
-    if method != "auto":
-        return [method], "asked for"
-    if not problem.noisy:
-        return ["dual"], "some measurements have no noise"
-    noise, sizes = problem.noise_variance, (problem.measurements, problem.prior.freedoms)
-    # Where the information form fails, H has a null space that the covariance form does not mind.
-    first = ["covariance"] if sizes[0] < sizes[1] else ["information", "covariance"]
-    why = "fewer measurements than unknowns" if sizes[0] < sizes[1] else "no fewer measurements than unknowns"
-    if noise.size and noise.max() > WIDE * noise.min():
-        apart = f"noise variances {noise.max() / noise.min():.0e} apart"
-        return [*first, "square-root-information", "dual"], f"{why}, {apart}"
-    arrays = ["square-root-covariance"] if sizes[0] < sizes[1] else []
-    return [*first, "svd", *arrays, "square-root-information", "dual"], why
-
-
 def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, Solver]:
-    """The form whose posterior variances are right to `tolerance`. Raises InputError if there is none."""
-    form, solver, _ = _first_good(problem, method, tolerance, None)
+    """Return the form whose posterior variances are accurate to `tolerance`. Raises InputError if there is none."""
+    form, solver, _ = _first_accepted(problem, method, tolerance, None)
     return form, solver
 
 
-def estimate(problem: Problem, recorded: Vector, method: str = "auto", tolerance: float = TOLERANCE) -> Estimate:
+def estimate(problem: Problem, recorded: FloatArray, method: str = "auto", tolerance: float = TOLERANCE) -> Estimate:
     """Reconstruct the image with the least mean squared error of any linear estimator (Eq. 4).
 
     recorded : (M,) g, in the units of f
-    Raises InputError for numbers that are none, if memory does not suffice, or if no form is right to `tolerance`.
+    Raises InputError for values that are not finite, if memory does not suffice, or if no form reaches `tolerance`.
     """
     if recorded.shape != (problem.measurements,) or not np.isfinite(recorded).all():
         raise InputError(
             f"expected {problem.measurements} finite measurements, got others; leave dead pixels out first"
         )
-    form, solver, refined = _first_good(problem, method, tolerance, recorded)
+    form, solver, refined = _first_accepted(problem, method, tolerance, recorded)
     if refined is None:
-        raise RuntimeError("measurements were given, and nothing was estimated from them")
-    image = problem.prior.mean + problem.prior.spread(refined.freedoms[:, 0])
-    return Estimate(image, refined.freedoms[:, 0], refined.multipliers[:, 0], form, solver)
+        raise RuntimeError("measurements were given, but no estimate was computed")
+    image = problem.prior.mean + problem.prior.apply_root(refined.coefficients[:, 0])
+    return Estimate(image, refined.coefficients[:, 0], refined.multipliers[:, 0], form, solver)
 
 
-def _first_good(
-    problem: Problem, method: str, tolerance: float, recorded: Vector | None
+def _candidates(problem: Problem, method: str) -> tuple[list[str], str]:
+    """Names of the forms to try, the cheapest first, and the reason for them."""
+    if method != "auto":
+        return [method], "requested by estimator.method"
+    if not problem.noisy:
+        return ["dual"], "some measurements have no noise"
+    noise, fewer = problem.noise_variance, problem.measurements < problem.prior.dimension
+    # If the information form fails, H has a null space, which the covariance form tolerates.
+    first = ["covariance"] if fewer else ["information", "covariance"]
+    why = "fewer measurements than unknowns" if fewer else "no fewer measurements than unknowns"
+    if noise.size and noise.max() > WIDE_NOISE * noise.min():
+        ratio = f"noise variances {noise.max() / noise.min():.0e} apart"
+        return [*first, "square-root-information", "dual"], f"{why}, {ratio}"
+    array_form = ["square-root-covariance"] if fewer else []
+    return [*first, "svd", *array_form, "square-root-information", "dual"], why
+
+
+def _first_accepted(
+    problem: Problem, method: str, tolerance: float, recorded: FloatArray | None
 ) -> tuple[Form, Solver, RefinedSolution | None]:
-    names, why = candidates(problem, method)
-    exactly = ExactResiduals(problem)
+    names, why = _candidates(problem, method)
+    residuals = ExactResiduals(problem)
     tried: list[tuple[str, str]] = []
     refined: RefinedSolution | None = None
     solver = Solver("", why, 0.0, 0.0)
-    worth: list[Form] = []  # correcting, since the estimate is right and only variances are not
+    refinable: list[Form] = []  # forms whose estimate is accurate and whose variances are not
     for name in names:
         try:
-            form = _built(name, problem)
+            form = _factorised(name, problem)
         except NotSolvableError as error:
             tried.append((name, str(error)))
             continue
-        solver = Solver(name, why, form.condition, variance_error(form, exactly), tuple(tried))
-        solver, refined = _with_estimate(solver, form, exactly, recorded)
+        solver = Solver(name, why, form.condition, variance_error(form, residuals), tuple(tried))
+        solver, refined = _with_estimate(solver, form, residuals, recorded)
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
         if (solver.bound or 0.0) <= tolerance:
-            worth.append(form)
-    for form in reversed(worth if method == "auto" else []):
-        corrected = RefinedForm(problem, form.condition, form, exactly)
+            refinable.append(form)
+    for form in reversed(refinable if method == "auto" else []):
+        corrected = RefinedForm(problem, form.condition, form, residuals)
         solver = Solver(f"{form.name}, corrected", why, form.condition, corrected.variance_error, tuple(tried))
-        solver, refined = _with_estimate(solver, form, exactly, recorded)
+        solver, refined = _with_estimate(solver, form, residuals, recorded)
         if _accepted(solver, tolerance, tried):
             return corrected, solver, refined
-    if refined is not None and recorded is not None and (solver.bound or 0.0) < SOMEHOW:
-        _refuse_contradictions(exactly, recorded, refined)
+    if refined is not None and recorded is not None and (solver.bound or 0.0) < UNKNOWN_BOUND:
+        _check_contradictions(residuals, recorded, refined)
     raise InputError(
         f"no form of the estimator reaches a relative error of {tolerance:g} here ("
         + "; ".join(f"{name}: {reason}" for name, reason in tried)
@@ -165,41 +166,41 @@ def _first_good(
 
 
 def _with_estimate(
-    solver: Solver, form: Form, exactly: ExactResiduals, recorded: Vector | None
+    solver: Solver, form: Form, residuals: ExactResiduals, recorded: FloatArray | None
 ) -> tuple[Solver, RefinedSolution | None]:
     if recorded is None:
         return solver, None
-    refined = refine(form, exactly, np.zeros((form.problem.prior.freedoms, 1)), exactly.recorded(recorded))
+    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), residuals.recorded(recorded))
     bound = float(refined.bound[0]) + EPS
-    if bound <= USEFUL:
-        _refuse_contradictions(exactly, recorded, refined)
+    if bound <= USEFUL_BOUND:
+        _check_contradictions(residuals, recorded, refined)
     return replace(solver, bound=bound, refinements=refined.steps), refined
 
 
 def _accepted(solver: Solver, tolerance: float, tried: list[tuple[str, str]]) -> bool:
     worst = max(solver.variance_bound, solver.bound or 0.0)
     if worst > tolerance:
-        what = "variances" if solver.variance_bound > tolerance else "the estimate"
-        tried.append((solver.method, f"{what} right to {worst:.1e} only"))
+        quantity = "variances are" if solver.variance_bound > tolerance else "the estimate is"
+        tried.append((solver.method, f"{quantity} accurate to {worst:.1e} only"))
     return worst <= tolerance
 
 
-def _refuse_contradictions(exactly: ExactResiduals, recorded: Vector, refined: RefinedSolution) -> None:
-    left = exactly.contradiction(recorded, refined.freedoms[:, 0])
-    if left > CONTRADICTION:
+def _check_contradictions(residuals: ExactResiduals, recorded: FloatArray, refined: RefinedSolution) -> None:
+    misfit = residuals.contradiction(recorded, refined.coefficients[:, 0])
+    if misfit > CONTRADICTION:
         raise InputError(
-            f"measurements that are said to have no noise contradict one another or the prior by {left:.2g} of their"
-            " values; set estimator.noise_variance to what noise they have"
+            f"measurements without noise contradict one another or the prior by {misfit:.2g} of their values; set"
+            " estimator.noise_variance to the variance of their noise"
         )
 
 
-def _built(name: str, problem: Problem) -> Form:
-    sizes, correlated = (problem.measurements, problem.unknowns), not problem.prior.independent
-    needed, free = needed_memory(name, *sizes, correlated=correlated), free_memory()
+def _factorised(name: str, problem: Problem) -> Form:
+    correlated = not problem.prior.independent
+    needed, free = needed_memory(name, problem.measurements, problem.unknowns, correlated=correlated), free_memory()
     if needed > free:
         raise NotSolvableError(f"it needs {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free")
-    with np.errstate(all="ignore"):  # what overflows is caught by the certificate
+    with np.errstate(all="ignore"):  # the certificate detects overflow
         form = FORMS[name](problem)
     if name in ("covariance", "information") and form.condition * EPS > 10**-LEAST_DIGITS:
-        raise NotSolvableError(f"a condition of {form.condition:.1e} leaves no digits")
+        raise NotSolvableError(f"a condition number of {form.condition:.1e} leaves no digits")
     return form

@@ -1,10 +1,10 @@
-"""What the dense forms of the estimator need of memory."""
+"""Memory that the dense forms of the estimator need."""
 
 from __future__ import annotations
 
 
 def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bool = False) -> int:
-    """Bytes that a form and the analysis of its error need; a `correlated` prior adds its root and copies of it."""
+    """Return the bytes needed by a form and its error analysis; a `correlated` prior adds its root and copies of it."""
     both = measurements + unknowns
     matrix = {
         "covariance": 3 * measurements**2 + 2 * measurements * unknowns + 2 * unknowns**2,

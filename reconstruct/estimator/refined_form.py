@@ -1,7 +1,7 @@
-"""A form whose every answer is corrected until the certificate is content: the last resort of the estimator.
+"""A form whose every solution is refined until the certificate accepts it: the last resort of the estimator.
 
-Where rows and columns of H are of very different size at once, a factorisation in float64 may keep few digits of the
-least variances and yet enough for corrections to converge. It costs many solutions a pixel.
+If rows and columns of H both differ widely in size, a float64 factorisation may keep few digits of the smallest
+variances and still suffice for refinement to converge. It costs many solutions per pixel.
 """
 
 from __future__ import annotations
@@ -12,42 +12,44 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..forms.form import Form, Matrix, Vector
+from ommatid.runtime.arrays import FloatArray
+
+from ..forms.form import Form
 from .certificate import exact_variances, refine
 from .double_double import exact
 from .residuals import ExactResiduals
 
-CHUNK = 256
+CHUNK = 256  # pixels solved together
 
 
 @dataclass(frozen=True)
 class RefinedForm(Form):
-    """Another form's solutions, refined."""
+    """The refined solutions of another form."""
 
     form: Form
-    exactly: ExactResiduals
+    residuals: ExactResiduals
 
     name: ClassVar[str] = "corrected"
 
-    def solve(self, shift: Matrix, residual: Matrix) -> tuple[Matrix, Matrix]:
-        """What refinement makes of the other form's solution."""
-        refined = refine(self.form, self.exactly, shift, exact(residual))
-        return refined.freedoms, refined.multipliers
+    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the refined solution."""
+        refined = refine(self.form, self.residuals, shift, exact(residual))
+        return refined.coefficients, refined.multipliers
 
     @cached_property
-    def _variances(self) -> tuple[Vector, Vector]:
+    def _variances(self) -> tuple[FloatArray, FloatArray]:
         pixels = np.arange(self.problem.unknowns)
         blocks = [pixels[start : start + CHUNK] for start in range(0, pixels.size, CHUNK)]
-        values, doubts = zip(*(exact_variances(self.form, self.exactly, block) for block in blocks), strict=True)
-        return np.maximum(np.concatenate(values), 0.0), np.concatenate(doubts)
+        values, errors = zip(*(exact_variances(self.form, self.residuals, block) for block in blocks), strict=True)
+        return np.maximum(np.concatenate(values), 0.0), np.concatenate(errors)
 
-    def variance(self) -> Vector:
-        """To the last digit that the other form's corrections converge to."""
+    def variance(self) -> FloatArray:
+        """Return the refined posterior variances."""
         return self._variances[0]
 
     @property
     def variance_error(self) -> float:
         """A bound on the relative error of every posterior variance."""
-        variance, doubt = self._variances
-        doubt = np.where(doubt >= 0, doubt, np.inf)  # NaN is a doubt, too
-        return float(np.divide(doubt, variance, out=np.where(doubt > 0, np.inf, 0.0), where=variance > 0).max())
+        variance, error = self._variances
+        error = np.where(error >= 0, error, np.inf)  # NaN counts as an unbounded error
+        return float(np.divide(error, variance, out=np.where(error > 0, np.inf, 0.0), where=variance > 0).max())

@@ -1,10 +1,10 @@
-"""The two residuals of the estimator's equations, in twice the precision of float64.
+"""Residuals of the estimator's equations in double-double arithmetic.
 
-With c and r the right sides (`forms.form`), u and l what was found for them,
+For right-hand sides c and r (`forms.form`) and a computed solution u and l,
 
     p = c + L^T H^T l - u,    q = r - H L u - Rv l.
 
-Both cancel almost wholly: in plain float64 little but rounding would be left of them.
+Both cancel almost completely; float64 would leave little but rounding error.
 """
 
 from __future__ import annotations
@@ -13,91 +13,93 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
+
+from ommatid.runtime.arrays import FloatArray
 
 from ..prior import Prior
 from ..problem import Problem
-from .double_double import ROUNDING, DoubleDouble, SparseRows, exact, rows_of, rows_of_dense
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from .double_double import ROUNDING, DoubleDouble, SparseRows, dense_rows, exact, sparse_rows
 
 
 @dataclass(frozen=True)
 class ExactResiduals:
-    """A problem's matrices laid out for products in twice the precision."""
+    """The matrices of a problem, stored for products in double-double arithmetic."""
 
     problem: Problem
 
     @cached_property
     def _matrix(self) -> SparseRows:
-        return rows_of(self.problem.matrix)
+        return sparse_rows(self.problem.matrix)
 
     @cached_property
     def _transposed(self) -> SparseRows:
-        return rows_of(sparse.csr_array(self.problem.matrix.T))
+        return sparse_rows(sparse.csr_array(self.problem.matrix.T))
 
     @cached_property
     def _root(self) -> tuple[SparseRows, SparseRows]:
         root = self.problem.prior.root
-        return rows_of_dense(root), rows_of_dense(root.T)
+        return dense_rows(root), dense_rows(root.T)
 
     @cached_property
-    def _sizes(self) -> tuple[sparse.csr_array, Prior]:
+    def _magnitudes(self) -> tuple[sparse.csr_array, Prior]:
+        """|H|, and the prior with |L|."""
         prior = self.problem.prior
         return abs(self.problem.matrix), Prior(prior.mean, np.abs(prior.root))
 
     @property
     def rounding(self) -> float:
-        """Relative rounding of the residuals, from the number of terms in their longest sum."""
+        """Relative rounding error of the residuals, from the number of terms in their longest sum."""
         longest = max(self._matrix.data.shape[0], self._transposed.data.shape[0])
-        return ROUNDING * (4 + longest + (0 if self.problem.prior.independent else self.problem.prior.freedoms))
+        return ROUNDING * (4 + longest + (0 if self.problem.prior.independent else self.problem.prior.dimension))
 
     @cached_property
-    def signal(self) -> Vector:
-        """A size for every row of H L, at least its norm: (M,)."""
-        matrix, prior = self._sizes
+    def signal(self) -> FloatArray:
+        """An upper bound on the norm of every row of H L: (M,)."""
+        matrix, prior = self._magnitudes
         return np.asarray(matrix @ np.sqrt(prior.variance))
 
-    def observe(self, freedoms: DoubleDouble) -> DoubleDouble:
-        """H L u."""
+    def forward(self, coefficients: DoubleDouble) -> DoubleDouble:
+        """Apply H L."""
         prior = self.problem.prior
-        spread = freedoms.scaled(prior.root[:, None]) if prior.independent else self._root[0].times(freedoms)
-        return self._matrix.times(spread)
+        image = coefficients.scaled(prior.root[:, None]) if prior.independent else self._root[0].times(coefficients)
+        return self._matrix.times(image)
 
     def adjoint(self, measurements: DoubleDouble) -> DoubleDouble:
-        """L^T H^T l."""
+        """Apply L^T H^T."""
         prior = self.problem.prior
-        seen = self._transposed.times(measurements)
-        return seen.scaled(prior.root[:, None]) if prior.independent else self._root[1].times(seen)
+        image = self._transposed.times(measurements)
+        return image.scaled(prior.root[:, None]) if prior.independent else self._root[1].times(image)
 
-    def recorded(self, values: Vector) -> DoubleDouble:
-        """g - H f0: (M, 1)."""
+    def recorded(self, values: FloatArray) -> DoubleDouble:
+        """Return g - H f0: (M, 1)."""
         return exact(values[:, None]) - self._matrix.times(exact(self.problem.prior.mean[:, None]))
 
     def residuals(
-        self, u: DoubleDouble, pull: DoubleDouble, shift: DoubleDouble, recorded: DoubleDouble
+        self, u: DoubleDouble, multipliers: DoubleDouble, shift: DoubleDouble, recorded: DoubleDouble
     ) -> tuple[DoubleDouble, DoubleDouble]:
-        """p and q of the module's text, l being `pull`: (K, q) and (M, q)."""
+        """Return p, (K, q), and q, (M, q), of the module docstring."""
         noise = self.problem.noise_variance[:, None]
-        return shift + self.adjoint(pull) - u, recorded - self.observe(u) - pull.scaled(noise)
+        return shift + self.adjoint(multipliers) - u, recorded - self.forward(u) - multipliers.scaled(noise)
 
-    def doubts(self, u: Matrix, pull: Matrix, shift: Matrix, recorded: Matrix) -> tuple[Matrix, Matrix]:
-        """How far rounding may have moved p and q, from the sizes of all that is added up in them."""
-        matrix, prior = self._sizes
-        u, pull = np.abs(u), np.abs(pull)
-        p = np.abs(shift) + prior.gather(matrix.T @ pull) + u
-        q = np.abs(recorded) + matrix @ prior.spread(u) + self.problem.noise_variance[:, None] * pull
+    def rounding_errors(
+        self, u: FloatArray, multipliers: FloatArray, shift: FloatArray, recorded: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return bounds on the rounding errors of p and q, from the magnitudes of the terms of their sums."""
+        matrix, prior = self._magnitudes
+        u, multipliers = np.abs(u), np.abs(multipliers)
+        p = np.abs(shift) + prior.apply_root_transposed(matrix.T @ multipliers) + u
+        q = np.abs(recorded) + matrix @ prior.apply_root(u) + self.problem.noise_variance[:, None] * multipliers
         return self.rounding * p, self.rounding * q
 
-    def contradiction(self, recorded: Vector, u: Vector) -> float:
-        """How far measurements without noise are from being met, at most: |g - H f|_i / (|g| + |H| |f|)_i.
+    def contradiction(self, recorded: FloatArray, u: FloatArray) -> float:
+        """Return the largest relative misfit |g - H f|_i / (|g| + |H| |f|)_i of the measurements without noise.
 
-        Rounding leaves 1e-16, measurements in float32 1e-7, and those that contradict one another or the prior more.
+        Rounding leaves 1e-16, float32 measurements 1e-7; contradictory measurements leave more.
         """
-        silent = self.problem.noise_variance == 0
-        left = (self.recorded(recorded) - self.observe(exact(u[:, None]))).high[:, 0]
-        matrix, prior = self._sizes
-        size = np.abs(recorded) + matrix @ (np.abs(prior.mean) + prior.spread(np.abs(u)))
-        return float(np.divide(np.abs(left), size, out=np.zeros_like(size), where=silent & (size > 0)).max(initial=0.0))
+        noise_free = self.problem.noise_variance == 0
+        misfit = (self.recorded(recorded) - self.forward(exact(u[:, None]))).high[:, 0]
+        matrix, prior = self._magnitudes
+        size = np.abs(recorded) + matrix @ (np.abs(prior.mean) + prior.apply_root(np.abs(u)))
+        relative = np.divide(np.abs(misfit), size, out=np.zeros_like(size), where=noise_free & (size > 0))
+        return float(relative.max(initial=0.0))

@@ -20,7 +20,7 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..prior import Prior, between_pixels, lag_distances
+from ..prior import Prior, lag_distances, stationary_matrix
 
 OUTSIDE = 1e-6  # share of a measurement's footprint that may lie outside its tile
 
@@ -127,7 +127,7 @@ class Evidence:
     def _correlation(self, length: float) -> tuple[FloatArray, FloatArray]:
         """Return P1 = exp(-distance / length) and its derivative by the logarithm of the length: (N, N) each."""
         lags = lag_distances(self.shape) / length
-        return between_pixels(np.exp(-lags), self.shape), between_pixels(lags * np.exp(-lags), self.shape)
+        return stationary_matrix(np.exp(-lags), self.shape), stationary_matrix(lags * np.exp(-lags), self.shape)
 
     def _normal_matrix(self, weights: FloatArray) -> FloatArray:
         """Return H^T diag(weights) H: (N, N)."""

@@ -1,1 +1,1 @@
-"""The ways to compute Eq. 4, one a module, all of the same interface: `form.Form`."""
+"""Algebraic forms of the estimator (Eq. 4), one per module, all with the interface `form.Form`."""

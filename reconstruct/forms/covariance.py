@@ -1,8 +1,8 @@
-"""Covariance form: Cholesky of H P0 H^T + Rv, the smaller matrix where measurements are fewer than unknowns.
+"""Covariance form: Cholesky of H P0 H^T + Rv, the smaller matrix if measurements are fewer than unknowns.
 
-Rows are scaled to a unit diagonal first. It needs no inverse of P0 or Rv, but forms squares: with noise far below the
-prior it keeps half the digits at best. I - A H is a difference here; its squares, together with those of A, still
-make a covariance that cannot be negative (Joseph's form of Eq. 5).
+Rows are scaled to a unit diagonal first. No inverse of P0 or Rv is needed, but H is squared: with noise far below the
+prior at best half the digits remain. Variances come from Joseph's form of Eq. 5, a sum of squares, because the
+difference I - A H alone could make them negative.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from typing import ClassVar
 import numpy as np
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray
+
 from ..problem import Problem
 from .cholesky import Factor, factorise_positive
-from .form import Form, Matrix, Vector
+from .form import Form
 
 
 @dataclass(frozen=True)
@@ -27,32 +29,33 @@ class Covariance(Form):
 
     name: ClassVar[str] = "covariance"
 
-    def solve(self, shift: Matrix, residual: Matrix) -> tuple[Matrix, Matrix]:
-        """l = C^-1 (r - H L c), u = c + L^T H^T l."""
-        multiplier = self.factor.solve(residual - self.problem.observe(shift))
+    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return u = c + L^T H^T l and l = C^-1 (r - H L c)."""
+        multiplier = self.factor.solve(residual - self.problem.forward(shift))
         return shift + self.problem.adjoint(multiplier), multiplier
 
     @cached_property
-    def _shrinkage(self) -> tuple[Matrix, Matrix]:
-        observed = self.problem.observed()
-        gain = self.factor.solve(observed)
-        return np.eye(observed.shape[1]) - observed.T @ gain, gain
+    def _defect_and_gain(self) -> tuple[FloatArray, FloatArray]:
+        """I - L^T H^T C^-1 H L, (K, K), and C^-1 H L, (M, K)."""
+        dense = self.problem.dense_matrix()
+        gain = self.factor.solve(dense)
+        return np.eye(dense.shape[1]) - dense.T @ gain, gain
 
-    def variance(self) -> Vector:
-        """The diagonal of (I - A H) P0 (I - A H)^T + A Rv A^T."""
-        defect, gain = self._shrinkage
-        spread = self.problem.prior.spread
-        return np.square(spread(defect)).sum(axis=1) + np.square(spread(gain.T * self.problem.deviation)).sum(axis=1)
+    def variance(self) -> FloatArray:
+        """Return the diagonal of (I - A H) P0 (I - A H)^T + A Rv A^T."""
+        defect, gain = self._defect_and_gain
+        root = self.problem.prior.apply_root
+        return np.square(root(defect)).sum(axis=1) + np.square(root(gain.T * self.problem.deviation)).sum(axis=1)
 
 
 def covariance(problem: Problem) -> Covariance:
-    """Factorise in covariance form. Raises NotSolvableError where the matrix is not positive definite in float64."""
+    """Factorise in covariance form. Raises NotSolvableError if the matrix is not positive definite in float64."""
     if problem.prior.independent:
-        half = sparse.csr_array(problem.matrix.multiply(problem.prior.root[None, :]))
-        matrix = np.asarray((half @ half.T).toarray())
+        scaled = sparse.csr_array(problem.matrix.multiply(problem.prior.root[None, :]))
+        matrix = np.asarray((scaled @ scaled.T).toarray())
     else:
-        observed = problem.observed()
-        matrix = observed @ observed.T
+        dense = problem.dense_matrix()
+        matrix = dense @ dense.T
     matrix[np.diag_indices(problem.measurements)] += problem.noise_variance
     factor, condition = factorise_positive(matrix)
     return Covariance(problem, condition, factor)

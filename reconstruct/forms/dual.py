@@ -1,9 +1,9 @@
-"""Dual form: of all (u, w) with H L u + S w = r the one of least norm, by pivoted QR of [H L, S].
+"""Dual form: the solution (u, w) of H L u + S w = r with the least norm, by pivoted QR of [H L, S].
 
-It divides by neither S nor L and so serves measurements without noise, pixels that are known, and noise of very
-different size side by side. Pivoting splits (u, w) into basic variables, which the measurements determine, and free
-ones t, for which the prior speaks: basic = y - W t with W = R1^-1 R2. Small variances then come from small numbers,
-not from differences of large ones. The dearest form: cubic in measurements and unknowns together.
+It divides by neither S nor L, so it admits measurements without noise, known pixels, and noise that differs widely
+between measurements. Pivoting splits (u, w) into basic variables, which the measurements determine, and free ones t,
+which the prior determines: basic = y - W t with W = R1^-1 R2. Small variances are then sums of small numbers, not
+differences of large ones. It is the most expensive form: cubic in measurements plus unknowns.
 """
 
 from __future__ import annotations
@@ -14,82 +14,83 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy import linalg
 
+from ommatid.runtime.arrays import FloatArray
+
 from ..problem import Problem
-from .form import Form, Matrix, Vector, root_variance
+from .form import Form, root_variance
 from .sorted_qr import Indices, SortedQr, sorted_qr
 
 EPS = float(np.finfo(np.float64).eps)
-SWEEPS = 30
+SCALING_SWEEPS = 30
 
 
 @dataclass(frozen=True)
 class Dual(Form):
-    """Rows with signal `active`, divided by `scale`; [H L, S] of them is Q [R1 R2] in the order `basic`, `free`.
+    """Rows with signal are `active`, divided by `scale`; their [H L, S] is Q [R1 R2] in the order `basic`, `free`.
 
     orthogonal : (m, rank) Q
     triangle : (rank, rank) R1;  weights : (rank, K + m - rank) W
-    normal : the QR of [W; I]
+    normal : the QR decomposition of [W; I]
     """
 
     active: Indices
-    scale: Vector
+    scale: FloatArray
     basic: Indices
     free: Indices
-    orthogonal: Matrix
-    triangle: Matrix
-    weights: Matrix
+    orthogonal: FloatArray
+    triangle: FloatArray
+    weights: FloatArray
     normal: SortedQr
 
     name: ClassVar[str] = "dual"
 
-    def solve(self, shift: Matrix, residual: Matrix) -> tuple[Matrix, Matrix]:
-        """The (u, w) nearest to (c, 0) that meets r; l from the basic columns of (H L, S)^T l = (u - c, w)."""
-        freedoms, rank = self.problem.prior.freedoms, self.basic.size
+    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the u of the (u, w) nearest to (c, 0), and l from the basic columns of (H L, S)^T l = (u - c, w)."""
+        dimension, rank = self.problem.prior.dimension, self.basic.size
         scaled = residual[self.active] / self.scale[:, None]
-        target = np.zeros((freedoms + self.active.size, shift.shape[1]))
-        target[:freedoms] = shift
+        target = np.zeros((dimension + self.active.size, shift.shape[1]))
+        target[:dimension] = shift
         particular = linalg.solve_triangular(self.triangle, self.orthogonal.T @ scaled, check_finite=False)
-        right = np.vstack([particular - target[self.basic], target[self.free]])
-        chosen = self.normal.solve(right)
-        found = np.empty_like(target)
-        found[self.free] = chosen
-        found[self.basic] = particular - self.weights @ chosen
-        moved = (found - target)[self.basic]
+        free = self.normal.solve(np.vstack([particular - target[self.basic], target[self.free]]))
+        solution = np.empty_like(target)
+        solution[self.free] = free
+        solution[self.basic] = particular - self.weights @ free
+        change = (solution - target)[self.basic]
         multiplier = np.zeros_like(residual)
         if rank:
-            some = self.orthogonal @ linalg.solve_triangular(self.triangle, moved, trans="T", check_finite=False)
-            multiplier[self.active] = some / self.scale[:, None]
+            rows = self.orthogonal @ linalg.solve_triangular(self.triangle, change, trans="T", check_finite=False)
+            multiplier[self.active] = rows / self.scale[:, None]
         noise = self.problem.noise_variance
-        silent = np.setdiff1d(np.flatnonzero(noise > 0), self.active)
-        multiplier[silent] = residual[silent] / noise[silent, None]
-        return found[:freedoms], multiplier
+        without_signal = np.setdiff1d(np.flatnonzero(noise > 0), self.active)
+        multiplier[without_signal] = residual[without_signal] / noise[without_signal, None]
+        return solution[:dimension], multiplier
 
-    def variance(self) -> Vector:
-        """The diagonal of L T T^T L^T, T = [I; -W] R^-1 in the rows of u."""
-        inverse = self.normal.inverse()
-        root = np.zeros((self.problem.prior.freedoms + self.active.size, self.free.size))
+    def variance(self) -> FloatArray:
+        """Return the diagonal of L T T^T L^T with T = [I; -W] R^-1 in the rows of u."""
+        inverse, dimension = self.normal.inverse(), self.problem.prior.dimension
+        root = np.zeros((dimension + self.active.size, self.free.size))
         root[self.free] = inverse
         root[self.basic] = -self.weights @ inverse
-        return root_variance(self.problem, root[: self.problem.prior.freedoms])
+        return root_variance(self.problem, root[:dimension])
 
 
 def dual(problem: Problem) -> Dual:
     """Factorise in dual form."""
-    observed = problem.observed()
-    active = np.flatnonzero(observed.any(axis=1))
-    scale = _row_scale(observed[active])
-    signal, noise = observed[active] / scale[:, None], problem.deviation[active] / scale
+    dense = problem.dense_matrix()
+    active = np.flatnonzero(dense.any(axis=1))
+    scale = _row_scale(dense[active])
+    signal, noise = dense[active] / scale[:, None], problem.deviation[active] / scale
     rows = np.argsort(-np.maximum(np.abs(signal).max(axis=1, initial=0.0), noise), kind="stable")
     active, scale = active[rows], scale[rows]
-    orthogonal, triangle, order, rank = _eliminated(np.hstack([signal[rows], np.diag(noise[rows])]))
+    orthogonal, triangle, order, rank = _pivoted_qr(np.hstack([signal[rows], np.diag(noise[rows])]))
     first = triangle[:, :rank]
-    weights: Matrix = np.zeros((0, order.size))
+    weights: FloatArray = np.zeros((0, order.size))
     if rank:
         weights = linalg.solve_triangular(first, triangle[:, rank:], check_finite=False)
-    kept = np.abs(np.diagonal(first))
+    diagonal = np.abs(np.diagonal(first))
     return Dual(
         problem,
-        float(kept.max(initial=1.0) / kept.min(initial=1.0)),
+        float(diagonal.max(initial=1.0) / diagonal.min(initial=1.0)),
         active,
         scale,
         order[:rank],
@@ -101,48 +102,48 @@ def dual(problem: Problem) -> Dual:
     )
 
 
-def _row_scale(matrix: Matrix) -> Vector:
-    """How large rows are whatever the sizes of columns are, in powers of 2: (m,), for rows that are not all zeros.
+def _row_scale(matrix: FloatArray) -> FloatArray:
+    """Return the size of every row independent of column sizes, as powers of 2: (m,); rows must not be all zeros.
 
-    |a_ij| is nearly row_i column_j: least squares in the logarithms (Curtis and Reid 1972), by alternate means.
-    Rows are to be divided by it; columns keep their size, by which pivoting tells what the prior says most of.
+    Fits |a_ij| = row_i column_j by least squares in the logarithms (Curtis and Reid 1972), by alternating means.
+    Only rows are scaled; pivoting relies on column sizes to find the directions of largest prior variance.
     """
-    there = matrix != 0
-    logarithm = np.log2(np.abs(matrix), out=np.zeros_like(matrix), where=there)
-    in_row, in_column = there.sum(axis=1), np.maximum(there.sum(axis=0), 1)
+    nonzero = matrix != 0
+    logarithm = np.log2(np.abs(matrix), out=np.zeros_like(matrix), where=nonzero)
+    in_row, in_column = nonzero.sum(axis=1), np.maximum(nonzero.sum(axis=0), 1)
     row, column = np.zeros(matrix.shape[0]), np.zeros(matrix.shape[1])
-    for _ in range(SWEEPS):
-        row = (logarithm.sum(axis=1) - there @ column) / in_row
-        column = (logarithm.sum(axis=0) - row @ there) / in_column
+    for _ in range(SCALING_SWEEPS):
+        row = (logarithm.sum(axis=1) - nonzero @ column) / in_row
+        column = (logarithm.sum(axis=0) - row @ nonzero) / in_column
     return np.exp2(np.round(row))
 
 
-def _eliminated(whole: Matrix) -> tuple[Matrix, Matrix, Indices, int]:
-    """Pivoted QR, (m, n), by columns of very different size: Q, (m, rank), R, (rank, n), the order, and the rank.
+def _pivoted_qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray, Indices, int]:
+    """Pivoted QR, (m, n), of columns of very different size: Q, (m, rank), R, (rank, n), column order and rank.
 
-    What is left of a column below its own rounding is rounding and becomes 0, so that it is not taken for a pivot
-    before smaller columns that are there: there the prior speaks, and small noise must not drown in it.
+    A remaining column below its own rounding error is set to 0, so that it is not chosen as a pivot before smaller but
+    significant columns; otherwise rounding errors would replace the prior in these directions.
     """
-    rows, columns = whole.shape
-    rounding = 4 * EPS * columns * np.sqrt(np.square(whole).sum(axis=0))
-    orthogonal, triangle, rank = np.eye(rows), whole.copy(), 0
+    rows, columns = matrix.shape
+    rounding = 4 * EPS * columns * np.sqrt(np.square(matrix).sum(axis=0))
+    orthogonal, triangle, rank = np.eye(rows), matrix.copy(), 0
     order: Indices = np.arange(columns, dtype=np.intp)
-    turned: Matrix
-    reduced: Matrix
+    rotation: FloatArray
+    reduced: FloatArray
     pivots: Indices
-    decompose: Any = linalg.qr
+    qr: Any = linalg.qr
     while rank < min(rows, columns):
         rest = triangle[rank:, rank:]
         rest[:, np.sqrt(np.square(rest).sum(axis=0)) <= rounding[order[rank:]]] = 0.0
         if not rest.any():
             break
-        turned, reduced, pivots = decompose(rest, pivoting=True, check_finite=False)
-        orthogonal[:, rank:] = orthogonal[:, rank:] @ turned
+        rotation, reduced, pivots = qr(rest, pivoting=True, check_finite=False)
+        orthogonal[:, rank:] = orthogonal[:, rank:] @ rotation
         triangle[:rank, rank:] = triangle[:rank, rank:][:, pivots]
         triangle[rank:, rank:] = reduced
         order[rank:] = order[rank:][pivots]
         diagonal = np.abs(np.diagonal(reduced))
-        sound = diagonal > rounding[order[rank : rank + diagonal.size]]
-        rank += diagonal.size if sound.all() else max(int(np.argmin(sound)), 1)
+        significant = diagonal > rounding[order[rank : rank + diagonal.size]]
+        rank += diagonal.size if significant.all() else max(int(np.argmin(significant)), 1)
     triangle = triangle[:rank]
     return orthogonal[:, :rank], np.where(np.abs(triangle) > rounding[order], triangle, 0.0), order, rank

@@ -1,11 +1,11 @@
-"""What every form of the estimator can do (Wood et al., Eq. 4 and Eq. 5).
+"""Interface of the algebraic forms of the estimator (Wood et al. 2005, Eq. 4 and 5).
 
-One linear system holds them all. With f = f0 + L u and multipliers l,
+All forms solve one linear system. With f = f0 + L u and multipliers l,
 
     u - L^T H^T l = c,    H L u + Rv l = r.
 
-With c = 0 and r = g - H f0 its u is the estimate; with r = 0 and c = L^T z, L u is the posterior covariance times z,
-and -l is A^T z. The forms differ in how they factorise it, in what they cost, and in what rounding does to them.
+With c = 0 and r = g - H f0, u gives the estimate. With r = 0 and c = L^T z, L u is the posterior covariance times z,
+and -l is A^T z. The forms differ in the matrix they factorise, in cost, and in sensitivity to rounding.
 """
 
 from __future__ import annotations
@@ -17,19 +17,21 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
+
 from ..problem import Problem
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+Vector = FloatArray
+Matrix = FloatArray
 
 
 class NotSolvableError(Exception):
-    """This form cannot factorise this problem in float64; another one may."""
+    """The form cannot factorise the problem in float64; another form may."""
 
 
 @dataclass(frozen=True)
 class Form(ABC):
-    """A factorised problem. `condition` is that of the matrix that was factorised, in the 1 or 2-norm."""
+    """A factorised problem. `condition` is the condition number of the factorised matrix, in the 1- or 2-norm."""
 
     problem: Problem
     condition: float
@@ -37,41 +39,35 @@ class Form(ABC):
     name: ClassVar[str]
 
     @abstractmethod
-    def solve(self, shift: Matrix, residual: Matrix) -> tuple[Matrix, Matrix]:
+    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve the system above for c = `shift`, (K, q), and r = `residual`, (M, q): u, (K, q), and l, (M, q)."""
 
     @abstractmethod
-    def variance(self) -> Vector:
-        """The diagonal of the posterior covariance where prior and noise are what was expected: (N,), never below 0."""
+    def variance(self) -> FloatArray:
+        """Posterior variance of every pixel if prior and noise are as assumed: (N,), never negative."""
 
-    def columns(self, pixels: NDArray[np.intp]) -> tuple[Matrix, Matrix]:
-        """For some pixels, c = L^T e_i, r = 0: u, (K, q), with |u|^2 the prior's part of Eq. 5, and l = -A^T e_i."""
+    def pixel_solutions(self, pixels: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Solve for c = L^T e_i, r = 0 of each pixel i: u, (K, q), and l = -A^T e_i, (M, q).
+
+        |u|^2 is the prior's part of Eq. 5.
+        """
         unit = np.zeros((self.problem.unknowns, pixels.size))
         unit[pixels, np.arange(pixels.size)] = 1.0
-        return self.solve(self.problem.prior.gather(unit), np.zeros((self.problem.measurements, pixels.size)))
+        shift = self.problem.prior.apply_root_transposed(unit)
+        return self.solve(shift, np.zeros((self.problem.measurements, pixels.size)))
 
-    def gain(self, residual: Matrix) -> Matrix:
-        """A r of Eq. 4: (M,) to (N,), or (M, q) to (N, q) for many at once."""
-        block = _block(residual)
-        u, _ = self.solve(np.zeros((self.problem.prior.freedoms, block.shape[1])), block)
-        return self.problem.prior.spread(u).reshape(self.problem.unknowns, *residual.shape[1:])
-
-    def covariance(self, image: Matrix) -> Matrix:
-        """The posterior covariance times z: (N,) to (N,), or (N, q) to (N, q)."""
-        block = _block(image)
-        u, _ = self.solve(self.problem.prior.gather(block), np.zeros((self.problem.measurements, block.shape[1])))
-        return self.problem.prior.spread(u).reshape(image.shape)
+    def gain(self, residual: FloatArray) -> FloatArray:
+        """Apply A of Eq. 4 to residuals: (M,) to (N,), or (M, q) to (N, q)."""
+        block = residual[:, None] if residual.ndim == 1 else residual
+        u, _ = self.solve(np.zeros((self.problem.prior.dimension, block.shape[1])), block)
+        return self.problem.prior.apply_root(u).reshape(self.problem.unknowns, *residual.shape[1:])
 
 
-def _block(values: Matrix) -> Matrix:
-    return values[:, None] if values.ndim == 1 else values
+def multipliers(problem: Problem, u: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return l = Rv^-1 (r - H L u): (M, q); needs noise in every measurement."""
+    return (residual - problem.forward(u)) / problem.noise_variance[:, None]
 
 
-def multipliers(problem: Problem, u: Matrix, residual: Matrix) -> Matrix:
-    """l = Rv^-1 (r - H L u): (M, q), where every measurement has noise."""
-    return (residual - problem.observe(u)) / problem.noise_variance[:, None]
-
-
-def root_variance(problem: Problem, root: Matrix) -> Vector:
-    """The diagonal of L T T^T L^T for a root T, (K, q): (N,), sums of squares."""
-    return np.square(problem.prior.spread(root)).sum(axis=1)
+def root_variance(problem: Problem, root: FloatArray) -> FloatArray:
+    """Return the diagonal of L T T^T L^T for a root T, (K, q): (N,), as sums of squares."""
+    return np.square(problem.prior.apply_root(root)).sum(axis=1)

@@ -1,7 +1,7 @@
-"""Information form: Cholesky of I + B^T B, B = S^-1 H L, the smaller matrix where unknowns are fewer.
+"""Information form: Cholesky of I + B^T B with B = S^-1 H L, the smaller matrix if unknowns are fewer.
 
-Fast, and right to ten digits and more where H leaves no null space. With a null space and little noise the unit matrix
-drowns in the rounding of B^T B, and digits are lost in proportion to the ratio of prior to noise.
+Fast, and accurate to ten digits or more if H has full rank. With a null space and little noise the identity is lost in
+the rounding of B^T B; digits are lost in proportion to the ratio of prior to noise.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray
+
 from ..problem import Problem
 from .cholesky import Factor, factorise_positive
-from .form import Form, Matrix, NotSolvableError, Vector, multipliers
+from .form import Form, NotSolvableError, multipliers
 
 
 @dataclass(frozen=True)
@@ -27,25 +29,25 @@ class Information(Form):
 
     name: ClassVar[str] = "information"
 
-    def solve(self, shift: Matrix, residual: Matrix) -> tuple[Matrix, Matrix]:
-        """u = (I + B^T B)^-1 (c + L^T H^T Rv^-1 r)."""
+    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return u = (I + B^T B)^-1 (c + L^T H^T Rv^-1 r) and its multipliers."""
         u = self.factor.solve(shift + self.problem.adjoint(residual / self.problem.noise_variance[:, None]))
         return u, multipliers(self.problem, u, residual)
 
     @cached_property
-    def inverse(self) -> Matrix:
+    def inverse(self) -> FloatArray:
         """(I + B^T B)^-1: (K, K)."""
         return self.factor.inverse()
 
-    def variance(self) -> Vector:
-        """The diagonal of L (I + B^T B)^-1 L^T."""
+    def variance(self) -> FloatArray:
+        """Return the diagonal of L (I + B^T B)^-1 L^T."""
         if self.problem.prior.independent:
             return self.problem.prior.variance * np.diagonal(self.inverse)
         root = self.problem.prior.root
         return np.maximum(np.einsum("ij,ij->i", root @ self.inverse, root), 0.0)
 
-    def columns(self, pixels: NDArray[np.intp]) -> tuple[Matrix, Matrix]:
-        """From the inverse, which costs a third of solving for every pixel."""
+    def pixel_solutions(self, pixels: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Take u from the inverse, which costs a third of solving for every pixel."""
         prior = self.problem.prior
         root = prior.root[pixels]
         u = self.inverse[:, pixels] * root if prior.independent else self.inverse @ root.T
@@ -53,7 +55,7 @@ class Information(Form):
 
 
 def information(problem: Problem) -> Information:
-    """Factorise in information form. Raises NotSolvableError without noise, or where float64 does not suffice."""
+    """Factorise in information form. Raises NotSolvableError without noise, or if float64 does not suffice."""
     if not problem.noisy:
         raise NotSolvableError("it needs noise in every measurement")
     if problem.prior.independent:
@@ -61,7 +63,7 @@ def information(problem: Problem) -> Information:
         scaled = sparse.csr_array(scaled.multiply(problem.prior.root[None, :]))
         normal = np.asarray((scaled.T @ scaled).toarray())
     else:
-        whitened = problem.whitened()
+        whitened = problem.whitened_matrix()
         normal = whitened.T @ whitened
     normal[np.diag_indices(normal.shape[0])] += 1.0
     if not np.isfinite(normal).all():

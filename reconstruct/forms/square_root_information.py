@@ -1,8 +1,8 @@
-"""Square-root information form: QR of the whitened rows B = S^-1 H L above the unit matrix that stands for the prior.
+"""Square-root information form: QR of the whitened rows B = S^-1 H L stacked on the identity of the prior.
 
-Nothing is squared, so twice the digits of the information form survive. Rows are sorted by size and columns pivoted,
-so noise of very different size from one measurement to the next does no harm. Where H leaves a null space and the
-noise is so small that the rounding of B outweighs the prior, it is wrong in silence, and the certificate must say so.
+Nothing is squared, so it keeps twice the digits of the information form. Rows are sorted by size and columns pivoted,
+so noise may differ widely between measurements. If H has a null space and the noise is so small that the rounding of B
+outweighs the prior, the result is wrong without a warning; the certificate has to detect it.
 """
 
 from __future__ import annotations
@@ -12,34 +12,36 @@ from typing import ClassVar
 
 import numpy as np
 
+from ommatid.runtime.arrays import FloatArray
+
 from ..problem import Problem
-from .form import Form, Matrix, NotSolvableError, Vector, multipliers, root_variance
+from .form import Form, NotSolvableError, multipliers, root_variance
 from .sorted_qr import SortedQr, sorted_qr
 
 
 @dataclass(frozen=True)
 class SquareRootInformation(Form):
-    """The QR of [B; I], (M + K, K), in `normal`."""
+    """The QR decomposition of [B; I], (M + K, K), as `normal`."""
 
     normal: SortedQr
 
     name: ClassVar[str] = "square-root-information"
 
-    def solve(self, shift: Matrix, residual: Matrix) -> tuple[Matrix, Matrix]:
-        """The least squares solution of B u = S^-1 r, u = c."""
+    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the least-squares solution of B u = S^-1 r, u = c, and its multipliers."""
         u = self.normal.solve(np.vstack([residual / self.problem.deviation[:, None], shift]))
         return u, multipliers(self.problem, u, residual)
 
-    def variance(self) -> Vector:
-        """The diagonal of L R^-1 R^-T L^T."""
+    def variance(self) -> FloatArray:
+        """Return the diagonal of L R^-1 R^-T L^T."""
         return root_variance(self.problem, self.normal.inverse())
 
 
 def square_root_information(problem: Problem) -> SquareRootInformation:
-    """Factorise in square-root information form. Raises NotSolvableError where a measurement has no noise."""
+    """Factorise in square-root information form. Raises NotSolvableError if a measurement has no noise."""
     if not problem.noisy:
         raise NotSolvableError("it needs noise in every measurement")
-    stacked = np.vstack([problem.whitened(), np.eye(problem.prior.freedoms)])
+    stacked = np.vstack([problem.whitened_matrix(), np.eye(problem.prior.dimension)])
     if not np.isfinite(stacked).all():
         raise NotSolvableError("its matrix leaves the range of double precision")
     normal = sorted_qr(stacked)

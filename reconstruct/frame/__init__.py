@@ -1,1 +1,1 @@
-"""Whole frames by preconditioned conjugate gradients."""
+"""Estimates of whole frames by preconditioned conjugate gradients."""

@@ -1,14 +1,14 @@
-"""The posterior of a camera that sees the same everywhere, all but solved: a sine transform, and strips at the border.
+"""Approximate inverse of the precision of a shift-invariant camera: a sine transform, and strips at the border.
 
-Where the sub-imagers of a type are m x m and one pixel apart, its sensor pixels are all the averages over boxes of m x
-m pixels that lie in what it sees. With noise of one variance for each type and independent pixels, the precision
+If a lens type has m x m sub-imagers one pixel apart, its sensor pixels are all the averages over boxes of m x m pixels
+inside its field. With one noise variance per lens type and independent pixels, the precision
 
-    K = sum over types of (G x G') / variance + 1 / P0,   G = D^T D, D sliding means along one axis,
+    K = sum over types of (G x G') / variance + 1 / P0,   G = D^T D, D moving averages along one axis,
 
-is Toeplitz but for the border. In its place M, of the same averages over an image continued with opposite sign beyond
-its edges, is diagonal under the sine transform (DST-II), and K differs from M near the border alone. So three steps
-give K^-1 r to a few parts in a hundred or better: solve K exactly in strips along the border, M on what is left, and
-the strips once more (a symmetric multiplicative Schwarz method; Smith, Bjorstad and Gropp 1996).
+is Toeplitz except at the border. M, the same sum for an image continued antisymmetrically beyond its edges, is diagonal
+under the sine transform (DST-II) and differs from K near the border only. Three steps approximate K^-1 r to a few
+percent or better: solve K exactly in strips along the border, M for the remaining residual, and the strips again
+(a symmetric multiplicative Schwarz method; Smith, Bjorstad and Gropp 1996).
 """
 
 from __future__ import annotations
@@ -17,17 +17,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, linalg, sparse
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
-Vector = NDArray[np.float64]
-Image = NDArray[np.float64]
+Pair = tuple[sparse.csr_array, sparse.csr_array]
 
-DEPTH = 5  # of a strip, in boxes of the widest type: what it leaves is a hundredth at a noise variance of 1e-2
-WORKERS = -1  # threads of a transform: all cores; each row is transformed by one of them, so results do not change
+DEPTH = 5  # of a strip, in boxes of the widest type: the error is a percent at a noise variance of 1e-2
+WORKERS = -1  # threads of a transform: all cores; each row belongs to one thread, so results do not change
 
 
 @dataclass(frozen=True)
@@ -48,13 +47,12 @@ class BoxMeans:
         return sparse.csr_array(means.T @ means)
 
     @cached_property
-    def continued(self) -> sparse.csr_array:
-        """The same of all means of the axis continued with opposite sign: Toeplitz less what its ends mirror."""
+    def mirrored_gram(self) -> sparse.csr_array:
+        """G of all means of the antisymmetrically continued axis: Toeplitz minus the mirrored terms at the ends."""
         reach = self.width - 1
         kernel = (self.width - np.abs(np.arange(-reach, reach + 1))) / self.width**2
-        toeplitz = sparse.lil_array(
-            sparse.diags_array(kernel, offsets=list(range(-reach, reach + 1)), shape=self._square)
-        )
+        offsets = list(range(-reach, reach + 1))
+        toeplitz = sparse.lil_array(sparse.diags_array(kernel, offsets=offsets, shape=(self.size, self.size)))
         for i in range(reach):
             for j in range(reach - i):
                 share = (reach - i - j) / self.width**2
@@ -62,80 +60,81 @@ class BoxMeans:
                 toeplitz[self.size - 1 - i, self.size - 1 - j] -= share
         return sparse.csr_array(toeplitz)
 
-    @property
-    def _square(self) -> tuple[int, int]:
-        return self.size, self.size
-
     @cached_property
-    def transfer(self) -> Vector:
-        """Eigenvalues of `continued` under the sine transform: (size,)."""
+    def transfer(self) -> FloatArray:
+        """Eigenvalues of `mirrored_gram` under the sine transform: (size,)."""
         return self.transfer_at(np.pi * (np.arange(self.size) + 1) / self.size)
 
-    def transfer_at(self, angle: Vector) -> Vector:
-        """The squared transfer function of a mean, at angles above 0 and below 2 pi a pixel."""
+    def transfer_at(self, angle: FloatArray) -> FloatArray:
+        """Return the squared transfer function of a mean at angular frequencies in (0, 2 pi) per pixel."""
         return np.square(np.sin(self.width * angle / 2) / (self.width * np.sin(angle / 2)))
 
     @property
-    def rims(self) -> tuple[int, int]:
-        """How many pixels from either end the two differ."""
+    def borders(self) -> tuple[int, int]:
+        """Number of pixels at either end where `gram` and `mirrored_gram` differ."""
         return self.first + self.width - 1, self.size - self.end + self.width - 1
 
 
 @dataclass(frozen=True)
 class Preconditioner:
-    """K of a whole frame; each type has its means along rows and columns and its weight, 1 / variance of the noise.
+    """K of a shift-invariant camera: for each type the means along rows and columns, and its weight 1 / variance.
 
-    prior : 1 / P0 of independent pixels, or its spectrum, (rows, columns), under the sine transform
+    prior : 1 / P0 of independent pixels, or 1 / its spectrum, (rows, columns), under the sine transform
     """
 
     types: tuple[tuple[BoxMeans, BoxMeans], ...]
     weights: tuple[float, ...]
-    prior: float | Image
+    prior: float | FloatArray
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the frame."""
         return self.types[0][0].size, self.types[0][1].size
 
+    def widest(self, axis: int) -> int:
+        """Return the largest box width along an axis."""
+        return max(means[axis].width for means in self.types)
+
     @cached_property
-    def spectrum(self) -> Image:
+    def spectrum(self) -> FloatArray:
         """Eigenvalues of M: (rows, columns)."""
         total = np.zeros(self.shape)
-        for (down, across), weight in zip(self.types, self.weights, strict=True):
-            total += weight * np.outer(down.transfer, across.transfer)
+        for (vertical, horizontal), weight in zip(self.types, self.weights, strict=True):
+            total += weight * np.outer(vertical.transfer, horizontal.transfer)
         total += self.prior
         return total
 
-    def solve(self, image: Image) -> Image:
-        """About K^-1 r, (rows, columns): symmetric and positive, so that conjugate gradients can lean on it."""
-        left = np.array(image, dtype=np.float64)
+    def solve(self, image: FloatArray) -> FloatArray:
+        """Return approximately K^-1 r, (rows, columns): symmetric positive definite, as conjugate gradients need."""
+        residual = np.array(image, dtype=np.float64)
         if not isinstance(self.prior, float):
-            return self._transformed(left)
-        found = np.zeros(self.shape)
+            return self._solve_transform(residual)
+        solution = np.zeros(self.shape)
         for strip in self._strips:
-            strip.correct(found, left, self.prior)
-        step = self._transformed(left)
-        found += step
-        left = self._rim_of(step)
+            strip.correct(solution, residual, self.prior)
+        step = self._solve_transform(residual)
+        solution += step
+        residual = self._border_difference(step)
         for strip in reversed(self._strips):
-            strip.correct(found, left, self.prior)
-        return found
+            strip.correct(solution, residual, self.prior)
+        return solution
 
-    def _transformed(self, image: Image) -> Image:
+    def _solve_transform(self, image: FloatArray) -> FloatArray:
+        """M^-1 r."""
         waves = fft.dstn(image, 2, workers=WORKERS)
         waves /= self.spectrum
         return np.asarray(fft.idstn(waves, 2, workers=WORKERS, overwrite_x=True))
 
-    def _rim_of(self, image: Image) -> Image:
-        """(M - K) f, which is not zero in a rim alone."""
-        left = np.zeros(self.shape)
-        for one in self._rim:
-            left[one.window] = one.apply(image)
-        return left
+    def _border_difference(self, image: FloatArray) -> FloatArray:
+        """(M - K) f, which is 0 except at the border."""
+        difference = np.zeros(self.shape)
+        for window in self._windows:
+            difference[window.window] = window.apply(image)
+        return difference
 
     @cached_property
-    def _rim(self) -> tuple[_Window, ...]:
-        (rows, columns), (tall, broad) = self.shape, self._rims
+    def _windows(self) -> tuple[_BorderWindow, ...]:
+        (rows, columns), (tall, broad) = self.shape, self._borders
         inner = slice(tall[0], rows - tall[1])
         windows = [
             (slice(0, tall[0]), slice(0, columns)),
@@ -143,125 +142,125 @@ class Preconditioner:
             (inner, slice(0, broad[0])),
             (inner, slice(columns - broad[1], columns)),
         ]
-        return tuple(_Window.of(self, window) for window in windows)
+        return tuple(_border_window(self, window) for window in windows)
 
     @cached_property
-    def _rims(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        ends = [[means[axis].rims for means in self.types] for axis in (0, 1)]
-        return tuple((max(end[0] for end in axis), max(end[1] for end in axis)) for axis in ends)  # type: ignore[return-value]
+    def _borders(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Widths of the border at both ends of both axes."""
+        vertical, horizontal = ([means[axis].borders for means in self.types] for axis in (0, 1))
+        return _largest(vertical), _largest(horizontal)
 
     @cached_property
     def _strips(self) -> tuple[_Strip, ...]:
-        """Top, bottom, left and right."""
+        """Strips along the top, bottom, left and right."""
         strips: list[_Strip] = []
         for axis in (0, 1):
             size = self.shape[axis]
-            depth = min(DEPTH * max(means[axis].width for means in self.types), size // 2)
+            depth = min(DEPTH * self.widest(axis), size // 2)
             ends = slice(0, depth), slice(size - depth, size)
-            strips += [_Strip.of(self, float(np.asarray(self.prior)), axis, place) for place in ends]
+            strips += [_factorised_strip(self, float(np.asarray(self.prior)), axis, part) for part in ends]
         return tuple(strips)
 
 
+def _largest(borders: list[tuple[int, int]]) -> tuple[int, int]:
+    return max(border[0] for border in borders), max(border[1] for border in borders)
+
+
 @dataclass(frozen=True)
-class _Window:
-    """(M - K) in a window of the frame: of each type what is to be applied to the rows and to the columns near it."""
+class _BorderWindow:
+    """(M - K) in a window of the frame, as pairs of factors along rows and columns that apply to the pixels `near`."""
 
     window: tuple[slice, slice]
     near: tuple[slice, slice]
-    parts: tuple[tuple[sparse.csr_array, sparse.csr_array], ...]
+    parts: tuple[Pair, ...]
 
-    @staticmethod
-    def of(whole: Preconditioner, window: tuple[slice, slice]) -> _Window:
-        reach = [max(means[axis].width for means in whole.types) - 1 for axis in (0, 1)]
-        near = (
-            slice(max(window[0].start - reach[0], 0), min(window[0].stop + reach[0], whole.shape[0])),
-            slice(max(window[1].start - reach[1], 0), min(window[1].stop + reach[1], whole.shape[1])),
-        )
-        parts: list[tuple[sparse.csr_array, sparse.csr_array]] = []
-        for (down, across), weight in zip(whole.types, whole.weights, strict=True):
-            for share, one, other in (
-                (weight, down.continued, across.continued),
-                (-weight, down.gram, across.gram),
-            ):
-                parts.append((share * one[window[0], near[0]], sparse.csr_array(other[window[1], near[1]])))
-        return _Window(window, near, tuple(parts))
-
-    def apply(self, image: Image) -> Image:
+    def apply(self, image: FloatArray) -> FloatArray:
         nearby = image[self.near]
-        return sum((level @ (upright @ nearby).T for upright, level in self.parts), np.zeros(self._turned)).T
-
-    @property
-    def _turned(self) -> tuple[int, int]:
         rows, columns = self.window
-        return columns.stop - columns.start, rows.stop - rows.start
+        start = np.zeros((columns.stop - columns.start, rows.stop - rows.start))
+        return sum((level @ (upright @ nearby).T for upright, level in self.parts), start).T
+
+
+def _border_window(system: Preconditioner, window: tuple[slice, slice]) -> _BorderWindow:
+    near = tuple(
+        slice(max(part.start - system.widest(axis) + 1, 0), min(part.stop + system.widest(axis) - 1, size))
+        for axis, (part, size) in enumerate(zip(window, system.shape, strict=True))
+    )
+    parts: list[Pair] = []
+    for (vertical, horizontal), weight in zip(system.types, system.weights, strict=True):
+        for share, upright, level in (
+            (weight, vertical.mirrored_gram, horizontal.mirrored_gram),
+            (-weight, vertical.gram, horizontal.gram),
+        ):
+            parts.append((share * upright[window[0], near[0]], sparse.csr_array(level[window[1], near[1]])))
+    return _BorderWindow(window, (near[0], near[1]), tuple(parts))
 
 
 @dataclass(frozen=True)
 class _Strip:
-    """K in a strip along one edge, factorised; pixels stand across the strip first, which keeps its band narrow."""
+    """K in a strip along one edge, factorised; pixels are numbered across the strip first for a narrow band."""
 
     axis: int
-    place: slice
+    part: slice
     near: slice
-    factor: Vector
-    parts: tuple[tuple[sparse.csr_array, sparse.csr_array], ...]
+    factor: FloatArray
+    parts: tuple[Pair, ...]
 
-    @staticmethod
-    def of(whole: Preconditioner, prior: float, axis: int, place: slice) -> _Strip:
-        depth, length = place.stop - place.start, whole.shape[1 - axis]
-        reach = max(means[1 - axis].width for means in whole.types) - 1
-        side = max(means[axis].width for means in whole.types) - 1
-        band = np.zeros((reach * depth + min(side, depth - 1) + 1, length, depth))
-        for means, weight in zip(whole.types, whole.weights, strict=True):
-            along, through = means[1 - axis].gram, means[axis].gram[place, place].toarray()
-            for far in range(means[1 - axis].width):
-                column = weight * along.diagonal(-far)
-                for down in range(1 - means[axis].width, means[axis].width):
-                    below = far * depth + down
-                    if below < 0 or abs(down) >= depth:
-                        continue
-                    entries = np.diagonal(through, -down)
-                    across = slice(max(-down, 0), max(-down, 0) + entries.size)
-                    band[below, : column.size, across] += column[:, None] * entries
-        band[0] += prior
-        flat = band.reshape(band.shape[0], length * depth)
-        near = slice(max(place.start - side, 0), min(place.stop + side, whole.shape[axis]))
-        parts = [
-            (sparse.csr_array(weight * means[axis].gram[near, place]), means[1 - axis].gram)
-            for means, weight in zip(whole.types, whole.weights, strict=True)
-        ]
-        factor = linalg.cholesky_banded(flat, overwrite_ab=True, lower=True, check_finite=False)
-        return _Strip(axis, place, near, factor, tuple(parts))
-
-    def correct(self, found: Image, left: Image, prior: float) -> None:
-        """Solve for what is left in the strip, and take what that explains from what is left, also beside the strip."""
-        mine, other = (found, left) if self.axis == 0 else (found.T, left.T)
-        depth, length = self.place.stop - self.place.start, other.shape[1]
-        right = np.ascontiguousarray(other[self.place].T).ravel()
-        solved = linalg.cho_solve_banded((self.factor, True), right, overwrite_b=True, check_finite=False)
-        step = solved.reshape(length, depth)
-        mine[self.place] += step.T
-        other[self.place] -= prior * step.T
-        for through, along in self.parts:
-            other[self.near] -= through @ (along @ step).T
+    def correct(self, solution: FloatArray, residual: FloatArray, prior: float) -> None:
+        """Solve for the residual in the strip, and update the residual in and near the strip."""
+        image, right = (solution, residual) if self.axis == 0 else (solution.T, residual.T)
+        depth, length = self.part.stop - self.part.start, right.shape[1]
+        flat = np.ascontiguousarray(right[self.part].T).ravel()
+        step = linalg.cho_solve_banded((self.factor, True), flat, overwrite_b=True, check_finite=False)
+        step = step.reshape(length, depth)
+        image[self.part] += step.T
+        right[self.part] -= prior * step.T
+        for across, along in self.parts:
+            right[self.near] -= across @ (along @ step).T
 
 
-def is_sliding(kind: LensType) -> bool:
-    """Whether a type's sensor pixels are all the averages over boxes that lie in what it sees."""
-    return kind.step == 1 and kind.ratio.denominator == 1 and kind.array == (int(kind.ratio), int(kind.ratio))
+def _factorised_strip(system: Preconditioner, prior: float, axis: int, part: slice) -> _Strip:
+    depth, length = part.stop - part.start, system.shape[1 - axis]
+    reach, side = system.widest(1 - axis) - 1, system.widest(axis) - 1
+    band = np.zeros((reach * depth + min(side, depth - 1) + 1, length, depth))
+    for means, weight in zip(system.types, system.weights, strict=True):
+        along, across = means[1 - axis].gram, means[axis].gram[part, part].toarray()
+        for distance in range(means[1 - axis].width):
+            column = weight * along.diagonal(-distance)
+            for offset in range(1 - means[axis].width, means[axis].width):
+                row = distance * depth + offset
+                if row < 0 or abs(offset) >= depth:
+                    continue
+                entries = np.diagonal(across, -offset)
+                pixels = slice(max(-offset, 0), max(-offset, 0) + entries.size)
+                band[row, : column.size, pixels] += column[:, None] * entries
+    band[0] += prior
+    near = slice(max(part.start - side, 0), min(part.stop + side, system.shape[axis]))
+    parts = [
+        (sparse.csr_array(weight * means[axis].gram[near, part]), means[1 - axis].gram)
+        for means, weight in zip(system.types, system.weights, strict=True)
+    ]
+    flat = band.reshape(band.shape[0], length * depth)
+    factor = linalg.cholesky_banded(flat, overwrite_ab=True, lower=True, check_finite=False)
+    return _Strip(axis, part, near, factor, tuple(parts))
 
 
-def preconditioner_for(camera: Camera, weights: tuple[float, ...], prior: float | Image) -> Preconditioner:
-    """K of a camera all of whose types slide. Raises ValueError if one does not."""
+def is_sliding(lens_type: LensType) -> bool:
+    """Return True if the type's sensor pixels are all the averages over boxes inside its field (shift-invariant)."""
+    ratio = lens_type.ratio
+    return lens_type.step == 1 and ratio.denominator == 1 and lens_type.array == (int(ratio), int(ratio))
+
+
+def preconditioner_for(camera: Camera, weights: tuple[float, ...], prior: float | FloatArray) -> Preconditioner:
+    """Return the preconditioner of a shift-invariant camera. Raises ValueError if a lens type is not."""
     types: list[tuple[BoxMeans, BoxMeans]] = []
-    for kind in camera.types:
-        if not is_sliding(kind):
-            raise ValueError(f"lens type '{kind.name}' does not see every box of {kind.ratio} x {kind.ratio} pixels")
-        ends = [int(first + span) for first, span in zip(kind.origin, kind.span, strict=True)]
-        sizes = camera.shape
-        down, across = (
-            BoxMeans(int(kind.ratio), first, end, size)
-            for first, end, size in zip(kind.origin, ends, sizes, strict=True)
+    for lens_type in camera.types:
+        ratio = lens_type.ratio
+        if not is_sliding(lens_type):
+            raise ValueError(f"lens type '{lens_type.name}' does not see every box of {ratio} x {ratio} pixels")
+        vertical, horizontal = (
+            BoxMeans(int(ratio), first, int(first + span), size)
+            for first, span, size in zip(lens_type.origin, lens_type.span, camera.shape, strict=True)
         )
-        types.append((down, across))
+        types.append((vertical, horizontal))
     return Preconditioner(tuple(types), weights, prior)

@@ -1,1 +1,1 @@
-"""Methods of reconstruction: dense, by tiles, and what all methods share."""
+"""Estimation methods: one dense problem, tile by tile, and their common interface."""

@@ -1,4 +1,4 @@
-"""What every way to an estimate - one dense problem, tiles, the whole frame - is given, and what it has to answer."""
+"""Interface of the estimation methods (dense, tiles, frame): their task and their result."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
 from ommatid.scenes.model import Model
@@ -20,13 +20,12 @@ from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval
 from ..prior import Prior, prior_of, spectrum_of
 
-Vector = NDArray[np.float64]
-Image = NDArray[np.float64]
+Vector = FloatArray
 
 
 @dataclass(frozen=True)
 class Execution:
-    """Who does what can be done side by side, absent: threads of this process; and who hears how the work goes on."""
+    """Workers for parallel tasks (default: threads of this process) and a callback for progress."""
 
     workers: Workers | None = None
     progress: Progress = no_progress
@@ -34,23 +33,23 @@ class Execution:
 
 @dataclass(frozen=True)
 class EstimationTask:
-    """What is to be estimated from what.
+    """Everything an estimation method needs: H, measurements, noise, prior and settings.
 
-    recorded : (M,) g;  used : (M,) which of them count
-    believed : (pixels used,) the variance that the estimator expects of each, 0 allowed
+    recorded : (M,) g;  used : (M,) True for measurements that are used
+    expected_noise : (measurements used,) the noise variance that the estimator assumes, 0 allowed
     """
 
     model: Model
-    recorded: Vector
-    used: NDArray[np.bool_]
-    expected_noise: Vector
+    recorded: FloatArray
+    used: BoolArray
+    expected_noise: FloatArray
     prior: estimation.PriorTable
     settings: estimation.EstimatorTable
     tiles: estimation.TilesTable
 
     @cached_property
     def complete(self) -> bool:
-        """Whether all pixels are used."""
+        """True if all measurements are used."""
         return bool(self.used.all())
 
     @property
@@ -59,88 +58,88 @@ class EstimationTask:
         return self.model.camera.rows, self.model.camera.columns
 
     def prior_on(self, shape: tuple[int, int]) -> Prior:
-        """What is known beforehand of an image of this shape."""
+        """Return the prior of an image of this shape."""
         return prior_of(self.prior, shape, self.model.camera.target_pitch)
 
-    def precision_on(self, shape: tuple[int, int]) -> float | Image:
-        """1 / P0 of independent pixels, or 1 / its spectrum under the cosine transform: (rows, columns)."""
+    def precision_on(self, shape: tuple[int, int]) -> float | FloatArray:
+        """Return 1 / P0 of independent pixels, or 1 / its spectrum under the DCT-II: (rows, columns)."""
         return 1 / spectrum_of(self.prior, shape, self.model.camera.target_pitch)
 
-    def prior_spread(self, weights: Vector) -> float:
-        """w^T P0 w, the variance of a weighted sum of pixels before anything is recorded; weights : (N,)."""
+    def prior_variance_of_sum(self, weights: FloatArray) -> float:
+        """Return w^T P0 w, the prior variance of a weighted sum of pixels; weights : (N,)."""
         spectrum = spectrum_of(self.prior, self.shape, self.model.camera.target_pitch)
         if isinstance(spectrum, float):
             return spectrum * float(weights @ weights)
         waves = fft.dctn(weights.reshape(self.shape), 2, norm="ortho")
         return float(np.sum(spectrum * np.square(waves)))
 
-    def over_all(self, values: Vector, rest: float) -> Vector:
-        """Values of the pixels used as values of all: (pixels used,) to (M,), `rest` for the others."""
+    def on_all_measurements(self, values: FloatArray, fill: float) -> FloatArray:
+        """Return values of the used measurements on all of them: (measurements used,) to (M,), else `fill`."""
         if self.complete:
             return values
-        spread = np.full(self.used.size, rest)
-        spread[self.used] = values
-        return spread
+        filled = np.full(self.used.size, fill)
+        filled[self.used] = values
+        return filled
 
 
 @dataclass(frozen=True)
 class MethodResult:
     """An estimate and its error.
 
-    image : (N,) f^;  multipliers : (pixels used,) Rv^-1 (g - H f^)
-    expected : Eq. 5 with the noise as it is;  interval : for the image that was given as the truth
-    variance_of_sum : of a weighted sum of pixels, (N,) weights, the expected squared error
+    image : (N,) f^;  multipliers : (measurements used,) Rv^-1 (g - H f^)
+    expected : Eq. 5 with the actual noise;  interval : for the true image, if it is known
+    variance_of_sum : expected squared error of a weighted sum of pixels, as a function of (N,) weights
     """
 
-    image: Vector
-    multipliers: Vector
+    image: FloatArray
+    multipliers: FloatArray
     solver: Solver
     expected: ExpectedError
     interval: Interval | None
-    variance_of_sum: Callable[[Vector], float]
+    variance_of_sum: Callable[[FloatArray], float]
 
 
 class Method(ABC):
-    """One way to an estimate."""
+    """An estimation method applied to one task."""
 
-    def __init__(self, task: EstimationTask, hands: Execution) -> None:
-        """Of a task, with somebody to do the work."""
+    def __init__(self, task: EstimationTask, execution: Execution) -> None:
+        """Create the method for `task`, run by `execution`."""
         self.task = task
-        self.hands = hands
+        self.execution = execution
 
     @cached_property
-    def image(self) -> Vector:
-        """f^ alone: (N,)."""
-        return self.estimated()
+    def image(self) -> FloatArray:
+        """The estimate f^ without its error: (N,)."""
+        return self.estimate_image()
 
     @abstractmethod
-    def estimated(self) -> Vector:
-        """Find f^ alone: (N,)."""
+    def estimate_image(self) -> FloatArray:
+        """Compute f^ without its error: (N,)."""
 
     @abstractmethod
-    def result(self, noise: dict[str, Vector], truth: Vector | None) -> MethodResult:
-        """The estimate and its error where the noise, (pixels used,) variances by name, is as given."""
+    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+        """Return the estimate and its error for the actual `noise`: (measurements used,) variances by cause."""
 
 
-def total(noise: dict[str, Vector]) -> Vector:
-    """The sum of variances of several causes; where each is one number for all pixels, so is the sum."""
-    values = list(noise.values())
-    if all(is_one_number(one) for one in values):
-        return np.broadcast_to(sum(float(one[0]) for one in values if one.size), values[0].shape)
-    summed = np.array(values[0])
-    for one in values[1:]:
-        summed += one
-    return summed
+def total_variance(noise: dict[str, FloatArray]) -> FloatArray:
+    """Return the sum of the variances of all causes; uniform if every one of them is."""
+    variances = list(noise.values())
+    if all(is_uniform(variance) for variance in variances):
+        return np.broadcast_to(sum(float(variance[0]) for variance in variances if variance.size), variances[0].shape)
+    total = np.array(variances[0])
+    for variance in variances[1:]:
+        total += variance
+    return total
 
 
-def is_one_number(values: Vector) -> bool:
-    """Whether an array repeats one number and stores it once."""
+def is_uniform(values: FloatArray) -> bool:
+    """Return True if an array repeats one number that is stored once (or is empty)."""
     return values.strides == (0,) or values.size == 0
 
 
-def residual_multipliers(task: EstimationTask, image: Vector) -> Vector:
-    """Rv^-1 (g - H f^): (pixels used,); zeros where a measurement is said to have no noise."""
-    left = task.recorded - task.model.forward(image)
+def residual_multipliers(task: EstimationTask, image: FloatArray) -> FloatArray:
+    """Return Rv^-1 (g - H f^): (measurements used,); 0 for a measurement without noise."""
+    residual = task.recorded - task.model.forward(image)
     if not task.complete:
-        left = left[task.used]
-    return np.divide(left, task.expected_noise, out=np.zeros_like(left), where=task.expected_noise > 0)
+        residual = residual[task.used]
+    return np.divide(residual, task.expected_noise, out=np.zeros_like(residual), where=task.expected_noise > 0)

@@ -1,19 +1,20 @@
-"""Join tiles, reconstructed each on its own, exactly, by the measurements that couple them (Wood et al., Eq. 7).
+"""Exact merging of separately estimated tiles by the measurements that couple them (Wood et al. 2005, Eq. 7).
 
-A frame is cut into disjoint tiles of pixels, independent of one another beforehand. A measurement belongs to a tile if
-all the pixels that it sees lie in it; the others couple tiles. Eq. 7 joins tiles by the lemma for (A + B C D)^-1,
-whose differences lose half the digits and more where the noise is far below the prior. Here a posterior is kept as a
-square root T of its covariance, T T^T, and the same update is made of orthogonal transformations. With H, g and
-Rv = S^2 of the measurements that are new, and m the mean before,
+A frame is cut into disjoint tiles of pixels that are independent in the prior. A measurement belongs to a tile if all
+pixels it depends on lie in the tile; the others couple tiles. Eq. 7 merges tiles by the matrix inversion lemma, whose
+differences lose half the digits or more if the noise is far below the prior. Here a posterior is stored as a square
+root T of its covariance, T T^T, and updated by orthogonal transformations. With H, g and Rv = S^2 of the new
+measurements and the previous mean m,
 
     B = S^-1 H T,    T (I + B^T B)^-1 T^T,    m + T (I + B^T B)^-1 B^T S^-1 (g - H m)
 
-are the covariance and the mean after. Of I + B^T B only as many directions differ from I as B has rows that tell
-something new, a small part of a tile's pixels, and only in these is it factorised.
+are the updated covariance and mean. I + B^T B differs from I in as many directions as B has independent rows, a small
+part of a tile's pixels, and only these are factorised.
 
-Variances are right to 1e-14 of each at any noise. What rounding leaves of T where tiles alone leave a direction open,
-1e-16 of the prior's deviation, is more beside a small noise: means were found right to 1e-13 of that deviation at a
-noise variance of 1e-2, to 2e-12 at 1e-6 and to 3e-9 at 1e-10 (the paper's lenses, five tiles of 19 x 19 at most).
+Variances are accurate to a relative 1e-14 at any noise. Where single tiles leave a direction undetermined, rounding
+errors of T, 1e-16 of the prior's standard deviation, exceed a small noise: means were accurate to 1e-13 of that
+standard deviation at a noise variance of 1e-2, to 2e-12 at 1e-6 and to 3e-9 at 1e-10 (the paper's lenses, up to five
+tiles of 19 x 19).
 """
 
 from __future__ import annotations
@@ -21,174 +22,175 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 
-from ..forms.sorted_qr import sorted_qr
+from ..forms.sorted_qr import Indices, sorted_qr
 from ..problem import Problem
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Indices = NDArray[np.intp]
-
-ROUNDING = 64 * float(np.finfo(np.float64).eps)  # of sums of products, for all that is lost before in T
-LARGEST = 1e150  # whose square is a number
-BLOCK = 64  # columns that LAPACK applies together
+ROUNDING = 64 * float(np.finfo(np.float64).eps)  # of sums of products, including earlier losses in T
+LARGEST = 1e150  # whose square is finite
+BLOCK = 64  # columns that LAPACK processes together
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """What is known of some pixels of a frame.
+    """Mean and covariance of some pixels of a frame.
 
-    pixels : (n,) which of the frame's pixels, in ascending order
-    mean : (n,) the estimate f^ of them
-    root : (n, K) T, with T T^T their covariance; its columns have no meaning of their own
+    pixels : (n,) indices of the pixels, in ascending order
+    mean : (n,) their estimate f^
+    root : (n, K) T, where T T^T is their covariance
     """
 
     pixels: Indices
-    mean: Vector
-    root: Matrix
+    mean: FloatArray
+    root: FloatArray
 
     @property
-    def covariance(self) -> Matrix:
+    def covariance(self) -> FloatArray:
         """T T^T: (n, n)."""
         return self.root @ self.root.T
 
     @property
-    def variance(self) -> Vector:
-        """The diagonal of T T^T: (n,), sums of squares and so never below 0."""
+    def variance(self) -> FloatArray:
+        """The diagonal of T T^T: (n,), as sums of squares."""
         return np.square(self.root).sum(axis=1)
 
 
-def cut(shape: tuple[int, int], tile: tuple[int, int]) -> list[Indices]:
-    """The pixels of tiles of (rows, columns) `tile`, row by row; those at the far ends may be smaller."""
+def disjoint_tiles(shape: tuple[int, int], tile: tuple[int, int]) -> list[Indices]:
+    """Return the pixels of tiles of (rows, columns) `tile`, row by row; those at the far ends may be smaller."""
     grid = np.arange(shape[0] * shape[1], dtype=np.intp).reshape(shape)
-    starts = [range(0, size, step) for size, step in zip(shape, tile, strict=True)]
-    return [grid[row : row + tile[0], column : column + tile[1]].ravel() for row in starts[0] for column in starts[1]]
+    starts = product(*(range(0, size, step) for size, step in zip(shape, tile, strict=True)))
+    return [grid[row : row + tile[0], column : column + tile[1]].ravel() for row, column in starts]
 
 
-def alone(problem: Problem, recorded: Vector, pixels: Indices) -> Posterior:
-    """A tile's posterior from the measurements that it has to itself, of a frame's `problem` and (M,) `recorded`.
+def tile_posterior(problem: Problem, recorded: FloatArray, pixels: Indices) -> Posterior:
+    """Return the posterior of a tile from its own measurements, of a frame's `problem` and (M,) `recorded`.
 
-    Raises InputError for a prior under which tiles are not independent, for pixels that are not the frame's or come
-    twice, and where one of its measurements is no number or is said to have no noise.
+    Raises InputError for correlated pixels, for pixels outside the frame or given twice, and if one of the tile's
+    measurements is not finite or has no noise.
     """
     if not problem.prior.independent:
-        raise InputError("tiles are joined under a prior of independent pixels only; solve the frame as a whole")
+        raise InputError("merging tiles needs a prior of independent pixels; solve the frame as a whole")
     tile = np.unique(pixels)
     if tile.size != pixels.size or tile.size == 0 or tile[0] < 0 or tile[-1] >= problem.unknowns:
-        raise InputError(f"a tile takes pixels from 0 to {problem.unknowns - 1}, each once and at least one")
+        raise InputError(f"expected pixels from 0 to {problem.unknowns - 1} in a tile, each once and at least one")
     prior = Posterior(tile, problem.prior.mean[tile], np.diag(problem.prior.root[tile]))
-    return _updated(prior, problem, recorded, np.flatnonzero(_sees_only(problem, tile)))
+    return _updated(prior, problem, recorded, np.flatnonzero(_inside(problem, tile)))
 
 
-def merge(first: Posterior, second: Posterior, problem: Problem, recorded: Vector) -> Posterior:
-    """Both tiles' posterior together: theirs side by side, and the measurements that see pixels of both and no others.
+def merge_posteriors(first: Posterior, second: Posterior, problem: Problem, recorded: FloatArray) -> Posterior:
+    """Return the joint posterior of two tiles, updated by the measurements that depend on pixels of both only.
 
-    Raises InputError if they share pixels, and where such a measurement is no number or is said to have no noise.
+    Raises InputError if they share pixels, and if such a measurement is not finite or has no noise.
     """
     pixels = np.concatenate([first.pixels, second.pixels])
     order = np.argsort(pixels, kind="stable")
     if np.unique(pixels).size != pixels.size:
-        raise InputError("tiles that are to be joined share pixels; cut the frame into tiles that do not overlap")
+        raise InputError("tiles to be merged share pixels; cut the frame into tiles that do not overlap")
     mean = np.concatenate([first.mean, second.mean])
-    beside: Matrix = linalg.block_diag(first.root, second.root)
-    coupling = _sees_only(problem, pixels)
-    for one in (first, second):
-        coupling &= ~_sees_only(problem, one.pixels)
-    return _updated(Posterior(pixels[order], mean[order], beside[order]), problem, recorded, np.flatnonzero(coupling))
+    root: FloatArray = linalg.block_diag(first.root, second.root)
+    coupling = _inside(problem, pixels) & ~_inside(problem, first.pixels) & ~_inside(problem, second.pixels)
+    return _updated(Posterior(pixels[order], mean[order], root[order]), problem, recorded, np.flatnonzero(coupling))
 
 
-def sweep(problem: Problem, recorded: Vector, tiles: Sequence[Indices]) -> Posterior:
-    """The posterior of all `tiles` together, each solved alone and joined to those before it.
+def merge_tiles(problem: Problem, recorded: FloatArray, tiles: Sequence[Indices]) -> Posterior:
+    """Return the posterior of all `tiles` together: each is estimated alone and merged with those before it.
 
-    If they are the whole frame, so are the measurements that are used. Raises InputError as `alone` and `merge` do.
+    If the tiles partition the frame, all measurements are used. Raises InputError as `tile_posterior` and
+    `merge_posteriors` do.
     """
     if not tiles:
-        raise InputError("expected one tile or more to sweep over, got none")
-    found = (alone(problem, recorded, tile) for tile in tiles)
-    return reduce(lambda done, tile: merge(done, tile, problem, recorded), found)
+        raise InputError("expected one tile or more to merge, got none")
+    posteriors = (tile_posterior(problem, recorded, tile) for tile in tiles)
+    return reduce(lambda merged, tile: merge_posteriors(merged, tile, problem, recorded), posteriors)
 
 
-def _sees_only(problem: Problem, pixels: Indices) -> NDArray[np.bool_]:
-    """Which measurements see some of these pixels and no others: (M,)."""
+def _inside(problem: Problem, pixels: Indices) -> BoolArray:
+    """True for measurements that depend on some of these pixels and on no others: (M,)."""
     inside = np.zeros(problem.unknowns)
     inside[pixels] = 1.0
     matrix = problem.matrix
-    seen = sparse.csr_array(((matrix.data != 0).astype(np.float64), matrix.indices, matrix.indptr), shape=matrix.shape)
-    within, beyond = np.asarray(seen @ inside), np.asarray(seen @ (1.0 - inside))
-    return (within > 0) & (beyond == 0)
+    pattern = sparse.csr_array(
+        ((matrix.data != 0).astype(np.float64), matrix.indices, matrix.indptr), shape=matrix.shape
+    )
+    return (np.asarray(pattern @ inside) > 0) & (np.asarray(pattern @ (1.0 - inside)) == 0)
 
 
-def _updated(before: Posterior, problem: Problem, recorded: Vector, some: Indices) -> Posterior:
-    """The posterior after some measurements more, as the module's text has it."""
-    _refuse(problem, recorded, some)
-    rows = sparse.csr_array(problem.matrix[some][:, before.pixels])
-    with np.errstate(all="ignore"):  # what overflows is refused
-        away = (recorded[some] - rows @ before.mean) / problem.deviation[some]
-        observed, doubt = _observed(rows, before.root, problem.deviation[some])
-    for values in (away, observed, doubt):
+def _updated(before: Posterior, problem: Problem, recorded: FloatArray, numbers: Indices) -> Posterior:
+    """Return the posterior after the measurements `numbers`, by the equations of the module docstring."""
+    _check_measurements(problem, recorded, numbers)
+    rows = sparse.csr_array(problem.matrix[numbers][:, before.pixels])
+    deviation = problem.deviation[numbers]
+    with np.errstate(all="ignore"):  # overflow is refused below
+        residual = (recorded[numbers] - rows @ before.mean) / deviation
+        whitened, rounding = _whitened(rows, before.root, deviation)
+    for values in (residual, whitened, rounding):
         if not np.abs(values).max(initial=0.0) < LARGEST:
-            raise InputError("so little noise beside the prior or the measurements leaves double precision; raise it")
-    triangle, told, order = _told(observed, np.linalg.norm(doubt, axis=0), away)
-    rank = told.size
+            raise InputError(
+                "the noise is too small relative to the prior or the measurements for double precision; raise it"
+            )
+    triangle, projected, order = _independent_rows(whitened, np.linalg.norm(rounding, axis=0), residual)
+    rank = projected.size
     if rank == 0:
         return before
-    turned, narrow = _turned(before.root[:, order], triangle)
+    rotated, narrow = _rotated(before.root[:, order], triangle)
     normal = sorted_qr(np.vstack([narrow.T, np.eye(rank)]))
-    step = normal.solve(np.concatenate([told, np.zeros(rank)])[:, None])[:, 0]
-    root = np.hstack([turned[:, :rank] @ normal.inverse(), turned[:, rank:]])
-    return Posterior(before.pixels, before.mean + turned[:, :rank] @ step, root)
+    step = normal.solve(np.concatenate([projected, np.zeros(rank)])[:, None])[:, 0]
+    root = np.hstack([rotated[:, :rank] @ normal.inverse(), rotated[:, rank:]])
+    return Posterior(before.pixels, before.mean + rotated[:, :rank] @ step, root)
 
 
-def _refuse(problem: Problem, recorded: Vector, some: Indices) -> None:
-    if recorded.shape != (problem.measurements,) or not np.isfinite(recorded[some]).all():
+def _check_measurements(problem: Problem, recorded: FloatArray, numbers: Indices) -> None:
+    if recorded.shape != (problem.measurements,) or not np.isfinite(recorded[numbers]).all():
         raise InputError(
             f"expected {problem.measurements} finite measurements, got others; leave dead pixels out first"
         )
-    if not (problem.noise_variance[some] > 0).all():
-        raise InputError("tiles are joined by measurements with noise only; set estimator.noise_variance above 0")
+    if not (problem.noise_variance[numbers] > 0).all():
+        raise InputError("merging tiles needs measurements with noise only; set estimator.noise_variance above 0")
 
 
-def _observed(rows: sparse.csr_array, root: Matrix, deviation: Vector) -> tuple[Matrix, Matrix]:
-    """B, (q, K), and how much of its entries may be rounding, (q, K); what may be nothing else is 0 in both.
+def _whitened(rows: sparse.csr_array, root: FloatArray, deviation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return B, (q, K), and bounds on the rounding errors of its entries; entries below the bound are 0 in both.
 
-    A tile alone leaves directions open that H sees nothing of. What rounding makes of their zeros is nothing beside
-    the prior but much beside a small noise, and would be taken for news of them.
+    A single tile leaves directions undetermined in which H T is exactly 0. Its rounding error there is negligible
+    beside the prior but not beside a small noise, and would act as a measurement.
     """
-    observed = np.asarray(rows @ root) / deviation[:, None]
-    doubt = ROUNDING * np.asarray(abs(rows) @ np.abs(root)) / deviation[:, None]
-    nothing = np.abs(observed) <= doubt
-    observed[nothing] = 0.0
-    doubt[nothing] = 0.0
-    return observed, doubt
+    whitened = np.asarray(rows @ root) / deviation[:, None]
+    rounding = ROUNDING * np.asarray(abs(rows) @ np.abs(root)) / deviation[:, None]
+    zero = np.abs(whitened) <= rounding
+    whitened[zero] = 0.0
+    rounding[zero] = 0.0
+    return whitened, rounding
 
 
-def _told(observed: Matrix, doubt: Vector, away: Vector) -> tuple[Matrix, Vector, Indices]:
-    """What measurements say without repeating one another: R, (r, K), Q^T S^-1 (g - H m), (r,), and an order.
+def _independent_rows(
+    whitened: FloatArray, rounding: FloatArray, residual: FloatArray
+) -> tuple[FloatArray, FloatArray, Indices]:
+    """Reduce measurements to independent rows: R, (r, K), Q^T S^-1 (g - H m), (r,), and the order of columns.
 
-    B = Q R with its columns in that order, by pivoting, so that directions of large variance come first. Where nothing
-    but rounding is left of a column, (K,) `doubt` of its norm, it becomes 0: then open directions stay apart from well
-    known ones, which are far smaller.
+    B = Q R with its columns in that order, by pivoting, so that directions of large variance come first. A remaining
+    column below its (K,) `rounding` error is set to 0; this keeps undetermined directions apart from well-determined
+    ones, which are far smaller.
     """
-    found = sorted_qr(observed)
-    last = min(observed.shape)
-    left = np.sqrt(np.cumsum(np.square(found.triangle)[::-1], axis=0)[::-1])
-    triangle = np.where(left > doubt[found.pivots], found.triangle, 0.0)
-    sound = np.diagonal(triangle) != 0
-    rank = last if sound.all() else int(np.argmin(sound))
-    return triangle[:rank], found.orthogonal[:, :rank].T @ away[found.rows], found.pivots
+    qr = sorted_qr(whitened)
+    remaining = np.sqrt(np.cumsum(np.square(qr.triangle)[::-1], axis=0)[::-1])
+    triangle = np.where(remaining > rounding[qr.pivots], qr.triangle, 0.0)
+    significant = np.diagonal(triangle) != 0
+    rank = min(whitened.shape) if significant.all() else int(np.argmin(significant))
+    return triangle[:rank], qr.orthogonal[:, :rank].T @ residual[qr.rows], qr.pivots
 
 
-def _turned(root: Matrix, triangle: Matrix) -> tuple[Matrix, Matrix]:
-    """T Q, (n, K), and W, (r, r), of R^T = Q [W; 0]; Q is never formed, so this costs 4 n K r operations."""
-    decompose: Any = linalg.qr
+def _rotated(root: FloatArray, triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return T Q, (n, K), and W, (r, r), of R^T = Q [W; 0]; Q is not formed, so this costs 4 n K r operations."""
+    qr: Any = linalg.qr
     lapack: Any = linalg.lapack
-    (reflectors, factors), narrow = decompose(triangle.T, mode="raw", check_finite=False)
-    turned, _, _ = lapack.dormqr("R", "N", reflectors, factors, root, BLOCK * root.shape[0])
-    return turned, narrow[: triangle.shape[0]]
+    (reflectors, factors), narrow = qr(triangle.T, mode="raw", check_finite=False)
+    rotated, _, _ = lapack.dormqr("R", "N", reflectors, factors, root, BLOCK * root.shape[0])
+    return rotated, narrow[: triangle.shape[0]]

@@ -1,18 +1,20 @@
-"""A frame in overlapping tiles, each reconstructed on its own from the measurements that see nothing else.
+"""A frame in overlapping tiles, each estimated from the measurements that depend on no pixel outside it.
 
-Of every tile the core is kept; the border, where measurements are missing that reach beyond it, is dropped: neighbours
-have it. Tiles in which H and the noise are the same share one factorisation.
+Only the core of each tile is kept. Its border, which lacks the measurements that extend beyond it, belongs to the cores
+of the neighbours. Tiles with the same H and noise share one factorisation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.processors import one_thread
 from ommatid.scenes.tables.estimation import EstimatorTable
 
@@ -22,15 +24,12 @@ from ..forms.form import Form
 from ..prior import Prior
 from ..problem import Problem
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-
-NEIGHBOURS = 9  # tiles whose errors go with a tile's: the variance of a sum is at most so many times the sum of theirs
+NEIGHBOURS = 9  # tiles with correlated errors: the variance of a sum is at most so many times the sum of theirs
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A window of the frame, and its core, both as slices of rows and of columns."""
+    """A window of the frame and its core, each as slices of rows and columns."""
 
     window: tuple[slice, slice]
     core: tuple[slice, slice]
@@ -43,31 +42,28 @@ class Tile:
 
     @property
     def kept(self) -> NDArray[np.intp]:
-        """Which pixels of the window, row by row, are the core's."""
-        inside = np.zeros(self.shape, dtype=np.bool_)
-        starts = [window.start for window in self.window]
-        rows, columns = (slice(core.start - at, core.stop - at) for core, at in zip(self.core, starts, strict=True))
-        inside[rows, columns] = True
+        """Indices of the core's pixels in the window, row by row."""
+        inside: BoolArray = np.zeros(self.shape, dtype=np.bool_)
+        top, left = (window.start for window in self.window)
+        rows, columns = self.core
+        inside[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = True
         return np.flatnonzero(inside)
 
 
-def cut(shape: tuple[int, int], size: int, overlap: int) -> list[Tile]:
-    """Tiles of at most `size` x `size` pixels whose cores, `overlap` less on each side, share out the frame."""
-    axes = [list(_cut(length, size, overlap)) for length in shape]
-    return [
-        Tile((rows, columns), (core_rows, core_columns))
-        for rows, core_rows in axes[0]
-        for columns, core_columns in axes[1]
-    ]
+def overlapping_tiles(shape: tuple[int, int], size: int, overlap: int) -> list[Tile]:
+    """Return tiles of at most `size` x `size` pixels whose cores, `overlap` less on each side, partition the frame."""
+    rows, columns = (list(_intervals(length, size, overlap)) for length in shape)
+    return [Tile((row[0], column[0]), (row[1], column[1])) for row, column in product(rows, columns)]
 
 
-def _cut(length: int, size: int, overlap: int) -> Iterator[tuple[slice, slice]]:
+def _intervals(length: int, size: int, overlap: int) -> Iterator[tuple[slice, slice]]:
+    """Windows and cores along one axis."""
     first = 0
     while first < length:
         start = max(first - overlap, 0)
         stop = min(start + size, length)
         last = length if stop == length else stop - overlap
-        if stop == length:  # the last tile is as large as the others, the more it sees
+        if stop == length:  # the last window gets full size, too: more measurements lie inside it
             start = max(length - size, 0)
         yield slice(start, stop), slice(first, last)
         first = last
@@ -75,79 +71,83 @@ def _cut(length: int, size: int, overlap: int) -> Iterator[tuple[slice, slice]]:
 
 @dataclass(frozen=True)
 class TileTask:
-    """Tiles that differ in what was recorded alone: the work of one factorisation.
+    """Tiles that differ only in their measurements, so that one factorisation serves all.
 
-    recorded : (m, tiles) g;  noise : (m,) variances by name, of the noise as it is
-    kept : which pixels of a window count;  truth : (n, tiles) where the image is known
+    recorded : (m, tiles) g;  noise : (m,) actual noise variances by cause, empty to estimate images only
+    kept : indices of the core's pixels;  truth : (n, tiles) true images, if known
     """
 
     matrix: sparse.csr_array
-    recorded: Matrix
-    believed: Vector
-    noise: dict[str, Vector]
+    recorded: FloatArray
+    expected_noise: FloatArray
+    noise: dict[str, FloatArray]
     prior: Prior
     kept: NDArray[np.intp]
-    told: EstimatorTable
-    truth: Matrix | None = None
-    image_only: bool = False
+    settings: EstimatorTable
+    truth: FloatArray | None = None
+
+    @property
+    def problem(self) -> Problem:
+        """The inverse problem of one tile."""
+        return Problem(self.matrix, self.prior, self.expected_noise)
 
 
 @dataclass(frozen=True)
-class SolvedTile:
-    """What becomes of a piece, for the pixels kept: images (kept, tiles); the rest is the same for all its tiles.
+class SolvedTiles:
+    """Images of the kept pixels, (kept, tiles), and their error, the same for all tiles of a task.
 
-    variance, resolved : (kept,), of Eq. 5 and of A H;  missing, parts : means over them of what Eq. 5 consists of
-    given : for each tile, sums over them of the error to be expected where the truth is known, and its variance
+    variance, resolved : (kept,) Eq. 5 and the diagonal of A H;  missing, parts : means of the parts of Eq. 5
+    given : (2, tiles) sums over the pixels of the expected error for the true image, and their variances
     """
 
-    image: Matrix
+    image: FloatArray
     solver: Solver
-    variance: Vector
-    resolved: Vector
+    variance: FloatArray
+    resolved: FloatArray
     missing: float
     parts: dict[str, float]
-    given: Matrix | None
+    given: FloatArray | None
 
 
-def work(piece: TileTask) -> SolvedTile:
-    """Factorise once, then estimate every tile of a piece. Raises InputError where no form is right."""
-    problem = Problem(piece.matrix, piece.prior, piece.believed)
-    method = piece.told.method if piece.told.method in FORMS else "auto"
-    first = estimate(problem, piece.recorded[:, 0], method, piece.told.tolerance)
-    image = first.image[piece.kept, None]
-    if piece.recorded.shape[1] > 1:
-        away = piece.recorded - (problem.matrix @ problem.prior.mean)[:, None]
-        image = (problem.prior.mean[:, None] + first.form.gain(away))[piece.kept]
-    if piece.image_only:
-        nothing = np.zeros(0)
-        return SolvedTile(image, first.solver, nothing, nothing, 0.0, {}, None)
-    expected = expected_error(first.form, piece.noise, pixels=piece.kept)
-    given = None if piece.truth is None else _given(piece, first.form, piece.truth)
-    return SolvedTile(
+def solve_tiles(task: TileTask) -> SolvedTiles:
+    """Factorise once and estimate every tile of a task. Raises InputError if no form reaches the tolerance."""
+    problem = task.problem
+    method = task.settings.method if task.settings.method in FORMS else "auto"
+    first = estimate(problem, task.recorded[:, 0], method, task.settings.tolerance)
+    image = first.image[task.kept, None]
+    if task.recorded.shape[1] > 1:
+        residual = task.recorded - (problem.matrix @ problem.prior.mean)[:, None]
+        image = (problem.prior.mean[:, None] + first.form.gain(residual))[task.kept]
+    if not task.noise:
+        return SolvedTiles(image, first.solver, np.zeros(0), np.zeros(0), 0.0, {}, None)
+    expected = expected_error(first.form, task.noise, pixels=task.kept)
+    given = None if task.truth is None else _error_given(task, first.form, task.truth)
+    return SolvedTiles(
         image, first.solver, expected.variance, expected.resolved, expected.missing, expected.parts, given
     )
 
 
-def work_alone(piece: TileTask) -> SolvedTile:
-    """The same in a process of its own: by one thread, for more of them change the last digits."""
+def solve_tiles_single_threaded(task: TileTask) -> SolvedTiles:
+    """Solve a task in a worker process with one thread, because the number of threads changes the last digits."""
     with one_thread():
-        return work(piece)
+        return solve_tiles(task)
 
 
-def _given(piece: TileTask, form: Form, truth: Matrix) -> Matrix:
-    """(2, tiles): |(I - A H)(f - f0)|^2 + trace(A Rvm A^T) over the pixels kept, and at most so much variance of it."""
-    away = truth - form.problem.prior.mean[:, None]
-    bias = (away - form.gain(form.problem.matrix @ away))[piece.kept]
-    actual = np.sum(list(piece.noise.values()), axis=0)
-    _, negative = form.columns(piece.kept)
-    together = negative.T @ (actual[:, None] * negative)
-    own = 4 * np.einsum("it,it->t", bias, together @ bias) + 2 * float(np.square(together).sum())
-    return np.stack([np.square(bias).sum(axis=0) + float(np.trace(together)), NEIGHBOURS * own])
+def _error_given(task: TileTask, form: Form, truth: FloatArray) -> FloatArray:
+    """(2, tiles): |(I - A H)(f - f0)|^2 + trace(A Rvm A^T) over the kept pixels, and an upper bound on its variance."""
+    deviation = truth - form.problem.prior.mean[:, None]
+    bias = (deviation - form.gain(form.problem.matrix @ deviation))[task.kept]
+    actual = np.sum(list(task.noise.values()), axis=0)
+    _, negative = form.pixel_solutions(task.kept)
+    noise_covariance = negative.T @ (actual[:, None] * negative)
+    own = 4 * np.einsum("it,it->t", bias, noise_covariance @ bias) + 2 * float(np.square(noise_covariance).sum())
+    return np.stack([np.square(bias).sum(axis=0) + float(np.trace(noise_covariance)), NEIGHBOURS * own])
 
 
-def pulled(piece: TileTask, weights: Vector) -> Vector:
-    """A^T w of a tile: (n,) weights of its pixels to (m,)."""
-    problem = Problem(piece.matrix, piece.prior, piece.believed)
-    form = estimate(problem, piece.recorded[:, 0], tolerance=piece.told.tolerance).form
-    _, negative = form.solve(problem.prior.gather(weights[:, None]), np.zeros((problem.measurements, 1)))
+def transposed_gain(task: TileTask, weights: FloatArray) -> FloatArray:
+    """Return A^T w of a tile: (n,) weights of its pixels to (m,)."""
+    problem = task.problem
+    form = estimate(problem, task.recorded[:, 0], tolerance=task.settings.tolerance).form
+    shift = problem.prior.apply_root_transposed(weights[:, None])
+    _, negative = form.solve(shift, np.zeros((problem.measurements, 1)))
     return -negative[:, 0]

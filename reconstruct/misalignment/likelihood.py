@@ -195,10 +195,10 @@ def likelihood_at(recording: MisalignedRecording, scores: FloatArray) -> Likelih
     inner[np.diag_indices_from(inner)] += 1.0
     factor = np.asarray(linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False))
     residual: FloatArray = recording.recorded - matrix @ prior.mean
-    gathered = prior.gather(weighted.T @ residual)
+    gathered = prior.apply_root_transposed(weighted.T @ residual)
     u: FloatArray = np.asarray(linalg.cho_solve((factor, True), gathered, check_finite=False))
-    multipliers: FloatArray = (residual - matrix @ prior.spread(u)) / noise
+    multipliers: FloatArray = (residual - matrix @ prior.apply_root(u)) / noise
     squares = float(noise @ multipliers**2 + u @ u + scores @ scores)
     determinant = float(np.log(noise).sum() + 2 * np.log(np.diagonal(factor)).sum())
-    image = prior.mean + prior.spread(u)
+    image = prior.mean + prior.apply_root(u)
     return LikelihoodPoint(recording, scores, matrix, factor, 0.5 * (squares + determinant), multipliers, image)

@@ -34,7 +34,7 @@ class RobustMethod(Method):
         recorded = white.vector(task.recorded[task.used])
         return white, estimate(problem, recorded, task.settings.method, task.settings.tolerance)
 
-    def estimated(self) -> FloatArray:
+    def estimate_image(self) -> FloatArray:
         """Return f^ alone: (N,)."""
         return self._solved[1].image
 
@@ -68,11 +68,11 @@ class AlignedMethod(Method):
 
     @cached_property
     def _dense(self) -> DenseMethod:
-        return DenseMethod(replace(self.task, model=_aligned_model(self.task.model, self.alignment)), self.hands)
+        return DenseMethod(replace(self.task, model=_aligned_model(self.task.model, self.alignment)), self.execution)
 
-    def estimated(self) -> FloatArray:
+    def estimate_image(self) -> FloatArray:
         """Return f^ alone: (N,)."""
-        return self._dense.estimated()
+        return self._dense.estimate_image()
 
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error with the given noise; the remaining uncertainty of the fit adds to it."""

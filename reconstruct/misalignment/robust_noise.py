@@ -183,7 +183,7 @@ def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray]) -> 
     weights = np.zeros(form.problem.measurements)
     for start in range(0, count, CHUNK):
         pixels = np.arange(start, min(start + CHUNK, count))
-        u, negative = form.columns(pixels)
+        u, negative = form.pixel_solutions(pixels)
         prior, noisy = np.square(u).sum(axis=0), np.square(negative).sum(axis=0)
         variance[pixels] = prior + noisy
         missing += float(prior.sum()) / count

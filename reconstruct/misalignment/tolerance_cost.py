@@ -38,7 +38,7 @@ def misalignment_variance(form: Form, used: BoolArray, camera: Camera, prior: Pr
     added = np.empty(form.problem.unknowns)
     for chunk, _, u, negative in solved_columns(form, np.arange(form.problem.unknowns)):
         shifted = shift.T @ negative
-        in_prior = prior.gather(shifted)
+        in_prior = prior.apply_root_transposed(shifted)
         spread = np.zeros(negative.shape[1])
         for rows, block in zip(slices, blocks, strict=True):
             spread += np.sum(negative[rows] * (block @ negative[rows]), axis=0)

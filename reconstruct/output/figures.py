@@ -1,30 +1,38 @@
-"""Pictures of a result: the estimate as it is, and an overview with its error and its error bars.
+"""Images of a result: the estimate by itself, and an overview with its error and its standard deviation.
 
 Maps are drawn upright with pixels of the target along both axes; values are in the target's units, 0 to 255.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.stack import Stack
 
 from ..restore import Reconstruction
 
-Image = NDArray[np.float64]
-
 COLUMN_INCHES = 3.4
 RESOLUTION = 110
 
 
-def write_estimate(path: Path, estimate: Image) -> None:
-    """Write an estimate, (rows, columns), as 8-bit PNG, a pixel for a pixel; values outside 0 to 255 are clipped."""
+@dataclass(frozen=True)
+class OverviewPanel:
+    """A map of the overview, and the colour scale that suits its content."""
+
+    title: str
+    image: FloatArray
+    content: Literal["values", "recorded", "error", "deviation"]
+
+
+def write_estimate(path: Path, estimate: FloatArray) -> None:
+    """Write an estimate, (rows, columns), as 8-bit PNG, one pixel each; values outside 0 to 255 are clipped."""
     from skimage import io
 
     pixels = np.clip(np.round(estimate), 0, WHITE).astype(np.uint8)
@@ -39,74 +47,68 @@ def write_overview(path: Path, title: str, stack: Stack, restoration: Reconstruc
 
     shape = restoration.shape
     estimate = restoration.estimate.reshape(shape)
-    above = _recorded(stack)
-    below: list[tuple[str, Image, str]] = [("Estimate", estimate, "values")]
+    above, below = _sub_images(stack), [OverviewPanel("Estimate", estimate, "values")]
     if restoration.truth is not None:
         truth = restoration.truth.reshape(shape)
-        above.insert(0, ("Truth", truth, "values"))
-        below.append(("Error: estimate minus truth", estimate - truth, "signed"))
+        above.insert(0, OverviewPanel("Truth", truth, "values"))
+        below.append(OverviewPanel("Error: estimate minus truth", estimate - truth, "error"))
     deviation = np.sqrt(restoration.expected.variance).reshape(shape)
-    below.append(("Expected deviation (error bars)", deviation, "spread"))
+    below.append(OverviewPanel("Expected standard deviation", deviation, "deviation"))
     across = max(len(above), len(below) + 1)
     figure: Any = Figure(figsize=(COLUMN_INCHES * across, 7.2), dpi=RESOLUTION, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
     grey = _grey_range(restoration)
-    for number, panels in enumerate((above, below)):
-        for place, (name, image, kind) in enumerate(panels):
-            _panel(figure, figure.add_subplot(2, across, 1 + number * across + place), name, image, kind, grey)
-    _budget(figure.add_subplot(2, across, across + len(below) + 1), restoration)
+    for line, panels in enumerate((above, below)):
+        for index, panel in enumerate(panels):
+            _draw_panel(figure, figure.add_subplot(2, across, 1 + line * across + index), panel, grey)
+    _draw_budget(figure.add_subplot(2, across, across + len(below) + 1), restoration)
     write_whole(path, lambda beside: figure.savefig(beside, format="png"))
 
 
-def _budget(axes: Any, restoration: Reconstruction) -> None:
-    parts = {name.replace("_", " "): part for name, part in restoration.budget().items() if part > 0}
-    shares = [100 * part / restoration.expected.mse for part in parts.values()]
-    bars = axes.barh(list(parts), shares, color="tab:blue")
-    axes.bar_label(bars, [f"{share:.2g} %" for share in shares], padding=3, fontsize=8)
+def _draw_budget(axes: Any, restoration: Reconstruction) -> None:
+    mse = restoration.expected.mse
+    shares = {name.replace("_", " "): 100 * part / mse for name, part in restoration.budget().items() if part > 0}
+    bars = axes.barh(list(shares), list(shares.values()), color="tab:blue")
+    axes.bar_label(bars, [f"{share:.2g} %" for share in shares.values()], padding=3, fontsize=8)
     axes.invert_yaxis()
-    axes.set_xlim(0, 1.25 * max(shares))
+    axes.set_xlim(0, 1.25 * max(shares.values()))
     axes.set_box_aspect(0.9)
-    axes.set_title(
-        f"Where the expected squared error\nof {restoration.expected.mse:.3g} a pixel comes from", fontsize=10
-    )
+    axes.set_title(f"Causes of the expected squared error\nof {mse:.3g} per pixel", fontsize=10)
     axes.set_xlabel("share (%)", fontsize=8)
     axes.tick_params(labelsize=8)
 
 
 def _grey_range(restoration: Reconstruction) -> tuple[float, float]:
-    shown = restoration.estimate if restoration.truth is None else restoration.truth
-    low, high = float(shown.min()), float(shown.max())
+    image = restoration.estimate if restoration.truth is None else restoration.truth
+    low, high = float(image.min()), float(image.max())
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 
-def _recorded(stack: Stack) -> list[tuple[str, Image, str]]:
-    """The middle sub-image of each lens type."""
-    chosen: list[tuple[str, Image, str]] = []
+def _sub_images(stack: Stack) -> list[OverviewPanel]:
+    """Return the middle sub-image of each lens type."""
+    panels: list[OverviewPanel] = []
     subs = list(zip(stack.camera.sub_imagers, stack.images(), strict=True))
-    for kind in stack.camera.types:
-        members = [(sub, image) for sub, image in subs if sub.type == kind]
+    for lens_type in stack.camera.types:
+        members = [(sub, image) for sub, image in subs if sub.type == lens_type]
         sub, image = members[len(members) // 2]
-        name = f"Type {kind.name}, sub-image {sub.k}, {sub.l} of {kind.array[0]} x {kind.array[1]}"
-        chosen.append((f"{name}\nmagnification {1 / kind.ratio}", image, "recorded"))
-    return chosen
+        rows, columns = lens_type.array
+        name = f"Type {lens_type.name}, sub-image {sub.k}, {sub.l} of {rows} x {columns}"
+        panels.append(OverviewPanel(f"{name}\nmagnification {1 / lens_type.ratio}", image, "recorded"))
+    return panels
 
 
-def _panel(figure: Any, axes: Any, name: str, image: Image, kind: str, grey: tuple[float, float]) -> None:
+def _draw_panel(figure: Any, axes: Any, panel: OverviewPanel, grey: tuple[float, float]) -> None:
     low, high, colours, label = *grey, "gray", "value (0 to 255)"
-    if kind == "signed":
-        high = float(np.abs(image).max()) or 1.0
+    if panel.content == "error":
+        high = float(np.abs(panel.image).max()) or 1.0
         low, colours, label = -high, "RdBu_r", "error (units of the values)"
-    elif kind == "spread":
-        low, high, colours, label = (
-            0.0,
-            float(image.max()) or 1.0,
-            "viridis",
-            "standard deviation (units of the values)",
-        )
-    drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
-    axes.set_title(name, fontsize=10)
-    unit = "sensor pixels" if kind == "recorded" else "target pixels"
+    elif panel.content == "deviation":
+        low, high, colours = 0.0, float(panel.image.max()) or 1.0, "viridis"
+        label = "standard deviation (units of the values)"
+    drawn = axes.imshow(panel.image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+    axes.set_title(panel.title, fontsize=10)
+    unit = "sensor pixels" if panel.content == "recorded" else "target pixels"
     axes.set_xlabel(f"column ({unit})", fontsize=8)
     axes.set_ylabel(f"row ({unit})", fontsize=8)
     axes.tick_params(labelsize=8)

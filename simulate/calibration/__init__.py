@@ -1,1 +1,1 @@
-"""H from rendered point sources or traced rays: entries, their uncertainty, and fits of few numbers."""
+"""H from rendered point sources or traced rays: entries, their uncertainty, and parametric fits."""

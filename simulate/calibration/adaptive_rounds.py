@@ -1,8 +1,8 @@
-"""Calibration until H is known well enough for what it is used for: rounds of ever more samples.
+"""Calibration with as many samples as the use of H justifies: rounds with more and more samples.
 
-What a round's uncertainty of H adds to the expected error is judged by whoever reconstructs with it; this module jumps
-to the samples that bring it below a tenth of all the rest, by the exponent with which it has fallen. Each round stands
-for itself. Grids of samples fit the edges of pixels of f where the lens types allow it, see `passes.on_grid`.
+A stopping rule says what a round's uncertainty of H adds to the expected error; this module chooses the samples that
+bring it below a tenth of all the rest, by the exponent with which it has fallen. Each round stands alone. Grids of
+samples fit the edges of pixels of f where the lens types allow it, see `passes.on_grid`.
 """
 
 from __future__ import annotations
@@ -28,65 +28,69 @@ from .point_sources import Plans
 from .stopping_rule import StoppingRule
 
 GOAL = 0.1  # of all the rest of the expected error: what the uncertainty of H may add
-DONE, AIM = 0.025, 0.0125  # with how little a round is content, and what it is planned for
-LEAST, MOST, MOST_FLOAT32 = 256, 2**19, 40960  # samples a pixel of a round; the last where sums are float32
-MOST_EXACT = 2**16  # samples a pixel of a pass where they are not
-LEAPS = (2.0, 64.0)  # from the samples of a round to those of the next
+DONE, AIM = 0.025, 0.0125  # addition at which a round is accepted, and the one it is planned for
+LEAST, MOST, MOST_FLOAT32 = 256, 2**19, 40960  # samples per pixel of a round; the last if sums are float32
+MOST_EXACT = 2**16  # samples per pixel of a pass if sums are float64
+LEAPS = (2.0, 64.0)  # least and largest growth of the samples from one round to the next
 
 
 def calibrate_until(
     setup: Setup,
-    judge: StoppingRule | None,
+    stopping_rule: StoppingRule | None,
     progress: Progress = no_progress,
-    partial: Checkpoint | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Model:
-    """The first model whose uncertainty adds little, or the one of the most samples; its record says what it took.
+    """Return the first model whose uncertainty adds little, or the one with the most samples; its record lists all.
 
-    Raises ValueError without a judge, and what calibration raises.
+    Raises ValueError without a stopping rule, and what calibration raises.
     """
-    if judge is None:
-        raise ValueError("calibration.samples 'auto' needs somebody to say when it is enough")
+    if stopping_rule is None:
+        raise ValueError("calibration.samples 'auto' needs a stopping rule, got none")
     scene = setup.scene
-    exact = not choose(scene.render.variant).startswith("scalar")
-    most = MOST if exact else MOST_FLOAT32
-    state = {} if partial is None else partial.state()
+    float64 = not choose(scene.render.variant).startswith("scalar")
+    most = MOST if float64 else MOST_FLOAT32
+    state = {} if checkpoint is None else checkpoint.state()
     tried: list[dict[str, Any]] = json.loads(str(state["tried"])) if "tried" in state else []
     while True:
         samples = _next(tried, EXPONENTS.get(scene.render.sampler, STRATIFIED), most)
-        plans = plans_of(setup, samples, exact)
-        number = scene.calibration.model_copy(update={"samples": samples})
-        told = replace(setup, scene=scene.model_copy(update={"calibration": number}))
-        model = rendered_model(told, progress, None, plans, exact)
+        plans = plans_of(setup, samples, float64)
+        model = rendered_model(
+            replace(setup, scene=_with_samples(scene, samples)), progress, plans=plans, float64=float64
+        )
         spent = {name: plan.total for name, plan in plans.items()}
-        tried.append({"asked": max(spent.values()), "samples": spent, "adds": judge.added_error(model)})
+        tried.append({"asked": max(spent.values()), "samples": spent, "adds": stopping_rule.added_error(model)})
         if tried[-1]["adds"] <= DONE or samples >= most:
-            break  # and whoever is stopped before the model is written does this round again, not one more
-        if partial is not None:
-            kept = json.dumps(tried)
-            partial.offer(lambda kept=kept: {"tried": np.array(kept)})
-    how = {
+            break  # not in the checkpoint: a run that is interrupted before the model is written repeats this round
+        if checkpoint is not None:
+            text = json.dumps(tried)
+            checkpoint.offer(lambda text=text: {"tried": np.array(text)})
+    adaptive = {
         "goal": GOAL,
         "adds": tried[-1]["adds"],
         "reached": tried[-1]["adds"] <= GOAL,
-        "judged_by": judge.description,
+        "judged_by": stopping_rule.description,
+        "tried": tried,
     }
-    totals = [sum(one["samples"][name] for one in tried) for name in plans]
-    counted = {"samples": max(totals), "fewest_samples": min(totals), "auto": {**how, "tried": tried}}
-    return replace(model, scene=_open(model.scene), record=model.record | counted)
+    totals = [sum(each["samples"][name] for each in tried) for name in plans]
+    counts = {"samples": max(totals), "fewest_samples": min(totals), "auto": adaptive}
+    return replace(model, scene=_with_samples(model.scene, "auto"), record=model.record | counts)
 
 
-def plans_of(setup: Setup, samples: int, exact: bool) -> Plans:
-    """Of each lens type, about so many samples a pixel on a grid that fits the edges of its pixels of f."""
-    scene = setup.scene
-    alike = scene.calibration.fit is not None  # which counts on equal numbers
-    most, sampler = MOST_EXACT if exact else MOST_SAMPLES, scene.render.sampler
+def plans_of(setup: Setup, samples: int, float64: bool) -> Plans:
+    """Return plans of about `samples` per pixel, by lens type, on grids that fit the edges of pixels of f.
+
+    A fit of the geometry takes the same plan for all, since it assumes equal numbers.
+    """
+    fits = setup.scene.calibration.fit is not None
+    most, sampler = MOST_EXACT if float64 else MOST_SAMPLES, setup.scene.render.sampler
     return {
-        kind.name: on_grid(samples, sampler, 1 if alike else cells_of(kind.ratio), most) for kind in setup.camera.types
+        lens_type.name: on_grid(samples, sampler, 1 if fits else cells_of(lens_type.ratio), most)
+        for lens_type in setup.camera.types
     }
 
 
 def _next(tried: list[dict[str, Any]], exponent: float, most: int) -> int:
-    """Samples of the next round."""
+    """Return the samples of the next round."""
     if not tried:
         return LEAST
     asked, adds = tried[-1]["asked"], tried[-1]["adds"]
@@ -97,7 +101,6 @@ def _next(tried: list[dict[str, Any]], exponent: float, most: int) -> int:
     return min(ceil(min(max(asked * (adds / AIM) ** (1 / exponent), fewest), largest)), most)
 
 
-def _open(scene: Scene) -> Scene:
-    """The scene with the number of samples left open, as it was asked for."""
-    told = scene.calibration.model_copy(update={"samples": "auto"})
-    return scene.model_copy(update={"calibration": told})
+def _with_samples(scene: Scene, samples: int | str) -> Scene:
+    calibration = scene.calibration.model_copy(update={"samples": samples})
+    return scene.model_copy(update={"calibration": calibration})

@@ -1,4 +1,4 @@
-"""H entry by entry, from rays or rendered point sources: each entry with its variance."""
+"""H entry by entry, from rays or rendered point sources, each entry with its variance."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse, stats
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
@@ -26,13 +26,13 @@ from .point_sources import Plans, Responses, responses_from_points
 def rendered_model(
     setup: Setup,
     progress: Progress = no_progress,
-    partial: Checkpoint | None = None,
+    checkpoint: Checkpoint | None = None,
     plans: Plans | None = None,
-    exact: bool = False,
+    float64: bool = False,
 ) -> Model:
-    """H by rays or point sources, with so many samples as the scene or the plans of the lens types say.
+    """Determine H by rays or point sources, with the samples of the scene or of the plans of the lens types.
 
-    exact : that sums are taken for float64, where they are
+    float64 : True if the renderer sums in float64, whose rounding is then neglected
     """
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     record = dict[str, Any](method=scene.calibration.method)
@@ -41,9 +41,9 @@ def rendered_model(
 
         responses = responses_from_rays(setup, progress, plans)
     else:
-        responses = responses_from_points(setup, progress, partial, plans)
-    if exact:
-        responses = replace(responses, summed=1)
+        responses = responses_from_points(setup, progress, checkpoint, plans)
+    if float64:
+        responses = replace(responses, float32_samples=1)
     variance = entry_variances(responses, camera)
     if scene.calibration.fit == "geometry":
         from .geometry_fit import fit_geometry
@@ -59,26 +59,26 @@ def rendered_model(
     return Model(setup.resolved, camera, responses.matrix, variance, responses.batches, record)
 
 
-def _compared(responses: Responses, variance: NDArray[np.float64], camera: Camera) -> dict[str, Any]:
-    """How far H lies from the ideal one, where that has a closed form."""
-    if any(kind.optics.distortion is not None and camera.is_blurred(kind) for kind in camera.types):
+def _compared(responses: Responses, variance: FloatArray, camera: Camera) -> dict[str, Any]:
+    """Compare H with the ideal one, if that has a closed form."""
+    if any(lens.optics.distortion is not None and camera.is_blurred(lens) for lens in camera.types):
         return {}
     return {"agreement": agreement(responses.matrix, variance, camera, responses.passes)}
 
 
-def entry_variances(responses: Responses, camera: Camera) -> NDArray[np.float64]:
-    """Variances of H's entries, drawn towards their sub-imager's mean and never below float32's rounding."""
+def entry_variances(responses: Responses, camera: Camera) -> FloatArray:
+    """Return the variances of H's entries, shrunk towards their sub-imager's mean and never below rounding."""
     starts = responses.matrix.indptr
-    settled = np.empty_like(responses.variance)
-    for place in camera.slices():
-        stored = slice(int(starts[place.start]), int(starts[place.stop]))
-        settled[stored] = shrink_variances(responses.variance[stored], responses.passes)
-    summed = responses.samples if responses.summed is None else responses.summed
-    return np.maximum(settled, rounding_variance(responses.matrix.data, summed))
+    shrunk = np.empty_like(responses.variance)
+    for rows in camera.slices():
+        stored = slice(int(starts[rows.start]), int(starts[rows.stop]))
+        shrunk[stored] = shrink_variances(responses.variance[stored], responses.passes)
+    summed = responses.samples if responses.float32_samples is None else responses.float32_samples
+    return np.maximum(shrunk, rounding_variance(responses.matrix.data, summed))
 
 
-def agreement(matrix: sparse.csr_array, variance: NDArray[np.float64], camera: Camera, passes: int) -> dict[str, float]:
-    """How far H lies from the ideal one: RMS difference, largest z, and the chance of so large a one (Sidak).
+def agreement(matrix: sparse.csr_array, variance: FloatArray, camera: Camera, passes: int) -> dict[str, float]:
+    """Compare H with the ideal one: RMS difference, largest z, and the chance of a larger z (Sidak).
 
     Over every entry that either of them has. The chance takes z as Student's t with one degree fewer than passes.
     """
@@ -89,10 +89,10 @@ def agreement(matrix: sparse.csr_array, variance: NDArray[np.float64], camera: C
     known = sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
     # Where no ray has hit there is no scatter either: such an entry counts as uncertain as the others are on average.
     unseen = float(variance.mean())
-    spread = np.asarray(known[difference.nonzero()], dtype=np.float64).ravel()
-    spread[spread == 0] = unseen
+    variances = np.asarray(known[difference.nonzero()], dtype=np.float64).ravel()
+    variances[variances == 0] = unseen
     values = np.asarray(difference[difference.nonzero()], dtype=np.float64).ravel()
-    largest = float(np.max(np.abs(values) / np.sqrt(spread), initial=0.0))
+    largest = float(np.max(np.abs(values) / np.sqrt(variances), initial=0.0))
     single = 2 * float(stats.t.sf(largest, passes - 1))
     chance = -np.expm1(entries * np.log1p(-single)) if single < 1 else 1.0
     rms = float(np.sqrt((difference.data**2).sum() / max(entries, 1)))

@@ -1,4 +1,4 @@
-"""How far the H of a few numbers is from measured entries, and the numbers for which it is least far.
+"""Deviance between measured entries of H and those of a geometry, and its minimisation.
 
 The rays of a pixel are a draw from its row of H, so the measure is the multinomial deviance of all cells: the entries,
 those that are zero included, and the light that lands beside the target. Each share, h measured and p of the model, is
@@ -14,47 +14,44 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
 
 from .geometry_model import BLUR, FEW, WIDE, entries, scales
 
-Vector = NDArray[np.float64]
-Whole = NDArray[np.int64]
-
-LEAST_BLUR = 0.05  # pixels of f; nothing tells less from none
+LEAST_BLUR = 0.05  # pixels of f; a smaller blur cannot be distinguished from none
 STEPS, HALVINGS = 20, 8
-SETTLED = 1e-5  # relative gain of deviance below which a fit is done
-NEAR = 0.01  # pixels of f within which derivatives are taken for the same until a fit is done
+SETTLED = 1e-5  # relative gain of deviance below which a fit has converged
+NEAR = 0.01  # pixels of f within which derivatives are reused before convergence
 DIFFERENCE = 1e-4  # pixels of f, of derivatives
-PAIRS = 3  # of displacements, for derivatives of a blur that is not wide: they need not be as good as H
+PAIRS = 3  # of displacements, for derivatives of a blur that is not wide: they need not be as accurate as H
 
 
 @dataclass(frozen=True)
 class EntryTable:
-    """Shares of light by place: `keys` rise, pixel * (N + 1) + texel, texel N for what lands beside the target."""
+    """Shares of light by cell: `keys` rise, pixel * (N + 1) + texel, texel N for the light beside the target."""
 
-    keys: Whole
-    values: Vector
+    keys: IntArray
+    values: FloatArray
 
-    def at(self, keys: Whole) -> Vector:
-        """The shares at other places, 0 where there is none."""
-        place = np.minimum(np.searchsorted(self.keys, keys), self.keys.size - 1)
-        return np.where(self.keys[place] == keys, self.values[place], 0.0)
+    def at(self, keys: IntArray) -> FloatArray:
+        """Return the shares of other cells, 0 where there is none."""
+        index = np.minimum(np.searchsorted(self.keys, keys), self.keys.size - 1)
+        return np.where(self.keys[index] == keys, self.values[index], 0.0)
 
 
 def entry_table(matrix: sparse.csr_array) -> EntryTable:
-    """Entries of some rows of H, and what of each row is missing to 1."""
-    found = with_outside(matrix)
-    return EntryTable(found.keys, np.maximum(found.values, 0.0))
+    """Return the entries of some rows of H, and the part of each row that is missing to 1."""
+    table = with_outside(matrix)
+    return EntryTable(table.keys, np.maximum(table.values, 0.0))
 
 
 def with_outside(matrix: sparse.csr_array, whole: float = 1.0) -> EntryTable:
-    """Entries of some rows, (pixels, N), and what of each row is missing to `whole`."""
+    """Return the entries of some rows, (pixels, N), and the part of each row that is missing to `whole`."""
     pixels, texels = matrix.shape
     rows = np.repeat(np.arange(pixels), np.diff(matrix.indptr))
     keys = np.concatenate([rows * (texels + 1) + matrix.indices, np.arange(pixels) * (texels + 1) + texels])
@@ -65,36 +62,36 @@ def with_outside(matrix: sparse.csr_array, whole: float = 1.0) -> EntryTable:
 
 @dataclass(frozen=True)
 class Derivatives:
-    """Of shares by the free numbers, at the numbers `where`: `jacobian` is (cells, free numbers), cells at `keys`."""
+    """Derivatives of shares by the free parameters at `where`: `jacobian`, (cells, free), of the cells `keys`."""
 
-    where: Vector
-    keys: Whole
-    jacobian: Vector
+    where: FloatArray
+    keys: IntArray
+    jacobian: FloatArray
 
-    def at(self, keys: Whole) -> Vector:
-        """Those of other cells, 0 where there is none: (keys, free numbers)."""
+    def at(self, keys: IntArray) -> FloatArray:
+        """Return those of other cells, 0 where there is none: (keys, free parameters)."""
         return np.column_stack([EntryTable(self.keys, column).at(keys) for column in self.jacobian.T])
 
 
 class Deviance:
-    """The deviance of one sub-imager, and its least place."""
+    """The deviance of one sub-imager as a function of its geometry, and its minimum."""
 
     def __init__(self, camera: Camera, sub: SubImager, measured: EntryTable, rays: int) -> None:
-        """Of what `rays` rays a pixel measured."""
+        """Create the deviance from entries that were measured with `rays` rays per pixel."""
         self.camera, self.sub, self.measured, self.rays = camera, sub, measured, rays
         self.least = 0.5 / rays
         self.scales = scales(camera, sub)
 
-    def model(self, numbers: Vector, pairs: int | None = None) -> EntryTable:
-        """The shares that numbers make. Raises InputError if the image folds."""
+    def model(self, numbers: FloatArray, pairs: int | None = None) -> EntryTable:
+        """Return the shares of a geometry. Raises InputError if the image folds."""
         return entry_table(entries(self.camera, self.sub, numbers, pairs))
 
-    def ridge(self, free: NDArray[np.bool_]) -> Vector:
-        """Information that a number is within a pixel of f of its start: what no pixel shows stays where it is."""
+    def ridge(self, free: BoolArray) -> FloatArray:
+        """Return the information that fixes unobservable parameters to within a pixel of f of their start."""
         return np.diag(1 / np.square(self.scales[free]))
 
-    def deviance(self, numbers: Vector, start: Vector) -> float:
-        """D and the ridge; infinite where the image folds."""
+    def deviance(self, numbers: FloatArray, start: FloatArray) -> float:
+        """Return D and the ridge; infinite if the image folds."""
         try:
             model = self.model(numbers)
         except InputError:
@@ -105,8 +102,8 @@ class Deviance:
             2 * self.rays * (h * np.log(h / p) - (h - p)).sum() + np.square((numbers - start) / self.scales).sum()
         )
 
-    def derivatives(self, numbers: Vector, free: NDArray[np.bool_]) -> Derivatives:
-        """Central differences of all free numbers."""
+    def derivatives(self, numbers: FloatArray, free: BoolArray) -> Derivatives:
+        """Return central differences by all free parameters."""
         pairs = PAIRS if numbers[BLUR] <= WIDE else FEW
         sides: list[tuple[EntryTable, EntryTable, float]] = []
         for number in np.flatnonzero(free):
@@ -118,10 +115,10 @@ class Deviance:
         columns = [(ahead.at(keys) - behind.at(keys)) / step for ahead, behind, step in sides]
         return Derivatives(numbers, keys, np.column_stack(columns))
 
-    def solve(self, candidates: list[Vector]) -> tuple[Vector, NDArray[np.bool_], Derivatives]:
-        """The numbers of least deviance, which of them are free, and the derivatives there."""
+    def solve(self, candidates: list[FloatArray]) -> tuple[FloatArray, BoolArray, Derivatives]:
+        """Return the parameters of least deviance, which of them are free, and the derivatives there."""
         deviances = [self.deviance(each, each) for each in candidates]
-        at, worst = candidates[int(np.argmin(deviances))], min(deviances)
+        at, least = candidates[int(np.argmin(deviances))], min(deviances)
         start, free = at, np.ones(at.size, dtype=np.bool_)
         free[BLUR] = at[BLUR] > 0
         derivatives = self.derivatives(at, free)
@@ -132,9 +129,9 @@ class Deviance:
             if free[BLUR] and at[BLUR] + step[BLUR] < LEAST_BLUR:  # its bound
                 at, free = np.where(np.arange(at.size) == BLUR, 0.0, at), free & (np.arange(at.size) != BLUR)
                 start = np.where(free, start, 0.0)
-                worst, derivatives = self.deviance(at, start), self.derivatives(at, free)
+                least, derivatives = self.deviance(at, start), self.derivatives(at, free)
                 continue
-            if gain < SETTLED * (worst + 1):
+            if gain < SETTLED * (least + 1):
                 if derivatives.where is at:
                     break
                 derivatives = self.derivatives(at, free)
@@ -142,17 +139,17 @@ class Deviance:
             for halved in range(HALVINGS):
                 there = at + step / 2**halved
                 deviance = self.deviance(there, start)
-                if deviance < worst:
+                if deviance < least:
                     break
-            else:  # within what half a ray tells
+            else:  # converged to within half a ray
                 break
-            at, worst = there, deviance
+            at, least = there, deviance
         return at, free, derivatives if derivatives.where is at else self.derivatives(at, free)
 
     def _step(
-        self, at: Vector, start: Vector, free: NDArray[np.bool_], derivatives: Derivatives
-    ) -> tuple[Vector, float]:
-        """A Gauss-Newton step, (6,), and the fall of the deviance that it promises."""
+        self, at: FloatArray, start: FloatArray, free: BoolArray, derivatives: Derivatives
+    ) -> tuple[FloatArray, float]:
+        """Return a Gauss-Newton step, (6,), and the predicted fall of the deviance."""
         model = self.model(at)
         keys = np.union1d(np.union1d(derivatives.keys, self.measured.keys), model.keys)
         jacobian, p = derivatives.at(keys), model.at(keys)

@@ -1,11 +1,11 @@
-"""H of few numbers a sub-imager instead of the noise of its every entry: `calibration.fit = "geometry"`.
+"""H from six fitted parameters per sub-imager instead of its noisy entries: `calibration.fit = "geometry"`.
 
-The numbers of `geometry_model` are fitted to each sub-imager's entries. Their weights are the model's own, as if rays
-were independent: the scatter of 16 passes says too little of each entry, and its errors would go into the fit.
-Stratified rays scatter less, and not alike everywhere. That makes the fit no less right, and what it is worth the
-batches tell, which go through the same linear map: the covariance of the numbers is theirs, pooled over a lens type. A
-sub-imager is accepted where the weighted sum of squares that the fit leaves is not above what it leaves of the
-batches, by an F test with the degrees of freedom that these show; any other keeps its entries as they were measured.
+The parameters of `geometry_model` are fitted to each sub-imager's entries. Their weights are the model's own, as if
+rays were independent: the scatter of 16 passes determines the variance of each entry poorly, and its errors would enter
+the fit. Stratified rays scatter less, and unevenly. The fit remains unbiased, and its covariance follows from the
+batches, which go through the same linear map, pooled over a lens type. A sub-imager is accepted if the weighted sum of
+squares of its residuals is not above that of the batches, by an F test with their effective degrees of freedom; the
+others keep their measured entries.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse, stats
 
+from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.runtime.processors import processors
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
@@ -29,78 +29,77 @@ from .geometry_model import UNITS
 from .geometry_start import starts
 from .point_sources import Responses
 
-Vector = NDArray[np.float64]
-Whole = NDArray[np.int64]
-
-SIGNIFICANCE = 0.01  # at which a right model is refused, of all sub-imagers together
+SIGNIFICANCE = 0.01  # at which a correct model is rejected, for all sub-imagers together
 
 
 @dataclass(frozen=True)
 class GeometryFit:
-    """What was found of one sub-imager; places are those of its cells, all that it or its model has.
+    """Fit of one sub-imager; its cells are all that the measurement or the model has.
 
-    numbers, free : (6,) as `geometry_model` names them, and which were fitted
+    numbers, free : (6,) parameters of `geometry_model`, and which of them were fitted
     keys, model : (cells,);  jacobian : (cells, free numbers);  information : jacobian^T weights jacobian
-    deviations : (batches, free numbers), of each batch's numbers
-    left, expected : weighted sum of squares between H and model, and what the batches say it should be
-    freedom : degrees of freedom of the sums;  accepted : whether all sub-imagers' sums allow this one
-    covariance : (free, free) of the numbers; `pooled` adds what the batches say, where the fit is accepted
+    deviations : (batches, free numbers), of each batch's parameters
+    left, expected : weighted sum of squared residuals, and its expectation from the batches
+    freedom : degrees of freedom of the sums;  accepted : True if the F test accepts the model
+    covariance : (free, free) of the parameters; `pooled` adds the scatter of the batches for accepted fits
     """
 
     sub: SubImager
-    numbers: Vector
-    free: NDArray[np.bool_]
-    keys: Whole
-    model: Vector
-    jacobian: Vector
-    information: Vector
-    deviations: Vector
+    numbers: FloatArray
+    free: BoolArray
+    keys: IntArray
+    model: FloatArray
+    jacobian: FloatArray
+    information: FloatArray
+    deviations: FloatArray
     left: float
     expected: float
     freedom: float
-    covariance: Vector
+    covariance: FloatArray
     accepted: bool = False
 
     @property
     def chance(self) -> float:
-        """Of a sum of squares as large as this if the model is right."""
+        """Probability of a sum of squares at least as large if the model is correct."""
         ratio = self.left / self.expected
         return float(stats.f.sf(ratio, self.freedom, self.freedom * (len(self.deviations) - 1)))
 
     @property
-    def deviation(self) -> Vector:
-        """Standard deviations of the numbers: (6,), 0 where they were not fitted."""
-        found = np.zeros(self.free.size)
-        found[self.free] = np.sqrt(np.diagonal(self.covariance))
-        return found
+    def deviation(self) -> FloatArray:
+        """Standard deviations of the parameters: (6,), 0 where they were not fitted."""
+        deviation = np.zeros(self.free.size)
+        deviation[self.free] = np.sqrt(np.diagonal(self.covariance))
+        return deviation
 
 
-def fit_geometry(responses: Responses, variance: Vector, camera: Camera) -> tuple[Responses, Vector, dict[str, Any]]:
-    """H with the model's entries wherever the model holds, their variance, and the record of the fits.
+def fit_geometry(
+    responses: Responses, variance: FloatArray, camera: Camera
+) -> tuple[Responses, FloatArray, dict[str, Any]]:
+    """Return H with the fitted entries of all accepted sub-imagers, their variance, and the record of the fits.
 
-    variance : (nnz,) of the entries of `responses`, kept where the model is refused
+    variance : (nnz,) of the entries of `responses`, kept where the fit is rejected
     """
     fits = {fit.sub.name: fit for fit in fit_all(responses, camera)}
-    parts: list[tuple[sparse.csr_array, Vector, NDArray[np.float32]]] = []
-    for sub, place in zip(camera.sub_imagers, camera.slices(), strict=True):
+    parts: list[tuple[sparse.csr_array, FloatArray, Float32Array]] = []
+    for sub, rows in zip(camera.sub_imagers, camera.slices(), strict=True):
         fit = fits.get(sub.name)
         if fit is not None and fit.accepted:
             parts.append(_modelled(fit, camera, responses.samples))
         else:
-            parts.append(_raw(responses, variance, place))
+            parts.append(_measured(responses, variance, rows))
     matrices, variances, batches = zip(*parts, strict=True)
     matrix = sparse.csr_array(sparse.vstack(matrices, format="csr"))
-    found = replace(
+    fitted = replace(
         responses, matrix=matrix, variance=np.concatenate(variances), batches=np.concatenate(batches, axis=1)
     )
-    return found, found.variance, describe(camera, list(fits.values()))
+    return fitted, fitted.variance, describe(camera, list(fits.values()))
 
 
 def describe(camera: Camera, fits: list[GeometryFit]) -> dict[str, Any]:
-    """What a model's record says: how many were accepted, which not, and the numbers of each lens type's accepted."""
+    """Return the entry of a model's record: accepted and rejected fits, statistics of the parameters by lens type."""
     good = {fit.sub.name: fit for fit in fits if fit.accepted}
     expected = sum(fit.expected for fit in good.values())
-    types: dict[str, list[Vector]] = {}
+    types: dict[str, list[FloatArray]] = {}
     for fit in good.values():
         types.setdefault(fit.sub.type.name, []).append(fit.numbers)
     return {
@@ -113,40 +112,40 @@ def describe(camera: Camera, fits: list[GeometryFit]) -> dict[str, Any]:
     }
 
 
-def _statistics(numbers: Vector) -> dict[str, dict[str, float]]:
+def _statistics(numbers: FloatArray) -> dict[str, dict[str, float]]:
     mean, rms = numbers.mean(axis=0), np.sqrt(np.square(numbers).mean(axis=0))
     return {name: {"mean": float(mean[at]), "rms": float(rms[at])} for at, name in enumerate(UNITS)}
 
 
 def fit_all(responses: Responses, camera: Camera) -> list[GeometryFit]:
-    """The fits of all sub-imagers but those that diffract, which no disk describes, in the order of measurements."""
-    places = {
-        sub: place
-        for sub, place in zip(camera.sub_imagers, camera.slices(), strict=True)
+    """Fit all sub-imagers but those that diffract, which no disk describes, in the order of measurements."""
+    slices = {
+        sub: rows
+        for sub, rows in zip(camera.sub_imagers, camera.slices(), strict=True)
         if camera.wavelength is None or sub.type.optics.aperture is None
     }
     with ThreadPoolExecutor(processors()) as threads:
-        found = list(threads.map(partial(fit_one, responses, camera), places, places.values()))
-    single = -np.expm1(np.log1p(-SIGNIFICANCE) / max(len(found), 1))
-    return pooled([replace(fit, accepted=fit.chance >= single) for fit in found])
+        fits = list(threads.map(partial(fit_one, responses, camera), slices, slices.values()))
+    single = -np.expm1(np.log1p(-SIGNIFICANCE) / max(len(fits), 1))
+    return pooled([replace(fit, accepted=fit.chance >= single) for fit in fits])
 
 
-def fit_one(responses: Responses, camera: Camera, sub: SubImager, place: slice) -> GeometryFit:
-    """Fit one sub-imager, whose pixels stand at `place` among the measurements."""
-    rows = responses.matrix[place]
-    measured, rays = entry_table(rows), responses.passes * responses.samples
+def fit_one(responses: Responses, camera: Camera, sub: SubImager, rows: slice) -> GeometryFit:
+    """Fit one sub-imager, whose pixels are the given rows of H."""
+    matrix = responses.matrix[rows]
+    measured, rays = entry_table(matrix), responses.passes * responses.samples
     problem = Deviance(camera, sub, measured, rays)
-    at, free, derivatives = problem.solve(starts(camera, sub, rows))
+    at, free, derivatives = problem.solve(starts(camera, sub, matrix))
     model = problem.model(at)
     keys = np.union1d(np.union1d(derivatives.keys, measured.keys), model.keys)
     jacobian = derivatives.at(keys)
     p = model.at(keys)
     weights = rays / (p + problem.least)
     information = (jacobian.T * weights) @ jacobian + problem.ridge(free)
-    batches = _batches(responses, place, keys)
+    batches = _batches(responses, rows, keys)
     gain = np.linalg.solve(information, jacobian.T * weights)
     deviations = batches @ gain.T
-    # Where no ray is expected there is no scatter to learn from either: half a ray may be missing there.
+    # Where no ray is expected there is no scatter either: half a ray may be missing there.
     unseen = gain[:, p < problem.least] * problem.least
     residuals = batches - deviations @ jacobian.T
     gram = (residuals * weights) @ residuals.T
@@ -169,16 +168,16 @@ def fit_one(responses: Responses, camera: Camera, sub: SubImager, place: slice) 
 
 
 def pooled(fits: list[GeometryFit]) -> list[GeometryFit]:
-    """The same with covariances: the scatter of the batches of a type's accepted sub-imagers with the same numbers.
+    """Add covariances from the batches, pooled over accepted sub-imagers of a type with the same free parameters.
 
-    In units in which independent rays would make it 1 the scatter is alike all over a type. It is drawn towards a
-    multiple of 1, with the weight of as many batches as there are numbers and one.
+    Whitened by the information of independent rays, the scatter is alike over a type. It is shrunk towards a multiple
+    of the identity, with the weight of as many batches as there are parameters, plus one.
     """
     groups: dict[tuple[str, bytes], list[int]] = {}
     for number, fit in enumerate(fits):
         if fit.accepted:
             groups.setdefault((fit.sub.type.name, fit.free.tobytes()), []).append(number)
-    found = list(fits)
+    result = list(fits)
     for group in groups.values():
         factors = [np.linalg.cholesky(fits[number].information) for number in group]
         white = np.concatenate([fits[n].deviations @ factor for n, factor in zip(group, factors, strict=True)])
@@ -189,27 +188,27 @@ def pooled(fits: list[GeometryFit]) -> list[GeometryFit]:
         scatter = (freedom * scatter + (size + 1) * typical) / (freedom + size + 1)
         for number, factor in zip(group, factors, strict=True):
             back = np.linalg.inv(factor)
-            found[number] = replace(fits[number], covariance=fits[number].covariance + back.T @ scatter @ back)
-    return found
+            result[number] = replace(fits[number], covariance=fits[number].covariance + back.T @ scatter @ back)
+    return result
 
 
-def _batches(responses: Responses, place: slice, keys: Whole) -> Vector:
-    """Deviations of the batches at these places: (batches, cells)."""
-    rows, stored = responses.matrix[place], _stored(responses, place)
+def _batches(responses: Responses, rows: slice, keys: IntArray) -> FloatArray:
+    """Return the deviations of the batches in some cells: (batches, cells)."""
+    matrix, stored = responses.matrix[rows], _stored(responses, rows)
     each = (
-        sparse.csr_array((batch, rows.indices, rows.indptr), shape=rows.shape)
+        sparse.csr_array((batch, matrix.indices, matrix.indptr), shape=matrix.shape)
         for batch in responses.batches[:, stored].astype(np.float64)
     )
     return np.array([with_outside(batch, 0.0).at(keys) for batch in each])
 
 
-def _stored(responses: Responses, place: slice) -> slice:
+def _stored(responses: Responses, rows: slice) -> slice:
     pointers = responses.matrix.indptr
-    return slice(int(pointers[place.start]), int(pointers[place.stop]))
+    return slice(int(pointers[rows.start]), int(pointers[rows.stop]))
 
 
-def _freedom(gram: Vector) -> float:
-    """(tr S)^2 / tr S^2 of the covariance S of what batches of Gram matrix `gram` are draws of.
+def _freedom(gram: FloatArray) -> float:
+    """Return the effective degrees of freedom (tr S)^2 / tr S^2 of the covariance S, from the Gram matrix of draws.
 
     tr S^2 without bias from few draws: Bai and Saranadasa 1996, Statistica Sinica 6, 311.
     """
@@ -221,13 +220,15 @@ def _freedom(gram: Vector) -> float:
     return max(1.0, trace**2 / max(squares, trace**2 * 1e-9))
 
 
-def _raw(responses: Responses, variance: Vector, place: slice) -> tuple[sparse.csr_array, Vector, NDArray[np.float32]]:
-    stored = _stored(responses, place)
-    return responses.matrix[place], variance[stored], responses.batches[:, stored]
+def _measured(
+    responses: Responses, variance: FloatArray, rows: slice
+) -> tuple[sparse.csr_array, FloatArray, Float32Array]:
+    stored = _stored(responses, rows)
+    return responses.matrix[rows], variance[stored], responses.batches[:, stored]
 
 
-def _modelled(fit: GeometryFit, camera: Camera, samples: int) -> tuple[sparse.csr_array, Vector, NDArray[np.float32]]:
-    """The model's entries, J C J^T for their variances, and J times each batch's numbers."""
+def _modelled(fit: GeometryFit, camera: Camera, samples: int) -> tuple[sparse.csr_array, FloatArray, Float32Array]:
+    """Return the fitted entries, their variances J C J^T, and J times each batch's parameters."""
     pixel, texel = np.divmod(fit.keys, camera.unknowns + 1)
     kept = (fit.model > 0) & (texel < camera.unknowns)
     rows, jacobian, values = pixel[kept], fit.jacobian[kept], fit.model[kept]

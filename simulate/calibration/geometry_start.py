@@ -1,30 +1,27 @@
-"""Where the fit of a sub-imager's geometry starts: as designed, and as the moments of its entries suggest.
+"""Starting points of the fit of a sub-imager's geometry: its design, and an estimate from moments of its entries.
 
-The middles of what the pixels see, against where the design puts them, give the shift, the magnification and the
-rotation by least squares; their mean square widths give the blur, since that of an even disk of diameter b is b^2 / 16
-along either axis, on top of what there is without it.
+The centroids of the pixels' footprints, compared with the design, give the shift, the magnification and the rotation by
+least squares; their mean square widths give the blur, since a uniform disk of diameter b adds b^2 / 16 along each axis.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
 
 from .geometry_model import BLUR, COLUMN, MAGNIFICATION, ROTATION, ROW, designed, entries
 
-Vector = NDArray[np.float64]
-
-WHOLE = 0.99  # of a pixel's light, that its middle and its width are to be trusted with
+WHOLE = 0.99  # of a pixel's light that has to land on the target for its moments to be used
 LEAST = 0.1  # pixels of f: a blur to start from
 
 
-def starts(camera: Camera, sub: SubImager, measured: sparse.csr_array) -> list[Vector]:
-    """Numbers to start from, (6,) each: as designed and by moments. measured : (pixels, N)."""
+def starts(camera: Camera, sub: SubImager, measured: sparse.csr_array) -> list[FloatArray]:
+    """Return starting parameters, (6,) each, as designed and by moments. measured : (pixels, N)."""
     plan = designed(camera, sub)
     sharp = plan.copy()
     sharp[BLUR] = 0.0
@@ -39,7 +36,7 @@ def starts(camera: Camera, sub: SubImager, measured: sparse.csr_array) -> list[V
     both = whole & inside
     if both.sum() < 3:
         return [plan]
-    found = plan.copy()
+    estimate = plan.copy()
     away = intended[both] - np.array([float(at) for at in sub.type.middle(sub.window)])
     row, column = away.T
     ones, none = np.ones_like(row), np.zeros_like(row)
@@ -47,17 +44,17 @@ def starts(camera: Camera, sub: SubImager, measured: sparse.csr_array) -> list[V
     down, across = np.column_stack([ones, none, -row, column]), np.column_stack([none, ones, -column, -row])
     moved = (middle - intended)[both].T.ravel()
     numbers, *_ = np.linalg.lstsq(np.vstack([down, across]), moved, rcond=None)
-    found[[ROW, COLUMN, MAGNIFICATION, ROTATION]] += numbers
+    estimate[[ROW, COLUMN, MAGNIFICATION, ROTATION]] += numbers
     if not pinhole:
         grown = float((width[both] - least[both] * (1 - 2 * numbers[2])).mean())
-        found[BLUR] = max(4 * max(grown, 0.0) ** 0.5, LEAST)
-    return [plan, found]
+        estimate[BLUR] = max(4 * max(grown, 0.0) ** 0.5, LEAST)
+    return [plan, estimate]
 
 
-def moments(matrix: sparse.csr_array, columns: int) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-    """Middles, (pixels, 2) in rows and columns of f, mean square widths along an axis, (pixels,), of rows of H.
+def moments(matrix: sparse.csr_array, columns: int) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return moments of rows of H: centroids, (pixels, 2) in rows and columns of f, and mean square widths, (pixels,).
 
-    The last array tells whose light lands on the target, all but a hundredth.
+    The last array is True for pixels with at least 99 % of their light on the target.
     """
     light = matrix.sum(axis=1)
     share = np.maximum(light, np.finfo(float).tiny)

@@ -1,10 +1,10 @@
 """Point sources: emitters of radiance 1 that fill one pixel of f, a grid of them at a time.
 
 The grid's spacing is wider than any sensor pixel's footprint, so every sensor pixel sees at most one of its sources,
-and sweeping the grid over all its places gives every pixel of f its turn: H column by column. Through pinholes several
-grids shine at once, each so much brighter than the one before that the sum of a pixel's rays, every one of which brings
-back one source whole, tells how many came from each. All sweeps of one pass share a seed, so that the errors of a row
-of H cancel in its sum; none is shared with the data.
+and sweeping the grid over all its offsets lights every pixel of f once: H column by column. Through pinholes several
+grids shine at once, each so much brighter than the previous one that the sum of a pixel's rays, every one of which
+brings back one source whole, encodes how many came from each. All sweeps of one pass share a seed, so that the errors
+of a row of H cancel in its sum; none is shared with the data.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import MachineError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
@@ -32,90 +32,79 @@ if TYPE_CHECKING:
     from ..renderer.renderer import Renderer
 
 ROW_TOLERANCE = 1e-4  # float32 sums of up to 4096 samples are wrong by 4e-5
-RENDERINGS = 8.0  # that a calibration takes, about: its seconds over those of rendering one picture as finely
+RENDERINGS = 8.0  # approximate time of a calibration, in renderings of one picture with as many samples
 STRAYS = 2  # rays of a sensor pixel that float32 may have rounded over the edge of the target
 
 
 # Rows of H of one group, the variances of their entries, (nnz,), and their batches, (batches, nnz).
-Part = tuple[sparse.csr_array, NDArray[np.float64], NDArray[np.float32]]
+Part = tuple[sparse.csr_array, FloatArray, Float32Array]
 Plans = dict[str, Plan]  # by the name of a group
 
 
 @dataclass(frozen=True)
 class Responses(OverPasses):
-    """H before it becomes a model.
+    """Measured entries of H, before they become a model.
 
-    `matrix` holds the means of its entries, `variance`, (nnz,), their variances from the scatter of the passes, and
-    `batches`, (batches, nnz), deviations of the means of some passes from those of all.
-    Where the groups' passes differ, `samples` are the most. summed : of them, how many are added up in float32; absent:
-    all
+    matrix : means of the entries;  variance : (nnz,) of these means, from the scatter of the passes
+    batches : (batches, nnz) deviations of the means of some passes from those of all
+    samples : the most, where the groups differ;  float32_samples : of them, those summed in float32; None: all
     """
 
     matrix: sparse.csr_array
-    variance: NDArray[np.float64]
-    batches: NDArray[np.float32]
-    summed: int | None = None
+    variance: FloatArray
+    batches: Float32Array
+    float32_samples: int | None = None
 
 
-def grid(camera: Camera, apart: int, row: int, column: int) -> NDArray[np.float64]:
-    """The target, (rows, columns), with sources of radiance 1 at every `apart` pixels from (row, column)."""
+def grid(camera: Camera, spacing: int, row: int, column: int) -> FloatArray:
+    """Return the target, (rows, columns), with sources of radiance 1 at every `spacing` pixels from (row, column)."""
     image = np.zeros(camera.shape)
-    image[row::apart, column::apart] = 1.0
+    image[row::spacing, column::spacing] = 1.0
     return image
 
 
 def responses_from_points(
     setup: Setup,
     progress: Progress = no_progress,
-    partial: Checkpoint | None = None,
+    checkpoint: Checkpoint | None = None,
     plans: Plans | None = None,
 ) -> Responses:
-    """Sweep grids of point sources over the target; nothing that light has hit is dropped.
+    """Measure H by sweeping grids of point sources over the target.
 
-    partial : where passes that are done are kept and found again;  plans : of each group, absent: all as the scene says
+    plans : of each group; None: all as the scene says
     """
     from ..renderer.renderer import Renderer
 
     scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
-    rig = Renderer(camera, variant, scene.render.sampler, together=False)  # each type its own spacing
+    renderer = Renderer(camera, variant, scene.render.sampler, together=False)  # each type has its own spacing
     if plans is None:
-        plans = dict.fromkeys(rig.groups, plan(scene.calibration.sample_count, scene.render.sampler))
-    sweeps = {group: SourceSweep(rig, group) for group in rig.groups}
-    shares = {group: sweep.reach.apart**2 for group, sweep in sweeps.items()}
-    rows: list[sparse.csr_array] = []
-    variances: list[NDArray[np.float64]] = []
-    batches: list[NDArray[np.float32]] = []
+        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
+    sweeps = {group: SourceSweep(renderer, group) for group in renderer.groups}
+    shares = {group: sweep.visible.spacing**2 for group, sweep in sweeps.items()}
+    parts: list[Part] = []
     done, finished = 0, State()
-    before = State() if partial is None else partial.state()
+    state = State() if checkpoint is None else checkpoint.state()
     for group, sweep in sweeps.items():
         begun, work = done, plans[group]
 
         def report(fraction: float, begun: int = begun, share: int = shares[group]) -> None:
             progress((begun + fraction * share) / sum(shares.values()))
 
-        sweep.resume(before)
+        sweep.resume(state)
         while sweep.tally.count < work.passes:
-            sweep.one_more(work, scene.render.seed, report)
-            if partial is not None:
-                partial.offer(lambda sweep=sweep, finished=finished: {**finished, **sweep.state()})
-        finished = {**finished, **sweep.state()} if partial is not None else finished
-        tally, means = sweep.tally, sweep.batches
-        # Of a pixel that now and then gets no light at all nothing is known; so it has no entries.
-        lit = ~sweep.dark
-        matrix, order = entries_of(camera, sweep.reach, tally.mean * lit[:, None])
-        _check_rows(matrix, sweep.uniform.mean * lit, ROW_TOLERANCE + STRAYS / work.total)
-        rows.append(matrix)
-        variances.append(tally.variance.ravel()[order])
-        batches.append((means.reshape(BATCHES, -1)[:, order] - matrix.data).astype(np.float32))
+            sweep.add_pass(work, scene.render.seed, report)
+            if checkpoint is not None:
+                checkpoint.offer(lambda sweep=sweep, finished=finished: {**finished, **sweep.state()})
+        finished = {**finished, **sweep.state()} if checkpoint is not None else finished
+        parts.append(sweep.part(work))
         done += shares[group]
-    parts = list(zip(rows, variances, batches, strict=True))
-    return responses_of(parts, plans, variant, scene.render.seed)
+    return joined_parts(parts, plans, variant, scene.render.seed)
 
 
-def responses_of(parts: list[Part], plans: Plans, variant: str, seed: int) -> Responses:
-    """The responses of all groups from those of each, in their order; all have as many passes."""
+def joined_parts(parts: list[Part], plans: Plans, variant: str, seed: int) -> Responses:
+    """Join the responses of all groups, in their order; all have the same number of passes."""
     rows, variances, batches = zip(*parts, strict=True)
-    work = max(plans.values(), key=lambda one: one.samples)
+    work = max(plans.values(), key=lambda plan: plan.samples)
     return Responses(
         matrix=sparse.csr_array(sparse.vstack(rows, format="csr")),
         variance=np.concatenate(variances),
@@ -128,75 +117,83 @@ def responses_of(parts: list[Part], plans: Plans, variant: str, seed: int) -> Re
 
 
 class SourceSweep:
-    """What each sensor pixel of a group reads of every grid, pass by pass.
+    """Readings of all sensor pixels of a group for every grid, pass by pass.
 
-    tally : (pixels of the group, places of the grid);  batches : the same, in batches of passes, one for each
-    uniform : (pixels,), of a uniform target
+    tally : (pixels of the group, offsets of the grid);  batches : the same, per batch of passes
+    uniform : (pixels,), of a uniform target;  dark : (pixels,), True if no ray of some pass reaches the target
     """
 
-    def __init__(self, rig: Renderer, group: str) -> None:
-        """Before the first pass."""
-        self._rig, self._group, self.reach = rig, group, visible_pixels(rig, group)
-        shape = self.reach.row.size, self.reach.apart**2
+    def __init__(self, renderer: Renderer, group: str) -> None:
+        """Create an empty sweep."""
+        self._renderer, self._group, self.visible = renderer, group, visible_pixels(renderer, group)
+        shape = self.visible.row.size, self.visible.spacing**2
         self.tally, self.uniform = Tally(*shape), Tally(shape[0])
         self.dark = np.zeros(shape[0], dtype=np.bool_)
         self.batches = np.zeros((BATCHES, *shape), dtype=np.float32)
 
     def state(self) -> State:
-        """All of it, to be kept."""
+        """Return the arrays of a checkpoint."""
         tallies = {**self.tally.state(self._group), **self.uniform.state(f"{self._group}.uniform")}
         return {**tallies, f"{self._group}.batches": self.batches, f"{self._group}.dark": self.dark}
 
     def resume(self, state: State) -> None:
-        """Go on where a kept one stopped, if there is one."""
+        """Continue from a checkpoint, if it holds this group."""
         self.tally.resume(self._group, state)
         self.uniform.resume(f"{self._group}.uniform", state)
         self.batches = state.get(f"{self._group}.batches", self.batches)
         self.dark = state.get(f"{self._group}.dark", self.dark)
 
-    def one_more(self, work: Plan, seed: int, progress: Progress) -> None:
-        """The next pass."""
-        number, camera = self.tally.count, self._rig.camera
-        apart = self.reach.apart
-        places, levels = apart**2, brightness(work.samples, self._rig.exact if self._rig.even else 0)
+    def add_pass(self, work: Plan, seed: int, progress: Progress) -> None:
+        """Render the next pass."""
+        renderer, number, spacing = self._renderer, self.tally.count, self.visible.spacing
+        levels = brightness(work.samples, renderer.exact_below if renderer.has_equal_weights else 0)
+        offsets, together = spacing**2, renderer.channels * levels.size
         values = np.empty(self.tally.mean.shape)
         pass_seeds = sampler_seeds(seed, "calibration", number, work.passes)
-        for first in range(0, places, self._rig.channels * levels.size):
-            several = range(first, min(first + self._rig.channels * levels.size, places))
-            together = [several[start : start + levels.size] for start in range(0, len(several), levels.size)]
-            self._rig.set_target(*(_shining(camera, apart, some, levels) for some in together))
+        for first in range(0, offsets, together):
+            chunk = range(first, min(first + together, offsets))
+            channels = [chunk[start : start + levels.size] for start in range(0, len(chunk), levels.size)]
+            renderer.set_target(*(_sources(renderer.camera, spacing, shown, levels) for shown in channels))
             readings = self._read(work.samples, pass_seeds)
-            for some, reading in zip(together, readings, strict=False):
+            for shown, reading in zip(channels, readings, strict=False):
                 alone = reading[:, None] if levels.size == 1 else separate_sources(reading, work.samples, levels)
-                values[:, some] = alone[:, : len(some)]
-            progress((number + several.stop / places) / work.passes)
-        self._rig.set_target(np.ones(camera.shape))
+                values[:, shown] = alone[:, : len(shown)]
+            progress((number + chunk.stop / offsets) / work.passes)
+        renderer.set_target(np.ones(renderer.camera.shape))
         self.uniform.add(self._read(work.samples, pass_seeds)[0])
         self.batches[number % BATCHES] += (values * (BATCHES / work.passes)).astype(np.float32)
         self.tally.add(values)
 
-    def _read(self, samples: int, seeds: Callable[[int], int]) -> NDArray[np.float64]:
-        found = self._rig.expose(self._group, samples, seeds)
-        self.dark |= np.isnan(found[0])
-        return np.nan_to_num(found)
+    def _read(self, samples: int, seeds: Callable[[int], int]) -> FloatArray:
+        readings = self._renderer.expose(self._group, samples, seeds)
+        self.dark |= np.isnan(readings[0])
+        return np.nan_to_num(readings)
+
+    def part(self, work: Plan) -> Part:
+        """Return the rows of H, without entries for pixels that some pass leaves dark. Raises MachineError."""
+        lit = ~self.dark
+        matrix, order = entries_of(self._renderer.camera, self.visible, self.tally.mean * lit[:, None])
+        _check_rows(matrix, self.uniform.mean * lit, ROW_TOLERANCE + STRAYS / work.total)
+        batches = (self.batches.reshape(BATCHES, -1)[:, order] - matrix.data).astype(np.float32)
+        return matrix, self.tally.variance.ravel()[order], batches
 
 
-def brightness(samples: int, exact: int) -> NDArray[np.int64]:
-    """Radiances of grids that shine together: powers of more than `samples`, as many as add up exactly.
+def brightness(samples: int, exact_below: int) -> IntArray:
+    """Return the radiances of grids that shine together: powers of more than `samples`, as many as add up exactly.
 
-    exact : below which sums of whole numbers come out whole, 0 where rays do not bring back sources whole
+    exact_below : limit of exact sums of whole numbers, 0 if rays do not bring back sources whole
     """
     base = 1 << samples.bit_length()
     levels = [1]
-    while samples * sum([*levels, levels[-1] * base]) < exact:
+    while samples * sum([*levels, levels[-1] * base]) < exact_below:
         levels.append(levels[-1] * base)
     return np.array(levels)
 
 
-def separate_sources(readings: NDArray[np.float64], samples: int, levels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """What each of the grids alone would have given: (pixels,) to (pixels, grids).
+def separate_sources(readings: FloatArray, samples: int, levels: IntArray) -> FloatArray:
+    """Return the readings that each of the grids alone would have given: (pixels,) to (pixels, grids).
 
-    Raises DeniedError where rays have not brought back sources whole.
+    Raises MachineError if rays have not brought back sources whole.
     """
     sums = readings * samples
     whole = np.rint(sums)
@@ -206,14 +203,14 @@ def separate_sources(readings: NDArray[np.float64], samples: int, levels: NDArra
     return (whole.astype(np.int64)[:, None] // levels % base) / samples
 
 
-def _shining(camera: Camera, apart: int, places: range, levels: NDArray[np.int64]) -> NDArray[np.float64]:
+def _sources(camera: Camera, spacing: int, offsets: range, levels: IntArray) -> FloatArray:
     image = np.zeros(camera.shape)
-    for place, level in zip(places, levels.tolist(), strict=False):
-        image += level * grid(camera, apart, *divmod(place, apart))
+    for offset, level in zip(offsets, levels.tolist(), strict=False):
+        image += level * grid(camera, spacing, *divmod(offset, spacing))
     return image
 
 
-def _check_rows(matrix: sparse.csr_array, uniform: NDArray[np.float64], tolerance: float) -> None:
+def _check_rows(matrix: sparse.csr_array, uniform: FloatArray, tolerance: float) -> None:
     worst = float(np.abs(matrix.sum(axis=1) - uniform).max())
     if worst > tolerance:
         raise MachineError(
@@ -222,22 +219,20 @@ def _check_rows(matrix: sparse.csr_array, uniform: NDArray[np.float64], toleranc
         )
 
 
-def entries_of(
-    camera: Camera, reach: VisiblePixels, readings: NDArray[np.float64]
-) -> tuple[sparse.csr_array, NDArray[np.int64]]:
-    """Give each reading to the one source near its pixel's footprint, and drop what no light has hit.
+def entries_of(camera: Camera, visible: VisiblePixels, readings: FloatArray) -> tuple[sparse.csr_array, IntArray]:
+    """Assign each reading to the one source near its pixel's footprint, and drop those without light.
 
-    Returns the rows of H, and which of the flattened readings became its entries.
+    Returns the rows of H, and the indices of the flattened readings that became its entries.
     """
-    row, column, apart = reach.row, reach.column, reach.apart
-    swept = np.arange(apart)
-    source_row = row[:, None] + (swept - row[:, None]) % apart
-    source_column = column[:, None] + (swept - column[:, None]) % apart
-    down = np.repeat(source_row, apart, axis=1).ravel()
-    across = np.tile(source_column, (1, apart)).ravel()
+    row, column, spacing = visible.row, visible.column, visible.spacing
+    swept = np.arange(spacing)
+    source_row = row[:, None] + (swept - row[:, None]) % spacing
+    source_column = column[:, None] + (swept - column[:, None]) % spacing
+    down = np.repeat(source_row, spacing, axis=1).ravel()
+    across = np.tile(source_column, (1, spacing)).ravel()
     inside = (down >= 0) & (down < camera.rows) & (across >= 0) & (across < camera.columns)
     hit = np.flatnonzero(inside & (readings.ravel() != 0))
-    pixel, unknown = hit // apart**2, (down * camera.columns + across)[hit]
+    pixel, unknown = hit // spacing**2, (down * camera.columns + across)[hit]
     order = np.lexsort((unknown, pixel))
     shape = (readings.shape[0], camera.unknowns)
     matrix = sparse.csr_array((readings.ravel()[hit[order]], (pixel[order], unknown[order])), shape=shape)

@@ -1,8 +1,9 @@
-"""H from rays alone: every ray of a sensor pixel brings its weight to the pixel of f that it meets.
+"""H from rays alone: every ray of a sensor pixel adds its weight to the pixel of f that it meets.
 
-What point sources show one after the other, the rays know at once: row i of H is where the rays of pixel i land. They
-are those that point sources are seen by, with the same seeds, and are summed in float64, so that both give the same H.
-Light is reversible; what follows a ray from the sensor is the light that comes back on it (Veach 1997, section 4.5).
+Row i of H is the distribution of the rays of pixel i over the target, which point sources measure one after the other.
+The rays are those of the point sources' renderings, with the same seeds, and are summed in float64, so that both
+methods give the same H. A ray followed from the sensor carries the light that travels it in reverse (Veach 1997,
+section 4.5).
 """
 
 from __future__ import annotations
@@ -10,95 +11,96 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import check_transport_variant, choose
 from ..sampling.passes import BATCHES, Plan, plan
 from ..sampling.seeds import sampler_seeds
-from .point_sources import Part, Plans, Responses, responses_of
+from .point_sources import Part, Plans, Responses, joined_parts
 
 if TYPE_CHECKING:
     from ..renderer.renderer import Renderer
 
 
 class TracedEntries(NamedTuple):
-    """Of one pass: where in H, pixel * N + texel, rising; what stands there; (pixels,) which get no light at all."""
+    """Entries of H from one pass: `where`, pixel * N + texel, rising, and their values; (pixels,) without any light."""
 
-    where: NDArray[np.int64]
-    values: NDArray[np.float64]
-    dark: NDArray[np.bool_]
+    where: IntArray
+    values: FloatArray
+    dark: BoolArray
 
 
 def responses_from_rays(setup: Setup, progress: Progress = no_progress, plans: Plans | None = None) -> Responses:
-    """Trace all rays of all passes. Raises InputError where only Mitsuba's slow backend works.
+    """Measure H by tracing all rays of all passes. Raises InputError if only Mitsuba's scalar backend works.
 
-    plans : of each group, absent: all as the scene says
+    plans : of each group; None: all as the scene says
     """
     from ..renderer.renderer import Renderer
 
-    scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
+    scene, variant = setup.scene, choose(setup.scene.render.variant)
     check_transport_variant(variant)
-    rig = Renderer(camera, variant, scene.render.sampler, together=False)
-    parts: list[Part] = []
+    renderer = Renderer(setup.simulated, variant, scene.render.sampler, together=False)
     if plans is None:
-        plans = dict.fromkeys(rig.groups, plan(scene.calibration.sample_count, scene.render.sampler))
-    blocks = [(group, block) for group in rig.groups for block in rig.blocks(group, plans[group].samples)]
-    for place, (group, block) in enumerate(blocks):
+        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
+    parts: list[Part] = []
+    blocks = [(group, block) for group in renderer.groups for block in renderer.blocks(group, plans[group].samples)]
+    for index, (group, block) in enumerate(blocks):
         passes: list[TracedEntries] = []
         work = plans[group]
         for number in range(work.passes):
-            passes.append(one_pass(rig, group, block, work, number, scene.render.seed))
-            progress((place + (number + 1) / work.passes) / len(blocks))
-        parts.append(_joined(passes, (block.stop - block.start, camera.unknowns)))
-    return responses_of(parts, plans, variant, scene.render.seed)
+            passes.append(one_pass(renderer, group, block, work, number, scene.render.seed))
+            progress((index + (number + 1) / work.passes) / len(blocks))
+        parts.append(_joined(passes, (block.stop - block.start, setup.camera.unknowns)))
+    return joined_parts(parts, plans, variant, scene.render.seed)
 
 
-def one_pass(rig: Renderer, group: str, block: slice, work: Plan, number: int, seed: int) -> TracedEntries:
-    """The entries of H, of the pixels of a block, that the rays of one pass make."""
-    from .transport_kernels import collected  # pyright: ignore[reportUnknownVariableType]
+def one_pass(renderer: Renderer, group: str, block: slice, work: Plan, number: int, seed: int) -> TracedEntries:
+    """Trace one pass of the pixels of a block."""
+    from .transport_kernels import sums_by_texel  # pyright: ignore[reportUnknownVariableType]
 
-    texels, weights = rig.hits(group, work.samples, sampler_seeds(seed, "calibration", number, work.passes), block)
+    seeds = sampler_seeds(seed, "calibration", number, work.passes)
+    texels, weights = renderer.hits(group, work.samples, seeds, block)
     weights = np.ones(texels.shape) if weights is None else weights
-    counts, columns, sums = collected(texels, weights)
+    counts, columns, sums = sums_by_texel(texels, weights)
     pixel = np.repeat(np.arange(counts.size), counts)
-    brought = weights.sum(axis=1)
-    return TracedEntries(pixel * rig.camera.unknowns + columns, sums / brought[pixel], brought == 0)
+    total = weights.sum(axis=1)
+    return TracedEntries(pixel * renderer.camera.unknowns + columns, sums / total[pixel], total == 0)
 
 
 def _joined(passes: list[TracedEntries], shape: tuple[int, int]) -> Part:
-    """Mean over the passes, the variance of that mean, and the deviations of batches of passes from it.
+    """Return the mean over the passes, the variance of that mean, and the deviations of batches of passes from it.
 
-    Of a pixel that now and then gets no light at all nothing is known; so it has no entries.
+    A pixel that gets no light at all in some pass has no entries, since nothing is known of it.
     """
-    dark = np.logical_or.reduce([one.dark for one in passes])
+    dark = np.logical_or.reduce([entries.dark for entries in passes])
     if dark.any():
-        passes = [_lit(one, ~dark[one.where // shape[1]]) for one in passes]
+        passes = [_without(entries, dark[entries.where // shape[1]]) for entries in passes]
     matrix = sparse.csr_array(shape, dtype=np.float64)
-    for one in passes:
-        matrix = sparse.csr_array(matrix + _matrix(one, shape))
+    for entries in passes:
+        matrix = sparse.csr_array(matrix + _matrix(entries, shape))
     matrix.data /= len(passes)
-    mean: NDArray[np.float64] = matrix.data
-    places = np.repeat(np.arange(shape[0]), np.diff(matrix.indptr)) * shape[1] + matrix.indices
-    squares = np.zeros(places.size)
-    batches = np.zeros((BATCHES, places.size))
+    mean: FloatArray = matrix.data
+    cells = np.repeat(np.arange(shape[0]), np.diff(matrix.indptr)) * shape[1] + matrix.indices
+    squares = np.zeros(cells.size)
+    batches = np.zeros((BATCHES, cells.size))
     for number, (where, values, _) in enumerate(passes):
-        found = np.searchsorted(places, where)
-        batches[number % BATCHES, found] += values * (BATCHES / len(passes))
-        away = -mean
-        away[found] += values
-        squares += np.square(away)
+        index = np.searchsorted(cells, where)
+        batches[number % BATCHES, index] += values * (BATCHES / len(passes))
+        deviation = -mean
+        deviation[index] += values
+        squares += np.square(deviation)
     return matrix, squares / (len(passes) * (len(passes) - 1)), (batches - mean).astype(np.float32)
 
 
-def _matrix(one: TracedEntries, shape: tuple[int, int]) -> sparse.csr_array:
-    pixel, texel = np.divmod(one.where, shape[1])
+def _matrix(entries: TracedEntries, shape: tuple[int, int]) -> sparse.csr_array:
+    pixel, texel = np.divmod(entries.where, shape[1])
     starts = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=shape[0]))])
-    return sparse.csr_array((one.values, texel, starts), shape=shape)
+    return sparse.csr_array((entries.values, texel, starts), shape=shape)
 
 
-def _lit(one: TracedEntries, kept: NDArray[np.bool_]) -> TracedEntries:
-    return TracedEntries(one.where[kept], one.values[kept], one.dark)
+def _without(entries: TracedEntries, removed: BoolArray) -> TracedEntries:
+    return TracedEntries(entries.where[~removed], entries.values[~removed], entries.dark)

@@ -1,4 +1,4 @@
-"""Who is asked, between rounds of a calibration, whether to go on: whoever will reconstruct with what it finds."""
+"""The criterion by which a calibration with an open number of samples stops."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ommatid.scenes.model import Model
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """Who says of a model whether its H is known well enough.
+    """Decides whether H is known precisely enough for the reconstruction that will use it.
 
-    adds : what the uncertainty of H adds to the expected error of a reconstruction, relative to all the rest of it
-    by : fingerprint of what is reconstructed;  words : the same for people
+    added_error : from a model to what the uncertainty of its H adds to the expected error, relative to all the rest
+    fingerprint : of the reconstruction;  description : of the same for people
     """
 
     added_error: Callable[[Model], float]

@@ -1,4 +1,4 @@
-"""The loop of `transport`, compiled: the rays of a pixel, in any order, as entries of its row of H."""
+"""The compiled loop of `ray_transport`, from the rays of a pixel, in any order, to entries of its row of H."""
 
 # pyright: basic
 from __future__ import annotations
@@ -8,15 +8,15 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def collected(texels, weights):
-    """Sums of weights by texel for every pixel: (P, S) each, texels below 0 left out, to counts (P,), texels and sums.
+def sums_by_texel(texels, weights):
+    """Sum the weights, (P, S), by texel for every pixel, without texels below 0: counts (P,), texels and sums.
 
-    Texels rise within a pixel. A pixel sees few of them and the same ones again and again, so each ray is looked up
-    among those already met.
+    Texels rise within a pixel. A pixel sees few of them again and again, so each ray is looked up by bisection among
+    the previous ones.
     """
     pixels, samples = texels.shape
     counts = np.zeros(pixels, dtype=np.int64)
-    found = np.empty(texels.size, dtype=np.int64)
+    known = np.empty(texels.size, dtype=np.int64)
     sums = np.empty(texels.size, dtype=np.float64)
     start = 0
     for pixel in range(pixels):
@@ -28,18 +28,18 @@ def collected(texels, weights):
             low, high = start, stop
             while low < high:
                 middle = (low + high) // 2
-                if found[middle] < texel:
+                if known[middle] < texel:
                     low = middle + 1
                 else:
                     high = middle
-            if low == stop or found[low] != texel:
-                for place in range(stop, low, -1):
-                    found[place] = found[place - 1]
-                    sums[place] = sums[place - 1]
-                found[low] = texel
+            if low == stop or known[low] != texel:
+                for index in range(stop, low, -1):
+                    known[index] = known[index - 1]
+                    sums[index] = sums[index - 1]
+                known[low] = texel
                 sums[low] = 0.0
                 stop += 1
             sums[low] += weights[pixel, sample]
         counts[pixel] = stop - start
         start = stop
-    return counts, found[:start].copy(), sums[:start].copy()
+    return counts, known[:start].copy(), sums[:start].copy()

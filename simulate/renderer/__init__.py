@@ -1,1 +1,1 @@
-"""The camera and its scene in Mitsuba; the only folder that imports it."""
+"""The camera and its target in Mitsuba; the only package that imports it."""

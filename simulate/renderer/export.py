@@ -1,4 +1,4 @@
-"""The camera and its target as a plain Mitsuba scene of stock sensors, which Mitsuba's own command renders."""
+"""Export of a pinhole camera and its target as a plain Mitsuba scene, which Mitsuba's own command renders."""
 
 # pyright: basic
 from __future__ import annotations
@@ -15,15 +15,16 @@ from .variant import activate
 
 
 def export(setup: Setup, path: Path) -> Path:
-    """Write FILE.xml, a sensor a sub-imager in the order of the stack, and the target's picture beside it.
+    """Write FILE.xml, with one sensor per sub-imager in the order of the stack, and the target's picture beside it.
 
-    Returns the picture's path. Raises InputError unless `path` ends in .xml, DeniedError for a full disk.
+    Returns the picture's path. Raises InputError for lenses that stock sensors do not have, and unless `path` ends in
+    .xml; MachineError for a full disk.
     """
     scene, camera = setup.scene, setup.camera
     if not camera.is_ideal_pinhole:
         raise InputError(
-            f"{scene.source}: stock sensors of Mitsuba are pinholes where they should be, so lenses that are more, or a"
-            " [camera.tolerance], cannot be exported; remove them with --set"
+            f"{scene.source}: stock sensors of Mitsuba are pinholes at their designed positions, so other lenses or a"
+            " [camera.tolerance] cannot be exported; remove them with --set"
         )
     if path.suffix != ".xml":
         raise InputError(f"{path}: expected the name of a Mitsuba scene, ending in .xml")
@@ -32,10 +33,10 @@ def export(setup: Setup, path: Path) -> Path:
 
     picture = path.with_name(f"{path.stem}.target.exr")
     write_truth(picture, setup.image)
-    described = scene_of(target_of(camera, texture_of({"filename": picture.name})))
+    plugins = scene_of(target_of(camera, texture_of({"filename": picture.name})))
     for sub in camera.sub_imagers:
         name = sub.name.replace(".", "_")  # a dot would be a path into the scene
-        described[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.sample_count)
-    state = mi.parser.parse_dict(mi.parser.ParserConfig("scalar_rgb"), described)
+        plugins[name] = stock_sensor(camera, sub, scene.render.sampler, scene.render.sample_count)
+    state = mi.parser.parse_dict(mi.parser.ParserConfig("scalar_rgb"), plugins)
     write_whole(path, lambda beside: mi.parser.write_file(state, str(beside)))
     return picture

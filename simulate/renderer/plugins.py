@@ -1,4 +1,4 @@
-"""What a camera and its target are in Mitsuba's own terms: plugins by their dictionaries. Lengths are millimetres."""
+"""Mitsuba plugins of a camera and its target, as dictionaries. Lengths are millimetres."""
 
 # pyright: basic
 from __future__ import annotations
@@ -12,28 +12,30 @@ from ommatid.scenes.scene import Sampler
 
 from ..sampling.samplers import fitting
 
-BLOCK = 4  # scalar variants seed by block, and pick its size by the number of threads unless it is given
+BLOCK = 4  # scalar variants seed by block, and derive its size from the number of threads unless it is given
 
 
 def scene_of(target: dict[str, Any]) -> dict[str, Any]:
-    """A Mitsuba scene with the emissive target and no sensor: light goes straight, nothing bounces."""
+    """Return a Mitsuba scene with the emissive target and no sensor, without interreflections."""
     return {"type": "scene", "integrator": {"type": "path", "max_depth": 1, "block_size": BLOCK}, "target": target}
 
 
 def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
-    """The rectangle that the picture is on, seen from the front, upright, one texel a pixel of f."""
+    """Return the emissive rectangle of the target, which shows its picture upright, one texel per pixel of f."""
     import mitsuba as mi
 
     half = [camera.columns * camera.target_pitch / 2, camera.rows * camera.target_pitch / 2, 1.0]
-    place = mi.ScalarTransform4f().translate([0, 0, camera.distance]).rotate([0, 1, 0], 180).scale(half)
-    return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": texture}}
+    to_world = mi.ScalarTransform4f().translate([0, 0, camera.distance]).rotate([0, 1, 0], 180).scale(half)
+    return {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area", "radiance": texture}}
 
 
 def stock_sensor(
     camera: Camera, sub: SubImager, sampler: Sampler, samples: int, channels: int = 1, far: float = 2.0
 ) -> dict[str, Any]:
-    """One sub-imager as Mitsuba's own `perspective` with a shifted principal point; it sees as far as `far` times the
-    target's distance."""
+    """Return one sub-imager as Mitsuba's `perspective` sensor with a shifted principal point.
+
+    far : of the far clipping plane, in distances of the target
+    """
     import mitsuba as mi
 
     rows, columns = sub.type.pixels
@@ -56,7 +58,7 @@ def stock_sensor(
 
 
 def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:
-    """A film that neither filters nor rounds to half precision."""
+    """Return a film that neither filters nor rounds to half precision."""
     return {
         "type": "hdrfilm",
         "width": width,
@@ -68,7 +70,7 @@ def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:
 
 
 def texture_of(source: dict[str, Any]) -> dict[str, Any]:
-    """Texels as they are: upright, not filtered, not wrapped, not read as sRGB."""
+    """Return a texture of unmodified texels: upright, not filtered, not wrapped, not read as sRGB."""
     import mitsuba as mi
 
     upright = mi.ScalarTransform3f().translate([0, 1]).scale([1, -1])  # row 0 would lie at v = 0, the bottom

@@ -1,4 +1,4 @@
-"""From a point of the sensor through the surfaces of a real lens into the world, on Mitsuba's fast backends."""
+"""Rays from the sensor through the surfaces of a real lens into the world, on Mitsuba's fast backends."""
 
 # pyright: basic
 from __future__ import annotations
@@ -13,37 +13,37 @@ from ommatid.scenes.optics.blur import Blur
 
 from ..lenses.prescription import prescription_of
 from ..lenses.ray_trace import Functions, exit_disk_of, path, trace
-from .lens import LensModel, displaced
+from .lens import Emission, LensModel, sample_displacement, slope_table
 
 
 class RealLens(LensModel):
-    """A lens of surfaces; where the light has a wavelength, its pupil diffracts as an open one of its f-number does."""
+    """A lens of surfaces; if the light has a wavelength, its pupil diffracts as an open one of its f-number does."""
 
-    weighs = True
+    has_weights = True
 
-    def __init__(self, camera: Camera, kind: LensType) -> None:
-        """Of a lens type with surfaces. Raises InputError where they show no image, or let no light through."""
-        super().__init__(camera, kind)
+    def __init__(self, camera: Camera, lens_type: LensType) -> None:
+        """Create the model of a lens type with surfaces. Raises InputError if these form no image or pass no light."""
+        super().__init__(camera, lens_type)
         import drjit as dr
         import mitsuba as mi
 
-        lens = prescription_of(camera, kind)
-        self._numbers = [dr.opaque(mi.Float, float(number)) for number in path(lens, exit_disk_of(camera, kind, lens))]
+        lens, depth = prescription_of(camera, lens_type), camera.depth(lens_type)
+        numbers = path(lens, exit_disk_of(camera, lens_type, lens))
+        self._numbers = [dr.opaque(mi.Float, float(number)) for number in numbers]
         self._functions = Functions(dr.sqrt, dr.select, dr.maximum)
         self._radii = None
         if camera.wavelength is not None:
-            slope = camera.wavelength * lens.working_f_number(camera.depth(kind)) / np.pi / camera.depth(kind)
+            slope = camera.wavelength * lens.working_f_number(depth) / np.pi / depth
             blur = Blur(airy=slope * camera.distance / camera.target_pitch)
-            self.tail = blur.reach
-            self._radii = mi.Float((blur.radii * camera.target_pitch / camera.distance).astype(np.float32))
+            self.tail, self._radii = blur.reach, slope_table(blur, camera)
 
-    def leave(self, x: Any, y: Any, depth: Any, sampler: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any], Any]:
-        """Origin and direction (not normalised), from the lens's centre, of rays from (x, y, -depth), and weights."""
+    def emit(self, x: Any, y: Any, depth: Any, sampler: Any) -> Emission:
+        """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
         import mitsuba as mi
 
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
         (at_x, at_y), (u, v, w), weight = trace(self._numbers, x, y, on_disk.x, on_disk.y, depth, self._functions)
         if self._radii is None:
             return (at_x, at_y, 0), (u, v, w), weight
-        away = displaced(self._radii, sampler.next_2d())
-        return (at_x, at_y, 0), (u / w + away[0], v / w + away[1], 1), weight
+        shift = sample_displacement(self._radii, sampler.next_2d())
+        return (at_x, at_y, 0), (u / w + shift[0], v / w + shift[1], 1), weight

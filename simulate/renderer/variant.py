@@ -1,7 +1,7 @@
-"""Which of Mitsuba's variants work on this machine, and the choice of one.
+"""Mitsuba's variants: which of them work on this machine, and the choice of one.
 
-LLVM 15 and 16 load, and then kill the process at the first rendering, so a version is asked for before the backend
-is touched. A variant is global to the process.
+LLVM 15 and 16 load, and then kill the process at the first rendering, so the version is checked before the backend is
+used. A variant is global to the process.
 """
 
 # pyright: basic
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
 
 OLDEST_LLVM = (17, 0, 0)
-PATIENCE = 120  # seconds
+PATIENCE = 120  # seconds that a trial rendering may take
 PREFERENCE = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 
 _PROBE = """
@@ -52,7 +52,7 @@ print(json.dumps({"reason": reason, "speed": speed}))
 
 @dataclass(frozen=True)
 class BackendStatus:
-    """What was found out about a variant: why it cannot be used ("" if it can), and its samples per second."""
+    """Result of a trial of a variant: why it cannot be used ("" if it can), and its samples per second."""
 
     variant: str
     reason: str
@@ -60,7 +60,7 @@ class BackendStatus:
 
 
 def unusable_reason(variant: str) -> str:
-    """Why a variant cannot be used here, or "" if it can; touches no backend that could kill the process."""
+    """Return why a variant cannot be used here, or "" if it can, without loading a backend that kills the process."""
     import drjit as dr
 
     if variant.startswith("cuda"):
@@ -71,7 +71,7 @@ def unusable_reason(variant: str) -> str:
         try:
             version = tuple(dr.detail.llvm_version())
         except AttributeError:  # not part of Dr.Jit's public interface
-            return "the version of LLVM could not be found out"
+            return "the version of LLVM is unknown"
         if version < OLDEST_LLVM:
             return (
                 f"LLVM {version[0]} was found, which fails at the first rendering; {OLDEST_LLVM[0]} or newer is needed"
@@ -80,7 +80,7 @@ def unusable_reason(variant: str) -> str:
 
 
 def choose(requested: str) -> str:
-    """The variant to render with. Raises InputError if the one asked for does not work here."""
+    """Return the variant to render with. Raises InputError if the requested one does not work here."""
     if requested == "auto":
         return next(variant for variant in PREFERENCE if not unusable_reason(variant))
     reason = unusable_reason(requested)
@@ -90,19 +90,19 @@ def choose(requested: str) -> str:
 
 
 def check_fast_variant(camera: Camera, variant: str) -> None:
-    """Raise InputError where a camera is more than a set of pinholes and the backend is the slow one."""
+    """Raise InputError if a camera has other lenses than ideal pinholes and the variant is scalar."""
     if variant.startswith("scalar") and not camera.is_ideal_pinhole:
         raise InputError(f"lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}")
 
 
 def check_transport_variant(variant: str, key: str = "calibration.method") -> None:
-    """Raise InputError where calibration by transport is asked, by a key, of the slow backend."""
+    """Raise InputError if `key` asks for calibration by transport and the variant is scalar."""
     if variant.startswith("scalar"):
         raise InputError(f"{key} 'transport' needs Mitsuba's fast backend, got {variant}; {remedy()}")
 
 
 def activate(variant: str) -> None:
-    """Make a variant Mitsuba's current one, and send its log to stderr."""
+    """Make a variant Mitsuba's current one, and redirect its log to stderr."""
     import mitsuba as mi
 
     if mi.variant() != variant:
@@ -116,13 +116,13 @@ def activate(variant: str) -> None:
 
 
 def release() -> None:
-    """Give back the memory that the renderer keeps for its next work, if it has been loaded."""
+    """Free the memory that Dr.Jit caches, if it is loaded."""
     dr = sys.modules.get("drjit")
     if dr is not None:
         dr.flush_malloc_cache()
 
 
-INTERRUPTED = "Received interrupt signal"  # on which whoever asked for it hears the command line's own sentence
+INTERRUPTED = "Received interrupt signal"  # suppressed: the command line reports Ctrl-C itself
 _APPENDERS: dict[str, Any] = {}
 
 
@@ -145,24 +145,24 @@ def _stderr_appender() -> Any:
 
 
 def probe(variant: str) -> BackendStatus:
-    """Render a little in a process of its own, so that a broken backend can take down nothing but that."""
+    """Try a variant by a small rendering in a separate process, which a broken backend may kill."""
     try:
-        ended = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", _PROBE, variant], capture_output=True, text=True, timeout=PATIENCE, check=False
         )
     except subprocess.TimeoutExpired:
         return BackendStatus(variant, f"a trial rendering did not end in {PATIENCE} s", 0.0)
-    answer = ended.stdout.rfind('{"reason"')  # a backend may have written before it
-    if ended.returncode != 0 or answer < 0:
-        last = ended.stderr.strip().splitlines()[-1:] or [f"it ended with status {ended.returncode}"]
+    answer = process.stdout.rfind('{"reason"')  # a backend may have written before it
+    if process.returncode != 0 or answer < 0:
+        last = process.stderr.strip().splitlines()[-1:] or [f"it ended with status {process.returncode}"]
         return BackendStatus(variant, f"a trial rendering failed: {last[0]}", 0.0)
-    found = json.loads(ended.stdout[answer:])
-    return BackendStatus(variant, found["reason"], found["speed"])
+    status = json.loads(process.stdout[answer:])
+    return BackendStatus(variant, status["reason"], status["speed"])
 
 
-def diagnosis(found: list[BackendStatus]) -> str:
-    """One sentence on what is slow, and the one command that mends it."""
-    works = {one.variant for one in found if not one.reason}
+def diagnosis(statuses: list[BackendStatus]) -> str:
+    """Summarise the trials in one sentence, with the command that repairs a slow or broken backend."""
+    works = {status.variant for status in statuses if not status.reason}
     if "cuda_ad_mono" in works or "llvm_ad_mono" in works:
         return "The fast backend works; nothing to repair."
     if "scalar_rgb" in works:
@@ -171,7 +171,7 @@ def diagnosis(found: list[BackendStatus]) -> str:
 
 
 def remedy() -> str:
-    """The one command that brings the fast backend."""
+    """Return the command that installs the fast backend."""
     if shutil.which("apt-get"):
         prefix = "" if os.geteuid() == 0 else "sudo "
         return f"run: {prefix}apt-get install -y libllvm19"

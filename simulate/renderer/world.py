@@ -1,7 +1,7 @@
-"""A world behind the flat target, or instead of it: any Mitsuba scene file.
+"""Worlds: Mitsuba scene files behind the flat target, or instead of it.
 
-The file is in millimetres, the camera at its origin looking along +z with +y up. Its own sensors are not used, its
-integrator is; without one, light bounces along paths of up to 8 segments where anything reflects it.
+The file is in millimetres, the camera at its origin looking along +z with +y up. Its own sensors are ignored, its
+integrator is used; without one, light is followed along paths of up to 8 segments if anything reflects it.
 """
 
 # pyright: basic
@@ -23,45 +23,45 @@ from ommatid.scenes.scene import Scene, WorldTable
 from .plugins import BLOCK
 from .variant import activate
 
-TARGET = "ommatid_target"  # the rectangle's name in the world: a name that its file will not have given
-BACKWARDS = "ptracer"  # the integrator that starts at the lamps, and takes no block size
-DEEPEST = 8  # segments of a path, where the file says nothing
+TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file
+BACKWARDS = "ptracer"  # the integrator that starts at the emitters, and takes no block size
+DEEPEST = 8  # segments of a path, if the file has no integrator
 
 
 @dataclass(frozen=True)
 class StagedWorld:
-    """A world with the target in it as Mitsuba has it, and the integrator that light is followed by in it.
+    """A world with the target in it as a Mitsuba scene, and its integrator.
 
-    straight : whether light that bounces was left out, since nothing reflects any
+    direct_only : True if interreflections are left out, since nothing reflects
     """
 
     scene: Any
     integrator: Any
-    straight: bool = False
+    direct_only: bool = False
 
 
 def world_of(scene: Scene) -> WorldTable:
-    """The world of a scene. Raises ValueError where it has none."""
+    """Return the [world] of a scene. Raises ValueError if it has none."""
     if scene.world is None:
         raise ValueError(f"{scene.source}: expected a scene with a [world], got one without")
     return scene.world
 
 
 def files(scene: Scene) -> list[Path]:
-    """The world's file and those that it names and that are found beside it; not those that `$variables` name.
+    """Return the world's file and those beside it that it names, except by `$variables`.
 
     Raises InputError if there is no such file or it is not XML.
     """
     path = Path(world_of(scene).file)
-    found, waiting = [path], [path]
+    known, waiting = [path], [path]
     while waiting:
         for name in _named(waiting.pop(), scene):
-            beside = path.parent / name  # also of those in included files, as Mitsuba looks for them
-            if beside.is_file() and beside not in found:
-                found.append(beside)
+            beside = path.parent / name  # also for names in included files, as Mitsuba resolves them
+            if beside.is_file() and beside not in known:
+                known.append(beside)
                 if beside.suffix.lower() == ".xml":
                     waiting.append(beside)
-    return found
+    return known
 
 
 def _named(path: Path, scene: Scene) -> list[str]:
@@ -73,7 +73,7 @@ def _named(path: Path, scene: Scene) -> list[str]:
     except (OSError, ValueError, LookupError) as error:
         raise InputError(f"{where}: {path} could not be read as a Mitsuba scene ({error})") from error
     except ElementTree.ParseError as error:
-        raise InputError(f"{where}: {path} is not valid XML: {error}; mend it there") from error
+        raise InputError(f"{where}: {path} is not valid XML: {error}; correct it there") from error
     names = [
         element.get("value" if element.tag == "string" else "filename")
         for element in elements
@@ -83,7 +83,7 @@ def _named(path: Path, scene: Scene) -> list[str]:
 
 
 def describe(scene: Scene) -> dict[str, Any]:
-    """What values depend on of a world: SHA-256 of its file and of those that it names. Raises InputError."""
+    """Describe a world for a fingerprint, by SHA-256 of its file and of those that it names. Raises InputError."""
     world = world_of(scene)
     folder = Path(world.file).parent
     sums: dict[str, str] = {}
@@ -96,7 +96,7 @@ def describe(scene: Scene) -> dict[str, Any]:
 def stage(scene: Scene, variant: str, target: Any | None) -> StagedWorld:
     """Build the world, with the target's rectangle (a Mitsuba shape) in it, if there is one.
 
-    Raises InputError for a file that Mitsuba cannot make a scene of, and where nothing shines.
+    Raises InputError for a file that Mitsuba cannot build a scene from, and for a world without an emitter.
     """
     activate(variant)
     import mitsuba as mi
@@ -109,54 +109,54 @@ def stage(scene: Scene, variant: str, target: Any | None) -> StagedWorld:
         state = mi.parser.parse_file(config, file)
         if state.root.type != mi.ObjectType.Scene:
             raise InputError(f"{where} holds a single {state.root.type.name.lower()}; expected a whole <scene>")
-        followed = _adapt(state, Path(file).parent)
+        has_integrator = _adapt(state, Path(file).parent)
         mi.parser.transform_all(config, state)
         if target is not None:
-            target.set_id(TARGET)  # by which its parameters are found again
+            target.set_id(TARGET)  # by which its parameters are identified
             state.root.props[TARGET] = target
         built: Any = mi.parser.instantiate(config, state)
     except (RuntimeError, TypeError) as error:
-        what = re.sub(r"^\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
-        raise InputError(f"{where} is no scene that Mitsuba can build: {what}") from error
+        reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
+        raise InputError(f"{where} is no scene that Mitsuba can build: {reason}") from error
     if not built.emitters():
         raise InputError(f"{where} has no emitter, so all is black; add one, such as <emitter type='constant'/>")
-    if not followed:
-        straight = not (scene.render.complete or bounces(built))
-        path = {"type": "path", "max_depth": 1 if straight else DEEPEST, "block_size": BLOCK}
-        return StagedWorld(built, mi.load_dict(path), straight)
+    if not has_integrator:
+        direct_only = not (scene.render.complete or has_interreflections(built))
+        path = {"type": "path", "max_depth": 1 if direct_only else DEEPEST, "block_size": BLOCK}
+        return StagedWorld(built, mi.load_dict(path), direct_only)
     if not isinstance(built.integrator(), mi.SamplingIntegrator):
         raise InputError(f"{where}: its integrator does not follow rays from a camera; expected one such as 'path'")
     return StagedWorld(built, built.integrator())
 
 
 def _adapt(state: Any, folder: Path) -> bool:
-    """Drop the sensors, name files by their whole path, and say whether there is an integrator."""
+    """Remove the sensors, make paths of files absolute, and return True if there is an integrator."""
     import mitsuba as mi
 
-    kinds = mi.Properties.Type
-    followed = False
+    types = mi.Properties.Type
+    has_integrator = False
     root = state.root.props
     for key in list(root.keys()):
-        if root.type(key) == kinds.ResolvedReference:
-            kind = state.nodes[root[key].index()].type
-            followed |= kind == mi.ObjectType.Integrator
-            if kind == mi.ObjectType.Sensor:
+        if root.type(key) == types.ResolvedReference:
+            node_type = state.nodes[root[key].index()].type
+            has_integrator |= node_type == mi.ObjectType.Integrator
+            if node_type == mi.ObjectType.Sensor:
                 del root[key]
     for node in state.nodes:
         props = node.props
-        if "filename" in props and props.type("filename") == kinds.String:
+        if "filename" in props and props.type("filename") == types.String:
             beside = folder / props["filename"]
             if beside.is_file():
                 props["filename"] = str(beside)
         if node.type == mi.ObjectType.Integrator and props.plugin_name() != BACKWARDS:
             props["block_size"] = BLOCK
-    return followed
+    return has_integrator
 
 
-def bounces(world: Any) -> bool:
-    """Whether light may reach the camera of a Mitsuba scene by another way than straight from an emitter.
+def has_interreflections(world: Any) -> bool:
+    """Return True if light may reach the camera of a Mitsuba scene on other paths than directly from an emitter.
 
-    False only where every surface is known to be black: anything else may reflect, or let through what is behind it.
+    False only if every surface is known to be black: anything else may reflect or transmit light.
     """
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""Work that was broken off: what is done of it waits beside the result, and the next run carries on from there."""
+"""Checkpoints of interrupted computations, stored beside the result so that the next run continues from there."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from ommatid.scenes.formats import npz
 
 State = dict[str, NDArray[Any]]
 
-SPACING = 30.0  # seconds between two savings: what a power cut may cost
+SPACING = 30.0  # seconds between two savings: the work that a power cut may lose
 
 
 class Checkpoint:
-    """What is done so far of something that a fingerprint names."""
+    """The finished part of a computation that a fingerprint identifies."""
 
     def __init__(self, path: Path, fingerprint: str) -> None:
-        """Of the result that will stand at `path`."""
+        """Create the checkpoint of the result at `path`; nothing is read or written yet."""
         self._path = _beside(path)
         self._fingerprint = fingerprint
         self._saved = monotonic()
         self._latest: Callable[[], State] | None = None
 
     def state(self) -> State:
-        """What an earlier run left, if it was of the same; else nothing."""
+        """Return the state that an earlier run saved; empty if there is none or its fingerprint differs."""
         try:
-            found = npz.read(self._path)
+            state = npz.read(self._path)
         except ValueError:
             return {}
-        return found if str(found.pop("fingerprint", "")) == self._fingerprint else {}
+        return state if str(state.pop("fingerprint", "")) == self._fingerprint else {}
 
     def offer(self, latest: Callable[[], State]) -> None:
-        """Say how far the work is; it is written now and then, and when the work is broken off."""
+        """Register the current state, which is written every 30 seconds and when the computation is interrupted."""
         self._latest = latest
         if monotonic() - self._saved > SPACING:
             self.save()
 
     def save(self) -> None:
-        """Write what was offered last. Raises DeniedError."""
+        """Write the state that was offered last. Raises MachineError."""
         if self._latest is None:
             return
         state = {**self._latest(), "fingerprint": np.array(self._fingerprint)}
@@ -57,10 +57,6 @@ class Checkpoint:
         write_whole(self._path, fill)
         self._saved = monotonic()
 
-    def remove(self) -> None:
-        """The work is done."""
-        self._path.unlink(missing_ok=True)
-
 
 def _beside(path: Path) -> Path:
     return path.with_name(f".{path.name}.partial.npz")
@@ -68,14 +64,14 @@ def _beside(path: Path) -> Path:
 
 @contextmanager
 def open_checkpoint(path: Path, fingerprint: str) -> Generator[Checkpoint]:
-    """What is done so far of the result at `path`: kept when the work is broken off, removed when it is done."""
-    partial = Checkpoint(path, fingerprint)
+    """Open the checkpoint of the result at `path`: saved if the computation is interrupted, removed when it ends."""
+    checkpoint = Checkpoint(path, fingerprint)
     try:
-        yield partial
+        yield checkpoint
     except BaseException:
         try:
-            partial.save()
-        except MachineError:  # what broke the work off is the thing to tell
-            partial.remove()
+            checkpoint.save()
+        except MachineError:  # the original exception is the one to report
+            _beside(path).unlink(missing_ok=True)
         raise
-    partial.remove()
+    _beside(path).unlink(missing_ok=True)

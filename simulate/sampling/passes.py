@@ -8,16 +8,14 @@ from functools import cache
 from math import ceil, isqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.scene import Sampler
 
 from .checkpoint import State
 from .samplers import filling, fitting
 
-Vector = NDArray[np.float64]
-
-BATCHES = 8  # passes are also averaged in this many batches, whose scatter shows how errors go together
+BATCHES = 8  # passes are also averaged in this many batches, whose scatter shows the correlation of errors
 FEWEST_PASSES = 16
 MOST_SAMPLES = 4096  # in one pass: the renderer's sums are float32
 JITTERED: tuple[Sampler, ...] = ("multijitter", "stratified")  # one sample in every cell of a grid
@@ -27,29 +25,29 @@ ROUNDING = 2.0**-24  # relative, of float32
 
 @dataclass(frozen=True)
 class Plan:
-    """How many passes, and how many samples a pixel in each."""
+    """Number of passes, and of samples per pixel in each."""
 
     passes: int
     samples: int
 
     @property
     def total(self) -> int:
-        """Samples a pixel of all passes."""
+        """Samples per pixel of all passes."""
         return self.passes * self.samples
 
 
 def plan(samples: int, sampler: Sampler = "multijitter") -> Plan:
-    """Divide `samples` a pixel over at least 16 passes, rounding up to a grid that the sampler can fill."""
+    """Divide `samples` per pixel over at least 16 passes, rounded up to a grid that the sampler can fill."""
     passes = max(FEWEST_PASSES, BATCHES * ceil(samples / MOST_SAMPLES / BATCHES))
     return Plan(passes, fitting(sampler, ceil(samples / passes)))
 
 
 def on_grid(samples: int, sampler: Sampler, cells: int = 1, most: int = MOST_SAMPLES) -> Plan:
-    """At least `samples` a pixel in passes, none of more than `most`: for squares, on a grid of a multiple of `cells`.
+    """Divide at least `samples` per pixel over passes of at most `most`, on grids of a multiple of `cells` a side.
 
-    Where a pixel sees cells x cells whole pixels of f, such a grid puts equally many samples into each of them, and a
-    sampler that jitters within its cells gives the pixel's value without any error. Sides are few, 1, 2, 3, 4, 6, 8,
-    12, ... times `cells`: Mitsuba compiles for every one.
+    Where a sensor pixel sees cells x cells whole pixels of f, such a grid puts equally many samples into each of them,
+    and a sampler that jitters within its cells gives the pixel's value without any error. Sides are few, 1, 2, 3, 4,
+    6, 8, 12, ... times `cells`, since Mitsuba compiles anew for every one.
     """
     each = ceil(samples / FEWEST_PASSES)
     times = ceil((isqrt(max(each - 1, 0)) + 1) / cells)
@@ -66,13 +64,13 @@ _filling = cache(filling)
 
 
 def cells_of(ratio: Fraction) -> int:
-    """Along one side of a sensor pixel that covers `ratio` pixels of f: into how many alike their edges can cut it."""
+    """Return the number of equal parts that the edges of pixels of f can cut a side of `ratio` pixels of f into."""
     return ratio.numerator if ratio.numerator <= MOST_CELLS else 1
 
 
 @dataclass(frozen=True)
 class OverPasses:
-    """How a mean over passes was made: passes, samples a pixel in each, Mitsuba's variant, the first sampler's seed."""
+    """Parameters of a mean over passes: passes, samples per pixel in each, Mitsuba's variant, first sampler seed."""
 
     passes: int
     samples: int
@@ -80,7 +78,7 @@ class OverPasses:
     first_seed: int
 
     def record(self) -> dict[str, int | str]:
-        """What the file that holds the mean says of it; samples are those of all passes."""
+        """Return the entries for the record of a stack or a model; samples are those of all passes."""
         return {
             "samples": self.passes * self.samples,
             "passes": self.passes,
@@ -93,50 +91,50 @@ class Tally:
     """Running mean and variance over passes of arrays of one shape (Welford), in float64."""
 
     def __init__(self, *shape: int) -> None:
-        """Start empty."""
+        """Create an empty tally."""
         self.count = 0
         self._mean = np.zeros(shape)
         self._squares = np.zeros(shape)
 
     def state(self, name: str) -> State:
-        """All of it, to be kept under `name`."""
+        """Return the arrays of a checkpoint, under keys that begin with `name`."""
         return {f"{name}.count": np.array(self.count), f"{name}.mean": self._mean, f"{name}.squares": self._squares}
 
     def resume(self, name: str, state: State) -> None:
-        """Go on where a kept one of this name stopped, if there is one."""
+        """Continue from a checkpoint, if it holds a tally of this name."""
         if f"{name}.count" in state:
             self.count = int(state[f"{name}.count"])
             self._mean, self._squares = state[f"{name}.mean"], state[f"{name}.squares"]
 
-    def add(self, values: Vector) -> None:
-        """Take in one more pass."""
+    def add(self, values: FloatArray) -> None:
+        """Add one pass."""
         self.count += 1
-        away = values - self._mean
-        self._mean += away / self.count
-        self._squares += away * (values - self._mean)
+        deviation = values - self._mean
+        self._mean += deviation / self.count
+        self._squares += deviation * (values - self._mean)
 
     @property
-    def mean(self) -> Vector:
+    def mean(self) -> FloatArray:
         """Mean over the passes."""
         return self._mean
 
     @property
-    def variance(self) -> Vector:
-        """Unbiased variance of that mean, from the scatter of the passes alone; NaN of a single one."""
+    def variance(self) -> FloatArray:
+        """Unbiased variance of that mean, from the scatter of the passes alone; NaN for a single pass."""
         if self.count < 2:
             return np.full_like(self._mean, np.nan)
         return self._squares / (self.count * (self.count - 1))
 
 
-def rounding_variance(values: Vector, samples: int) -> Vector:
-    """Variance that float32 leaves in a mean of `samples` values: of its storage, and of the sums it came from.
+def rounding_variance(values: FloatArray, samples: int) -> FloatArray:
+    """Return the variance that float32 leaves in a mean of `samples` values, by storage and by summation.
 
     A value of 0 is given the rounding of 1, since noise of exactly 0 has no inverse.
     """
     return ((np.abs(values) * (1 + samples / 8) + 1) * ROUNDING) ** 2
 
 
-def samples_within(values: Vector, variance: Vector) -> int:
-    """The most samples whose rounding, as `rounding_variance` has it, leaves no more than `variance`; 1 at least."""
+def samples_within(values: FloatArray, variance: FloatArray) -> int:
+    """Return the largest number of samples, at least 1, whose `rounding_variance` does not exceed `variance`."""
     sums = (np.sqrt(variance) / ROUNDING - 1) / np.maximum(np.abs(values), ROUNDING)
     return max(int(8 * (float(sums.min()) - 1)), 1)

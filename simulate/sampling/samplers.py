@@ -1,7 +1,7 @@
-"""Mitsuba's samplers: how many samples a pixel each can fill its grid with, and how fast its error should fall.
+"""Mitsuba's samplers: the numbers of samples that fill their grids, and how fast the error of a mean should fall.
 
-Mitsuba rounds other counts up by itself, with a warning; counts that fit are asked for instead, so that what is
-recorded is what was used.
+Mitsuba rounds other numbers up by itself, with a warning; numbers that fill the grid are requested instead, so that
+the recorded number is the one that was used.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ IN_THE_LIMIT = 64  # samples in a pass: with fewer, strata that hold a corner ar
 
 
 def fitting(sampler: Sampler, samples: int) -> int:
-    """The least number of samples, no fewer than asked for, that fills a sampler's grid.
+    """Return the least number of samples, no fewer than `samples`, that fills a sampler's grid.
 
-    Any for independent samples; a grid as square as may be for multijitter; squares for stratified; squares of primes
-    for orthogonal arrays (strength 2, Bose); powers of four for ldsampler, whose two sequences are binary.
+    Any number for independent samples; a grid as square as possible for multijitter; squares for stratified; squares
+    of primes for orthogonal arrays (strength 2, Bose); powers of four for ldsampler, whose two sequences are binary.
     """
     samples = max(samples, 1)
     if sampler == "independent":
@@ -42,16 +42,17 @@ def fitting(sampler: Sampler, samples: int) -> int:
 
 
 def filling(sampler: Sampler, most: int) -> int:
-    """The largest number of samples, no more than `most`, that fills a sampler's grid; where there is none, the
-    least."""
-    return next((one for one in range(most, 0, -1) if fitting(sampler, one) == one), fitting(sampler, 1))
+    """Return the largest number of samples up to `most` that fills a sampler's grid, or the least one if none does."""
+    return next(
+        (samples for samples in range(most, 0, -1) if fitting(sampler, samples) == samples), fitting(sampler, 1)
+    )
 
 
 @dataclass(frozen=True)
 class ConvergenceLaw:
-    """How the error of a mean over rays falls with their number, d log error / d log samples, as far as theory says.
+    """Theoretical slope of the error of a mean over rays, d log error / d log samples; None where theory has none.
 
-    least : samples in one pass from which on the law holds
+    why : the theory in one sentence;  least : samples in one pass from which the law holds
     """
 
     slope: float | None
@@ -60,26 +61,26 @@ class ConvergenceLaw:
 
 
 def law(sampler: Sampler, camera: Camera) -> ConvergenceLaw:
-    """Of a sampler in front of the lenses of a camera and a flat target, which is constant over each of its pixels."""
+    """Return the law of a sampler in front of a camera's lenses and a flat target, constant over each pixel of f."""
     if sampler == "independent":
         return ConvergenceLaw(-0.5, "independent samples: the variance of a mean of n is 1/n of one's")
-    if not all(kind.optics.is_pinhole for kind in camera.types):
+    if not all(lens_type.optics.is_pinhole for lens_type in camera.types):
         why = "rays differ in four or six numbers, and the sampler stratifies them only two by two"
         return ConvergenceLaw(None, why, IN_THE_LIMIT)
     if sampler == "ldsampler":
-        why = "theory bounds it alone: by order of log(n)/n (Koksma and Hlawka), which is no slope"
+        why = "theory gives only a bound: of order log(n)/n (Koksma and Hlawka), which is no slope"
         return ConvergenceLaw(None, why, IN_THE_LIMIT)
     why = "of n strata only those along edges, some n^1/2, err: n^1/2 / n^2 of variance (Mitchell 1996), for large n"
     return ConvergenceLaw(-0.75, why, IN_THE_LIMIT)
 
 
 def corners(camera: Camera, fewest: int, most: int) -> float:
-    """By how much a slope between so many samples in a pass may differ from -3/4, which holds in the limit.
+    """Return by how much a slope between two numbers of samples in a pass may differ from its limit of -3/4.
 
     Of s x s strata, 2 (m - 1) s lie along edges of pixels of f, of which (m - 1)^2 hold two at once, a corner. Their
     variance lies between none and twice that of two, so the error's square is C s^-3 (1 + c / s), |c| <= (m - 1) / 2.
     """
-    c = float(max(kind.ratio for kind in camera.types) - 1) / 2
+    c = float(max(lens_type.ratio for lens_type in camera.types) - 1) / 2
     sides = fewest**0.5, most**0.5
     if c >= sides[0] or fewest == most:
         return inf

@@ -1,1 +1,1 @@
-"""From light to recorded values."""
+"""Sensors: recorded values from light."""

@@ -1,18 +1,19 @@
-"""Electrons that the light of the target frees in each pixel, whatever the lenses are."""
+"""Electrons that the light of the target frees in each pixel, for every kind of lens."""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.setup import Setup
 
 
-def response(setup: Setup) -> NDArray[np.float64]:
-    """For each unit of f: (M,). Raises ValueError without a [sensor], InputError where surfaces show no image."""
+def response(setup: Setup) -> FloatArray:
+    """Return the electrons per unit of f, (M,).
+
+    Raises ValueError without a [sensor], InputError for a lens whose surfaces form no image.
+    """
     scene, camera = setup.scene, setup.camera
-    if all(kind.optics.surfaces is None for kind in camera.types):
+    if all(lens_type.optics.surfaces is None for lens_type in camera.types):
         return electrons(scene, camera)
     from ..lenses.etendue import relative_illumination, solid_angles
 

@@ -1,4 +1,4 @@
-"""Batches that are broken off at any moment: the next run repeats nothing finished and ends with the same files."""
+"""Batches that are interrupted at any moment: the next run repeats nothing finished and gives the same files."""
 
 from __future__ import annotations
 
@@ -29,13 +29,15 @@ from ommatid.runtime import files
 from ommatid.runtime.processors import one_thread, processors
 
 from ..conftest import TINY, Command, shell
-from ..runs import FILES, MADE, content
+from ..runs import FILES, MADE, assert_same_content, content
 
 COMMAND = ("run", "tiny.toml", "-o", "out", "--sweep", "render.seed=1,2", "--json")
 SCENES = ("tiny+render.seed=1", "tiny+render.seed=2")
-MOST_CHANGES = 60  # of the files of one attempt, after so many of which at most it is killed
+SHARED = ("index.html", "sweep.csv", "sweep.json", "sweep.png")
+OUTPUT = {*SHARED, *(f"{scene}/{name}" for scene in SCENES for name in FILES)}
+MOST_CHANGES = 60  # of files: a command is killed after a random number of changes up to this
 
-# Starts commands that have everything imported already, so that each begins its work at once.
+# Forks commands from a process that has imported everything, so that each begins its work at once.
 STARTER = """
 import os, sys
 import mitsuba, numba, scipy.linalg, skimage.metrics, matplotlib.backends.backend_agg
@@ -50,8 +52,8 @@ for line in sys.stdin:
     os.setsid()
     folder, *sys.argv[1:] = line.split()
     os.chdir(folder)
-    os.dup2(os.open("said", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-    os.dup2(os.open("told", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
+    os.dup2(os.open("stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
+    os.dup2(os.open("stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
     open("number.new", "w").write(str(os.getpid()))
     os.rename("number.new", "number")
     try:
@@ -65,46 +67,44 @@ for line in sys.stdin:
 
 @dataclass(frozen=True)
 class Attempt:
-    """A command that was killed, or ended by itself: what it said then."""
+    """A command that was killed or ended, and its output."""
 
     killed: bool
     out: str
     err: str
 
 
-def stamps(out: Path) -> dict[str, int]:
-    """When each file below a folder was written, hidden ones included."""
-    found: dict[str, int] = {}
+def modification_times(out: Path) -> dict[str, int]:
+    """Modification time of every file below a folder, hidden ones included."""
+    times: dict[str, int] = {}
     for folder, _, names in os.walk(out):
         for name in names:
-            try:
-                path = Path(folder) / name
-                found[str(path.relative_to(out))] = path.stat().st_mtime_ns
-            except FileNotFoundError:  # renamed meanwhile
-                continue
-    return found
+            path = Path(folder) / name
+            with suppress(FileNotFoundError):  # renamed meanwhile
+                times[str(path.relative_to(out))] = path.stat().st_mtime_ns
+    return times
 
 
-def finished_in(found: dict[str, int], scene: str) -> dict[str, int]:
-    """The files of stages that are done: each stands for itself, but for those of which run.json is the last."""
-    here = {name: found.get(f"{scene}/{name}", 0) for name in MADE}
-    done = ("stack.exr", "model.npz") if not here["run.json"] else MADE
-    return {f"{scene}/{name}": here[name] for name in done if here[name]}
+def finished_files(times: dict[str, int], scene: str) -> dict[str, int]:
+    """Files of finished stages. Those of the reconstruction are finished once run.json, the last, is there."""
+    here = {name: times[f"{scene}/{name}"] for name in MADE if f"{scene}/{name}" in times}
+    finished = MADE if "run.json" in here else ("stack.exr", "model.npz")
+    return {f"{scene}/{name}": here[name] for name in finished if name in here}
 
 
 def attempt(starter: subprocess.Popen[str], here: Path, workers: int, changes: int) -> Attempt:
-    """Run the command, and kill it and all its processes once its files have changed so often."""
+    """Run the command, and kill it with all its processes after a number of changes of its files."""
     assert starter.stdin is not None
     assert starter.stdout is not None
     (here / "number").unlink(missing_ok=True)
-    before, seen = stamps(here / "out"), 0
+    before, seen = modification_times(here / "out"), 0
     starter.stdin.write(" ".join((str(here), *COMMAND, "--workers", str(workers))) + "\n")
     starter.stdin.flush()
     while not (here / "number").exists():
         time.sleep(0.001)
     group = int((here / "number").read_text(encoding="ascii"))
     while seen < changes and not select.select([starter.stdout], [], [], 0.001)[0]:
-        now = stamps(here / "out")
+        now = modification_times(here / "out")
         seen += len(now.items() ^ before.items())
         before = now
     if seen >= changes:
@@ -112,63 +112,44 @@ def attempt(starter: subprocess.Popen[str], here: Path, workers: int, changes: i
             os.killpg(group, signal.SIGKILL)
     number, status = map(int, starter.stdout.readline().split())
     assert number == group
+    out, err = ((here / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
     killed = os.WIFSIGNALED(status)
-    assert killed or os.waitstatus_to_exitcode(status) == 0, (here / "said").read_text(encoding="utf-8")
-    told, said = ((here / name).read_text(encoding="utf-8") for name in ("told", "said"))
-    return Attempt(killed, told, said)
+    assert killed or os.waitstatus_to_exitcode(status) == 0, err
+    return Attempt(killed, out, err)
 
 
-def broken_off(starter: subprocess.Popen[str], here: Path, workers: int, random: np.random.Generator) -> int:
-    """Run a batch, kill it, and resume it until it is done: how often it was killed.
+def kill_and_resume(starter: subprocess.Popen[str], here: Path, workers: int, random: np.random.Generator) -> int:
+    """Run a batch, kill it and resume it until it ends; check each attempt, and return the number of kills.
 
-    workers : of the first attempt; the others are made by one process
+    workers : of the first attempt; the others use one process
     """
     here.mkdir()
     (here / "tiny.toml").write_text(TINY, encoding="utf-8")
     kills = 0
     while True:
-        before = stamps(here / "out")
-        made = attempt(starter, here, 1 if kills else workers, int(random.integers(1, MOST_CHANGES)))
-        after = stamps(here / "out")
-        done = {scene: finished_in(before, scene) for scene in SCENES}
-        for files_of_it in done.values():
-            assert {name: after.get(name) for name in files_of_it} == files_of_it, f"repeated after {kills} kills"
-        if not made.killed:
+        before = modification_times(here / "out")
+        ended = attempt(starter, here, 1 if kills else workers, int(random.integers(1, MOST_CHANGES)))
+        after = modification_times(here / "out")
+        finished = {scene: finished_files(before, scene) for scene in SCENES}
+        for times in finished.values():
+            assert {name: after.get(name) for name in times} == times, f"repeated after {kills} kills"
+        if not ended.killed:
             break
         kills += 1
     for scene in SCENES:
         line = f"render: up to date, nothing to do, {Path('out') / scene / 'stack.exr'}"
-        assert (line in made.err) == (f"{scene}/stack.exr" in done[scene])
+        assert (line in ended.err) == (f"{scene}/stack.exr" in finished[scene])
     for name, stage in (("model.npz", "calibrate"), ("run.json", "reconstruct")):
-        standing = sum(f"{scene}/{name}" in done[scene] for scene in SCENES)
-        assert made.err.count(f"{stage}: up to date") == standing
-    assert [one["values"] for one in json.loads(made.out)] == [{"render.seed": "1"}, {"render.seed": "2"}]
+        count = sum(f"{scene}/{name}" in finished[scene] for scene in SCENES)
+        assert ended.err.count(f"{stage}: up to date") == count
+    assert [document["values"] for document in json.loads(ended.out)] == [{"render.seed": "1"}, {"render.seed": "2"}]
     return kills
 
 
-def table(path: Path) -> list[dict[str, str]]:
+def rows_without_times(path: Path) -> list[dict[str, str]]:
     with path.open(encoding="utf-8", newline="") as stream:
-        return [
-            {name: value for name, value in row.items() if not name.startswith("seconds")}
-            for row in csv.DictReader(stream)
-        ]
-
-
-def everything(out: Path) -> dict[str, Any]:
-    """All that a batch wrote, without seconds."""
-    found: dict[str, Any] = {
-        f"{scene}/{name}": value for scene in SCENES for name, value in content(out / scene).items()
-    }
-    return found | {"sweep.csv": table(out / "sweep.csv")}
-
-
-def all_files() -> set[str]:
-    return {f"{scene}/{name}" for scene in SCENES for name in FILES} | {
-        "index.html",
-        "sweep.csv",
-        "sweep.json",
-        "sweep.png",
-    }
+        rows = list(csv.DictReader(stream))
+    return [{name: value for name, value in row.items() if not name.startswith("seconds")} for row in rows]
 
 
 @pytest.fixture(scope="module")
@@ -179,33 +160,31 @@ def starter() -> Generator[subprocess.Popen[str]]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory, starter: subprocess.Popen[str]) -> dict[str, Any]:
-    """What a run that nobody kills writes."""
-    here = tmp_path_factory.mktemp("undisturbed")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory, starter: subprocess.Popen[str]) -> Path:
+    """Output folder of a batch that is not killed."""
+    here = tmp_path_factory.mktemp("uninterrupted")
     (here / "tiny.toml").write_text(TINY, encoding="utf-8")
     assert not attempt(starter, here, 1, sys.maxsize).killed
-    assert stamps(here / "out").keys() == all_files()
-    return everything(here / "out")
+    assert modification_times(here / "out").keys() == OUTPUT
+    return here / "out"
 
 
 @pytest.mark.parametrize(("workers", "kills"), [(1, 8), (2, 1)])
 def test_a_batch_that_is_killed_at_any_moment_is_resumed(
-    workers: int, kills: int, starter: subprocess.Popen[str], tmp_path: Path, undisturbed: dict[str, Any]
+    workers: int, kills: int, starter: subprocess.Popen[str], tmp_path: Path, uninterrupted: Path
 ) -> None:
     random, killed = np.random.default_rng(5), 0
+    expected = {scene: content(uninterrupted / scene) for scene in SCENES}
     while killed < kills:
         here = tmp_path / str(killed)
-        killed += broken_off(starter, here, workers, random)
-        assert stamps(here / "out").keys() == all_files(), "files are left over, or missing"
-        found = everything(here / "out")
-        assert found.keys() == undisturbed.keys()
-        assert [name for name in found if found[name] != undisturbed[name]] == []
+        killed += kill_and_resume(starter, here, workers, random)
+        assert modification_times(here / "out").keys() == OUTPUT, "files are left over, or missing"
+        for scene in SCENES:
+            assert_same_content(here / "out" / scene, expected[scene])
+        assert rows_without_times(here / "out" / "sweep.csv") == rows_without_times(uninterrupted / "sweep.csv")
 
 
-# --- what killed processes leave
-
-
-def test_a_run_clears_what_one_that_was_killed_has_left(kept: Path, ommatid: Command) -> None:
+def test_a_run_removes_the_temporary_files_of_a_killed_one(kept: Path, ommatid: Command) -> None:
     for name in (f".0123abcd{files.PART}estimate.png", ".stack.exr.partial.npz", ".model.npz.partial.npz"):
         (kept / name).write_bytes(b"half")
     ended = ommatid("run", "tiny.toml", "-o", "out")
@@ -213,68 +192,75 @@ def test_a_run_clears_what_one_that_was_killed_has_left(kept: Path, ommatid: Com
     assert {path.name for path in kept.iterdir()} == FILES
 
 
-# --- side by side
+# --- the number of processes
 
 
-def nothing(*given: Any) -> Any:
-    raise AssertionError(f"not asked for: {given}")
+def unused(*arguments: Any) -> Any:
+    raise AssertionError(f"called with {arguments}")
 
 
 @pytest.mark.parametrize(("fit", "cores", "expected"), [(9, 4, 3), (2, 4, 2), (1, 4, 1), (9, 2, 2), (9, 1, 1)])
-def test_as_many_scenes_are_done_side_by_side_as_there_are_processors_and_memory_for(
+def test_processes_are_limited_by_scenes_processors_and_memory(
     fit: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batch, "processors", lambda: cores)
-    seen: list[int] = []
+    counts: list[int] = []
 
     class Counted(Batch):
-        def _beside(self, members: Sequence[Member], count: int) -> Works:
-            seen.append(min(count, len(members)))
+        def _in_processes(self, members: Sequence[Member], count: int) -> Works:
+            counts.append(min(count, len(members)))
             yield from ()
 
-        def _here(self, members: Sequence[Member]) -> Works:
-            seen.append(min(1, len(members)))
+        def _in_this_process(self, members: Sequence[Member]) -> Works:
+            counts.append(min(1, len(members)))
             yield from ()
 
     three = [Member(Path(f"{name}.toml"), Path(name)) for name in "abc"]
-    asked = Counted(nothing, nothing, nothing, nothing, nothing, lambda _: fit)
-    assert list(asked.works(three)) == []
-    assert list(asked.works(three, count=1)) == []
-    assert list(asked.works(three, count=7)) == []
-    assert list(asked.works(three[:1], count=7)) == []
-    assert seen == [expected, 1, 3, 1]
+    counted = Counted(unused, unused, unused, unused, unused, lambda _: fit)
+    for members, count in ((three, None), (three, 1), (three, 7), (three[:1], 7)):
+        assert list(counted.works(members, count=count)) == []
+    assert counts == [expected, 1, 3, 1]
 
 
-def test_memory_is_asked_of_the_scenes_that_need_most(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_that_of_the_largest_scenes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     large = [Member(here / "tiny.toml", here, ("target.shape=[60,60]", "camera.lens.I.pixels=fit"))] * 3
     small = [Member(here / "tiny.toml", here), Member(here / "missing.toml", here)]
-    needs = [PROGRAM_MEMORY + 7 * 8 * pixels**2 for pixels in (3600, 3600, 3600)]
-    for free, expected in ((needs[0] * 1.5, 1), (needs[0] * 2.5, 2), (needs[0] * 50, 5)):
+    needed = PROGRAM_MEMORY + 7 * 8 * 3600**2
+    for free, expected in ((needed * 1.5, 1), (needed * 2.5, 2), (needed * 50, 5)):
         monkeypatch.setattr(method_choice, "free_memory", lambda free=free: 2 * int(free))
         assert concurrent_by_memory([estimate_cost(member, (), ()).memory for member in (*small, *large)]) == expected
 
 
-def test_a_batch_is_shared_where_that_is_sooner() -> None:
-    """In closed form for two processors: n alike are done after n/2 of their time, or n (1 - 0.6/2) one by one."""
-    assert fastest_process_count([3.0] * 8, 2, 2) == 2, "2 + 12 s against 16.8"
-    assert fastest_process_count([2.0] * 2, 2, 2) == 1, "2 + 2 s against 2.8: they end before a process has begun"
-    assert fastest_process_count([60.0, 3.0], 2, 2) == 1, "the large one would have one processor all the time"
-    assert fastest_process_count([3.0, 60.0, 60.0], 2, 2) == 2
-    assert fastest_process_count([60.0] * 8, 1, 8) == 1, "no more than memory holds"
+@pytest.mark.parametrize(
+    ("seconds", "most", "shared", "expected"),
+    [
+        ([3.0] * 8, 2, 2, 2),  # 2 + 12 s against 16.8
+        ([2.0] * 2, 2, 2, 1),  # 2 + 2 s against 2.8: they end before a process has begun
+        ([60.0, 3.0], 2, 2, 1),  # the large one would have one processor all the time
+        ([3.0, 60.0, 60.0], 2, 2, 2),
+        ([60.0] * 8, 1, 8, 1),  # no more than memory holds
+    ],
+)
+def test_a_batch_uses_processes_if_that_is_faster(seconds: list[float], most: int, shared: int, expected: int) -> None:
+    """In closed form for two processors: n equal scenes take n/2 of their time, or n (1 - 0.6/2) one by one."""
+    assert fastest_process_count(seconds, most, shared) == expected
 
 
-def test_linear_algebra_is_done_by_one_thread_whatever_was_set_before() -> None:
+# --- threads of linear algebra
+
+
+def test_linear_algebra_uses_one_thread_whatever_the_setting() -> None:
+    def blas_threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
     with threadpool_limits(2, "blas"):
         with one_thread():
-            inside = {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
-        after = {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
-    assert inside == {1}
-    assert after == {2} or processors() == 1
+            assert blas_threads() == {1}
+        assert blas_threads() == {2} or processors() == 1
 
 
 def test_a_run_with_more_threads_for_linear_algebra_gives_the_same_files(finished: Path, here: Path) -> None:
     before = "import os\nos.environ['OPENBLAS_NUM_THREADS'] = '2'"
     ended = shell("run", "tiny.toml", "-o", "out", cwd=here, before=before)
     assert ended.code == 0, ended.err
-    found, expected = content(here / "out" / "tiny"), content(finished)
-    assert [name for name in found if found[name] != expected[name]] == []
+    assert_same_content(here / "out" / "tiny", content(finished))

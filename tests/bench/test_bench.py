@@ -18,7 +18,7 @@ from ommatid.bench.reference import reference, sample_plan
 from ommatid.bench.resources import CLEAR_REFS, Cost, measure_cost
 from ommatid.bench.scheduler import Job, Journal, Repeat, cell_from_repeats, measure, name_of
 from ommatid.bench.slopes import Slope, excess, recommend, slope
-from ommatid.bench.table import AUTO, CSV, JSON, BenchTable, Cell, Quantiles, Stage, read, write
+from ommatid.bench.table import AUTO, CSV, JSON, BenchTable, Cell, Quantiles, Stage, read, row_of, write
 from ommatid.pipeline.stages import opened
 from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.runtime.errors import InputError
@@ -223,6 +223,7 @@ def test_a_table_that_is_read_is_the_one_that_was_written(
     write(folder, table)
     assert read(folder / JSON) == table
     (row,) = csv.DictReader((folder / CSV).read_text(encoding="utf-8").splitlines())
+    assert list(row) == list(row_of(measured))
     assert float(row["error"]) == measured.error.median
     assert row["mse_high"] == ("" if measured.mse is None else str(measured.mse.high))
 

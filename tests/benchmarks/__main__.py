@@ -1,8 +1,7 @@
-"""What our ways to render, to calibrate and to estimate gain, and over what: `python -m tests.benchmarks`.
+"""Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` measures one part alone; the parts are `rendering`, `lenses`,
-`leaving-out`, `forms` and `frames`.
-Nothing here asserts a speed. Other load slows both sides of a ratio alike, so ratios are to be compared, not times.
+`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms` and
+`frames`. No speed is asserted. Other load slows both sides of a ratio alike, so compare ratios rather than times.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.versions import versions
 from ommatid.simulate.renderer.variant import unusable_reason
 
@@ -27,23 +26,24 @@ from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
 from .forms import NOISE, form_rows
 from .frame_tables import bandwidth_table, frames_table, growth_table
-from .leaving_out import SAMPLES as EACH
-from .leaving_out import SIDE as WIDE
+from .leaving_out import SAMPLES as LEAVING_OUT_SAMPLES
+from .leaving_out import SIDE as LEAVING_OUT_SIDE
 from .leaving_out import leaving_out_rows
-from .lenses import SAMPLES as BUNDLE
-from .lenses import SIDE, lens_rows, transport_rows
-from .lenses import VARIANT as LENSES
+from .lenses import SAMPLES as LENS_SAMPLES
+from .lenses import SIDE as LENS_SIDE
+from .lenses import VARIANT as LENS_VARIANT
+from .lenses import lens_rows, transport_rows
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
 
 
 def main() -> None:
-    """Run the benchmarks that are asked for, or every one, and print their tables as they come."""
+    """Run the parts that are named on the command line, or all, and print each table as soon as it is complete."""
     names = sys.argv[1:] or list(PARTS)
     unknown = [name for name in names if name not in PARTS]
     if unknown:
-        raise SystemExit(f"{unknown[0]!r} is no part of the benchmarks; expected some of: {', '.join(PARTS)}")
+        raise SystemExit(f"{unknown[0]!r} is not a part of the benchmarks; expected some of: {', '.join(PARTS)}")
     console = Console()
     console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell
     for name in names:
@@ -54,16 +54,14 @@ def main() -> None:
 def _rendering() -> Iterator[Table]:
     """Rendering and calibration, on every variant that works here."""
     start = perf_counter()
-    found = ", ".join(f"{name} {version}" for name, version in versions("mitsuba", "drjit").items())
-    table = Table(title=f"Speed against stock Mitsuba, on {os.cpu_count()} cores with {found}", show_lines=True)
-    for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
-        table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
+    releases = ", ".join(f"{name} {version}" for name, version in versions("mitsuba", "drjit").items())
+    table = _ratio_table(f"Speed against stock Mitsuba, on {os.cpu_count()} cores with {releases}")
     reasons = {variant: unusable_reason(variant) for variant in VARIANTS}
     working = [variant for variant in VARIANTS if not reasons[variant]]
     for variant in working:
         for samples in SAMPLES:
             for row in camera_rows(SCENES / "tile19.toml", variant, samples):
-                _add(table, f"camera: tile19\n{samples} samples a pixel", row)
+                _add(table, f"camera: tile19\n{samples} samples per pixel", row)
     for variant in working:
         for row in calibration_rows(SCENES / "photo.toml", variant):
             _add(table, f"calibration: 119 x 119\none pass of {PASS.samples} samples", row)
@@ -72,29 +70,29 @@ def _rendering() -> Iterator[Table]:
         [
             "Medians (minimum to maximum of the ratio) over repeats in alternation after a warm-up of each.",
             *skipped,
-            f"All of it took {perf_counter() - start:.0f} s.",
+            f"Total time: {perf_counter() - start:.0f} s.",
         ]
     )
     yield table
 
 
 def _forms() -> Iterator[Table]:
-    table = Table(title=f"Work and precision of the estimator's forms, noise variance {NOISE:g}", show_lines=False)
+    table = Table(title=f"Time and precision of the estimator's forms, noise variance {NOISE:g}", show_lines=False)
     for name in ("unknowns", "measurements", "lens types", "form", "factorise", "solve", "solve, refine and bound"):
         table.add_column(name, justify="right" if name not in ("lens types", "form") else "left")
-    for name in ("digits alone", "digits refined", "digits of the worst variance"):
+    for name in ("digits, unrefined", "digits, refined", "digits of the worst variance"):
         table.add_column(name, justify="right")
-    before = None
+    previous = None
     for row in form_rows(SCENES):
-        if before is not None and (row.unknowns, row.lenses) != before:
+        if previous is not None and (row.unknowns, row.lenses) != previous:
             table.add_section()
-        before = row.unknowns, row.lenses
-        what = [str(row.unknowns), str(row.measurements), row.lenses, row.form]
+        previous = row.unknowns, row.lenses
+        case = [str(row.unknowns), str(row.measurements), row.lenses, row.form]
         if row.seconds is None or row.digits is None:
-            table.add_row(*what, row.failed)
+            table.add_row(*case, row.failed)
             continue
         seconds = [f"{value:.2g} s" if value >= 1 else f"{value * 1e3:.3g} ms" for value in row.seconds]
-        table.add_row(*what, *seconds, *("reference" if isnan(value) else f"{value:.1f}" for value in row.digits))
+        table.add_row(*case, *seconds, *("reference" if isnan(value) else f"{value:.1f}" for value in row.digits))
     yield table
 
 
@@ -106,29 +104,27 @@ def _frames() -> Iterator[Table]:
 def _lenses() -> Iterator[Table]:
     def rows() -> Iterator[tuple[str, Row]]:
         for row in lens_rows():
-            yield f"{SIDE} x {SIDE} pixels\n{BUNDLE} samples a pixel", row
+            yield f"{LENS_SIDE} x {LENS_SIDE} pixels\n{LENS_SAMPLES} samples per pixel", row
         for row in transport_rows(SCENES / "tile19.toml"):
             yield "calibration: tile19\n1024 samples", row
 
-    yield _compared("Real lenses, and calibration by transport", rows())
+    yield _compared("Lenses with surfaces, and calibration by transport", rows())
 
 
 def _leaving_out() -> Iterator[Table]:
-    what = f"{WIDE} x {WIDE}, three types\n{EACH} samples a pixel"
-    yield _compared("What leaving out saves", ((what, row) for row in leaving_out_rows()))
+    case = f"{LEAVING_OUT_SIDE} x {LEAVING_OUT_SIDE}, three types\n{LEAVING_OUT_SAMPLES} samples per pixel"
+    yield _compared("Time saved by skipping negligible effects", ((case, row) for row in leaving_out_rows()))
 
 
 def _compared(title: str, rows: Iterator[tuple[str, Row]]) -> Table:
-    """A table of ratios on the fast backend; of what was measured, and the row."""
-    table = Table(title=title, show_lines=True)
-    for name in ("what", "variant", "A", "B", "time of A", "time of B", "B / A", "aim", "same result?"):
-        table.add_column(name, no_wrap=name in ("what", "variant", "time of A", "time of B", "B / A"))
-    reason = unusable_reason(LENSES)
+    """Return a table of ratios on the fast backend, from cases and their rows."""
+    table = _ratio_table(title)
+    reason = unusable_reason(LENS_VARIANT)
     if reason:
-        table.caption = f"All was left out: {reason}."
+        table.caption = f"Nothing was measured: {reason}."
         return table
-    for what, row in rows:
-        _add(table, what, row)
+    for case, row in rows:
+        _add(table, case, row)
     return table
 
 
@@ -141,26 +137,30 @@ PARTS: dict[str, Callable[[], Iterator[Table]]] = {
 }
 
 
-def _add(table: Table, what: str, row: Row) -> None:
-    median, least, most = (f"{value:.3g}" if value < 100 else f"{value:.0f}" for value in _spread(row.ratios))
+def _ratio_table(title: str) -> Table:
+    table = Table(title=title, show_lines=True)
+    for name in ("case", "variant", "A", "B", "time of A", "time of B", "B / A", "target", "difference of the results"):
+        table.add_column(name, no_wrap=name in ("case", "variant", "time of A", "time of B", "B / A"))
+    return table
+
+
+def _add(table: Table, case: str, row: Row) -> None:
+    ratios = float(np.median(row.ratios)), float(row.ratios.min()), float(row.ratios.max())
+    median, least, most = (f"{value:.3g}" if value < 100 else f"{value:.0f}" for value in ratios)
     table.add_row(
-        what,
+        case,
         row.variant,
         row.ours,
         row.other,
         _time(row.seconds),
         _time(row.other_seconds),
         f"{median} ({least} to {most})\n{row.ratios.size} repeats",
-        f"{row.aim:g}" if row.aim is not None else "-",
+        f"{row.target:g}" if row.target is not None else "-",
         row.check,
     )
 
 
-def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    return float(np.median(values)), float(values.min()), float(values.max())
-
-
-def _time(seconds: NDArray[np.float64]) -> str:
+def _time(seconds: FloatArray) -> str:
     median = float(np.median(seconds))
     if median >= 100:
         return f"{median:.0f} s"

@@ -1,7 +1,7 @@
-"""How near one application of H, and of its adjoint, comes to the speed at which memory can be read and written.
+"""Memory traffic of H and its adjoint, relative to the bandwidth of memory.
 
-H must at least read f once for each lens type and write g once, and its adjoint read g and write f once. Both are set
-against copies a = b and triads a = b + s c (McCalpin's STREAM, which counts two and three numbers for each of a), by
+H must at least read f once per lens type and write g once, and its adjoint read g and write f once. Both are compared
+with copies a = b and triads a = b + s c (McCalpin's STREAM, which counts two and three numbers per element of a), with
 as many threads in the same run.
 """
 
@@ -14,14 +14,12 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.optics.boxes import BoxFootprints
 
 from .alternation import alternate
 from .whole import whole_camera
-
-Vector = NDArray[np.float64]
 
 SIZE = 4096
 REPEATS = 7
@@ -30,45 +28,45 @@ BYTES = 8
 
 @dataclass(frozen=True)
 class BandwidthRow:
-    """What was done, the bytes that it must move at least, and of every repeat the seconds and the limit in bytes/s."""
+    """An operation, the bytes that it must at least move, and seconds and bandwidth (bytes/s) of every repeat."""
 
     name: str
     moved: int
-    seconds: NDArray[np.float64]
-    limit: NDArray[np.float64]
+    seconds: FloatArray
+    limit: FloatArray
 
     @property
     def speed(self) -> float:
-        """Bytes per second, from the median."""
+        """Bytes per second, from the median time."""
         return self.moved / float(np.median(self.seconds))
 
     @property
     def share(self) -> float:
-        """Of the limit, repeat by repeat: the median."""
+        """Median of the fraction of the bandwidth over repeats."""
         return float(np.median(self.moved / self.seconds / self.limit))
 
 
 def bandwidth_rows() -> list[BandwidthRow]:
-    """Copy, triad, H and its adjoint, in alternation; the limit is the faster of the first two."""
+    """Return copy, triad, H and its adjoint, in alternation; the bandwidth is that of the faster of the first two."""
     camera = whole_camera(SIZE)
     boxes, rng = BoxFootprints(camera), np.random.default_rng(0)
     image, readings = rng.normal(size=camera.unknowns), rng.normal(size=camera.measurements)
     first, second, third = np.zeros(readings.size), np.ones(readings.size), np.ones(readings.size)
-    ways = {
-        "copy": (lambda _: _shared(_copy, first, second, third), 2 * readings.size),
-        "triad": (lambda _: _shared(_triad, first, second, third), 3 * readings.size),
+    operations = {
+        "copy": (lambda _: _run_threads(_copy, first, second, third), 2 * readings.size),
+        "triad": (lambda _: _run_threads(_triad, first, second, third), 3 * readings.size),
         "H f": (lambda _: boxes.forward(image), len(camera.types) * camera.unknowns + readings.size),
         "H^T g": (lambda _: boxes.adjoint(readings), readings.size + camera.unknowns),
     }
-    for way, _ in ways.values():
-        way(0)
-    seconds = alternate([way for way, _ in ways.values()], REPEATS)
-    moved = [BYTES * numbers for _, numbers in ways.values()]
+    for run, _ in operations.values():
+        run(0)
+    seconds = alternate([run for run, _ in operations.values()], REPEATS)
+    moved = [BYTES * numbers for _, numbers in operations.values()]
     limit = np.maximum(moved[0] / seconds[0], moved[1] / seconds[1])
-    return [BandwidthRow(name, moved[place], seconds[place], limit) for place, name in enumerate(ways)]
+    return [BandwidthRow(name, moved[index], seconds[index], limit) for index, name in enumerate(operations)]
 
 
-def _shared(work, *arrays: Vector) -> None:
+def _run_threads(work, *arrays: FloatArray) -> None:
     count = os.cpu_count() or 1
     pieces = zip(*(np.array_split(array, count) for array in arrays), strict=True)
     with ThreadPoolExecutor(count) as threads:

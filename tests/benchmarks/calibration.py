@@ -1,7 +1,7 @@
-"""H of a large target from grids of point sources against one source a rendering.
+"""Time to calibrate H of a large target with grids of point sources, against one source per rendering.
 
-Point sources one by one take minutes to hours, so only some are rendered and their time is scaled to all. Both ways
-see the same rays where they share sensors and seeds, so there the entries of H must agree, not only within noise.
+Single point sources take minutes to hours, so only some are rendered and their time is scaled to all. With the same
+sensors and seeds both methods use the same rays, so that the entries of H must agree, not only within noise.
 """
 
 # pyright: basic
@@ -10,9 +10,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import read
@@ -26,62 +26,95 @@ from .alternation import Row, alternate
 PASS = Plan(passes=1, samples=16)
 SOURCES = 60
 REPEATS = {"llvm_ad_mono": 5, "scalar_rgb": 3}
-AIM = 50.0
+TARGET = 50.0
 OVERRIDES = ("target.shape=[119,119]", "target.origin=[98,196]")
 
 
 def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
-    """One row for sources that the same rig renders, and one for the whole camera in one sensor where that can be."""
+<<<<<<< HEAD
+    """Return a row for single sources with the same sensors, and one for the whole camera in a single sensor."""
     camera = derive(read(scene_file, OVERRIDES))
-    rig = Renderer(camera, variant, together=False)
+    renderer = Renderer(camera, variant, together=False)
     sources = np.random.default_rng(1).choice(camera.unknowns, SOURCES, replace=False)
-    matrix = by_grids(rig, 0)
-    singly = by_sources(rig, sources, 0)
+    matrix = from_grids(renderer, 0)
+    columns = from_sources(renderer, sources, 0)
+    largest = float(np.abs(matrix[:, sources].toarray() - columns).max())
+    methods = [lambda seed: from_grids(renderer, seed), lambda seed: from_sources(renderer, sources, seed)]
+    names = ["one source per rendering, a sensor per lens type"]
+    checks = [f"H of {SOURCES} sources differs by {largest:.2g} at most, {np.count_nonzero(columns)} nonzero entries"]
+=======
+    """Return a row for single sources in the same renderer, and one for the camera in one sensor, where possible."""
+    camera = derive(read(scene_file, OVERRIDES))
+    renderer = Renderer(camera, variant, together=False)
+    sources = np.random.default_rng(1).choice(camera.unknowns, SOURCES, replace=False)
+    matrix = by_grids(renderer, 0)
+    singly = by_sources(renderer, sources, 0)
     apart = float(np.abs(matrix[:, sources].toarray() - singly).max())
-    ways = [lambda seed: by_grids(rig, seed), lambda seed: by_sources(rig, sources, seed)]
+    ways = [lambda seed: by_grids(renderer, seed), lambda seed: by_sources(renderer, sources, seed)]
     names = ["one source a rendering, a sensor a lens type"]
     checks = [f"H of {SOURCES} sources differs by {apart:.2g} at most, {np.count_nonzero(singly)} entries not 0"]
+>>>>>>> wt-simulate
     if not variant.startswith("scalar"):
         whole = Renderer(camera, variant)
-        by_sources(whole, sources[:2], 0)
-        ways.append(lambda seed: by_sources(whole, sources, seed))
-        names.append("one source a rendering, one sensor in all")
+        from_sources(whole, sources[:2], 0)
+        methods.append(lambda seed: from_sources(whole, sources, seed))
+        names.append("one source per rendering, a single sensor")
         checks.append("other random numbers, not compared")
-    seconds = alternate(ways, REPEATS[variant])
+    seconds = alternate(methods, REPEATS[variant])
     return [
         Row(
-            variant,
-            "grids of sources",
-            f"{name}; all {camera.unknowns}, scaled from {SOURCES}",
-            seconds[0],
-            other * (camera.unknowns / SOURCES),
-            AIM,
-            check,
+            variant=variant,
+            ours="grids of sources",
+            other=f"{name}; all {camera.unknowns}, scaled from {SOURCES}",
+            seconds=seconds[0],
+            other_seconds=other * (camera.unknowns / SOURCES),
+            target=TARGET,
+            check=check,
         )
         for name, other, check in zip(names, seconds[1:], checks, strict=True)
     ]
 
 
-def by_grids(rig: Renderer, seed: int) -> sparse.csr_array:
-    """H, (M, N), by one pass of grids, the uniform target for its check included."""
+<<<<<<< HEAD
+def from_grids(renderer: Renderer, seed: int) -> sparse.csr_array:
+    """Return H, (M, N), from one pass of grids, including the uniform target for its check."""
     rows: list[sparse.csr_array] = []
-    for group in rig.groups:
-        swept = SourceSweep(rig, group)
-        swept.one_more(PASS, seed, no_progress)
-        tally = swept.tally
-        rows.append(entries_of(rig.camera, swept.reach, tally.mean)[0])
+    for group in renderer.groups:
+        sweep = SourceSweep(renderer, group)
+        sweep.one_more(PASS, seed, no_progress)
+        rows.append(entries_of(renderer.camera, sweep.reach, sweep.tally.mean)[0])
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 
 
-def by_sources(rig: Renderer, sources: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
+def from_sources(renderer: Renderer, sources: IntArray, seed: int) -> FloatArray:
+    """Return columns of H, (M, sources), from a rendering of the whole camera for each source."""
+=======
+def by_grids(renderer: Renderer, seed: int) -> sparse.csr_array:
+    """H, (M, N), by one pass of grids, the uniform target for its check included."""
+    rows: list[sparse.csr_array] = []
+    for group in renderer.groups:
+        swept = SourceSweep(renderer, group)
+        swept.add_pass(PASS, seed, no_progress)
+        tally = swept.tally
+        rows.append(entries_of(renderer.camera, swept.visible, tally.mean)[0])
+    return sparse.csr_array(sparse.vstack(rows, format="csr"))
+
+
+def by_sources(renderer: Renderer, sources: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
     """Columns of H, (M, sources), by a rendering of the whole camera for each source."""
-    camera = rig.camera
+>>>>>>> wt-simulate
+    camera = renderer.camera
     columns = np.empty((camera.measurements, sources.size))
-    for place, source in enumerate(sources):
+    for index, source in enumerate(sources):
         image = np.zeros(camera.shape)
         image.flat[source] = 1.0
-        rig.set_target(image)
-        for group in rig.groups:
+        renderer.set_target(image)
+        for group in renderer.groups:
+<<<<<<< HEAD
+            seeds = sampler_seeds(seed, "calibration", 0, PASS.passes)
+            columns[renderer.places(group), index] = renderer.expose(group, PASS.samples, seeds)[0]
+=======
             own = sampler_seeds(seed, "calibration", 0, PASS.passes)
-            columns[rig.places(group), place] = rig.expose(group, PASS.samples, own)[0]
+            columns[renderer.rows(group), place] = renderer.expose(group, PASS.samples, own)[0]
+>>>>>>> wt-simulate
     return columns

@@ -1,4 +1,4 @@
-"""Work and precision of the estimator's forms: digits against seconds, side by side on the same problems."""
+"""Time and precision of the estimator's forms on the same problems."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ommatid.reconstruct.estimator.certificate import ExactResiduals, refine
 from ommatid.reconstruct.estimator.estimate import FORMS
@@ -17,8 +16,6 @@ from ommatid.reconstruct.problem import Problem
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_matrix
-
-Vector = NDArray[np.float64]
 
 NOISE = 1e-6
 CASES = (
@@ -30,13 +27,13 @@ CASES = (
     ("tile41", ("I", "II"), "two types"),
 )
 REPEATS = 3
-LONG = 5.0  # seconds, from which on one repeat is enough
-REFERENCE = "square-root-information"  # its variances agree with the dual form's to 12 digits on these problems
+LONG = 5.0  # seconds, from which on there is a single repeat
+REFERENCE = "square-root-information"  # its variances agree with those of the dual form to 12 digits here
 
 
 @dataclass(frozen=True)
 class FormRow:
-    """Seconds to factorise, to solve, and to solve and certify; right digits alone, refined, and of all variances."""
+    """Seconds to factorise, to solve, and to solve and certify; correct digits unrefined, refined, and of variances."""
 
     unknowns: int
     measurements: int
@@ -48,11 +45,11 @@ class FormRow:
 
 
 def form_rows(gallery: Path) -> list[FormRow]:
-    """Every form on every case, in alternation within a case."""
-    return [row for name, lenses, words in CASES for row in _case(gallery / f"{name}.toml", lenses, words)]
+    """Return every form on every case, in alternation within a case."""
+    return [row for name, lenses, label in CASES for row in _case(gallery / f"{name}.toml", lenses, label)]
 
 
-def _case(path: Path, lenses: tuple[str, ...], words: str) -> list[FormRow]:
+def _case(path: Path, lenses: tuple[str, ...], label: str) -> list[FormRow]:
     camera = derive(read(path, (), lenses))
     problem = Problem(
         ideal_matrix(camera), independent(127.5, 5461.25, camera.unknowns), np.full(camera.measurements, NOISE)
@@ -75,12 +72,12 @@ def _case(path: Path, lenses: tuple[str, ...], words: str) -> list[FormRow]:
                 failed[name] = str(error)
             times[name].append(perf_counter() - start)
     shift = np.zeros((camera.unknowns, 1))
-    right = refine(built[REFERENCE], exactly, shift, exactly.recorded(recorded))
+    exact = refine(built[REFERENCE], exactly, shift, exactly.recorded(recorded))
     variance = built[REFERENCE].variance()
     rows: list[FormRow] = []
     for name in FORMS:
         if name in failed:
-            rows.append(FormRow(camera.unknowns, camera.measurements, words, name, None, None, failed[name]))
+            rows.append(FormRow(camera.unknowns, camera.measurements, label, name, None, None, failed[name]))
             continue
         start = perf_counter()
         alone, _ = built[name].solve(shift, exactly.recorded(recorded).high)
@@ -88,14 +85,14 @@ def _case(path: Path, lenses: tuple[str, ...], words: str) -> list[FormRow]:
         start = perf_counter()
         refined = refine(built[name], exactly, shift, exactly.recorded(recorded))
         certified = perf_counter() - start
-        size = float(np.linalg.norm(right.freedoms))
+        size = float(np.linalg.norm(exact.coefficients))
         digits = (
-            _digits(float(np.linalg.norm(alone - right.freedoms)) / size),
-            _digits(float(np.linalg.norm(refined.freedoms - right.freedoms)) / size),
+            _digits(float(np.linalg.norm(alone - exact.coefficients)) / size),
+            _digits(float(np.linalg.norm(refined.coefficients - exact.coefficients)) / size),
             np.nan if name == REFERENCE else _digits(float(np.max(np.abs(built[name].variance() / variance - 1)))),
         )
         seconds = (float(np.median(times[name])), solved, certified)
-        rows.append(FormRow(camera.unknowns, camera.measurements, words, name, seconds, digits))
+        rows.append(FormRow(camera.unknowns, camera.measurements, label, name, seconds, digits))
     return rows
 
 

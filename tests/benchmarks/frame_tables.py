@@ -1,4 +1,4 @@
-"""The measurements of whole frames as tables."""
+"""Tables of the benchmarks of whole frames."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from .whole import NOISE, predicted
 
 
 def frames_table() -> Table:
-    """Our frame solver against its rivals."""
+    """Return the frame solver against other solvers."""
     start = perf_counter()
     table = _empty(
         f"A frame of {SIZE} x {SIZE}, noise variance {NOISE:g}, to {ACCURACY:g} posterior standard deviations",
-        ("way",),
-        ("steps", "time", "time / ours", "aim", "memory", "memory / ours", "aim", "largest error"),
+        ("solver",),
+        ("steps", "time", "time / ours", "target", "memory", "memory / ours", "target", "largest error"),
     )
-    rows, apart = frame_rows()
+    rows, difference = frame_rows()
     for row in rows:
         if row.memory is None and row.ours is row.seconds:
             table.add_section()
         table.add_row(*_frame_cells(row))
     table.caption = (
-        f"Medians (minimum to maximum) of {REPEATS} repeats in alternation. The lower part is against its own first"
-        " line. Rivals take the fewest steps that suffice. H itself is stored before, and neither timed"
-        " nor counted; memory is what an interpreter of its own needs at its peak above what holds H and g. Errors are"
-        f" in posterior standard deviations, against our solver's solution to 1e-6, which is {apart:.1g} from"
-        f" Cholesky's. All of it took {perf_counter() - start:.0f} s."
+        f"Medians (minimum to maximum) of {REPEATS} repeats in alternation. The lower part is relative to its own first"
+        " line. The other solvers take the fewest steps that suffice. Storing H beforehand is neither timed nor"
+        " counted; memory is the peak of a separate interpreter above that with H and g. Errors are in posterior"
+        " standard deviations, against our solver's solution to 1e-6, which differs by"
+        f" {difference:.1g} from that of Cholesky. Total time: {perf_counter() - start:.0f} s."
     )
     return table
 
@@ -44,23 +44,23 @@ def _frame_cells(row: FrameRow) -> list[str]:
     times = f"{np.median(ratios):.3g} ({ratios.min():.3g} to {ratios.max():.3g})"
     memory = ["-", "-", "-"]
     if row.memory is not None and row.ours_memory is not None:
-        memory = [_gigabytes(row.memory), f"{row.memory / row.ours_memory:.3g}", _number(row.memory_aim)]
+        memory = [_gigabytes(row.memory), f"{row.memory / row.ours_memory:.3g}", _number(row.memory_target)]
     return [
         row.name,
         _number(row.steps),
         _time(float(np.median(row.seconds))),
         times,
-        _number(row.aim),
+        _number(row.target),
         *memory,
         f"{row.error:.3g}",
     ]
 
 
 def growth_table() -> Table:
-    """Our frame solver from small frames to large ones."""
+    """Return the frame solver's cost for frames of increasing size."""
     start = perf_counter()
     table = _empty(
-        f"Our frame solver as the frame grows, noise variance {NOISE:g}",
+        f"The frame solver for increasing sizes, noise variance {NOISE:g}",
         (),
         ("pixels", "time", "time / (N log N)", "steps", "bound", "data", "peak memory", "interior mse", "/ predicted"),
     )
@@ -76,23 +76,23 @@ def growth_table() -> Table:
             _gigabytes(row.held),
             _gigabytes(row.peak),
             f"{row.error:.4f}",
-            f"{row.error / variance:.4f} ({row.surprise:+.1f} s.e.)",
+            f"{row.error / variance:.4f} ({row.score:+.1f} s.e.)",
         )
     table.caption = (
-        "The fastest of a few repeats, each size in an interpreter of its own, with nothing prepared but what is"
-        " compiled; data: the whole process with image and readings alone. Interior: from"
-        f" {BORDER} pixels off the border; predicted there: {variance:.4f}."
-        f" All of it took {perf_counter() - start:.0f} s."
+        "The fastest of a few repeats, each size in a separate interpreter, compiled but without other preparation;"
+        " data: the process with image and readings only. Interior: at least"
+        f" {BORDER} pixels from the border; predicted there: {variance:.4f}."
+        f" Total time: {perf_counter() - start:.0f} s."
     )
     return table
 
 
 def bandwidth_table() -> Table:
-    """H and its adjoint against memory."""
+    """Return the memory traffic of H and its adjoint against the bandwidth of memory."""
     table = _empty(
         f"One application of H of {WIDE} x {WIDE} pixels against the bandwidth of memory",
-        ("what",),
-        ("must move", "time", "speed", "of the limit"),
+        ("operation",),
+        ("must move", "time", "speed", "fraction of the bandwidth"),
     )
     for row in bandwidth_rows():
         table.add_row(
@@ -102,15 +102,17 @@ def bandwidth_table() -> Table:
             f"{row.speed / 1e9:.3g} GB/s",
             f"{row.share:.0%}",
         )
-    table.caption = "Medians in alternation, on all cores; the limit is the faster of copy and triad beside it."
+    table.caption = (
+        "Medians in alternation, on all cores; the bandwidth is that of the faster of copy and triad in the same run."
+    )
     return table
 
 
-def _empty(title: str, words: tuple[str, ...], numbers: tuple[str, ...]) -> Table:
+def _empty(title: str, text_columns: tuple[str, ...], number_columns: tuple[str, ...]) -> Table:
     table = Table(title=title)
-    for name in words:
+    for name in text_columns:
         table.add_column(name, no_wrap=True)
-    for name in numbers:
+    for name in number_columns:
         table.add_column(name, justify="right", no_wrap=True)
     return table
 

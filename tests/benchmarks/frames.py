@@ -1,7 +1,7 @@
-"""A whole frame by our solver against every rival, from the same H and g and to the same error of every pixel.
+"""The frame solver against other solvers, from the same H and g and to the same error of every pixel.
 
-Rivals that take steps take as few as bring the largest error, in posterior standard deviations, below 0.01, our
-solver's own default. How few is found beforehand and not timed.
+Iterative solvers take as few steps as reduce the largest error below 0.01 posterior standard deviations, the frame
+solver's default accuracy. That number is determined beforehand and not timed.
 """
 
 from __future__ import annotations
@@ -10,108 +10,107 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY
+from ommatid.runtime.arrays import FloatArray
 
 from .alternation import alternate
 from .fresh import call, memory_of
 from .rivals import RIVALS, Rival, by_boxes, by_lsmr, factorised
 from .whole import SMALL, Whole, compile_all, deviations, stored
 
-Vector = NDArray[np.float64]
-
 SIZE = 539
-TUNED = 119  # the frame on which the counts of lsmr and of conjugate gradients are compared
+TUNING_SIZE = 119  # of the frame on which the steps of LSMR and of conjugate gradients are compared
 REPEATS = 3
-REFERENCE = 1e-6  # accuracy of what the errors are measured against
+REFERENCE = 1e-6  # accuracy of the solution with which errors are computed
 MOST_STEPS = 5000
-BRIEF = 5  # steps for a peak of memory, which more would not raise
-OURS = "our frame solver, from nothing"
-AGAIN = "our frame solver, prepared"
+FEW_STEPS = 5  # for the peak of memory, which does not increase with more
+OURS = "our frame solver, unprepared"
+PREPARED = "our frame solver, prepared"
 
 
 class _EnoughError(Exception):
-    """Stops a rival whose steps are watched."""
+    """Stops an iterative solver from its callback."""
 
 
 @dataclass(frozen=True)
 class FrameRow:
-    """One way: seconds of every repeat, its own and those of ours; its memory above H and g; its largest error.
+    """A solver: seconds of every repeat, its own and those of ours; its memory above H and g; its largest error.
 
-    memory, ours_memory : gigabytes; None where they were not measured
+    memory, ours_memory : gigabytes, None if not measured
     """
 
     name: str
     steps: int | None
-    seconds: NDArray[np.float64]
-    ours: NDArray[np.float64]
+    seconds: FloatArray
+    ours: FloatArray
     memory: float | None
     ours_memory: float | None
     error: float
-    aim: float | None = None
-    memory_aim: float | None = None
+    target: float | None = None
+    memory_target: float | None = None
 
 
 def frame_rows() -> tuple[list[FrameRow], float]:
-    """Our solver, every rival, and both that can prepare, prepared; and how far our reference is from Cholesky's."""
+    """Return a row per solver, prepared ones last, and the difference of the reference solution from Cholesky's."""
     compile_all()
     whole, errors = Whole.drawn(SIZE), _Errors(SIZE)
     matrix = stored(whole.camera)
     errors.reference = whole.estimate(REFERENCE).image
     counts = _counts(whole, matrix, errors)
     frame, factor = whole.frame(), factorised(matrix)
-    right = frame.collected(whole.unexpected)
-    apart = errors.of(factor(right))
+    right = frame.right_hand_side(whole.residual)
+    difference = errors.of(factor(right))
     direct = frame.solve(right).steps
-    ways = [
-        _Way(OURS, direct, OURS, lambda: whole.estimate().image),
-        *(_Way.of(rival, counts.get(rival.steps), whole, matrix) for rival in RIVALS),
-        _Way(AGAIN, direct, AGAIN, lambda: frame.solve(right).image),
-        _Way("CHOLMOD, factor kept", None, AGAIN, lambda: factor(right)),
+    solvers = [
+        _Solver(OURS, direct, OURS, lambda: whole.estimate().image),
+        *(_Solver.of(rival, counts.get(rival.steps), whole, matrix) for rival in RIVALS),
+        _Solver(PREPARED, direct, PREPARED, lambda: frame.solve(right).image),
+        _Solver("CHOLMOD, factor stored", None, PREPARED, lambda: factor(right)),
     ]
-    seconds = dict(zip((way.name for way in ways), alternate([way.work for way in ways], REPEATS), strict=True))
+    timed = alternate([solver.work for solver in solvers], REPEATS)
+    seconds = {solver.name: timed[index] for index, solver in enumerate(solvers)}
     memory = {name: _memory(name) for name in (OURS, *(rival.name for rival in RIVALS))}
     rows = [
         FrameRow(
-            way.name,
-            way.steps,
-            seconds[way.name],
-            seconds[way.against],
-            memory.get(way.name),
-            memory.get(way.against),
-            errors.of(way.found[-1]),
-            way.aim,
-            way.memory_aim,
+            name=solver.name,
+            steps=solver.steps,
+            seconds=seconds[solver.name],
+            ours=seconds[solver.against],
+            memory=memory.get(solver.name),
+            ours_memory=memory.get(solver.against),
+            error=errors.of(solver.solutions[-1]),
+            target=solver.target,
+            memory_target=solver.memory_target,
         )
-        for way in ways
+        for solver in solvers
     ]
-    return rows, apart
+    return rows, difference
 
 
 @dataclass(frozen=True)
-class _Way:
-    """A way, whose time its own is set against, and what it found last."""
+class _Solver:
+    """A solver, the name of the solver with which it is compared, and its last solution."""
 
     name: str
     steps: int | None
     against: str
-    solve: Callable[[], Vector]
-    aim: float | None = None
-    memory_aim: float | None = None
-    found: list[Vector] = field(default_factory=list[Vector])
+    solve: Callable[[], FloatArray]
+    target: float | None = None
+    memory_target: float | None = None
+    solutions: list[FloatArray] = field(default_factory=list[FloatArray])
 
     @staticmethod
-    def of(rival: Rival, steps: int | None, whole: Whole, matrix: sparse.csr_array) -> _Way:
-        def solve() -> Vector:
+    def of(rival: Rival, steps: int | None, whole: Whole, matrix: sparse.csr_array) -> _Solver:
+        def solve() -> FloatArray:
             return rival.solve(whole, matrix, steps or 0, None)
 
-        return _Way(rival.name, steps, OURS, solve, rival.aim, rival.memory_aim)
+        return _Solver(rival.name, steps, OURS, solve, rival.target, rival.memory_target)
 
     def work(self, seed: int) -> None:
         del seed
-        self.found[:] = [self.solve()]
+        self.solutions[:] = [self.solve()]
 
 
 class _Errors:
@@ -121,35 +120,35 @@ class _Errors:
         self.deviation = deviations(size).ravel()
         self.reference = np.zeros(size * size)
 
-    def of(self, image: Vector) -> float:
+    def of(self, image: FloatArray) -> float:
         return float(np.max(np.abs(image - self.reference) / self.deviation))
 
 
 def _counts(whole: Whole, matrix: sparse.csr_array, errors: _Errors) -> dict[str, int]:
-    """Steps that suffice.
+    """Return the numbers of steps that suffice.
 
-    Conjugate gradients are watched. LSMR lets nobody watch, so its count is found by bisection in a small frame, scaled
-    like that of conjugate gradients, and raised until it suffices.
+    Conjugate gradients are stopped by their callback. LSMR has none, so its number is found by bisection in a small
+    frame, scaled like that of conjugate gradients, and raised until it suffices.
     """
-    small, near = Whole.drawn(TUNED), _Errors(TUNED)
-    near.reference = small.estimate(REFERENCE).image
+    small, small_errors = Whole.drawn(TUNING_SIZE), _Errors(TUNING_SIZE)
+    small_errors.reference = small.estimate(REFERENCE).image
     table = stored(small.camera)
-    known = _watched(small, table, near)
-    short, long = known // 2, 2 * known
+    small_steps = _steps_of_cg(small, table, small_errors)
+    short, long = small_steps // 2, 2 * small_steps
     while long - short > 1:
         middle = (short + long) // 2
-        short, long = (short, middle) if near.of(by_lsmr(small, table, middle)) <= ACCURACY else (middle, long)
-    own = _watched(whole, matrix, errors)
-    steps = long * own // known
+        short, long = (short, middle) if small_errors.of(by_lsmr(small, table, middle)) <= ACCURACY else (middle, long)
+    cg_steps = _steps_of_cg(whole, matrix, errors)
+    steps = long * cg_steps // small_steps
     while errors.of(by_lsmr(whole, matrix, steps)) > ACCURACY:
         steps += -(-steps // 100)
-    return {"cg": own, "lsmr": steps}
+    return {"cg": cg_steps, "lsmr": steps}
 
 
-def _watched(whole: Whole, matrix: sparse.csr_array, errors: _Errors) -> int:
+def _steps_of_cg(whole: Whole, matrix: sparse.csr_array, errors: _Errors) -> int:
     count = 0
 
-    def watch(image: Vector) -> None:
+    def watch(image: FloatArray) -> None:
         nonlocal count
         count += 1
         if errors.of(image) <= ACCURACY:
@@ -159,7 +158,7 @@ def _watched(whole: Whole, matrix: sparse.csr_array, errors: _Errors) -> int:
         by_boxes(whole, matrix, MOST_STEPS, watch)
     except _EnoughError:
         return count
-    raise RuntimeError(f"conjugate gradients do not get there in {MOST_STEPS} steps")
+    raise RuntimeError(f"conjugate gradients do not reach {ACCURACY:g} in {MOST_STEPS} steps")
 
 
 def _memory(name: str) -> float:
@@ -168,12 +167,12 @@ def _memory(name: str) -> float:
 
 
 def needed(name: str, size: int) -> tuple[float, float]:
-    """Gigabytes that this process holds with H, if it is stored, and g, and its peak while one way estimates."""
+    """Return the gigabytes of this process with g and, if stored, H, and their peak during one estimate."""
     compile_all()
     whole = Whole.drawn(size)
     rival = next((rival for rival in RIVALS if rival.name == name), Rival(OURS, lambda *_: whole.estimate().image))
     if name != OURS:
         small = Whole.drawn(SMALL)
-        rival.solve(small, stored(small.camera), BRIEF, None)  # what it imports is not what it needs
+        rival.solve(small, stored(small.camera), FEW_STEPS, None)  # to import its modules
     matrix = stored(whole.camera) if rival.stored and name != OURS else sparse.csr_array((0, 0))
-    return memory_of(lambda: rival.solve(whole, matrix, BRIEF, None))
+    return memory_of(lambda: rival.solve(whole, matrix, FEW_STEPS, None))

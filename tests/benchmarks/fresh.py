@@ -1,12 +1,7 @@
-"""A function in a fresh interpreter, and the most memory that a piece of work needs there.
-
-Peaks are read from /proc, not from getrusage, whose ru_maxrss a child inherits from whoever started it, and which
-cannot be told to forget what was needed before the work began.
-"""
+"""A function in a fresh interpreter, and the peak memory of a computation there."""
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import json
 import subprocess
@@ -15,12 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ommatid.bench.resources import reset_peak_memory, resident_memory
+
 ROOT = Path(__file__).parents[2]
-STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def call(function: Callable[..., Any], *arguments: str | int) -> Any:
-    """What a function of a module returns in an interpreter of its own, through JSON."""
+    """Return the result of a module's function in an interpreter of its own, through JSON."""
     code = (
         f"import json; from {function.__module__} import {function.__name__} as work;"
         f" print(json.dumps(work(*{arguments!r})))"
@@ -30,18 +26,10 @@ def call(function: Callable[..., Any], *arguments: str | int) -> Any:
 
 
 def memory_of(work: Callable[[], object]) -> tuple[float, float]:
-    """Gigabytes that this process held before, and its peak while it worked; not numbers where there is no /proc."""
-    if not FORGET.exists():
-        work()
-        return float("nan"), float("nan")
+    """Return the gigabytes of this process before `work`, and their peak during it; NaN where they are not reported."""
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)  # what was freed goes back, or it would hide as much of what the work takes
-    FORGET.write_text("5")
-    held = _status("VmRSS")
+    is_reset = reset_peak_memory()
+    before = resident_memory("VmRSS")
     work()
-    return held, _status("VmHWM")
-
-
-def _status(name: str) -> float:
-    line = next(line for line in STATUS.read_text().splitlines() if line.startswith(f"{name}:"))
-    return int(line.split()[1]) * 1024 / 1e9
+    peak = resident_memory("VmHWM") if is_reset else None
+    return (float("nan"), float("nan")) if before is None or peak is None else (before / 1e9, peak / 1e9)

@@ -1,4 +1,4 @@
-"""What a whole frame costs as it grows, and whether its error is the one that was predicted."""
+"""Cost of a whole frame as its size increases, and its error against the predicted one."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .whole import MEAN, Whole, compile_all, predicted
 
 SIZES = (256, 512, 1024, 2048, 4079, 4096)
 REPEATS = {256: 7, 512: 5, 1024: 5, 2048: 3, 4079: 2, 4096: 2}
-BORDER = 32  # pixels, from which on nothing of the border is left
+BORDER = 32  # pixels, beyond which the border has no effect
 
 
 @dataclass(frozen=True)
 class GrowthRow:
     """A frame of size x size pixels in an interpreter of its own.
 
-    seconds : the fewest of a few repeats, from nothing prepared; sizes cannot alternate, and other load only adds
-    held, peak : gigabytes of the process with the data alone, and at its peak
+    seconds : minimum over a few repeats, without preparation; sizes cannot alternate, and other load only adds time
+    held, peak : gigabytes of the process with the data, and at its peak
     error : mean squared error of the interior
     """
 
@@ -41,34 +41,34 @@ class GrowthRow:
         return self.seconds / (self.size**2 * log(self.size**2))
 
     @property
-    def surprise(self) -> float:
-        """How far the error is from the predicted one, in standard errors."""
-        variance, spread = predicted()
-        return (self.error - variance) / spread * (self.size - 2 * BORDER)
+    def score(self) -> float:
+        """Difference of the error from the predicted one in standard errors."""
+        variance, deviation = predicted()
+        return (self.error - variance) / deviation * (self.size - 2 * BORDER)
 
 
 def growth_rows() -> list[GrowthRow]:
-    """One for each size."""
-    return [GrowthRow(*call(grown, size)) for size in SIZES]
+    """Return a row for each size."""
+    return [GrowthRow(*call(measured, size)) for size in SIZES]
 
 
-def grown(size: int) -> tuple[int, float, int, float, float, float, float]:
-    """The fields of a `GrowthRow`, measured in this process."""
+def measured(size: int) -> tuple[int, float, int, float, float, float, float]:
+    """Return the fields of a `GrowthRow`, measured in this process."""
     compile_all()
     whole = Whole.drawn(size)
     seconds: list[float] = []
-    found: list[Solution] = []
+    solutions: list[Solution] = []
 
     def work() -> None:
-        found.clear()
+        solutions.clear()
         start = perf_counter()
-        found[:] = [whole.estimate()]
+        solutions.append(whole.estimate())
         seconds.append(perf_counter() - start)
 
     held, peak = memory_of(work)
     for _ in range(1, REPEATS.get(size, 1)):
         work()
-    solution = found[-1]
-    wrong = (solution.image + MEAN - whole.image).reshape(size, size)[BORDER:-BORDER, BORDER:-BORDER]
-    error = float(np.square(wrong).mean())
+    solution = solutions[-1]
+    errors = (solution.image + MEAN - whole.image).reshape(size, size)[BORDER:-BORDER, BORDER:-BORDER]
+    error = float(np.square(errors).mean())
     return size, min(seconds), solution.steps, solution.bound, held, peak, error

@@ -1,4 +1,4 @@
-"""What leaving out saves: the same scene with what is too small to matter, and without it."""
+"""Time saved by skipping negligible effects: the same scene with and without them."""
 
 # pyright: basic
 from __future__ import annotations
@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.optics.negligible import SkippedEffect, negligible_shot_noise, without_negligible_effects
+from ommatid.scenes.optics.negligible import negligible_shot_noise, without_negligible_effects
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.renderer.renderer import Renderer
@@ -27,23 +27,28 @@ SENSOR = {"illuminance": "1 lux", "exposure": "3 ms", "read_noise": 30, "black_l
 RULES: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "apertures in focus": ({"aperture": "0.4 mm"}, {}),
     "apertures nearly in focus": ({"aperture": "0.4 mm", "focus": "970 mm"}, {}),
-    "diffraction that hardly shows": ({"aperture": "2.6 mm"}, {"wavelength": "550 nm"}),
+    "negligible diffraction": ({"aperture": "2.6 mm"}, {"wavelength": "550 nm"}),
 }
 
 
 def leaving_out_rows() -> list[Row]:
-    """Every rule: the light of a rendering with and without, and the electrons of an exposure."""
-    return [*(_light(kind) for kind in RULES), _shot()]
+    """Return a row per rule for the light of a rendering, and one for the electrons of an exposure."""
+    return [*(_light_row(rule) for rule in RULES), _shot_noise_row()]
 
 
 def _scene(lens: dict[str, str], more: dict[str, str], **tables: Any) -> tuple[Scene, Camera]:
-    kinds = [{"name": name, "magnification": ratio, "array": [m, m], "pixels": "fit"} for name, ratio, m in LENSES]
+    types = [{"name": name, "magnification": ratio, "array": [m, m], "pixels": "fit"} for name, ratio, m in LENSES]
     target = {"image": "photo:camera", "origin": [0, 0], "shape": [SIDE, SIDE]}
     tables = {"noise": {"variance": 100.0}, **tables} if "sensor" not in tables else tables
     scene = parse(
         {
             "target": {**target, "pixel_pitch": "1 mm", "distance": "1 m"},
-            "camera": {"pixel_pitch": "6 um", "lens_pitch": "3 mm", **more, "lens": [kind | lens for kind in kinds]},
+            "camera": {
+                "pixel_pitch": "6 um",
+                "lens_pitch": "3 mm",
+                **more,
+                "lens": [lens_type | lens for lens_type in types],
+            },
             **tables,
         },
         Path("benchmark"),
@@ -51,44 +56,53 @@ def _scene(lens: dict[str, str], more: dict[str, str], **tables: Any) -> tuple[S
     return scene, derive(scene)
 
 
-def _light(kind: str) -> Row:
+def _light_row(rule: str) -> Row:
     from ommatid.scenes.formats.picture import load
 
-    scene, camera = _scene(*RULES[kind])
+    scene, camera = _scene(*RULES[rule])
     short, left = without_negligible_effects(scene, camera)
     picture, each = load(scene), plan(SAMPLES * 16).samples
-    ways: list[Callable[[int], Any]] = [_exposure(one, picture, each) for one in (short, camera)]
-    images = [way(0) for way in ways]
-    seconds = alternate(ways, REPEATS)
-    apart = float(np.abs(images[0] - images[1]).max())
-    check = f"{apart:.2g} apart at most, chance included; stated {_bound(left):.2g} without it"
-    return Row(VARIANT, f"without {kind}", "complete", seconds[0], seconds[1], None, check)
+    methods: list[Callable[[int], Any]] = [_exposure(simulated, picture, each) for simulated in (short, camera)]
+    images = [method(0) for method in methods]
+    seconds = alternate(methods, REPEATS)
+    largest = float(np.abs(images[0] - images[1]).max())
+    bound = sum(effect.bound or 0.0 for effect in left)
+    check = f"at most {largest:.2g} including noise; bound without noise {bound:.2g}"
+    return Row(VARIANT, f"without {rule}", "complete", seconds[0], seconds[1], None, check)
 
 
+<<<<<<< HEAD
+def _exposure(camera: Camera, picture: FloatArray, samples: int) -> Callable[[int], FloatArray]:
+    renderer = Renderer(camera, VARIANT, SAMPLER)
+    renderer.set_target(picture)
+
+    def expose(seed: int) -> FloatArray:
+        groups = renderer.groups
+        return np.concatenate(
+            [renderer.expose(group, samples, lambda index: 100 * seed + index)[0] for group in groups]
+        )
+=======
 def _exposure(camera: Camera, picture: NDArray[np.float64], samples: int) -> Callable[[int], NDArray[np.float64]]:
-    rig = Renderer(camera, VARIANT, SAMPLER)
-    rig.set_target(picture)
+    renderer = Renderer(camera, VARIANT, SAMPLER)
+    renderer.set_target(picture)
 
     def expose(seed: int) -> NDArray[np.float64]:
-        found = [rig.expose(group, samples, lambda place: 100 * seed + place)[0] for group in rig.groups]
+        found = [renderer.expose(group, samples, lambda place: 100 * seed + place)[0] for group in renderer.groups]
         return np.concatenate(found)
+>>>>>>> wt-simulate
 
     return expose
 
 
-def _shot() -> Row:
+def _shot_noise_row() -> Row:
     scene, camera = _scene({"aperture": "0.4 mm"}, {}, sensor=SENSOR)
     left, sensor = negligible_shot_noise(scene, camera), scene.sensor
     assert sensor is not None
     freed, light = electrons(scene, camera), np.full(camera.measurements, 100.0)
 
-    def way(shot: bool) -> Callable[[int], Any]:
+    def recorder(shot: bool) -> Callable[[int], Any]:
         return lambda seed: record(light, freed, sensor, camera, seed, shot)
 
-    seconds = alternate([way(False), way(True)], REPEATS)
-    stated = "was not left out" if left is None else f"stated {left.bound:.2g}"
-    return Row("-", "without shot noise below the read noise", "complete", seconds[0], seconds[1], None, stated)
-
-
-def _bound(left: tuple[SkippedEffect, ...]) -> float:
-    return sum(one.bound or 0.0 for one in left)
+    seconds = alternate([recorder(False), recorder(True)], REPEATS)
+    check = "was not skipped" if left is None else f"bound {left.bound:.2g}"
+    return Row("-", "without shot noise below the read noise", "complete", seconds[0], seconds[1], None, check)

@@ -1,7 +1,7 @@
-"""Rays through five surfaces against Mitsuba's own `thinlens` on the same film; transport against point sources.
+"""Time of rays through five surfaces against Mitsuba's `thinlens` on the same film; transport against point sources.
 
-All look at the same picture with the same number of rays. Our thin lens and Mitsuba's have to show the same; the five
-surfaces, a cemented achromat and a singlet, differ by their aberrations.
+All render the same image with the same number of rays. ommatid's thin lens and Mitsuba's must agree; the image of the
+five surfaces, a cemented achromat and a singlet, differs by their aberrations.
 """
 
 # pyright: basic
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse, read
 from ommatid.scenes.setup import Setup
@@ -24,12 +24,12 @@ from ommatid.simulate.calibration.ray_transport import responses_from_rays
 from ommatid.simulate.renderer.plugins import film, scene_of, target_of, texture_of
 from ommatid.simulate.renderer.renderer import Renderer
 
-from .alternation import Row, alternate
+from .alternation import Row, alternate, difference_words
 
 VARIANT, SAMPLER = "llvm_ad_mono", "independent"
 SIDE, SAMPLES, REPEATS = 128, 256, 7
 APERTURE = 0.4  # mm
-AIM_OF_RAYS, AIM_OF_TRANSPORT = 1 / 3, 100.0
+TARGET_OF_RAYS, TARGET_OF_TRANSPORT = 1 / 3, 100.0
 FIVE = [
     {"radius": "1.6 mm", "thickness": "0.5 mm", "glass": "N-BK7", "semi_diameter": "0.3 mm"},
     {"radius": "-1.1 mm", "thickness": "0.25 mm", "glass": "N-SF11", "semi_diameter": "0.3 mm"},
@@ -40,7 +40,7 @@ FIVE = [
 
 
 def scene_with(lens: dict[str, Any]) -> Scene:
-    """One sub-imager of SIDE x SIDE pixels."""
+    """Return a scene with one sub-imager of SIDE x SIDE pixels."""
     kind = {"name": "I", "magnification": "1/2", "array": [1, 1], "pixels": [SIDE, SIDE], **lens}
     target = {"image": "photo:camera", "origin": [0, 0], "shape": [2 * SIDE] * 2}
     return parse(
@@ -54,62 +54,66 @@ def scene_with(lens: dict[str, Any]) -> Scene:
 
 
 def lens_rows() -> list[Row]:
-    """Ours through surfaces, and as a thin lens, against Mitsuba's."""
+    """Return rows for ommatid's lens with surfaces and its thin lens, against Mitsuba's thin lens."""
     from ommatid.scenes.formats.picture import load
 
     described = scene_with({"surfaces": FIVE})
     picture, camera = load(described), derive(described)
     thin = derive(scene_with({"aperture": f"{APERTURE} mm"}))
-    ways: list[Callable[[int], Any]] = [_ours(camera, picture), _ours(thin, picture), _thinlens(thin, picture)]
-    images = [way(0) for way in ways]
-    seconds = alternate(ways, REPEATS)
+    methods: list[Callable[[int], Any]] = [_ours(camera, picture), _ours(thin, picture), _thinlens(thin, picture)]
+    images = [method(0) for method in methods]
+    seconds = alternate(methods, REPEATS)
     rays = SIDE * SIDE * SAMPLES / 1e6
     name = f"Mitsuba's thinlens, {rays / np.median(seconds[2]):.0f} million rays a second"
     return [
         Row(
-            VARIANT,
-            f"{what}, {rays / np.median(mine):.0f} million",
-            name,
-            mine,
-            seconds[2],
-            aim,
-            _apart(image, images[2]),
+            variant=VARIANT,
+            ours=f"{lens}, {rays / np.median(own):.0f} million",
+            other=name,
+            seconds=own,
+            other_seconds=seconds[2],
+            target=target,
+            check=difference_words(image, images[2]),
         )
-        for what, mine, image, aim in (
-            ("five surfaces", seconds[0], images[0], AIM_OF_RAYS),
-            ("our thin lens", seconds[1], images[1], None),
+        for lens, own, image, target in (
+            ("five surfaces", seconds[0], images[0], TARGET_OF_RAYS),
+            ("thin lens", seconds[1], images[1], None),
         )
     ]
 
 
 def transport_rows(scene_file: Path) -> list[Row]:
-    """Calibration of a tile through lenses out of focus, and of its pinholes."""
+    """Return rows for the calibration of a tile with pinholes, and with lenses out of focus."""
     rows: list[Row] = []
-    for what, keys in (("pinholes", ()), ("lenses out of focus", ('aperture="0.4 mm"', 'focus="800 mm"'))):
+    for lenses, keys in (("pinholes", ()), ("lenses out of focus", ('aperture="0.4 mm"', 'focus="800 mm"'))):
         changes = [f"camera.lens.{name}.{key}" for name in ("I", "II", "III") for key in keys]
         setup = Setup.from_scene(read(scene_file, ["calibration.samples=1024", "render.complete=true", *changes]))
-        ways = [partial(_by, way, setup) for way in (responses_from_rays, responses_from_points)]
-        matrices = [way(0).matrix for way in ways]
-        apart = abs(matrices[0] - matrices[1]).max() / matrices[1].max()
-        seconds = alternate(ways, 3)
-        check = f"H differs by {apart:.1g} of its largest entry"
-        aim = AIM_OF_TRANSPORT if keys else None
-        rows.append(Row(VARIANT, f"transport, {what}", "point sources", seconds[0], seconds[1], aim, check))
+        methods = [partial(_calibrate, method, setup) for method in (responses_from_rays, responses_from_points)]
+        matrices = [method(0).matrix for method in methods]
+        largest = abs(matrices[0] - matrices[1]).max() / matrices[1].max()
+        seconds = alternate(methods, 3)
+        check = f"H differs by {largest:.1g} of its largest entry"
+        target = TARGET_OF_TRANSPORT if keys else None
+        rows.append(Row(VARIANT, f"transport, {lenses}", "point sources", seconds[0], seconds[1], target, check))
     return rows
 
 
-def _by(way: Callable[[Setup], Any], setup: Setup, seed: int) -> Any:
-    del seed  # the scene's own: both ways are to give the same H
-    return way(setup)
+def _calibrate(method: Callable[[Setup], Any], setup: Setup, seed: int) -> Any:
+    del seed  # both methods use the scene's own, to give the same H
+    return method(setup)
 
 
+<<<<<<< HEAD
+def _ours(camera: Camera, picture: FloatArray) -> Callable[[int], FloatArray]:
+=======
 def _ours(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
-    rig = Renderer(camera, VARIANT, SAMPLER)
-    rig.set_target(picture)
-    return lambda seed: rig.expose("I", SAMPLES, lambda _: seed)[0].reshape(SIDE, SIDE)
+>>>>>>> wt-simulate
+    renderer = Renderer(camera, VARIANT, SAMPLER)
+    renderer.set_target(picture)
+    return lambda seed: renderer.expose("I", SAMPLES, lambda _: seed)[0].reshape(SIDE, SIDE)
 
 
-def _thinlens(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
+def _thinlens(camera: Camera, picture: FloatArray) -> Callable[[int], FloatArray]:
     import mitsuba as mi
 
     texture = texture_of({"bitmap": mi.Bitmap(picture.astype(np.float32)[..., None])})
@@ -129,13 +133,8 @@ def _thinlens(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], N
         }
     )
 
-    def render(seed: int) -> NDArray[np.float64]:
-        found: Any = mi.render(stage, sensor=sensor, spp=SAMPLES, seed=seed)  # pyright: ignore
-        return np.array(found, dtype=np.float64)[..., 0]
+    def render(seed: int) -> FloatArray:
+        image: Any = mi.render(stage, sensor=sensor, spp=SAMPLES, seed=seed)  # pyright: ignore
+        return np.array(image, dtype=np.float64)[..., 0]
 
     return render
-
-
-def _apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> str:
-    away = one - other
-    return f"pixels differ by {np.sqrt((away**2).mean()):.2g} RMS, {np.abs(away).max():.2g} at most, of 255"

@@ -1,7 +1,7 @@
-"""A whole frame to estimate: a camera of three lens types, of any size, and what it reads of an image from the prior.
+"""A whole frame of any size: a camera with three lens types, and its measurements of an image drawn from the prior.
 
-Lens types with magnifications 1/3, 1/5 and 1/4 and as many sub-imagers as these make sub-pixel shifts, so that each
-type sees every box of m x m pixels; f0 = 127.5, P0 = 5461.25 and noise of variance 1e-2.
+Lens types have magnifications 1/3, 1/5 and 1/4 and one sub-imager per sub-pixel shift, so that each type measures every
+box of m x m pixels; f0 = 127.5, P0 = 5461.25 and noise of variance 1e-2.
 """
 
 from __future__ import annotations
@@ -11,35 +11,32 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY, FrameSystem, Solution
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_matrix
 
-Vector = NDArray[np.float64]
-Image = NDArray[np.float64]
-
 WIDTHS = (3, 5, 4)
 MEAN, VARIANCE, NOISE = 127.5, 5461.25, 1e-2
-SMALL = 59  # like 539 one less than a multiple of 60, so that the border is the same: all types see all of the frame
+SMALL = 59  # like 539 one less than a multiple of 60, so that all types see the whole frame and borders are alike
 WAVES = 1024  # of a grid of frequencies along one axis, over which the interior's variance is averaged
 
 
 @dataclass(frozen=True)
 class Whole:
-    """A camera, an image (N,) drawn from the prior, and what the camera reads of it, (M,)."""
+    """A camera, an image drawn from the prior, (N,), and its measurements, (M,)."""
 
     camera: Camera
-    image: Vector
-    readings: Vector
+    image: FloatArray
+    readings: FloatArray
 
     @staticmethod
     def drawn(size: int, seed: int = 0) -> Whole:
-        """A frame of size x size pixels."""
+        """Draw a frame of size x size pixels."""
         camera, rng = whole_camera(size), np.random.default_rng(seed)
         image = rng.normal(MEAN, VARIANCE**0.5, camera.unknowns)
         readings = BoxFootprints(camera).forward(image)
@@ -47,31 +44,31 @@ class Whole:
         return Whole(camera, image, readings)
 
     @property
-    def unexpected(self) -> Vector:
-        """g - H f0: (M,). What every type sees is inside the frame, so H f0 is f0 everywhere."""
+    def residual(self) -> FloatArray:
+        """g - H f0, (M,). All footprints are inside the frame, so H f0 is f0 everywhere."""
         return self.readings - MEAN
 
     def frame(self) -> FrameSystem:
-        """Its solver, with nothing prepared yet."""
+        """Return the frame's solver without any preparation."""
         weights = np.broadcast_to(1 / NOISE, self.camera.measurements)
         return FrameSystem(self.camera, BoxFootprints(self.camera), weights, 1 / VARIANCE)
 
     def estimate(self, accuracy: float = ACCURACY) -> Solution:
-        """f^ - f0, from nothing prepared."""
+        """Return f^ - f0, computed without preparation."""
         frame = self.frame()
-        return frame.solve(frame.collected(self.unexpected), accuracy)
+        return frame.solve(frame.right_hand_side(self.residual), accuracy)
 
 
 def whole_camera(size: int) -> Camera:
-    """The camera of a target of size x size pixels."""
+    """Return the camera of a target of size x size pixels."""
     return derive(whole_scene(size))
 
 
 def whole_scene(size: int) -> Scene:
-    """Its scene."""
+    """Return the scene of a target of size x size pixels."""
     lenses = [
-        {"name": "ABC"[place], "magnification": f"1/{width}", "array": [width, width], "pixels": "fit"}
-        for place, width in enumerate(WIDTHS)
+        {"name": "ABC"[index], "magnification": f"1/{width}", "array": [width, width], "pixels": "fit"}
+        for index, width in enumerate(WIDTHS)
     ]
     target = {
         "image": "photo:camera",
@@ -86,30 +83,30 @@ def whole_scene(size: int) -> Scene:
 
 @cache
 def compile_all() -> None:
-    """Load what is compiled, and start the threads that are kept, so that nothing of it is timed."""
+    """Load compiled functions and start threads, which must not be timed."""
     Whole.drawn(SMALL).estimate()
 
 
-def deviations(size: int) -> Image:
-    """Posterior standard deviation of every pixel of a frame of 60 k - 1 pixels: (size, size).
+def deviations(size: int) -> FloatArray:
+    """Return the posterior standard deviations of a frame of 60 k - 1 pixels a side, (size, size).
 
-    From all of C of a small frame with the same border; 29 pixels from there the middle one is that of any.
+    They are those of a small frame with the same border, whose central pixel, 29 pixels from it, stands for all others.
     """
     matrix = ideal_matrix(whole_camera(SMALL))
     precision = (matrix.T @ matrix).toarray() / NOISE
     precision[np.diag_indices_from(precision)] += 1 / VARIANCE
     root = linalg.solve_triangular(linalg.cholesky(precision, lower=True), np.eye(precision.shape[0]), lower=True)
     small = np.sqrt(np.square(root).sum(axis=0)).reshape(SMALL, SMALL)
-    places, middle = np.arange(size), SMALL // 2
-    folded = np.where(places < size // 2, np.minimum(places, middle), np.maximum(places - size + SMALL, middle))
+    index, middle = np.arange(size), SMALL // 2
+    folded = np.where(index < size // 2, np.minimum(index, middle), np.maximum(index - size + SMALL, middle))
     return small[np.ix_(folded, folded)]
 
 
 @cache
 def predicted() -> tuple[float, float]:
-    """Posterior variance far from the border, and the standard error of a mean squared error, times sqrt(pixels).
+    """Return the posterior variance far from the border, and the standard error of a mean squared error x sqrt(pixels).
 
-    There K is a convolution whose transfer function is the sum over types of the squared one of a mean over m x m.
+    There K is a convolution; its transfer function is the sum over types of that of a mean over m x m pixels, squared.
     """
     angle = np.pi * (np.arange(WAVES) + 0.5) / WAVES
     squared = [np.square(np.sin(width * angle / 2) / (width * np.sin(angle / 2))) for width in WIDTHS]
@@ -118,7 +115,7 @@ def predicted() -> tuple[float, float]:
 
 
 def stored(camera: Camera) -> sparse.csr_array:
-    """H, (M, N), with the short indices that make SciPy's products fastest."""
+    """Return H, (M, N), with the 32-bit indices for which SciPy's products are fastest."""
     matrix = ideal_matrix(camera)
-    short = (matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32))
-    return sparse.csr_array((matrix.data, *short), shape=matrix.shape)
+    indices = (matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32))
+    return sparse.csr_array((matrix.data, *indices), shape=matrix.shape)

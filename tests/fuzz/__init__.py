@@ -1,1 +1,1 @@
-"""Damaged files of every kind that is read: each is refused in a sentence or read for what it holds, never worse."""
+"""Damaged files of every type that is read: each must be refused with a short message or read for what it holds."""

@@ -1,4 +1,4 @@
-"""The long campaign: `python -m tests.fuzz --inputs 10000 --seed 1`, and one input of it again."""
+"""Long campaign: `python -m tests.fuzz --inputs 10000 --seed 1`; or one input of it again."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ..conftest import TINY, shell
-from .campaign import ANOTHER, REFUSED, UNCHANGED, Result, again, campaign, damaged, prepare
-from .kinds import KINDS, SCENE
+from .campaign import REFUSED, UNCHANGED, VALID, Result, campaign, command_for, damaged, prepare
+from .file_types import FILE_TYPES, SCENE
 
-COLUMNS = ("kind of input", "damaged", REFUSED, UNCHANGED, ANOTHER, "wrong", "seconds", "slowest")
+COLUMNS = ("type of input", "damaged", REFUSED, UNCHANGED, VALID, "wrong", "seconds", "slowest")
 
 
 def finished_run(folder: Path) -> Path:
-    """The folder of a finished run of the tiny scene."""
+    """Run the tiny scene and return its folder."""
     (folder / SCENE).write_text(TINY, encoding="utf-8")
     ended = shell("run", SCENE, "-o", "out", cwd=folder)
     if ended.code:
@@ -25,8 +25,8 @@ def finished_run(folder: Path) -> Path:
 
 
 def row(name: str, results: list[Result]) -> tuple[str, ...]:
-    """What became of a kind, in the table's columns."""
-    counts = [sum(result.verdict == verdict for result in results) for verdict in (REFUSED, UNCHANGED, ANOTHER)]
+    """Return the table row of a file type."""
+    counts = [sum(result.verdict == verdict for result in results) for verdict in (REFUSED, UNCHANGED, VALID)]
     wrong = sum(result.wrong for result in results)
     seconds = [result.seconds for result in results]
     times = f"{sum(seconds):.1f}", f"{max(seconds, default=0.0):.2f}"
@@ -34,52 +34,47 @@ def row(name: str, results: list[Result]) -> tuple[str, ...]:
 
 
 def main() -> None:
-    """Run the campaign over all kinds, or over one."""
-    options = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    options.add_argument("--inputs", type=int, default=10000, help="of all kinds together")
-    options.add_argument("--seed", type=int, default=1)
-    options.add_argument("--kind", choices=sorted(KINDS), help="this kind alone")
-    options.add_argument("--only", type=int, metavar="NUMBER", help="this input of --kind again")
-    options.add_argument("--keep", type=Path, metavar="FILE", help="where --only puts the damaged input")
-    options.add_argument("--workers", type=int, default=2)
-    told = options.parse_args()
-    names = [told.kind] if told.kind else list(KINDS)
+    """Run the campaign over all file types, or over one."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--inputs", type=int, default=10000, help="number of inputs of all types together")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kind", choices=sorted(FILE_TYPES), help="only this type")
+    parser.add_argument("--only", type=int, metavar="NUMBER", help="only this input of --kind")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="write the damaged input of --only to this file")
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    names = [options.kind] if options.kind else list(FILE_TYPES)
     with tempfile.TemporaryDirectory() as folder:
         finished = finished_run(Path(folder))
-        if told.only is not None:
-            _again(names[0], told.seed, told.only, finished, told.keep)
+        if options.only is not None:
+            if options.keep is not None:
+                options.keep.write_bytes(_input(names[0], options.seed, options.only, finished))
+            print(*campaign({names[0]: [options.only]}, options.seed, finished), sep="\n")
             return
-        each = -(-told.inputs // len(names))
-        with ThreadPoolExecutor(told.workers) as threads:
-            found = list(threads.map(lambda name: campaign({name: range(each)}, told.seed, finished), names))
-    _print(dict(zip(names, found, strict=True)), told.seed)
-    sys.exit(any(result.wrong for results in found for result in results))
+        each = -(-options.inputs // len(names))
+        with ThreadPoolExecutor(options.workers) as threads:
+            results = list(threads.map(lambda name: campaign({name: range(each)}, options.seed, finished), names))
+    _print(dict(zip(names, results, strict=True)), options.seed)
+    sys.exit(any(result.wrong for group in results for result in group))
 
 
-def _again(name: str, seed: int, number: int, finished: Path, keep: Path | None) -> None:
-    if keep is not None:
-        kind = KINDS[name]
-        with tempfile.TemporaryDirectory() as folder:
-            prepare(Path(folder), finished)
-            keep.write_bytes(damaged(kind, seed, number, kind.originals(Path(folder)))[1])
-    print(*campaign({name: [number]}, seed, finished), sep="\n")
+def _input(name: str, seed: int, number: int, finished: Path) -> bytes:
+    file_type = FILE_TYPES[name]
+    with tempfile.TemporaryDirectory() as folder:
+        prepare(Path(folder), finished)
+        return damaged(file_type, seed, number, file_type.originals(Path(folder)))[1]
 
 
-def _print(found: dict[str, list[Result]], seed: int) -> None:
-    rows = [COLUMNS, *(row(name, results) for name, results in found.items())]
-    rows.append(row("all", [result for results in found.values() for result in results]))
-    widths = [max(len(cells[column]) for cells in rows) for column in range(len(COLUMNS))]
-    for cells in rows:
-        print(
-            "  ".join(
-                cell.rjust(width) if column else cell.ljust(width)
-                for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
-            )
-        )
-    for results in found.values():
-        for result in results:
-            if result.wrong:
-                print(f"{again(result, seed)}\n    {result.verdict}")
+def _print(results: dict[str, list[Result]], seed: int) -> None:
+    every = [result for group in results.values() for result in group]
+    rows = [COLUMNS, *(row(name, group) for name, group in results.items()), row("all", every)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for first, *cells in rows:
+        numbers = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+        print("  ".join((first.ljust(widths[0]), *numbers)))
+    for result in every:
+        if result.wrong:
+            print(f"{command_for(result, seed)}\n    {result.verdict}")
 
 
 if __name__ == "__main__":

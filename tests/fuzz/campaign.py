@@ -1,7 +1,7 @@
-"""A campaign: many damaged inputs, each read in a process that may not hang, crash, grow or leave anything behind.
+"""Campaigns of damaged inputs, read in a process that must not hang, crash, exceed its memory or leave files behind.
 
-An input is known by its kind, a seed and a number, and is the same whenever these are. A process of its own reads one
-after the other, says what became of each, and is replaced where it died.
+An input is determined by its file type, a seed and a number. A worker process reads the inputs one by one and reports
+each result; if it dies, a new one continues with the next input.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -28,21 +29,22 @@ from time import perf_counter
 from ommatid.runtime.errors import InputError
 
 from ..examples import GALLERY
-from .kinds import BASE, EVERYTHING, KINDS, SCENE, Kind
+from .file_types import BASE, EVERYTHING, FILE_TYPES, SCENE, FileType
 
-REFUSED, UNCHANGED, ANOTHER = "refused", "read unchanged", "another valid one"
-VERDICTS = (REFUSED, UNCHANGED, ANOTHER)
-LONGEST = 1000  # characters of a sentence
-HANG = 10.0  # seconds of work after which an input of a few kilobytes hangs
-STUCK = 300.0  # seconds after which it does, worked or waited, however busy the machine is
-ROOM = 3 << 30  # bytes of addresses that a process may take beside what it has begun with
-COMMAND = 20  # of so many inputs one is also given to the command line, beside all that are valid
+REFUSED, UNCHANGED, VALID = "refused", "read unchanged", "valid, but different"
+VERDICTS = (REFUSED, UNCHANGED, VALID)
+MAX_MESSAGE = 1000  # characters
+CPU_LIMIT = 10.0  # seconds of work on an input of a few kilobytes
+TIME_LIMIT = 300.0  # seconds, on a busy machine
+MEMORY = 3 << 30  # bytes of address space beyond those at the start
+COMMAND_EVERY = 20  # one of so many inputs is also given to the command line, and every valid one
+COMMAND_FILES = ("new.exr", "new.png")
 ROOT = Path(__file__).parent.parent.parent
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of an input: one of the verdicts, or in words what was wrong with the program."""
+    """The result of one input: a verdict, or a description of the error in the program."""
 
     kind: str
     number: int
@@ -51,34 +53,31 @@ class Result:
 
     @property
     def wrong(self) -> bool:
-        """Whether the program has to be mended."""
+        """True if the program has an error."""
         return self.verdict not in VERDICTS
 
 
-def damaged(kind: Kind, seed: int, number: int, originals: list[bytes]) -> tuple[int, bytes]:
-    """Which original was damaged, and what it became."""
-    rng = Random(f"{kind.name} {seed} {number}")
-    place = rng.randrange(len(originals))
-    return place, kind.damaged(rng, originals[place])
+def damaged(file_type: FileType, seed: int, number: int, originals: list[bytes]) -> tuple[int, bytes]:
+    """Return the index of the original and its damaged content."""
+    rng = Random(f"{file_type.name} {seed} {number}")
+    index = rng.randrange(len(originals))
+    return index, file_type.damaged(rng, originals[index])
 
 
 def prepare(folder: Path, finished: Path) -> None:
-    """Lay out the files that inputs are read beside; `finished` is the folder of a run of the tiny scene."""
+    """Write the files that inputs refer to; `finished` is the folder of a finished run of the tiny scene."""
     (folder / SCENE).write_bytes((finished.parent.parent / SCENE).read_bytes())
-    for beside in ("lenses", "worlds"):
-        shutil.copytree(GALLERY / beside, folder / beside)
+    for name in ("lenses", "worlds"):
+        shutil.copytree(GALLERY / name, folder / name)
     (folder / BASE).write_text(EVERYTHING, encoding="utf-8")
     for name in ("stack.exr", "model.npz"):
         shutil.copy(finished / name, folder / f"sound{Path(name).suffix}")
 
 
-def campaign(wanted: Mapping[str, Iterable[int]], seed: int, finished: Path) -> list[Result]:
-    """Read damaged inputs, `wanted` by the names of their kinds, in that order.
-
-    A process that dies counts against the input that it was reading.
-    """
+def campaign(inputs: Mapping[str, Iterable[int]], seed: int, finished: Path) -> list[Result]:
+    """Read damaged inputs, given as numbers by file type; a process that dies counts against its current input."""
     results: list[Result] = []
-    left = [(name, number) for name, numbers in wanted.items() for number in numbers]
+    left = [(name, number) for name, numbers in inputs.items() for number in numbers]
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder), finished)
         while left:
@@ -92,142 +91,135 @@ def campaign(wanted: Mapping[str, Iterable[int]], seed: int, finished: Path) -> 
                 text=True,
                 check=False,
             )
-            told = [Result(**json.loads(line)) for line in ended.stdout.splitlines() if line.startswith('{"kind"')]
-            results += told
-            left = left[len(told) :]
+            lines = [line for line in ended.stdout.splitlines() if line.startswith('{"kind"')]
+            results += [Result(**json.loads(line)) for line in lines]
+            left = left[len(lines) :]
             if left:
-                hung = ended.returncode == -signal.SIGPROF or "Timeout" in ended.stderr
-                what = "hangs" if hung else f"ends with {ended.returncode}: {ended.stderr[-400:]}"
-                results.append(Result(*left.pop(0), f"the process {what}", HANG))
+                hangs = ended.returncode == -signal.SIGPROF or "Timeout" in ended.stderr
+                reason = "hangs" if hangs else f"ends with {ended.returncode}: {ended.stderr[-400:]}"
+                results.append(Result(*left.pop(0), f"the process {reason}", CPU_LIMIT))
     return results
 
 
-def _work(wanted: list[tuple[str, int]], seed: int, folder: Path) -> None:
+def _work(inputs: list[tuple[str, int]], seed: int, folder: Path) -> None:
+    """Read inputs in this process and print one result per line."""
     warnings.simplefilter("error")
-    warnings.simplefilter("ignore", ResourceWarning)  # decoders that try their luck leave files open
+    warnings.simplefilter("ignore", ResourceWarning)  # decoders leave files open
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for name, inputs in groupby(wanted, key=lambda one: one[0]):
-        kind = KINDS[name]
-        originals = kind.originals(folder)
-        contents = _known(kind, folder / kind.file, originals)
-        for _, number in inputs:
-            place, content = damaged(kind, seed, number, originals)
-            faulthandler.dump_traceback_later(STUCK, exit=True)
-            signal.setitimer(signal.ITIMER_PROF, HANG)  # which ends the process, even where it is deep in C
+    for name, numbers in groupby(inputs, key=lambda pair: pair[0]):
+        file_type = FILE_TYPES[name]
+        originals = file_type.originals(folder)
+        contents = _original_contents(file_type, folder / file_type.file, originals)
+        for _, number in numbers:
+            index, content = damaged(file_type, seed, number, originals)
+            faulthandler.dump_traceback_later(TIME_LIMIT, exit=True)
+            signal.setitimer(signal.ITIMER_PROF, CPU_LIMIT)  # ends the process, even inside C code
             start = perf_counter()
-            verdict = judged(kind, folder / kind.file, content, contents[place], number)
+            verdict = verdict_on(file_type, folder / file_type.file, content, contents[index], number)
             seconds = perf_counter() - start
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             faulthandler.cancel_dump_traceback_later()
             print(json.dumps(asdict(Result(name, number, verdict, seconds))), flush=True)
 
 
-def _known(kind: Kind, path: Path, originals: list[bytes]) -> list[object]:
-    """What sound ones hold. Afterwards the process may take no more than some room beside what that took."""
+def _original_contents(file_type: FileType, path: Path, originals: list[bytes]) -> list[object]:
+    """Read the originals, then limit the memory of the process relative to what that took."""
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
     contents: list[object] = []
     for original in originals:
         path.write_bytes(original)
-        contents.append(kind.read(path))
-    if kind.command:
-        _commanded(kind, path)  # imports what it needs
-        _clean(path.parent, {"new.exr", "new.png"})
+        contents.append(file_type.read(path))
+    if file_type.command:
+        _run_command(file_type, path)  # imports what it needs
+        _remove(path.parent, COMMAND_FILES)
     taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (taken + ROOM, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, hard))
     return contents
 
 
-def judged(kind: Kind, path: Path, content: bytes, expected: object, number: int) -> str:
-    """What is wrong with the program that reads this `content`, or what became of it."""
+def verdict_on(file_type: FileType, path: Path, content: bytes, expected: object, number: int) -> str:
+    """Return the verdict on this content, or a description of the error in the program."""
     path.write_bytes(content)
     before = set(os.listdir(path.parent))  # noqa: PTH208
-    verdict = _read(kind, path, expected)
-    if kind.command and verdict in VERDICTS and (number % COMMAND == 0 or verdict == ANOTHER):
-        verdict = _told(kind, path, verdict)
+    verdict = _read(file_type, path, expected)
+    if file_type.command and verdict in VERDICTS and (number % COMMAND_EVERY == 0 or verdict == VALID):
+        verdict = _command_verdict(file_type, path, verdict)
     left = set(os.listdir(path.parent)) - before  # noqa: PTH208
-    _clean(path.parent, left)
+    _remove(path.parent, left)
     return f"left behind: {', '.join(sorted(left))}" if left and verdict in VERDICTS else verdict
 
 
-def _clean(folder: Path, names: Iterable[str]) -> None:
+def _remove(folder: Path, names: Iterable[str]) -> None:
     for name in names:
         (folder / name).unlink(missing_ok=True)
 
 
-def _read(kind: Kind, path: Path, expected: object) -> str:
+def _read(file_type: FileType, path: Path, expected: object) -> str:
     try:
-        found = kind.read(path)
+        content = file_type.read(path)
     except InputError as error:
-        sentence = str(error)
-        if len(sentence) > LONGEST:
-            return f"a sentence of {len(sentence)} characters: {sentence[:300]}"
+        message = str(error)
+        if len(message) > MAX_MESSAGE:
+            return f"a message of {len(message)} characters: {message[:300]}"
         return REFUSED
     except BaseException as error:
-        return f"{type(error).__name__}: {str(error)[:300]} ({_where(error)})"
-    if found == expected:
+        return f"{type(error).__name__}: {str(error)[:300]} ({_location(error)})"
+    if content == expected:
         return UNCHANGED
-    return "a checksum that does not tell" if kind.sealed else ANOTHER
+    return "a change that the checksum does not reveal" if file_type.sealed else VALID
 
 
-def _where(error: BaseException) -> str:
-    place = error.__traceback__
-    found = ""
-    while place is not None:
-        file = Path(place.tb_frame.f_code.co_filename)
-        if ROOT in file.parents and ".venv" not in file.parts:
-            found = f"{file.name}:{place.tb_lineno}"
-        place = place.tb_next
-    return found
+def _location(error: BaseException) -> str:
+    """File and line of the innermost frame in this repository."""
+    own = [
+        f"{Path(frame.filename).name}:{frame.lineno}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if ROOT in Path(frame.filename).parents and ".venv" not in Path(frame.filename).parts
+    ]
+    return own[-1] if own else ""
 
 
-def _told(kind: Kind, path: Path, verdict: str) -> str:
-    """The verdict, or what the command line did otherwise than it has to."""
-    code, out, err = _commanded(kind, path)
+def _command_verdict(file_type: FileType, path: Path, verdict: str) -> str:
+    """The verdict if the command line agrees with it, else a description of what it did."""
+    code, out, err = _run_command(file_type, path)
     lines = err.splitlines()
-    if (
-        code == 2
-        and not out
-        and len(lines) == 1
-        and lines[0].startswith("ommatid: ")
-        and not lines[0].startswith("ommatid: unexpected")
-    ):
+    refused = code == 2 and not out and len(lines) == 1 and lines[0].startswith("ommatid: ")
+    if refused and not lines[0].startswith("ommatid: unexpected"):
         return verdict
     if code == 0 and verdict != REFUSED:
         json.loads(out)
-        _clean(path.parent, ("new.exr", "new.png"))
+        _remove(path.parent, COMMAND_FILES)
         return verdict
-    return f"the command, of what is {verdict}, ended with {code}, printed {out[:60]!r} and said {err[:400]!r}"
+    return f"the command on a file that is {verdict} ended with {code}, printed {out[:60]!r} and reported {err[:400]!r}"
 
 
-def _commanded(kind: Kind, path: Path) -> tuple[int, str, str]:
+def _run_command(file_type: FileType, path: Path) -> tuple[int, str, str]:
     from ommatid.cli import app
 
-    words = [path.name if word == "{file}" else word.replace("{file}", path.name) for word in kind.command]
+    words = [word.replace("{file}", path.name) for word in file_type.command]
     if words[-1] == "{sets}":
         try:
             changes = json.loads(path.read_bytes())
         except ValueError:
             changes = []
         words[-1:] = [part for change in changes for part in ("--set", change)]
-    saved = sys.argv
+    saved, code = sys.argv, 0
     sys.argv = ["ommatid", *words]
     try:
-        with _captured() as told:
+        with _captured() as output:
             try:
                 app.main()
-                code = 0
             except SystemExit as ended:
                 code = int(ended.code or 0)
     finally:
         sys.argv = saved
-    out, err = told()
-    return code, out, err
+    return code, *output()
 
 
 @contextlib.contextmanager
 def _captured() -> Generator[Callable[[], tuple[str, str]]]:
-    """What anything in this process writes to stdout and to stderr, libraries in C as well."""
+    """Capture stdout and stderr of this process, including those of C libraries."""
     texts: list[str] = []
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         sys.stdout.flush()
@@ -246,8 +238,8 @@ def _captured() -> Generator[Callable[[], tuple[str, str]]]:
                 texts.append(file.read().decode(errors="replace"))
 
 
-def again(result: Result, seed: int) -> str:
-    """The command that does one input again."""
+def command_for(result: Result, seed: int) -> str:
+    """Return the command that repeats one input."""
     return f"python -m tests.fuzz --kind {shlex.quote(result.kind)} --seed {seed} --only {result.number}"
 
 

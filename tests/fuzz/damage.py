@@ -1,4 +1,4 @@
-"""What happens to files on the way: bits flip, ends go missing, blocks come twice, elsewhere or as zeros."""
+"""Random damage to files: flipped bits, truncation, and blocks that are removed, repeated, exchanged or zeroed."""
 
 from __future__ import annotations
 
@@ -6,106 +6,104 @@ import struct
 from collections.abc import Callable, Sequence
 from random import Random
 
-Harm = Callable[[Random, bytearray], None]
+Damage = Callable[[Random, bytearray], None]
 
-MOST = 400  # bytes that one damage touches, at most
-WIDTHS = "bhiq"  # of whole numbers in headers, as `struct` calls them: 1, 2, 4 and 8 bytes
-TELLING = (0, 1, -1, 2, 7, 16, 255, 256, 1000, 65535, 65536, 10**6, 2**31 - 1, -(2**31), 2**32, 2**62, 2**63 - 1)
+MAX_BLOCK = 400  # bytes that one damage affects
+INTEGER_FORMATS = "bhiq"  # of `struct`: whole numbers of 1, 2, 4 and 8 bytes, as headers hold them
+BOUNDARIES = (0, 1, -1, 2, 7, 16, 255, 256, 1000, 65535, 65536, 10**6, 2**31 - 1, -(2**31), 2**32, 2**62, 2**63 - 1)
 
 
-def _place(rng: Random, data: bytearray) -> int:
+def _position(rng: Random, data: bytearray) -> int:
     return rng.randrange(len(data)) if data else 0
 
 
 def flip(rng: Random, data: bytearray) -> None:
     """Flip a bit."""
     if data:
-        data[_place(rng, data)] ^= 1 << rng.randrange(8)
+        data[_position(rng, data)] ^= 1 << rng.randrange(8)
 
 
 def overwrite(rng: Random, data: bytearray) -> None:
-    """Write other bytes over some."""
-    start = _place(rng, data)
+    """Overwrite some bytes."""
+    start = _position(rng, data)
     data[start : start + rng.randint(1, 16)] = rng.randbytes(rng.randint(1, 16))
 
 
 def number(rng: Random, data: bytearray) -> None:
-    """Write a number that means something over some bytes, as a header may hold it."""
-    start, width = _place(rng, data), rng.choice(WIDTHS)
-    size = struct.calcsize(width)
-    value = rng.choice(TELLING) % 2 ** (8 * size)
+    """Overwrite some bytes by a boundary value, as a header may hold it."""
+    start, size = _position(rng, data), struct.calcsize(rng.choice(INTEGER_FORMATS))
+    value = rng.choice(BOUNDARIES) % 2 ** (8 * size)
     data[start : start + size] = value.to_bytes(size, rng.choice(("little", "big")))
 
 
-def cut(rng: Random, data: bytearray) -> None:
-    """Lose the end."""
-    del data[_place(rng, data) :]
+def truncate(rng: Random, data: bytearray) -> None:
+    """Remove the end."""
+    del data[_position(rng, data) :]
 
 
 def remove(rng: Random, data: bytearray) -> None:
-    """Lose some bytes in the middle."""
-    start = _place(rng, data)
-    del data[start : start + rng.randint(1, MOST)]
+    """Remove a block."""
+    start = _position(rng, data)
+    del data[start : start + rng.randint(1, MAX_BLOCK)]
 
 
 def insert(rng: Random, data: bytearray) -> None:
-    """Gain some bytes in the middle."""
-    start = _place(rng, data)
-    data[start:start] = rng.randbytes(rng.randint(1, MOST))
+    """Insert a random block."""
+    start = _position(rng, data)
+    data[start:start] = rng.randbytes(rng.randint(1, MAX_BLOCK))
 
 
 def zero(rng: Random, data: bytearray) -> None:
-    """Have zeros in place of a block, as a disk leaves them."""
-    start = _place(rng, data)
-    size = min(rng.randint(1, MOST), len(data) - start)
+    """Overwrite a block by zeros, as a failing disk does."""
+    start = _position(rng, data)
+    size = min(rng.randint(1, MAX_BLOCK), len(data) - start)
     data[start : start + size] = bytes(size)
 
 
-def double(rng: Random, data: bytearray) -> None:
-    """Have a block twice."""
-    start = _place(rng, data)
-    block = data[start : start + rng.randint(1, MOST)]
-    data[start:start] = block
+def repeat(rng: Random, data: bytearray) -> None:
+    """Repeat a block."""
+    start = _position(rng, data)
+    data[start:start] = data[start : start + rng.randint(1, MAX_BLOCK)]
 
 
 def swap(rng: Random, data: bytearray) -> None:
-    """Have two blocks of one size change their places."""
-    size = rng.randint(1, max(1, min(MOST, len(data) // 2)))
-    one, other = sorted(rng.randrange(max(1, len(data) - size + 1)) for _ in range(2))
-    first, second = bytes(data[one : one + size]), bytes(data[other : other + size])
-    if other - one >= size:
-        data[one : one + size], data[other : other + size] = second, first
+    """Exchange two blocks of the same size."""
+    size = rng.randint(1, max(1, min(MAX_BLOCK, len(data) // 2)))
+    start, other = sorted(rng.randrange(max(1, len(data) - size + 1)) for _ in range(2))
+    first, second = bytes(data[start : start + size]), bytes(data[other : other + size])
+    if other - start >= size:
+        data[start : start + size], data[other : other + size] = second, first
 
 
-HARMS: tuple[Harm, ...] = (flip, flip, overwrite, number, cut, remove, insert, zero, double, swap)
+DAMAGES: tuple[Damage, ...] = (flip, flip, overwrite, number, truncate, remove, insert, zero, repeat, swap)
 
 
 def damaged(rng: Random, original: bytes) -> bytes:
-    """The bytes after one to four accidents."""
+    """Return the bytes after one to four random damages."""
     data = bytearray(original)
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
-        rng.choice(HARMS)(rng, data)
+        rng.choice(DAMAGES)(rng, data)
     return bytes(data)
 
 
-def near(rng: Random, original: bytes, marks: Sequence[bytes], room: int = 24) -> bytes:
-    """The bytes with a number or a few bytes changed within `room` behind one of some marks, as headers have them."""
+def damaged_near(rng: Random, original: bytes, marks: Sequence[bytes], room: int = 24) -> bytes:
+    """Return the bytes with a number or some bytes changed within `room` bytes after one of the marks of a header."""
     data = bytearray(original)
     for _ in range(rng.choice((1, 1, 2))):
-        places = _after(bytes(data), rng.choice(tuple(marks)))
-        if not places:
+        starts = _ends_of(bytes(data), rng.choice(tuple(marks)))
+        if not starts:
             continue
-        start = rng.choice(places)
+        start = rng.choice(starts)
         window = data[start : start + room]
         rng.choice((number, number, overwrite, flip, zero))(rng, window)
         data[start : start + room] = window
     return bytes(data)
 
 
-def _after(data: bytes, mark: bytes) -> list[int]:
-    found: list[int] = []
+def _ends_of(data: bytes, mark: bytes) -> list[int]:
+    ends: list[int] = []
     start = data.find(mark)
     while start >= 0:
-        found.append(start + len(mark))
+        ends.append(start + len(mark))
         start = data.find(mark, start + 1)
-    return found
+    return ends

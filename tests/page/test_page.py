@@ -452,7 +452,7 @@ def bench(camera: Camera) -> BenchTable:
 
 
 def test_a_bench_of_the_same_camera_is_drawn(run: data.Run) -> None:
-    assert "No results of <code>ommatid bench</code>" in html_of(run)
+    assert "there are no results for this camera" in html_of(run)
     table = bench(run.stack.camera)
     text = page(run, None, table, "0")
     assert 'id="plot-effort"' in text
@@ -509,7 +509,7 @@ def test_the_verdict_compares_measured_and_expected_error(error: dict[str, Any],
     assert words.agreement(described(**error).error) == agreement
     assert sentence in verdict
     assert "that of the target's pixel grid (1 pixel)." in verdict
-    cause = "75 %, is due to noise of the rendering: a larger `render.samples` would reduce it."
+    cause = "noise of the rendering, 75 %; a larger `render.samples` would reduce it."
     assert verdict.endswith(cause)
 
 

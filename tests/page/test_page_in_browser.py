@@ -284,7 +284,7 @@ def test_the_pointer_shows_the_values_of_all_maps(letter: Path, shown: Opened) -
         for name in MAPS:
             shown_values = tip(page, *position(page, name, 5.5, 17.5))
             assert (shown_values.pop("row"), shown_values.pop("column")) == ("5", "17")
-            shown_values["deviation"] = shown_values.pop("posterior standard deviation")
+            shown_values["deviation"] = shown_values.pop("standard deviation")
             # Five digits are shown.
             assert {key: float(value) for key, value in shown_values.items()} == pytest.approx(maps, rel=1e-4)
         page.locator("#pixel [name=row]").fill("5")

@@ -11,33 +11,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
 from ommatid.paper import claims, paper
 from ommatid.paper import figures as paper_figures
-from ommatid.paper.claims import CATCH, NO, YES
-from ommatid.paper.photograph_claims import pictures
-from ommatid.paper.photographs import Photograph, TileCrops, cut, load, measure, seeds, simulate_trials
+from ommatid.paper.claims import NO, QUALIFIED, YES
+from ommatid.paper.photograph_claims import photograph_claims
+from ommatid.paper.photographs import Photograph, TileCrops, crop_tiles, load, measure, seeds, simulate_trials
 from ommatid.paper.tile_errors import THREE, TWICE, TWO, PaperTile, TileError, Tiles, tile, tiles
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.tables.sensor import NoiseTable
-from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.sensor.gaussian import expose, generators
 
 from ..examples import familywise
-
-Values = NDArray[np.float64]
-
-
-def record(camera: Camera, light: Values, noise: NoiseTable, seed: int) -> Values:
-    return expose(light, noise, generators(camera, seed), camera.slices())
 
 
 @dataclass(frozen=True)
 class Written:
-    """What one run left behind, and the figures as they were drawn."""
+    """The folder and summary of one run, and the figures as they were drawn."""
 
     folder: Path
     description: dict[str, Any]
@@ -64,12 +55,12 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Written]:
     original = vars(paper_figures)["_save"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_figures, "_save", save)
-        yield Written(folder, paper.write_paper(folder, ideal_matrix, record), drawn)
+        yield Written(folder, paper.write_paper(folder), drawn)
 
 
 @pytest.fixture(scope="module")
 def computed() -> Tiles:
-    return tiles(ideal_matrix)
+    return tiles()
 
 
 REFERENCE = [
@@ -125,11 +116,11 @@ def test_figure_5_holds_the_tile_of_longer_lenses(written: Written) -> None:
 
 
 def test_two_types_of_longer_lenses() -> None:
-    assert tile(41, TWO, ideal_matrix).mse(1e-6) == pytest.approx(194.93058, rel=1e-7)
+    assert tile(41, TWO).mse(1e-6) == pytest.approx(194.93058, rel=1e-7)
 
 
 @pytest.mark.parametrize("lenses", [TWICE, TWO, THREE])
-def test_a_line_is_equation_5_written_out(computed: Tiles, lenses: tuple[str, ...]) -> None:
+def test_a_line_agrees_with_equation_5_in_dense_matrices(computed: Tiles, lenses: tuple[str, ...]) -> None:
     shown, expected, actual = computed[19, lenses], 1e-2, 3.0
     h, p0 = shown.form.problem.matrix.toarray(), 5461.25
     gain = np.linalg.solve(p0 * h @ h.T + expected * np.eye(len(h)), p0 * h).T
@@ -139,7 +130,7 @@ def test_a_line_is_equation_5_written_out(computed: Tiles, lenses: tuple[str, ..
     np.testing.assert_allclose(shown.line(expected).at(actual), np.diag(covariance), rtol=1e-7)
 
 
-def test_maps_are_of_the_tile_and_upright(written: Written, computed: Tiles) -> None:
+def test_maps_show_the_tile_upright(written: Written, computed: Tiles) -> None:
     rows = written.rows("fig3.csv")
     for number, lenses in enumerate((TWICE, TWO, THREE)):
         image = np.zeros((19, 19))
@@ -175,7 +166,7 @@ def test_figure_7_is_drawn_as_it_is_written(written: Written) -> None:
         for line, column in zip(axes.lines, wanted, strict=True):
             np.testing.assert_array_equal(line.get_ydata(), [float(row[column]) for row in part])
         for row in part:
-            assert float(row["mean"]) == pytest.approx(np.mean([float(row[one]) for one in tiles_at]), rel=1e-12)
+            assert float(row["mean"]) == pytest.approx(np.mean([float(row[name]) for name in tiles_at]), rel=1e-12)
     for row in parts[1]:
         assert float(row["noise_variance"]) == pytest.approx((256 / 2 ** int(row["bits"])) ** 2 / 12, rel=1e-12)
 
@@ -190,33 +181,33 @@ def test_every_axis_has_a_name(written: Written) -> None:
         assert (written.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_everything_is_written_and_nothing_else(written: Written) -> None:
+def test_all_files_are_written_and_no_others(written: Written) -> None:
     assert {path.name for path in written.folder.iterdir()} == set(written.description["files"])
     assert set(written.figures) == {"fig2", "fig3", "fig4", "fig5", "fig7", "distortion"}
     json.dumps(written.description, allow_nan=False)
 
 
 VERDICTS = {
-    "two sets of type I": CATCH,
-    "two types are better": CATCH,
+    "two sets of type I": QUALIFIED,
+    "two types are better": QUALIFIED,
     "one type or two: the null space": YES,
     "three types: the error falls": YES,
     "two types: the error is largest": YES,
-    "type I alone": CATCH,
-    "three types: the 35 x 35": CATCH,
-    "41 x 41": CATCH,
+    "type I alone": QUALIFIED,
+    "three types: the 35 x 35": QUALIFIED,
+    "41 x 41": QUALIFIED,
     "one type leaves": YES,
     "two coprime types": YES,
-    "quantisation": CATCH,
+    "quantisation": QUALIFIED,
     "real photographs": YES,
 }
 
 
 @pytest.mark.parametrize("beginning", VERDICTS)
-def test_each_claim_holds_as_was_measured_beforehand(written: Written, beginning: str) -> None:
+def test_each_claim_has_the_verdict_measured_beforehand(written: Written, beginning: str) -> None:
     found = written.claim(beginning)
     assert found["holds"] == VERDICTS[beginning]
-    assert bool(found["remark"]) or found["holds"] == YES, "a catch is named"
+    assert bool(found["remark"]) or found["holds"] == YES, "a qualification is stated"
     (row,) = [row for row in written.rows("claims.csv") if row["claim"] == found["claim"]]
     assert (row["holds"], row["remark"]) == (found["holds"], found["remark"])
     assert all(name in row["numbers"] for name in found["numbers"])
@@ -263,9 +254,9 @@ def test_the_printed_table_names_every_claim(written: Written) -> None:
         assert lines[claim["claim"]].startswith(claim["holds"])
 
 
-def test_a_claim_that_does_not_hold_is_said_not_to(computed: Tiles) -> None:
+def test_claims_fail_on_swapped_tiles(computed: Tiles) -> None:
     swapped = {**computed, (19, TWICE): computed[19, THREE], (19, THREE): computed[19, TWICE]}
-    verdicts = {claim.claim: claim.holds for claim in claims.errors(swapped)}
+    verdicts = {claim.claim: claim.holds for claim in claims.error_claims(swapped)}
     broken = (
         "two sets of type I",
         "two types are better",
@@ -277,18 +268,18 @@ def test_a_claim_that_does_not_hold_is_said_not_to(computed: Tiles) -> None:
         assert [holds for claim, holds in verdicts.items() if claim.startswith(beginning)] == [NO]
 
 
-def test_lines_cross_and_bend_where_they_do() -> None:
-    one, two = (
+def test_crossing_and_knee_of_lines() -> None:
+    first, second = (
         TileError(np.array([9.0, 11.0]), np.array([1.0, 1.0])),
         TileError(np.array([1.0, 3.0]), np.array([4.0, 6.0])),
     )
-    assert one.crossing(two) == 2.0
-    assert one.at(2.0).mean() == two.at(2.0).mean()
-    assert one.crossing(replace(two, noise=np.array([0.5, 0.5]))) == float("inf")
-    assert (one.knee, two.knee) == (10.0, 0.4)
+    assert first.crossing(second) == 2.0
+    assert first.at(2.0).mean() == second.at(2.0).mean()
+    assert first.crossing(replace(second, noise=np.array([0.5, 0.5]))) == float("inf")
+    assert (first.knee, second.knee) == (10.0, 0.4)
 
 
-def from_prior(shown: PaperTile, count: int, seed: int) -> Values:
+def from_prior(shown: PaperTile, count: int, seed: int) -> FloatArray:
     prior, rng = shown.form.problem.prior, np.random.default_rng(seed)
     return prior.mean + rng.normal(size=(count, prior.mean.size)) * prior.root
 
@@ -297,7 +288,7 @@ def test_images_from_the_prior_err_as_predicted(computed: Tiles) -> None:
     """The error's covariance has the eigenvalues P0 / (1 + s^2): mean and variance of its squared length follow."""
     shown, count = computed[19, TWO], 200
     noises = tuple(NoiseTable(variance=variance) for variance in (1e-6, 1e-3, 1.0, 100.0))
-    trials = measure(shown, from_prior(shown, count, 1), noises, record, seeds(3, 0))
+    trials = measure(shown, from_prior(shown, count, 1), noises, seeds(3, 0))
     for level, noise in enumerate(noises):
         eigenvalues = 5461.25 / (1 + shown.form.values**2 / noise.variance)
         spread = np.sqrt(2 * np.sum(eigenvalues**2)) / 361
@@ -308,7 +299,7 @@ def test_images_from_the_prior_err_as_predicted(computed: Tiles) -> None:
 def test_the_noise_alone_errs_as_predicted(computed: Tiles) -> None:
     shown, count = computed[19, THREE], 200
     noises = (NoiseTable(variance=1e-4), NoiseTable(variance=1.0), *(NoiseTable(bits=bits) for bits in (4, 8, 12)))
-    trials = measure(shown, from_prior(shown, count, 2), noises, record, seeds(4, 0))
+    trials = measure(shown, from_prior(shown, count, 2), noises, seeds(4, 0))
     limit = stats.norm.isf(familywise(len(noises)) / 2)
     z = (trials.from_noise.mean(axis=1) / trials.noise_part - 1) / (trials.spread / np.sqrt(count))
     assert np.abs(z).max() < limit
@@ -320,24 +311,24 @@ def test_the_noise_alone_errs_as_predicted(computed: Tiles) -> None:
         assert found == pytest.approx(trials.spread[level], rel=3 * np.sqrt((2 + excess) / (4 * count)))
 
 
-def test_noise_is_repeated_by_its_seed_and_shared_by_nothing(computed: Tiles) -> None:
+def test_noise_is_repeatable_and_independent(computed: Tiles) -> None:
     shown, noises = computed[19, THREE], (NoiseTable(variance=1e-2),) * 2
     images = np.tile(from_prior(shown, 1, 5), (3, 1))
-    trials = measure(shown, images, noises, record, seeds(6, 0))
-    assert np.unique(trials.measured).size == 6, "one image, one level of noise: errors of their own all the same"
-    fewer = measure(shown, images[:2], noises, record, seeds(6, 0))
+    trials = measure(shown, images, noises, seeds(6, 0))
+    assert np.unique(trials.measured).size == 6, "equal images and levels have different noise"
+    fewer = measure(shown, images[:2], noises, seeds(6, 0))
     np.testing.assert_array_equal(fewer.from_noise, trials.from_noise[:, :2])
     for other in (seeds(6, 1), seeds(7, 0)):
-        assert not np.intersect1d(measure(shown, images, noises, record, other).from_noise, trials.from_noise).size
+        assert not np.intersect1d(measure(shown, images, noises, other).from_noise, trials.from_noise).size
 
 
-def test_pictures_like_the_prior_are_no_photographs(computed: Tiles) -> None:
+def test_images_wider_than_the_prior_fail_the_claim_on_photographs(computed: Tiles) -> None:
     """Twice the prior's deviation: worse than predicted where the prior decides."""
     shown = computed[35, THREE]
     images = 127.5 + 2 * (from_prior(shown, 6, 8) - 127.5)
-    found = simulate_trials(shown, "prior", TileCrops(images, ((0, 0),) * 6), record, 0)
-    assert pictures(found)[1].holds == NO
-    assert pictures(broken_quantisation(found))[0].holds == NO
+    found = simulate_trials(shown, "prior", TileCrops(images, ((0, 0),) * 6), 0)
+    assert photograph_claims(found)[1].holds == NO
+    assert photograph_claims(broken_quantisation(found))[0].holds == NO
 
 
 def broken_quantisation(found: Photograph) -> Photograph:
@@ -345,40 +336,38 @@ def broken_quantisation(found: Photograph) -> Photograph:
 
 
 @pytest.mark.parametrize("shape", [(70, 105), (105, 70), (35, 210), (210, 35), (71, 300), (512, 512)])
-def test_tiles_are_cut_upright_and_apart(shape: tuple[int, int]) -> None:
+def test_tiles_are_cropped_upright_without_overlap(shape: tuple[int, int]) -> None:
     pixels = np.random.default_rng(0).uniform(0, 255, shape)
-    chosen = cut(pixels, 35, "noise", np.random.default_rng(1))
+    chosen = crop_tiles(pixels, 35, "noise", np.random.default_rng(1))
     covered = np.zeros(shape, dtype=int)
-    for image, (row, column) in zip(chosen.images, chosen.places, strict=True):
+    for image, (row, column) in zip(chosen.images, chosen.corners, strict=True):
         covered[row : row + 35, column : column + 35] += 1
         fraction = image.reshape(35, 35) - pixels[row : row + 35, column : column + 35]
-        assert np.abs(fraction).max() <= 0.5, "rounded, a picture of whole numbers is itself"
+        assert np.abs(fraction).max() <= 0.5, "rounding restores whole numbers"
         assert stats.kstest(fraction.ravel() + 0.5, "uniform").pvalue > familywise(36)
-    assert len(chosen.places) == 6
-    assert (covered.max(), covered.sum()) == (1, 6 * 35**2), "whole tiles, none over another"
+    assert len(chosen.corners) == 6
+    assert (covered.max(), covered.sum()) == (1, 6 * 35**2), "whole tiles without overlap"
 
 
-def test_tiles_are_cut_where_there_is_something_to_see() -> None:
+def test_tiles_are_cropped_where_contrast_is_highest() -> None:
     pixels = np.full((400, 600), 99.0)
     pixels[300, 100] = 200.0
-    rng = np.random.default_rng(0)
-    assert any(
-        row <= 300 < row + 35 and column <= 100 < column + 35 for row, column in cut(pixels, 35, "dot", rng).places
-    )
+    corners = crop_tiles(pixels, 35, "dot", np.random.default_rng(0)).corners
+    assert any(row <= 300 < row + 35 and column <= 100 < column + 35 for row, column in corners)
 
 
 @pytest.mark.parametrize("shape", [(69, 105), (104, 104), (34, 1000), (1000, 34), (35, 209)])
-def test_a_picture_that_holds_no_six_tiles_is_refused(shape: tuple[int, int]) -> None:
+def test_an_image_too_small_for_six_tiles_is_refused(shape: tuple[int, int]) -> None:
     with pytest.raises(InputError, match=f"6 tiles of 35 x 35 pixels.* got {shape[0]} x {shape[1]} in me.png"):
-        cut(np.zeros(shape), 35, "me.png", np.random.default_rng(0))
+        crop_tiles(np.zeros(shape), 35, "me.png", np.random.default_rng(0))
 
 
-def test_what_is_no_picture_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_unreadable_images_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "note.npy").write_text("no picture", encoding="utf-8")
     np.save(tmp_path / "small.npy", np.zeros((60, 60)))
     for name, expected in (("note.npy", "could not be read"), ("none.png", "no picture"), ("small.npy", "6 tiles")):
         with pytest.raises(InputError, match=f"--image.*{expected}") as refused:
-            paper.write_paper(tmp_path / "out", ideal_matrix, record, str(tmp_path / name))
+            paper.write_paper(tmp_path / "out", str(tmp_path / name))
         assert "\n" not in str(refused.value)
     assert not (tmp_path / "out").exists()
 
@@ -386,10 +375,10 @@ def test_what_is_no_picture_is_refused_before_anything_is_written(tmp_path: Path
 def test_an_unusable_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
     with pytest.raises(InputError, match="expected a folder"):
-        paper.write_paper(tmp_path / "file", ideal_matrix, record)
+        paper.write_paper(tmp_path / "file")
 
 
-def test_the_readers_picture_is_not_written_over(tmp_path: Path) -> None:
+def test_the_users_image_is_not_overwritten(tmp_path: Path) -> None:
     from skimage import io
 
     picture = tmp_path / "fig7.png"
@@ -397,5 +386,5 @@ def test_the_readers_picture_is_not_written_over(tmp_path: Path) -> None:
     save_image(picture, np.arange(80 * 120, dtype=np.uint8).reshape(80, 120), check_contrast=False)
     assert load(str(picture)).shape == (80, 120)
     with pytest.raises(InputError, match=r"fig7\.png: would replace"):
-        paper.write_paper(tmp_path, ideal_matrix, record, str(picture))
+        paper.write_paper(tmp_path, str(picture))
     assert {path.name for path in tmp_path.iterdir()} == {"fig7.png"}

@@ -46,7 +46,7 @@ def recorded(camera: Camera, image: FloatArray, rng: np.random.Generator, table:
 
 
 def drawn(prior: Prior, rng: np.random.Generator) -> FloatArray:
-    return prior.mean + prior.spread(rng.standard_normal(prior.freedoms))
+    return prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
 
 
 def fitted(camera: Camera, values: FloatArray, prior: Prior) -> Alignment:

@@ -14,15 +14,14 @@ from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.problem import Problem
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import camera
-from .test_estimate import problem, tile
+from ..examples import camera, posterior_covariance, random_problem, tile_problem
 
 
 @given(st.integers(0, 10**6), st.floats(0.1, 10))
 @settings(max_examples=40, deadline=None, derandomize=True)
 def test_expecting_another_noise_never_lowers_the_error(seed: int, factor: float) -> None:
     """The estimator that expects the actual noise has the least error of all linear ones."""
-    known = problem(seed, 8, 6)
+    known = random_problem(seed, 8, 6)
     noise = {"noise": known.noise_variance}
     right = expected_error(factorise(known)[0], noise)
     mismatched = Problem(known.matrix, known.prior, factor * known.noise_variance)
@@ -30,7 +29,7 @@ def test_expecting_another_noise_never_lowers_the_error(seed: int, factor: float
 
 
 def test_parts_add_up() -> None:
-    known = problem(5, 9, 6)
+    known = random_problem(5, 9, 6)
     parts = {"noise": 0.3 * known.noise_variance, "rendering": 0.7 * known.noise_variance}
     expected = expected_error(factorise(known)[0], parts)
     assert expected.missing + sum(expected.parts.values()) == pytest.approx(expected.mse)
@@ -44,10 +43,10 @@ def test_eq_5_holds_over_a_thousand_images_drawn_from_the_prior(form: str, lense
 
     One type leaves a null space, three leave none: both the prior's part and the noise's are tested.
     """
-    known = tile(lenses, 0.5)
+    known = tile_problem(lenses, 0.5)
     draws, unknowns = 1000, known.unknowns
     factorised, _ = factorise(known, form)
-    covariance = factorised.covariance(np.eye(unknowns))
+    covariance = posterior_covariance(factorised)
     rng = np.random.default_rng(7)
     images = rng.normal(127.5, known.prior.root[:, None], (unknowns, draws))
     recorded = known.matrix @ images + rng.normal(0, 0.5**0.5, (known.measurements, draws))
@@ -64,7 +63,7 @@ def test_eq_5_holds_over_a_thousand_images_drawn_from_the_prior(form: str, lense
 
 def test_the_error_with_more_noise_than_expected_is_predicted() -> None:
     """Eq. 5 with four times the expected noise, against errors of images drawn from the prior: four standard errors."""
-    known = tile(3, 1.0)
+    known = tile_problem(3, 1.0)
     rng = np.random.default_rng(8)
     draws, mean = 300, np.full((361, 1), 127.5)
     form, _ = factorise(known)
@@ -95,7 +94,7 @@ def test_the_interval_holds_99_of_100_errors(wide: bool) -> None:
 
 def test_the_error_of_a_regions_mean() -> None:
     """Against the errors of such means over images drawn from the prior; errors of neighbours cancel in it."""
-    known = tile(2, 1.0)
+    known = tile_problem(2, 1.0)
     form, _ = factorise(known)
     weights = np.zeros((19, 19))
     weights[5:11, 6:12] = 1 / 36
@@ -107,14 +106,14 @@ def test_the_error_of_a_regions_mean() -> None:
     error = form.gain(known.matrix @ images + rng.normal(size=(known.measurements, draws))) - images
     means = flat @ error
     assert np.mean(means**2) == pytest.approx(variance, rel=4 * (2 / draws) ** 0.5)
-    assert variance == pytest.approx(flat @ form.covariance(flat), rel=1e-9)
+    assert variance == pytest.approx(flat @ posterior_covariance(form) @ flat, rel=1e-9)
     assert variance < 0.5 * float(flat**2 @ form.variance()), "neighbours' errors cancel"
 
 
 def test_degrees_of_freedom_and_resolution() -> None:
     """Without noise the degrees of freedom are the rank of H; a pixel seen alone at P0 / Rv = 3 has 3/4 of one."""
-    assert expected_error(factorise(tile(3, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(361, abs=1e-6)
-    assert expected_error(factorise(tile(2, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(329, abs=1e-6)
+    assert expected_error(factorise(tile_problem(3, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(361, abs=1e-6)
+    assert expected_error(factorise(tile_problem(2, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(329, abs=1e-6)
     matrix = sparse.csr_array(np.diag([1.0, 1.0, 0.0]))
     known = Problem(matrix, Prior(np.zeros(3), np.full(3, 3.0**0.5)), np.array([1.0, 1e-12, 1.0]))
     found = expected_error(factorise(known)[0], {"noise": known.noise_variance})
@@ -131,5 +130,6 @@ def test_resolution_of_a_blur_is_its_width() -> None:
 
 
 def test_three_types_resolve_every_pixel_and_one_does_not() -> None:
-    widths = [float(np.median(expected_error(factorise(tile(count, 1e-6))[0], {}).resolution)) for count in (1, 2, 3)]
+    forms = [factorise(tile_problem(count, 1e-6))[0] for count in (1, 2, 3)]
+    widths = [float(np.median(expected_error(form, {}).resolution)) for form in forms]
     assert widths[0] > widths[1] > widths[2] == pytest.approx(1, abs=1e-3)

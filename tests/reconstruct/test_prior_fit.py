@@ -19,7 +19,7 @@ from ommatid.scenes.formats.picture import load
 from ommatid.scenes.tables.estimation import PriorTable as Table
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import camera, scene
+from ..examples import camera, posterior_covariance, scene
 
 Vector = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def evidence(
 
 
 def drawn(prior: Prior, seed: int) -> Vector:
-    return prior.mean + prior.spread(np.random.default_rng(seed).normal(size=prior.freedoms))
+    return prior.mean + prior.apply_root(np.random.default_rng(seed).normal(size=prior.dimension))
 
 
 @pytest.mark.parametrize("some", [706, 200])
@@ -122,7 +122,7 @@ def whitened(prior: Prior, noise: float, one: Evidence, image: Vector) -> float:
     """The squared error in units of its expectation, as a whole: e^T P^-1 e / N."""
     problem = Problem(MATRIX, prior, np.full(MATRIX.shape[0], noise))
     result = estimate(problem, one.residual + MATRIX @ prior.mean)
-    covariance = result.form.covariance(np.eye(361))
+    covariance = posterior_covariance(result.form)
     error = result.image - image
     return float(error @ np.linalg.solve(covariance, error)) / 361
 

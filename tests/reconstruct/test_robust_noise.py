@@ -53,7 +53,7 @@ def priors(side: int = SIDE) -> dict[str, Prior]:
 
 
 def drawn(prior: Prior, rng: np.random.Generator) -> FloatArray:
-    return prior.mean + prior.spread(rng.standard_normal(prior.freedoms))
+    return prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
 
 
 def drawn_matrix(camera: Camera, rng: np.random.Generator) -> Any:

@@ -1,4 +1,4 @@
-"""Tiles joined by Eq. 7 against their joined problem, solved anew, by other methods and in exact arithmetic."""
+"""Tiles merged by Eq. 7 against the joint problem, solved by other methods and in exact arithmetic."""
 
 from __future__ import annotations
 
@@ -6,37 +6,44 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.reconstruct.estimator.certificate import exact_variances
 from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
-from ommatid.reconstruct.methods.tile_merging import Posterior, alone, cut, merge, sweep
+from ommatid.reconstruct.forms.sorted_qr import Indices
+from ommatid.reconstruct.methods.tile_merging import (
+    Posterior,
+    disjoint_tiles,
+    merge_posteriors,
+    merge_tiles,
+    tile_posterior,
+)
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.stability.exact_answer import exact_answer
 
-from ..examples import Lenses, camera
+from ..examples import Lenses, camera, posterior_covariance
+from ..frames import FITTED
 
-Vector = NDArray[np.float64]
-THREE: Lenses = (("1/3", [3, 3], "fit"), ("1/5", [5, 5], "fit"), ("1/4", [4, 4], "fit"))
 TILE = (19, 19)
+SMALL: Lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
 DEVIATION = 5461.25**0.5
 
 
-def frame(shape: tuple[int, int], lenses: Lenses, noise: float) -> tuple[Problem, Vector]:
-    """A frame of random pixels under the paper's prior, and what is recorded of it."""
+def frame(shape: tuple[int, int], lenses: Lenses, noise: float) -> tuple[Problem, FloatArray]:
+    """A frame of random pixels under the paper's prior, and its measurements."""
     matrix = ideal_matrix(camera(shape, lenses))
     rng = np.random.default_rng(0)
     problem = Problem(matrix, independent(127.5, 5461.25, matrix.shape[1]), np.full(matrix.shape[0], noise))
     return problem, matrix @ rng.uniform(0, 255, problem.unknowns) + rng.normal(0, noise**0.5, problem.measurements)
 
 
-def chain(seed: int) -> tuple[Problem, Vector, list[NDArray[np.intp]]]:
-    """A random problem whose measurements see neighbours, 2 to 4 tiles of it, known pixels, noise over six decades."""
+def random_chain(seed: int) -> tuple[Problem, FloatArray, list[Indices]]:
+    """A random problem of local measurements in 2 to 4 tiles, with known pixels and noise over six decades."""
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(4, 13)), int(rng.integers(1, 25))
     dense = np.zeros((m, n))
@@ -51,18 +58,18 @@ def chain(seed: int) -> tuple[Problem, Vector, list[NDArray[np.intp]]]:
     return problem, recorded, np.split(np.arange(n, dtype=np.intp), ends)
 
 
-def assert_same(found: Posterior, other: Posterior, tolerance: float) -> None:
-    """Means beside the largest deviation, covariances beside the deviations of both pixels."""
-    np.testing.assert_array_equal(found.pixels, other.pixels)
-    deviation = np.sqrt(other.variance)
-    size = max(float(np.abs(other.mean).max()), float(deviation.max()))
-    np.testing.assert_allclose(found.mean, other.mean, rtol=0, atol=tolerance * size)
-    wrong = np.abs(found.covariance - other.covariance)
-    assert (wrong <= tolerance * np.outer(deviation, deviation)).all()
+def assert_same(first: Posterior, second: Posterior, tolerance: float) -> None:
+    """Means agree relative to the largest standard deviation, covariances relative to those of both pixels."""
+    np.testing.assert_array_equal(first.pixels, second.pixels)
+    deviation = np.sqrt(second.variance)
+    size = max(float(np.abs(second.mean).max()), float(deviation.max()))
+    np.testing.assert_allclose(first.mean, second.mean, rtol=0, atol=tolerance * size)
+    difference = np.abs(first.covariance - second.covariance)
+    assert (difference <= tolerance * np.outer(deviation, deviation)).all()
 
 
 @pytest.mark.parametrize(
-    ("lenses", "columns", "noise", "error"),
+    ("lens_types", "columns", "noise", "error"),
     [
         (3, 38, 1e-2, 1e-12),
         (3, 38, 1e-6, 1e-11),
@@ -72,116 +79,118 @@ def assert_same(found: Posterior, other: Posterior, tolerance: float) -> None:
         (2, 57, 1e-6, 1e-11),
     ],
 )
-def test_a_row_of_tiles_is_what_the_frame_solved_anew_is(lenses: int, columns: int, noise: float, error: float) -> None:
-    """With two lens types H has a null space; the frame's own answer is refined in twice the precision."""
-    problem, recorded = frame((19, columns), THREE[:lenses], noise)
-    found = sweep(problem, recorded, cut((19, columns), TILE))
+def test_a_row_of_tiles_is_the_estimate_of_the_frame(lens_types: int, columns: int, noise: float, error: float) -> None:
+    """With two lens types H has a null space. `error` is five times what the module states or more."""
+    problem, recorded = frame((19, columns), FITTED[:lens_types], noise)
+    merged = merge_tiles(problem, recorded, disjoint_tiles((19, columns), TILE))
     direct = estimate(problem, recorded, "svd")
     assert direct.solver.bound is not None
     assert direct.solver.bound < error / 100
-    assert found.mean == pytest.approx(direct.image, rel=0, abs=error * DEVIATION)
-    some = np.random.default_rng(1).choice(problem.unknowns, 100, replace=False)
-    variance, doubt = exact_variances(direct.form, ExactResiduals(problem), some)
-    assert (doubt < 1e-20 * variance).all()
-    assert found.variance[some] == pytest.approx(variance, rel=1e-12)
-    pair = np.zeros((problem.unknowns, 2))
-    pair[[0, -1], [0, 1]] = 1.0
-    assert found.covariance[:, [0, -1]] == pytest.approx(direct.form.covariance(pair), rel=0, abs=1e-10)
+    assert merged.mean == pytest.approx(direct.image, rel=0, abs=error * DEVIATION)
+    pixels = np.random.default_rng(1).choice(problem.unknowns, 100, replace=False)
+    variance, uncertainty = exact_variances(direct.form, ExactResiduals(problem), pixels)
+    assert (uncertainty < 1e-20 * variance).all()
+    assert merged.variance[pixels] == pytest.approx(variance, rel=1e-12)
+    ends = [0, problem.unknowns - 1]
+    assert merged.covariance[:, ends] == pytest.approx(posterior_covariance(direct.form, ends), rel=0, abs=1e-10)
 
 
 @pytest.mark.parametrize("noise", [1e-2, 1e-6])
 def test_small_tiles_in_exact_arithmetic(noise: float) -> None:
-    """Two 7 x 6 tiles, and four of 4 x 6 and 3 x 6 that meet in a corner: balls of 512 bits share no formula."""
-    problem, recorded = frame((7, 12), (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit")), noise)
-    right = exact_answer(problem, recorded)
+    """Two 7 x 6 tiles, and four of 4 x 6 and 3 x 6 that meet in a corner."""
+    problem, recorded = frame((7, 12), SMALL, noise)
+    answer = exact_answer(problem, recorded)
     for tile in ((7, 6), (4, 6)):
-        found = sweep(problem, recorded, cut((7, 12), tile))
-        assert np.abs(right.image.away(found.mean)).max() < 1e-11 * DEVIATION
-        assert (np.abs(right.variance.away(found.variance)) < 1e-12 * right.variance.high).all()
+        merged = merge_tiles(problem, recorded, disjoint_tiles((7, 12), tile))
+        assert np.abs(answer.image.difference(merged.mean)).max() < 1e-11 * DEVIATION
+        assert (np.abs(answer.variance.difference(merged.variance)) < 1e-12 * answer.variance.high).all()
 
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=100, deadline=None, derandomize=True)
-def test_any_order_of_merging_is_right(seed: int) -> None:
-    problem, recorded, tiles = chain(seed)
+def test_any_order_of_merging_is_exact(seed: int) -> None:
+    """To 1e-9, the rounding error at the least noise variance relative to the prior of these problems, 1e-8."""
+    problem, recorded, tiles = random_chain(seed)
     rng = np.random.default_rng(seed)
-    parts = [alone(problem, recorded, tile) for tile in tiles]
+    parts = [tile_posterior(problem, recorded, tile) for tile in tiles]
     while len(parts) > 1:
         first, second = (parts.pop(int(rng.integers(len(parts)))) for _ in range(2))
-        parts.append(merge(first, second, problem, recorded))
-    assert_same(parts[0], sweep(problem, recorded, tiles), 1e-9)
-    right = exact_answer(problem, recorded)
-    assert np.abs(right.image.away(parts[0].mean)).max() < 1e-9 * max(1.0, problem.prior.root.max())
-    assert (np.abs(right.variance.away(parts[0].variance)) <= 1e-9 * right.variance.high).all()
+        parts.append(merge_posteriors(first, second, problem, recorded))
+    assert_same(parts[0], merge_tiles(problem, recorded, tiles), 1e-9)
+    answer = exact_answer(problem, recorded)
+    assert np.abs(answer.image.difference(parts[0].mean)).max() < 1e-9 * max(1.0, problem.prior.root.max())
+    assert (np.abs(answer.variance.difference(parts[0].variance)) <= 1e-9 * answer.variance.high).all()
 
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=60, deadline=None, derandomize=True)
-def test_a_tile_is_the_whole_where_there_is_one_and_joining_never_raises_a_variance(seed: int) -> None:
-    problem, recorded, tiles = chain(seed)
-    whole = alone(problem, recorded, np.arange(problem.unknowns)[::-1])
-    assert_same(sweep(problem, recorded, tiles), whole, 1e-9)
+def test_merging_never_raises_a_variance_and_one_tile_is_the_whole(seed: int) -> None:
+    problem, recorded, tiles = random_chain(seed)
+    whole = tile_posterior(problem, recorded, np.arange(problem.unknowns)[::-1])
+    assert_same(merge_tiles(problem, recorded, tiles), whole, 1e-9)
     for tile in tiles:
-        assert (whole.variance[tile] <= alone(problem, recorded, tile).variance * (1 + 1e-12)).all()
+        assert (whole.variance[tile] <= tile_posterior(problem, recorded, tile).variance * (1 + 1e-12)).all()
 
 
 def test_any_order_of_whole_tiles() -> None:
-    problem, recorded = frame((19, 57), THREE, 1e-6)
-    tiles = cut((19, 57), TILE)
-    left, middle, right = (alone(problem, recorded, tile) for tile in tiles)
-    found = merge(left, merge(right, middle, problem, recorded), problem, recorded)
-    assert_same(found, sweep(problem, recorded, tiles), 1e-9)
-    apart = merge(left, right, problem, recorded)  # nothing sees both
+    problem, recorded = frame((19, 57), FITTED, 1e-6)
+    tiles = disjoint_tiles((19, 57), TILE)
+    left, middle, right = (tile_posterior(problem, recorded, tile) for tile in tiles)
+    right_first = merge_posteriors(left, merge_posteriors(right, middle, problem, recorded), problem, recorded)
+    assert_same(right_first, merge_tiles(problem, recorded, tiles), 1e-9)
+    apart = merge_posteriors(left, right, problem, recorded)  # no measurement couples them
     np.testing.assert_array_equal(apart.variance[apart.pixels % 57 < 19], left.variance)
 
 
-def test_the_errors_of_joined_tiles_are_as_large_as_their_covariance_says() -> None:
-    """200 images drawn from the prior: |e|^2 in units of the covariance is chi squared with n degrees of freedom."""
-    problem, _ = frame((7, 12), (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit")), 1.0)
-    rng, draws, total, tiles = np.random.default_rng(3), 200, 0.0, cut((7, 12), (7, 6))
+def test_errors_of_merged_tiles_agree_with_their_covariance() -> None:
+    """200 images drawn from the prior: e^T C^-1 e is chi squared with n degrees of freedom, within 3 deviations."""
+    problem, _ = frame((7, 12), SMALL, 1.0)
+    rng, draws, total, tiles = np.random.default_rng(3), 200, 0.0, disjoint_tiles((7, 12), (7, 6))
     for _ in range(draws):
         image = 127.5 + DEVIATION * rng.normal(size=84)
-        found = sweep(problem, problem.matrix @ image + rng.normal(size=problem.measurements), tiles)
-        total += float(np.square(np.linalg.solve(found.root, image - found.mean)).sum())
+        merged = merge_tiles(problem, problem.matrix @ image + rng.normal(size=problem.measurements), tiles)
+        total += float(np.square(np.linalg.solve(merged.root, image - merged.mean)).sum())
     assert abs(total - 84 * draws) < 3 * (2 * 84 * draws) ** 0.5
 
 
-def test_a_dead_pixel_of_another_tile_and_rows_that_repeat_one_another_do_no_harm() -> None:
+def test_dead_pixels_of_other_tiles_and_repeated_rows_have_no_effect() -> None:
     matrix = sparse.csr_array(np.array([[1.0, 1, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 1]]))
     problem = Problem(matrix, independent(4.0, 9.0, 4), np.full(5, 1e-6))
     recorded = np.array([7.0, 7.0, 9.0, 9.0, np.nan])
-    first, second = (alone(problem, recorded, np.array([pixel])) for pixel in (1, 2))
-    found = merge(first, second, problem, recorded)
-    assert found.mean == pytest.approx([4.5, 4.5], abs=1e-6)  # they share what is above 4 + 4
-    assert found.variance == pytest.approx([4.5, 4.5], abs=1e-6)
-    assert found.covariance[0, 1] == pytest.approx(-4.5, abs=1e-6)
+    first, second = (tile_posterior(problem, recorded, np.array([pixel])) for pixel in (1, 2))
+    merged = merge_posteriors(first, second, problem, recorded)
+    assert merged.mean == pytest.approx([4.5, 4.5], abs=1e-6)  # the excess over 4 + 4, shared equally
+    assert merged.variance == pytest.approx([4.5, 4.5], abs=1e-6)
+    assert merged.covariance[0, 1] == pytest.approx(-4.5, abs=1e-6)
 
 
-def test_cut_is_a_partition() -> None:
-    tiles = cut((5, 7), (2, 3))
+def test_disjoint_tiles_partition_the_frame() -> None:
+    tiles = disjoint_tiles((5, 7), (2, 3))
     assert [tile.size for tile in tiles] == [6, 6, 2, 6, 6, 2, 3, 3, 1]
     np.testing.assert_array_equal(np.sort(np.concatenate(tiles)), np.arange(35))
     assert tiles[1].tolist() == [3, 4, 5, 10, 11, 12]
 
 
-def test_what_cannot_be_joined_is_refused() -> None:
+def test_invalid_tiles_and_measurements_are_refused() -> None:
     matrix = sparse.csr_array(np.ones((2, 2)))
-    silent = Problem(matrix, independent(0.0, 1.0, 2), np.zeros(2))
+    noise_free = Problem(matrix, independent(0.0, 1.0, 2), np.zeros(2))
     recorded = np.ones(2)
-    first, second = (alone(silent, recorded, np.array([pixel])) for pixel in (0, 1))
+    first, second = (tile_posterior(noise_free, recorded, np.array([pixel])) for pixel in (0, 1))
     with pytest.raises(InputError, match="with noise only"):
-        merge(first, second, silent, recorded)
+        merge_posteriors(first, second, noise_free, recorded)
     with pytest.raises(InputError, match="do not overlap"):
-        merge(first, first, silent, recorded)
-    noisy = Problem(matrix, silent.prior, np.ones(2))
+        merge_posteriors(first, first, noise_free, recorded)
+    noisy = Problem(matrix, noise_free.prior, np.ones(2))
     with pytest.raises(InputError, match="dead pixels"):
-        merge(first, second, noisy, np.array([1.0, np.nan]))
+        merge_posteriors(first, second, noisy, np.array([1.0, np.nan]))
+    correlated = Problem(matrix, exponential(0.0, 1.0, (1, 2), 1.0), np.ones(2))
     with pytest.raises(InputError, match="independent pixels"):
-        alone(Problem(matrix, exponential(0.0, 1.0, (1, 2), 1.0), np.ones(2)), recorded, np.array([0]))
+        tile_posterior(correlated, recorded, np.array([0]))
     for wrong in ([], [0, 0], [2], [-1]):
         with pytest.raises(InputError, match="each once"):
-            alone(noisy, recorded, np.array(wrong, dtype=np.intp))
+            tile_posterior(noisy, recorded, np.array(wrong, dtype=np.intp))
     with pytest.raises(InputError, match="one tile or more"):
-        sweep(noisy, recorded, [])
+        merge_tiles(noisy, recorded, [])
+    extreme = Problem(matrix, independent(0.0, 1e308, 2), np.full(2, 1e-320))
     with pytest.raises(InputError, match="double precision"):
-        alone(Problem(matrix, independent(0.0, 1e308, 2), np.full(2, 1e-320)), recorded, np.array([0, 1]))
+        tile_posterior(extreme, recorded, np.array([0, 1]))

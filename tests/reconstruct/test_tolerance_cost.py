@@ -40,7 +40,7 @@ def test_it_is_the_mean_error_over_cameras_and_images(smooth: bool) -> None:
     rng = np.random.default_rng(0)
     more: list[float] = []
     for seed in range(DRAWS):
-        image = paper.mean + paper.spread(rng.standard_normal(paper.freedoms))
+        image = paper.mean + paper.apply_root(rng.standard_normal(paper.dimension))
         noise = rng.normal(0, NOISE**0.5, camera.measurements) - matrix @ paper.mean
         found = (paper.mean + form.gain(h @ image + noise) for h in (true_matrix(drawn_to("60 nm", seed)), matrix))
         crooked, straight = (float(np.square(estimate - image).mean()) for estimate in found)

@@ -200,7 +200,7 @@ def test_foreseen_samples_divide_the_variance_as_asked() -> None:
     for exponent in (1.0, 1.5, 2.0):
         course = SubImagerProgress(Plan(16, 16), exponent, last=Plan(16, 64))
         for too_large, most in ((10.0, 10**6), (1e4, 512)):
-            total = course.foreseen(too_large, most)
+            total = course.predicted_samples(too_large, most)
             each = min(total / 16, most)
             ratio = (each / 64) ** exponent * total / (16 * each)
             bound = max(course.last.total * 2, min(total, course.last.total * 64))
@@ -285,7 +285,7 @@ def test_jumps_are_few_and_what_cannot_be_reached_is_said() -> None:
 
     def judged(first: float) -> dict[str, Any]:
         judge = StoppingRule(lambda model: first * (model.record["samples"] / 256) ** -1.5, "law", "a law")
-        return calibrate(Setup(described, camera), judge=judge).record
+        return calibrate(Setup(described, camera), stopping_rule=judge).record
 
     record = judged(1.0)
     assert record["auto"]["reached"]

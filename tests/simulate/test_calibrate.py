@@ -37,7 +37,7 @@ def test_no_two_sources_of_a_grid_reach_one_sensor_pixel() -> None:
     for kind in camera.types:
         rows = ideal[start : start + kind.measurements]
         start += kind.measurements
-        apart = of_pinholes(camera, kind).apart
+        apart = of_pinholes(camera, kind).spacing
         lit = np.zeros((23, 23))
         for row in range(apart):
             for column in range(apart):

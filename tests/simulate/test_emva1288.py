@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from ommatid.reconstruct.methods.method import total
+from ommatid.reconstruct.methods.method import total_variance
 from ommatid.reconstruct.noise import known_noise, usable_pixels
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.errors import InputError
@@ -286,7 +286,7 @@ def test_the_second_look_at_the_noise_is_nearer_to_the_truth_and_as_good_a_weigh
         assert recording is not None
         found = restore(stack, model, truth)
         noises = [recording.noise_variance(light) for light in (recording.values, model.forward(truth))]
-        first, second = (total(noise) for noise in (known_noise(stack), found.noise))
+        first, second = (total_variance(noise) for noise in (known_noise(stack), found.noise))
         assert _distance(second, noises[1]) < _distance(first, noises[1]) < _distance(*noises)
         ideal = stack.scene.model_copy(update={"sensor": None})
         told = [replace(stack, scene=ideal, recording=None, variance=noise) for noise in noises]

@@ -76,7 +76,7 @@ def errors(variant: str, sampler: Sampler, samples: int, repeats: int) -> NDArra
     found = np.empty((repeats, seen.measurements))
     for number in range(repeats):
         for group in rig.groups:
-            found[number, rig.places(group)] = rig.expose(group, samples, sampler_seeds(5, "data", number, repeats))[0]
+            found[number, rig.rows(group)] = rig.expose(group, samples, sampler_seeds(5, "data", number, repeats))[0]
     return (found - ideal_matrix(seen) @ image.ravel())[:, :450]
 
 

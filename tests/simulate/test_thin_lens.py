@@ -13,9 +13,8 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.pose import corner_offset, pose_of
 from ommatid.scenes.scene import parse
 from ommatid.simulate.lenses import thin_lens
-from ommatid.simulate.sampling.seeds import sampler_seeds
 
-from ..examples import camera, needs, scene
+from ..examples import camera, mean_weights, needs, scene
 
 PLACES = st.floats(-1, 1)
 
@@ -90,7 +89,7 @@ def test_rendered_light_of_a_lens_type_is_that_of_its_solid_angle() -> None:
     data["camera"] |= {"pixel_pitch": "80 um", "lens_pitch": "9 mm"}
     data["camera"]["lens"][0]["aperture"] = "40 um"
     one = derive(parse(data, Path("test.toml")))
-    found = Renderer(one, "llvm_ad_mono").gathered("A", 256, sampler_seeds(0, "data", 0, 1)).reshape(25, 25)
+    found = mean_weights(Renderer(one, "llvm_ad_mono"), "A", 256).reshape(25, 25)
     away = (np.arange(25) - 12) * one.pixel_pitch / one.depth(one.types[0])
     cosine = 1 / np.sqrt(1 + away[:, None] ** 2 + away[None, :] ** 2)
     assert cosine.min() < 0.6

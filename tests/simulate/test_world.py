@@ -21,7 +21,7 @@ from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, light
 from ommatid.simulate.renderer.variant import activate
-from ommatid.simulate.renderer.world import bounces, files, stage
+from ommatid.simulate.renderer.world import files, has_interreflections, stage
 from ommatid.simulate.sampling.passes import rounding_variance
 
 from ..conftest import TINY, Command
@@ -221,7 +221,7 @@ LIT = (
 )
 
 
-def test_light_that_bounces_is_the_same_on_both_backends(tmp_path: Path) -> None:
+def test_interreflections_are_the_same_on_both_backends(tmp_path: Path) -> None:
     """Shadows and light from wall to ball and back; different seeds, so independent noise."""
     needs(FAST)
     found: list[Rendering] = []
@@ -244,9 +244,9 @@ BLACK = '<shape type="sphere"><bsdf type="diffuse"><float name="reflectance" val
         (rectangle(1, 1, 0, 0, Z, glow(1) + '<bsdf type="dielectric"/>'), True),
     ],
 )
-def test_light_bounces_unless_all_is_black(tmp_path: Path, content: str, expected: bool) -> None:
+def test_interreflections_exist_unless_all_is_black(tmp_path: Path, content: str, expected: bool) -> None:
     described, _ = world(tmp_path, content)
-    assert bounces(stage(described, "scalar_rgb", None).scene) is expected
+    assert has_interreflections(stage(described, "scalar_rgb", None).scene) is expected
 
 
 def test_light_that_cannot_bounce_is_left_out_to_the_last_digit(tmp_path: Path) -> None:
@@ -257,14 +257,14 @@ def test_light_that_cannot_bounce_is_left_out_to_the_last_digit(tmp_path: Path) 
     for inside, render in ((content, {}), (content, {"complete": True}), (LIT, {})):
         described, camera = world(tmp_path, inside, render=render)
         found.append(light(Setup(described, camera)))
-    assert [one.straight for one in found] == [True, False, False]
+    assert [rendering.direct_only for rendering in found] == [True, False, False]
     np.testing.assert_allclose(found[0].mean, found[1].mean, rtol=1e-6)
 
 
 def test_the_gallerys_still_life_has_bouncing_light_and_its_corridor_none() -> None:
     for name, expected in (("still_life", True), ("corridor", False)):
         data = flat_scene().plain() | {"world": {"file": str(GALLERY / "worlds" / f"{name}.xml")}}
-        assert bounces(stage(parse(data, Path("test.toml")), "scalar_rgb", None).scene) is expected
+        assert has_interreflections(stage(parse(data, Path("test.toml")), "scalar_rgb", None).scene) is expected
 
 
 def test_a_world_is_rendered_again_where_it_or_what_it_names_has_changed(tmp_path: Path) -> None:

@@ -1,0 +1,258 @@
+"""The types of files that are read: their valid originals, how these are damaged, and what is read from them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from ommatid.runtime.files import digest
+from ommatid.scenes import camera, model_file, scene, stack
+from ommatid.scenes.formats import picture
+from ommatid.scenes.hardware import frames, source_positions
+from ommatid.scenes.tables import lens_file
+
+from ..conftest import TINY
+from ..examples import GALLERY
+from . import mutations
+from .damage import damaged, damaged_near
+from .formats import encoded, exr_damaged, model_resealed, npy_damaged, npz_damaged, stack_resealed
+
+EVERYTHING = (
+    TINY.replace("pixels = [3, 3]", 'pixels = "fit"\naperture = "0.1 mm"\nfocus = "1.1 m"\nstep = 1')
+    .replace("[noise]\nvariance = 1e-2\n", "")
+    .replace("[camera]", '[camera]\nwavelength = "550 nm"')
+    + """
+[camera.tolerance]
+position = "1 um"
+rotation = "0.01 deg"
+focal_length = 0.001
+
+[sensor]
+illuminance = "500 lux"
+exposure = "10 ms"
+read_noise = 2.0
+
+[prior]
+kind = "exponential"
+correlation_length = "3 mm"
+
+[estimator]
+memory = "1 GB"
+tolerance = 1e-6
+
+[tiles]
+size = 12
+overlap = 3
+"""
+)
+SCENE = "tiny.toml"  # an undamaged scene in the folder
+BASE = "base.toml"  # the scene to which --set options apply
+PNG_MARKS = (b"IHDR", b"IDAT", b"IEND", b"\x89PNG\r\n\x1a\n")
+TIFF_MARKS = (b"II*\0", b"\0\1\3\0", b"\1\1\3\0", b"\2\1\3\0", b"\3\1\3\0", b"\x11\1\4\0", b"\x16\1", b"\x17\1")
+DOUBLET = b"# a doublet\n50.0\n29.475 3.76 1.67 25.2\n84.83 0.12 1 25.2\n0 4.2 0 17.1  # stop\n-25.87 2 1.603 14\n"
+Originals = Callable[[Path], list[bytes]]
+
+
+@dataclass(frozen=True)
+class FileType:
+    """A type of file.
+
+    file : its name in the folder;  originals : valid contents, from the files of that folder
+    damaged : returns damaged contents;  read : returns a value that is equal for equal contents
+    command : the command line that reads the file, if any
+    sealed : True if a checksum reveals every change
+    """
+
+    name: str
+    file: str
+    originals: Originals
+    damaged: Callable[[Random, bytes], bytes]
+    read: Callable[[Path], object]
+    command: tuple[str, ...]
+    sealed: bool = False
+
+
+def fingerprint(*parts: Any) -> str:
+    """Return a hash of arrays and other values."""
+    total = hashlib.sha256()
+    for part in parts:
+        total.update((digest(part) if isinstance(part, np.ndarray) else repr(part)).encode())
+    return total.hexdigest()
+
+
+def gallery_files(pattern: str, *more: bytes) -> Originals:
+    """The files of the gallery that match, and further contents."""
+    return lambda _: [*more, *(path.read_bytes() for path in sorted(GALLERY.glob(pattern)))]
+
+
+def from_folder(name: str) -> Originals:
+    """A file of the folder, made by a finished run."""
+    return lambda folder: [(folder / name).read_bytes()]
+
+
+def marked(*marks: bytes) -> Callable[[Random, bytes], bytes]:
+    """Damage near the marks of a header or anywhere."""
+
+    def damage(rng: Random, original: bytes) -> bytes:
+        return damaged_near(rng, original, marks) if rng.random() < 0.5 else damaged(rng, original)
+
+    return damage
+
+
+# Scenes and lenses
+
+
+def read_scene(path: Path, changes: tuple[str, ...] = ()) -> str:
+    described = scene.read(path, changes)
+    derived = camera.derive(described)
+    return fingerprint(described.plain(), derived.describe(), derived.measurements)
+
+
+def scene_mutated(rng: Random, original: bytes) -> bytes:
+    return mutations.scene(rng, tomllib.loads(original.decode())).encode()
+
+
+def settings_mutated(rng: Random, original: bytes) -> bytes:
+    return json.dumps(mutations.settings(rng, mutations.keys_of(tomllib.loads(original.decode())))).encode()
+
+
+def read_with_settings(path: Path) -> str:
+    text = path.read_bytes()
+    changes = json.loads(text) if text.startswith(b"[") and text[1:2] in (b'"', b"]") else []
+    return read_scene(path.with_name(BASE), tuple(changes))
+
+
+def rows_damaged(rng: Random, original: bytes) -> bytes:
+    if rng.random() < 0.4:
+        return damaged(rng, original)
+    words = original.decode().split(" ")
+    extreme = (*mutations.NUMBERS, "x", "#", "\n", "1,5", "١", "1e9", "\x00", "\x85")
+    words[rng.randrange(len(words))] = rng.choice(extreme)
+    return " ".join(words).encode()
+
+
+def read_lens(path: Path) -> str:
+    return fingerprint(lens_file.read_lens(path))
+
+
+# Stacks and models
+
+
+def read_stack(path: Path) -> str:
+    content = stack.read(path)
+    return fingerprint(content.values, content.variance, content.scene.plain(), content.record)
+
+
+def read_model(path: Path) -> str:
+    model, entries = model_file.read(path), None
+    if model.stored is not None:
+        entries = [model.stored.data, model.stored.indices.astype(np.int64), model.stored.indptr.astype(np.int64)]
+    return fingerprint(*(entries or ()), model.variance, model.batches, model.scene.plain(), model.record)
+
+
+# Pictures, frames and source positions
+
+
+def pictures(suffix: str, *dtypes: str) -> Originals:
+    """The same picture in several number types, and one in colour."""
+
+    def originals(_: Path) -> list[bytes]:
+        row, column = np.indices((20, 24))
+        grey = (row * 9 + column * 3) % 251
+        images = [grey.astype(dtype) for dtype in dtypes] + [np.stack([grey] * 3, axis=-1).astype(dtypes[0])]
+        return [encoded(suffix, pixels) for pixels in images]
+
+    return originals
+
+
+def read_picture(path: Path) -> str:
+    described = scene.read(path.with_name(SCENE), [f"target.image={path.name}", "target.origin=", "target.shape="])
+    return fingerprint(picture.load(described))
+
+
+def mosaics(suffix: str) -> Originals:
+    """Frames of the tiny camera's whole sensor: one, and three in one file."""
+
+    def originals(folder: Path) -> list[bytes]:
+        corners = frames.patches(camera.derive(scene.read(folder / SCENE)))
+        rows, columns = (corners.max(axis=0) - corners.min(axis=0) + 8).astype(int)
+        several = np.random.default_rng(3).integers(0, 4096, (3, rows, columns), dtype=np.uint16)
+        return [encoded(suffix, several[0]), encoded(suffix, several)]
+
+    return originals
+
+
+def read_mosaics(path: Path) -> str:
+    derived = camera.derive(scene.read(path.with_name(SCENE)))
+    settings = frames.AcquisitionSettings(origin=(0, 0))
+    return fingerprint(frames.read_frames(derived, [path], settings, mosaics=True).numbers)
+
+
+def positions_csv(_: Path) -> list[bytes]:
+    """Source positions in three images, in two notations."""
+    rows = [(image, row, column) for image in range(3) for row in (1, 7) for column in (2, 9)]
+    text = "image,row,column\n" + "".join(f"{image},{row},{column}\n" for image, row, column in rows)
+    named = "".join(f'{row}, {column}, "{image}.png", x\r\n' for image, row, column in rows)
+    return [text.encode(), b"\xef\xbb\xbfrow, column, image, note\r\n" + named.encode()]
+
+
+def read_positions(path: Path) -> str:
+    derived = camera.derive(scene.read(path.with_name(SCENE)))
+    return fingerprint(*source_positions.read_positions(path, derived, [Path(f"{index}.png") for index in range(3)]))
+
+
+def read_world(path: Path) -> str:
+    """The files that a world names; Mitsuba has to build it."""
+    from ommatid.simulate.renderer import world
+
+    described = scene.read(path.with_name(SCENE), [f"world.file={path.name}"])
+    files = world.files(described)
+    built = world.stage(described, "scalar_rgb", None)
+    return fingerprint(path.read_bytes(), len(files), len(built.scene.shapes()))
+
+
+SHOW = ("show", "{file}", "--json")
+LENS = ("show", SCENE, "--json", "--set", "camera.lens.I.surfaces={file}")
+STACK = ("reconstruct", "{file}", "sound.npz", "-o", "new.exr", "--json")
+MODEL = ("reconstruct", "sound.exr", "{file}", "-o", "new.exr", "--json")
+PICTURE = ("show", SCENE, "--json", "--set", "target.image={file}", "--set", "target.origin=", "--set", "target.shape=")
+IMPORT = ("import", SCENE, "{file}", "-o", "new.exr", "--origin", "0,0", "--json")
+PREDICT = ("predict", "{file}", "--json")
+SET = ("show", BASE, "--json", "{sets}")
+SCENES = gallery_files("*.toml", TINY.encode())
+LENSES_TOML, LENSES_DAT = gallery_files("lenses/*.toml"), gallery_files("lenses/*.dat", DOUBLET)
+TINY_SCENES: Originals = lambda _: [TINY.encode(), EVERYTHING.encode()]  # noqa: E731
+STACKS, MODELS = from_folder("sound.exr"), from_folder("sound.npz")
+PNG, TIFF = marked(*PNG_MARKS), marked(*TIFF_MARKS)
+FILE_TYPES = {
+    file_type.name: file_type
+    for file_type in (
+        FileType("scene, bytes", "scene.toml", SCENES, damaged, read_scene, SHOW),
+        FileType("scene, keys and values", "scene.toml", SCENES, scene_mutated, read_scene, SHOW),
+        FileType("scene, predicted", "scene.toml", TINY_SCENES, scene_mutated, read_scene, PREDICT),
+        FileType("settings", "settings.json", from_folder(BASE), settings_mutated, read_with_settings, SET),
+        FileType("lens, TOML", "lens.toml", LENSES_TOML, damaged, read_lens, LENS),
+        FileType("lens, keys and values", "lens.toml", LENSES_TOML, scene_mutated, read_lens, LENS),
+        FileType("lens, rows", "lens.dat", LENSES_DAT, rows_damaged, read_lens, LENS),
+        FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
+        FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
+        FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),
+        FileType("model, resealed", "model.npz", MODELS, model_resealed, read_model, MODEL),
+        FileType("picture, PNG", "p.png", pictures(".png", "u1", "u2"), PNG, read_picture, PICTURE),
+        FileType("picture, TIFF", "p.tif", pictures(".tif", "u1", "u2", "f4"), TIFF, read_picture, PICTURE),
+        FileType("picture, NPY", "p.npy", pictures(".npy", "u1", "u2", "f8"), npy_damaged, read_picture, PICTURE),
+        FileType("picture, EXR", "p.exr", pictures(".exr", "f4"), exr_damaged, read_picture, PICTURE),
+        FileType("frames, NPY", "f.npy", mosaics(".npy"), npy_damaged, read_mosaics, IMPORT),
+        FileType("frames, TIFF", "f.tif", mosaics(".tif"), TIFF, read_mosaics, IMPORT),
+        FileType("places, CSV", "places.csv", positions_csv, damaged, read_positions, ()),
+        FileType("world, XML", "world.xml", gallery_files("worlds/*.xml"), damaged, read_world, ()),
+    )
+}

@@ -207,7 +207,7 @@ def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
     with TemporaryDirectory(prefix="ommatid-") as folder:
         path = Path(folder) / "model.npz"
         if stack is None:
-            model, _ = stages.calibrated(setup, path, no_progress)
+            model, _ = stages.calibrated_model(setup, path, no_progress)
         else:
             check_scene(setup)
             model, _ = cached_model(path, setup, no_progress, for_stack(stack))
@@ -245,7 +245,7 @@ def _scene(scene: Scene | str | Path) -> Scene:
 
 
 def _setup(scene: Scene | str | Path) -> Setup:
-    return stages.checked(_scene(scene))
+    return stages.checked_setup(_scene(scene))
 
 
 notebook.show_in_notebooks()

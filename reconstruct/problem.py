@@ -73,8 +73,3 @@ class Problem:
         if self.prior.independent:
             return np.asarray(self.matrix.multiply(self.prior.root[None, :]).toarray())
         return np.asarray(self.matrix @ self.prior.root)
-
-    def whitened_matrix(self) -> FloatArray:
-        """B = S^-1 H L as a dense matrix: (M, K); needs noise in every measurement."""
-        dense = self.dense_matrix()
-        return np.divide(dense, self.deviation[:, None], out=dense)

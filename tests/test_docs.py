@@ -62,13 +62,13 @@ SCALAR = ["--set", "render.variant=scalar_rgb"]  # needs no compilation
 STARTER_SHAPE, SMALL_SHAPE = "shape = [59, 59]", "shape = [19, 19]"
 INDEPENDENT = ["--set", "prior.kind=independent", "--set", "prior.correlation_length="]
 SHORTER = {
-    "run scenes/misaligned.toml": [*QUICK, *INDEPENDENT, "--set", 'study.models=["ideal","true"]'],
-    "run scenes/corridor.toml": [*QUICK, *SCALAR, "--set", "target.shape=[19, 19]"],
+    "run misaligned": [*QUICK, *INDEPENDENT, "--set", 'study.models=["ideal","true"]'],
+    "run corridor": [*QUICK, *SCALAR, "--set", "target.shape=[19, 19]"],
     "bench": ["--seconds", "5"],
-    "run scenes/tile19.toml -o sweep": [*QUICK, *SCALAR, "--set", "calibration.method=ideal", "--workers", "1"],
-    "run scenes/tile19.toml -o auto": SCALAR,
-    "run scenes/tile19.toml -o within": [*SCALAR, "--within", "5 s"],
-    "predict scenes/sensor.toml": ["--set", "camera.wavelength="],
+    "run tile19 -o sweep": [*QUICK, *SCALAR, "--set", "calibration.method=ideal", "--workers", "1"],
+    "run tile19 -o auto": SCALAR,
+    "run tile19 -o within": [*SCALAR, "--within", "5 s"],
+    "predict sensor": ["--set", "camera.wavelength="],
     "run": [*QUICK, *SCALAR],
     "render": [*QUICK, *SCALAR],
     "calibrate": [*QUICK, *SCALAR],

@@ -40,29 +40,29 @@ class Member:
 
 
 # Each scene with a function that runs it, or collects its results, and returns the description or raises the error.
-Works = Generator[tuple[Member, Callable[[], Description]]]
+Runs = Generator[tuple[Member, Callable[[], Description]]]
 
 
 @dataclass(frozen=True)
 class Batch:
     """The functions that run the scenes of a batch.
 
-    opened : reads and checks a scene
+    open : reads and checks a scene
     stages : runs it and returns its description
-    watch : creates the observer for a folder
-    tell : reports a description to the user, and returns it
-    facts : versions that have to agree on all machines; True as argument adds the variant that `auto` stands for
-    fitting : number of scenes that are best run at once
+    observe : creates the observer for a folder
+    report : reports a description to the user, and returns it
+    versions : versions that have to agree on all machines; True as argument adds the variant that `auto` stands for
+    count : number of scenes that are best run at once
     """
 
-    opened: Callable[[Member], Setup]
+    open: Callable[[Member], Setup]
     stages: Stages
-    watch: Callable[[Path], RunObserver]
-    tell: Callable[[Member, Description], Description]
-    facts: Callable[[bool], dict[str, str]]
-    fitting: Callable[[Sequence[Member]], int]
+    observe: Callable[[Path], RunObserver]
+    report: Callable[[Member, Description], Description]
+    versions: Callable[[bool], dict[str, str]]
+    count: Callable[[Sequence[Member]], int]
 
-    def works(self, members: Sequence[Member], scheduler: str = "", count: int | None = None) -> Works:
+    def run(self, members: Sequence[Member], scheduler: str = "", count: int | None = None) -> Runs:
         """Yield every scene with a function that returns its description or raises its error.
 
         Scenes run in `count` processes or on the cluster at `scheduler`; without either, in as many processes as
@@ -76,30 +76,30 @@ class Batch:
 
     def _best_count(self, members: Sequence[Member]) -> int:
         most = min(len(members), processors())
-        return min(most, self.fitting(members)) if most > 1 else 1
+        return min(most, self.count(members)) if most > 1 else 1
 
-    def _in_this_process(self, members: Sequence[Member]) -> Works:
+    def _in_this_process(self, members: Sequence[Member]) -> Runs:
         for member in members:
-            yield member, partial(self._run, member)
+            yield member, partial(self._run_here, member)
 
-    def _run(self, member: Member) -> Description:
-        description = self.stages(self.opened(member), member.folder, self.watch(member.folder))
-        return self.tell(member, description)
+    def _run_here(self, member: Member) -> Description:
+        description = self.stages(self.open(member), member.folder, self.observe(member.folder))
+        return self.report(member, description)
 
-    def _in_processes(self, members: Sequence[Member], count: int) -> Works:
+    def _in_processes(self, members: Sequence[Member], count: int) -> Runs:
         """Yield scenes as they end; the processes write to the scenes' own folders."""
         with worker_pool(count=count) as pool:
-            for ended in pool.each(partial(_run_in_process, self.opened, self.stages), members):
+            for ended in pool.each(partial(_run_in_process, self.open, self.stages), members):
                 member = members[ended.index]
                 yield member, partial(self._collect, member, ended)
 
-    def _on_cluster(self, members: Sequence[Member], scheduler: str) -> Works:
+    def _on_cluster(self, members: Sequence[Member], scheduler: str) -> Runs:
         """Yield scenes with errors that show already here, then the others as they end."""
         waiting: list[Member] = []
         auto_variant = False
         for member in members:
             try:
-                setup = self.opened(member)
+                setup = self.open(member)
                 if setup.scene.world is not None:
                     raise InputError(
                         f"{member.scene}: the files of a [world] are not sent to other machines; leave out --scheduler"
@@ -113,8 +113,8 @@ class Batch:
         if not waiting:
             return
         with worker_pool(scheduler) as pool:
-            pool.check_versions(partial(self.facts, auto_variant))
-            packages = _ScenePackages(self.opened, tuple(waiting))
+            pool.check_versions(partial(self.versions, auto_variant))
+            packages = _ScenePackages(self.open, tuple(waiting))
             try:
                 for ended in pool.each(partial(carry_out, self.stages), packages):
                     member = packages.sent[ended.index]
@@ -132,32 +132,32 @@ class Batch:
         except MachineError as error:
             raise MachineError(f"{member.scene}: {error}") from error
         unpack(outcome, member.folder)
-        observer = self.watch(member.folder)
+        observer = self.observe(member.folder)
         for stage, executed in outcome.done.items():
             observer.done(stage, executed)
         if outcome.error is not None:
             raise outcome.error
-        return self.tell(member, outcome.description)
+        return self.report(member, outcome.description)
 
 
-def _run_in_process(opened: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:
+def _run_in_process(open_member: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:
     """Run a scene in another process of this machine, which reads its files and writes to its folder."""
-    return outcome_of(lambda observer: stages(opened(member), member.folder, observer))
+    return outcome_of(lambda observer: stages(open_member(member), member.folder, observer))
 
 
 class _ScenePackages:
     """Packages of a batch, made one by one as workers become free: all target images might not fit into memory."""
 
-    def __init__(self, opened: Callable[[Member], Setup], members: Sequence[Member]) -> None:
+    def __init__(self, open_member: Callable[[Member], Setup], members: Sequence[Member]) -> None:
         self.sent: list[Member] = []
         self.failed: dict[Member, Exception] = {}
-        self._opened = opened
+        self._open = open_member
         self._members = members
 
     def __iter__(self) -> Iterator[ScenePackage]:
         for member in self._members:
             try:
-                package = packed(self._opened(member), member.folder)
+                package = packed(self._open(member), member.folder)
             except Exception as error:  # a file was removed since it was checked
                 self.failed[member] = error
                 continue

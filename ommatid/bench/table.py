@@ -36,6 +36,14 @@ class _Record(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
+class _SparseRecord(_Record):
+    @model_serializer(mode="wrap")
+    def _without_absent(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out optional keys without a value."""
+        required = {name for name, field in type(self).model_fields.items() if field.is_required()}
+        return {key: value for key, value in serialize(self).items() if value is not None or key in required}
+
+
 class Quantiles(_Record):
     """Median, 10 % and 90 % quantile over repeats with independent seeds."""
 
@@ -107,7 +115,7 @@ class SkippedJob(_Record):
     late: bool = False
 
 
-class RecommendedSetting(_Record):
+class RecommendedSetting(_SparseRecord):
     """Recommended setting of one stage; keys that do not apply to the stage are absent from the file."""
 
     seconds: float
@@ -117,12 +125,8 @@ class RecommendedSetting(_Record):
     variant: str | None = None
     samples: int | Literal["auto"] | None = None
 
-    @model_serializer(mode="wrap")
-    def _applicable(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in serialize(self).items() if value is not None}
 
-
-class Recommendation(_Record):
+class Recommendation(_SparseRecord):
     """Cheapest settings that reach the noise floor; the stages are absent from the file if none was found.
 
     noise_floor : mean squared error of the image with exact light and exact H
@@ -137,10 +141,6 @@ class Recommendation(_Record):
     render: RecommendedSetting | None = None
     calibrate: RecommendedSetting | None = None
     reconstruct: RecommendedSetting | None = None
-
-    @model_serializer(mode="wrap")
-    def _found(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in serialize(self).items() if value is not None or key not in STAGES}
 
     def of(self, stage: Stage) -> RecommendedSetting | None:
         """Return the recommended setting of a stage, None if there is none."""

@@ -27,9 +27,9 @@ def show(
 
 def export(scene: SceneFile, file: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
     """Write a plain Mitsuba scene of stock sensors."""
-    from ommatid.pipeline.stages import exported
+    from ommatid.pipeline.stages import export_scene
 
-    description = exported(scene, file, options.changes(sets), options.lens_names(lens))
+    description = export_scene(scene, file, options.changes(sets), options.lens_names(lens))
     files = f"{file} and {description['picture']}: {len(description['sensors'])} sensors"
     output.say(f"{files}; render one with: mitsuba -m scalar_rgb -s 0 {file}")
     output.print_result(description, [], as_json)

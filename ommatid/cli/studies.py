@@ -59,9 +59,9 @@ def bench(
     """
     from ommatid.bench.bench import bench as measure
     from ommatid.bench.bench import rows
-    from ommatid.pipeline.stages import opened
+    from ommatid.pipeline.stages import open_scene
 
-    setup = opened(scene, options.changes(sets), options.lens_names(lens))
+    setup = open_scene(scene, options.changes(sets), options.lens_names(lens))
     with output.progress_bar("bench") as progress:
         table, made = measure(setup, folder, seconds, progress)
     output.say_done("bench", made, folder / "bench.json")

@@ -16,38 +16,43 @@ from urllib.parse import quote
 from ommatid.batch.sweep_row import NUMBERS, read_rows
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
+from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 
 from .cached import REPORT, read_stamp, sources_digest
+from .words import agreement
 
 INDEX = "index.html"
 
 
 @dataclass(frozen=True)
 class BatchEntry:
-    """Results of one scene of a batch, or the reason of its failure; numbers are None if not known."""
+    """Results of one scene of a batch, or the reason of its failure."""
 
     name: str
-    title: str
-    link: str = ""
-    picture: str = ""
-    mse: float | None = None
-    predicted: float | None = None
-    low: float | None = None
-    high: float | None = None
-    psnr: float | None = None
-    ssim: float | None = None
-    seconds: float | None = None
+    report: RunReport | None = None
     failure: str = ""
 
     @property
-    def agrees(self) -> bool | None:
-        """True if the measured error is inside the expected interval, None if either is not known."""
-        if self.mse is None or self.low is None or self.high is None:
-            return None
-        return self.low <= self.mse <= self.high
+    def title(self) -> str:
+        """Title of the scene, or the name of its folder."""
+        return (self.report.title if self.report else "") or self.name
+
+    @property
+    def agreement(self) -> str:
+        """Agreement of the measured error with the expected interval, as `agreement` of `words` returns it."""
+        return agreement(self.report.error) if self.report else "unknown"
+
+    @property
+    def seconds(self) -> float:
+        """Run time of all stages."""
+        return sum(stage.seconds for stage in self.report.stages.values()) if self.report else 0.0
+
+    def url(self, file: str) -> str:
+        """Return the address of a file of the run, relative to the index."""
+        return quote(f"{self.name}/{file}")
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,8 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     others = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
     entries = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *others)]
     sweep = read_sweep(output / NUMBERS)
-    content = [[asdict(entry) for entry in entries], None if sweep is None else asdict(sweep)]
+    described = [[entry.name, entry.failure, entry.report and entry.report.plain()] for entry in entries]
+    content = [described, None if sweep is None else asdict(sweep)]
     stamp = fingerprint([content, versions("bokeh"), sources_digest()])
     name = output.resolve().name
     return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
@@ -80,25 +86,11 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
 
 def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
-        return BatchEntry(folder.name, folder.name, failure=failure)
+        return BatchEntry(folder.name, failure=failure)
     try:
-        report = run_json.read(folder)
+        return BatchEntry(folder.name, run_json.read(folder))
     except InputError as error:
-        return BatchEntry(folder.name, folder.name, failure=str(error))
-    interval = report.error.expected_given_truth
-    return BatchEntry(
-        name=folder.name,
-        title=report.title or folder.name,
-        link=quote(f"{folder.name}/{REPORT}"),
-        picture=quote(f"{folder.name}/{PICTURE}"),
-        mse=report.error.mse,
-        predicted=report.error.predicted_mse,
-        low=None if interval is None else interval.low,
-        high=None if interval is None else interval.high,
-        psnr=report.error.psnr,
-        ssim=report.error.ssim,
-        seconds=sum(stage.seconds for stage in report.stages.values()),
-    )
+        return BatchEntry(folder.name, failure=str(error))
 
 
 def read_sweep(path: Path) -> SweepTable | None:
@@ -125,8 +117,17 @@ def page(entries: list[BatchEntry], sweep: SweepTable | None, name: str, stamp: 
     from .document import fill
 
     figures = _figures(entries, sweep)
-    content = {"entries": entries, "sweep": sweep, "title": f"Batch: {name}", "stamp": stamp, "words": words(entries)}
-    content |= {"drawn": {figure.name for figure in figures}, "document": ""}
+    content: dict[str, Any] = {
+        "entries": entries,
+        "sweep": sweep,
+        "title": f"Batch: {name}",
+        "words": words(entries),
+        "page_file": REPORT,
+        "picture_file": PICTURE,
+        "drawn": {figure.name for figure in figures},
+        "document": "",
+        "stamp": stamp,
+    }
     if figures:
         from . import plots
 
@@ -138,36 +139,35 @@ def words(entries: list[BatchEntry]) -> str:
     """Return the results of the batch in one sentence."""
     finished = [entry for entry in entries if not entry.failure]
     sentence = f"{len(finished)} of {len(entries)} scenes are finished"
-    compared = [entry for entry in finished if entry.agrees is not None]
-    if compared:
-        inside = sum(bool(entry.agrees) for entry in compared)
-        sentence += f"; the error of {inside} of {len(compared)} is inside the 99 % interval expected for its image"
+    agreements = [entry.agreement for entry in finished if entry.agreement != "unknown"]
+    if agreements:
+        inside = agreements.count("agrees")
+        sentence += f"; the error of {inside} of {len(agreements)} is inside the 99 % interval expected for its image"
     return f"{sentence}."
 
 
 def _figures(entries: list[BatchEntry], sweep: SweepTable | None) -> list[Any]:
-    known = [entry for entry in entries if entry.mse and entry.predicted]
+    errors = [(entry.title, entry.report.error) for entry in entries if entry.report]
+    known = [(title, error) for title, error in errors if error.mse and error.predicted_mse]
     figures = [_scenes_figure(known)] if len(known) > 1 else []
     series = {} if sweep is None else _series(sweep)
     return [*figures, _sweep_figure(sweep.keys[0], series)] if sweep is not None and series else figures
 
 
-def _scenes_figure(entries: list[BatchEntry]) -> Any:
+def _scenes_figure(scenes: list[tuple[str, ErrorReport]]) -> Any:
     from . import plots
 
+    errors = [error for _, error in scenes]
+    intervals = [error.expected_given_truth for error in errors]
+    columns = {
+        "title": [title for title, _ in scenes],
+        "measured": [error.mse for error in errors],
+        "predicted": [error.predicted_mse for error in errors],
+        "low": [error.mse if given is None else given.low for error, given in zip(errors, intervals, strict=True)],
+        "high": [error.mse if given is None else given.high for error, given in zip(errors, intervals, strict=True)],
+    }
     axes = "predicted mean squared error", "measured mean squared error"
-    chart = plots.chart("scenes", axes, x_axis_type="log", y_axis_type="log")
-    ends = [end(entry.predicted or 0 for entry in entries) for end in (min, max)]
-    chart.line(ends, ends, line_dash="6 4", line_color=plots.SOFT)
-    columns = {name: [getattr(entry, name) for entry in entries] for name in ("title", "mse", "predicted")}
-    columns["low"] = [entry.low or entry.mse for entry in entries]
-    columns["high"] = [entry.high or entry.mse for entry in entries]
-    data = plots.source(columns, "scenes")
-    chart.segment("predicted", "low", "predicted", "high", source=data, **plots.INTERVAL)
-    marks = chart.scatter("predicted", "mse", source=data, size=10, color=plots.MARK)
-    tips = [("scene", "@title"), ("predicted", "@predicted{%.4g}"), ("measured", "@mse{%.4g}")]
-    plots.hover(chart, [marks], tips, ("predicted", "mse"))
-    return chart
+    return plots.comparison("scenes", axes, plots.source(columns, "scenes"), [("scene", "@title")], size=10)
 
 
 def _series(sweep: SweepTable) -> dict[str, list[tuple[float, float, float]]]:

@@ -65,18 +65,9 @@ def figure(groups: list[ErrorGroup]) -> Any:
     """Draw measured against predicted RMS error, with the line of equality and the 99 % intervals."""
     numbers = [value for group in groups for value in (group.predicted, group.measured, group.low, group.high)]
     scale = "log" if min(numbers) > 0 and max(numbers) > LOG_RATIO * min(numbers) else "linear"
-    chart = plots.chart(
-        "errors", ("predicted RMS error of a pixel", "measured RMS error"), x_axis_type=scale, y_axis_type=scale
-    )
-    names = ErrorGroup.__annotations__
-    data = plots.source({name: [getattr(group, name) for group in groups] for name in names}, "groups")
-    ends = [min(group.predicted for group in groups), max(group.predicted for group in groups)]
-    chart.line(ends, ends, line_dash="6 4", line_width=1.5, line_color=plots.SOFT)
-    intervals = chart.segment(x0="predicted", x1="predicted", y0="low", y1="high", source=data, **plots.INTERVAL)
-    marks = chart.scatter(x="predicted", y="measured", source=data, size=9, color=plots.MARK)
-    tips = [("pixels", "@pixels"), ("predicted", "@predicted{%.4g}"), ("measured", "@measured{%.4g}")]
-    plots.hover(chart, [marks, intervals], tips, ("predicted", "measured"))
-    return chart
+    columns = {name: [getattr(group, name) for group in groups] for name in ErrorGroup.__annotations__}
+    axes = "predicted RMS error of a pixel", "measured RMS error"
+    return plots.comparison("errors", axes, plots.source(columns, "groups"), [("pixels", "@pixels")], scale)
 
 
 def words(groups: list[ErrorGroup]) -> str:

@@ -41,7 +41,6 @@ MARK, SOFT = "#2b8cbe", "#87919c"  # of measured values and of references, on li
 SERIES = tuple(palettes.Dark2_8)
 CROSSHAIR = "#ff2d78"
 DARK = "#101820"  # of the sensor between the sub-images
-INTERVAL = {"line_width": 9, "line_alpha": 0.35, "line_color": SOFT}
 BORDERS = {"min_border_left": 52, "min_border_right": 14, "min_border_top": 8}  # page.css depends on these
 BORDER_BELOW_MAP, BORDER_BELOW = 108, 50
 TEXT_SIZE = "12px"
@@ -147,6 +146,22 @@ def chart(name: str, axes: tuple[str, str], **options: Any) -> Any:
     """Return an empty chart."""
     plot = _blank(name, BORDER_BELOW, axes, **options)
     plot.grid.grid_line_alpha = 0.35
+    return plot
+
+
+def comparison(name: str, axes: tuple[str, str], data: Any, tips: Tips, scale: str = "log", size: int = 9) -> Any:
+    """Return a chart of "measured" against "predicted" values with the line of equality and intervals.
+
+    data : columns "predicted", "measured", and "low" and "high" for the ends of the intervals
+    """
+    plot = chart(name, axes, x_axis_type=scale, y_axis_type=scale)
+    ends = [min(data.data["predicted"]), max(data.data["predicted"])]
+    plot.line(ends, ends, line_dash="6 4", line_width=1.5, line_color=SOFT)
+    interval = {"line_width": 9, "line_alpha": 0.35, "line_color": SOFT}
+    intervals = plot.segment(x0="predicted", x1="predicted", y0="low", y1="high", source=data, **interval)
+    marks = plot.scatter(x="predicted", y="measured", source=data, size=size, color=MARK)
+    values = [("predicted", "@predicted{%.4g}"), ("measured", "@measured{%.4g}")]
+    hover(plot, [marks, intervals], [*tips, *values], ("predicted", "measured"))
     return plot
 
 

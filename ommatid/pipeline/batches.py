@@ -15,7 +15,7 @@ from ommatid.batch.sweep_row import summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.page.batch_index import cached_index
 
-from .stages import facts, fitting, member_opened
+from .stages import library_versions, open_member, process_count
 
 Section = tuple[str, list[tuple[str, str]]]
 
@@ -46,12 +46,13 @@ def scene_batch(
     changes: Sequence[str],
     lenses: Sequence[str],
     stages: Stages,
-    watch: Callable[[Path], RunObserver],
+    observe: Callable[[Path], RunObserver],
     report: Callable[[Member, Description], Description],
 ) -> Batch:
     """Create the batch that does `stages` with every scene after `changes`, and passes each result to `report`."""
-    asked = tuple(changes), tuple(lenses)
-    return Batch(partial(member_opened, *asked), stages, watch, report, facts, partial(fitting, *asked))
+    options = tuple(changes), tuple(lenses)
+    open_scene, count = partial(open_member, *options), partial(process_count, *options)
+    return Batch(open_scene, stages, observe, report, library_versions, count)
 
 
 def run_batch(
@@ -73,7 +74,7 @@ def run_batch(
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]
-    for member, work in batch.works(members, scheduler, workers):
+    for member, work in batch.run(members, scheduler, workers):
         document = _heading(member, with_folders)
         try:
             results[member] = {**document, **work()}

@@ -18,7 +18,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 
-from .stages import calibrated
+from .stages import calibrated_model
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def calibrate_file(
             raise InputError("--lens: recorded frames are of the whole camera; choose lens types in `reconstruct`")
         return _from_points(setup, output, recording)
     with naming_source(path):
-        return CalibrationOutcome(*calibrated(setup, output, progress), warnings=[])
+        return CalibrationOutcome(*calibrated_model(setup, output, progress), warnings=[])
 
 
 def _from_points(setup: Setup, output: Path, recording: PointRecording) -> CalibrationOutcome:

@@ -27,12 +27,12 @@ from ommatid.simulate.renderer.variant import choose as choose_variant
 from ommatid.simulate.validation import check_scene, check_scene_memory
 
 
-def opened(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
+def open_scene(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
     """Read a scene, and check it, its camera and its target image, before anything is written. Raises InputError."""
-    return checked(read(path, changes, lenses))
+    return checked_setup(read(path, changes, lenses))
 
 
-def checked(scene: Scene) -> Setup:
+def checked_setup(scene: Scene) -> Setup:
     """Derive the camera of a scene and load its image. Raises InputError if either cannot be done."""
     camera = derive(scene)  # first, since it is fast and finds most errors
     if scene.world is not None:
@@ -42,12 +42,12 @@ def checked(scene: Scene) -> Setup:
     return Setup(scene, camera, load(scene))
 
 
-def member_opened(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:
+def open_member(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:
     """Open a scene of a batch, with the changes of all scenes and then its own."""
-    return opened(member.scene, (*changes, *member.changes), lenses)
+    return open_scene(member.scene, (*changes, *member.changes), lenses)
 
 
-def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
+def process_count(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
     """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
     from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
 
@@ -56,15 +56,15 @@ def fitting(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Mem
     return fastest_process_count([cost.seconds for cost in costs], most, processors())
 
 
-def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     """Execute all stages of a scene, here or on a worker, and return the content of run.json."""
-    report = results(setup, folder, watch)
-    write_page(setup.camera, folder, watch)
+    report = results(setup, folder, observer)
+    write_page(setup.camera, folder, observer)
     return report.plain()
 
 
 @one_thread()
-def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
+def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
     """Execute all stages of a scene except the page."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
@@ -79,52 +79,52 @@ def results(setup: Setup, folder: Path, watch: RunObserver) -> RunReport:
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
     choose_method(scene, camera, setup.has_structured_matrix)  # checks the memory before any work
     study.check_study(scene, camera)
-    stack = _rendered(setup, folder, watch)
-    with watch.progress("calibrate") as progress:
+    stack = _rendered(setup, folder, observer)
+    with observer.progress("calibrate") as progress:
         model, made = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
-    watch.done("calibrate", made)
-    with watch.progress("reconstruct") as progress:
+    observer.done("calibrate", made)
+    with observer.progress("reconstruct") as progress:
         report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
-    watch.done("reconstruct", made)
+    observer.done("reconstruct", made)
     complete = report
     if scene.world is not None:
         from ommatid.analysis.depth_error import depth_error_of_run
 
         complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        complete = complete.with_changes(study=_studied(setup, stack, folder, watch))
+        complete = complete.with_changes(study=_studied(setup, stack, folder, observer))
     if complete.plain() != report.plain():
         run_json.write(folder, complete)
     return complete
 
 
-def write_page(camera: Camera, folder: Path, watch: RunObserver) -> None:
+def write_page(camera: Camera, folder: Path, observer: RunObserver) -> None:
     """Write report.html of the results in a folder, unless it is up to date."""
     from ommatid.page.cached import cached_page
     from ommatid.simulate.ideal import matrix_as_designed
 
-    with watch.progress("report"):
+    with observer.progress("report"):
         made = cached_page(folder, partial(matrix_as_designed, camera))
-    watch.done("report", made)
+    observer.done("report", made)
 
 
-def render(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def render(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     """Render a scene, here or on a worker, and describe its stack."""
-    stack = _rendered(setup, folder, watch)
+    stack = _rendered(setup, folder, observer)
     return {"sub_images": len(setup.camera.sub_imagers), **stack.record}
 
 
-def predict_scene(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
+def predict_scene(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     """Predict the error of a scene of a sweep, without rendering or writing anything."""
     from ommatid.analysis.predict import predict_scene
     from ommatid.analysis.prediction_table import json_of
 
-    del folder, watch
+    del folder, observer
     with naming_source(setup.scene.source):
         return json_of(predict_scene(setup.scene))
 
 
-def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
+def calibrated_model(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
     """Return the model at `path` and False if it is up to date; else calibrate it, and True.
 
     An adaptive calibration stops by the expected error of images drawn from the prior.
@@ -140,7 +140,7 @@ def calibrated(setup: Setup, path: Path, progress: Progress) -> tuple[Model, boo
     return cached_model(path, setup, progress, stopping_rule)
 
 
-def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
+def export_scene(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> dict[str, Any]:
     """Write the scene in `path` as a plain Mitsuba scene, and describe its files and sensors.
 
     Raises InputError for a scene with a world or with lenses that are more than pinholes.
@@ -149,42 +149,42 @@ def exported(path: Path, output: Path, changes: Sequence[str] = (), lenses: Sequ
     from ommatid.simulate.renderer.export import export
 
     check_output(output, path)
-    setup = opened(path, changes, lenses)
+    setup = open_scene(path, changes, lenses)
     if setup.scene.world is not None:
         raise InputError(f"{path}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")
     picture = export(setup, output)
     return {"file": str(output), "picture": str(picture), "sensors": [sub.name for sub in setup.camera.sub_imagers]}
 
 
-def facts(chosen: bool) -> dict[str, str]:
+def library_versions(with_variant: bool) -> dict[str, str]:
     """Return the versions that have to agree on all machines for equal results.
 
-    chosen : True adds the variant that 'auto' stands for
+    with_variant : True adds the variant that 'auto' stands for
     """
-    facts = versions("mitsuba", "drjit", "scipy")
-    if chosen:
-        facts["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
-    return facts
+    found = versions("mitsuba", "drjit", "scipy")
+    if with_variant:
+        found["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
+    return found
 
 
-def _rendered(setup: Setup, folder: Path, watch: RunObserver) -> Stack:
+def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> Stack:
     check_scene(setup, calibrates=False)
     prepare(setup, folder)
-    with watch.progress("render") as progress:
+    with observer.progress("render") as progress:
         stack, made = cached_stack(folder / "stack.exr", setup, progress)
-    watch.done("render", made)
+    observer.done("render", made)
     return stack
 
 
-def _studied(setup: Setup, stack: Stack, folder: Path, watch: RunObserver) -> tuple[StudyCase, ...]:
+def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> tuple[StudyCase, ...]:
     """Reconstruct the stack with every model of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models
     from ommatid.analysis.study import cached_study
     from ommatid.reconstruct.output.result_files import truth_beside
 
-    with watch.progress("study") as progress:
+    with observer.progress("study") as progress:
         known = study_models(setup, folder, no_progress, for_stack(stack))
         cases, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
-    watch.done("study", made)
+    observer.done("study", made)
     return cases

@@ -82,10 +82,10 @@ def shared_time(
     """
     request = TimeRequest(seconds, len(folders))
 
-    def run(setup: Setup, folder: Path, watch: RunObserver) -> dict[str, Any]:
+    def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
         begun = started if request.scenes == 1 else clock()
         share = (seconds - (begun - started)) / (request.scenes - folders.index(folder))
-        return run_within(setup, folder, watch, share, say, clock, begun, request)
+        return run_within(setup, folder, observer, share, say, clock, begun, request)
 
     return run
 
@@ -93,7 +93,7 @@ def shared_time(
 def run_within(
     setup: Setup,
     folder: Path,
-    watch: RunObserver,
+    observer: RunObserver,
     seconds: float,
     say: Callable[[str], None],
     clock: Clock = perf_counter,
@@ -110,36 +110,36 @@ def run_within(
     requested = asdict(TimeRequest(seconds) if request is None else request)
     earlier = _earlier_run(folder, setup, requested)
     if earlier is not None:
-        report = stages.results(_with_samples(setup, *(earlier.chosen[key] for key in KEYS)), folder, watch)
+        report = stages.results(_with_samples(setup, *(earlier.chosen[key] for key in KEYS)), folder, observer)
         same = earlier.model_dump(include={"within", "asked", "seconds", "chosen"})
-        return _finish(setup, folder, watch, report, same)
+        return _finish(setup, folder, observer, report, same)
 
-    few = _measured_run(setup, FEW, folder, watch, clock)
+    few = _measured_run(setup, FEW, folder, observer, clock)
     report, chosen = few.report, (FEW, FEW)
-    page = _page_seconds(setup, folder, watch, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
+    page = _page_seconds(setup, folder, observer, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
 
     def left() -> float:
         return (1 - RESERVE) * (seconds - (clock() - begun)) - page
 
     remaining = left()
     if _needs_few_samples(setup):
-        chosen, report = _adaptive_run(setup, folder, watch, few, remaining)
+        chosen, report = _adaptive_run(setup, folder, observer, few, remaining)
     elif (curves := _bench_curves(folder, setup)) is not None or remaining > 2 * few.wall:
         if curves is None:
-            more = _measured_run(setup, MORE, folder, watch, clock)
+            more = _measured_run(setup, MORE, folder, observer, clock)
             report, chosen, curves = more.report, (MORE, MORE), _fitted_curves(setup, few, more)
             remaining = left()
         allocation = _better(report.error, curves, remaining - few.other - COMPILATION)
         if allocation is not None:
             chosen = allocation.render, allocation.calibrate
-            report = stages.results(_with_samples(setup, *chosen), folder, watch)
+            report = stages.results(_with_samples(setup, *chosen), folder, observer)
     total = clock() - begun + page  # the final page is still to be written
     if total > seconds:
         fewest = ", the fewest possible" if chosen[0] == FEW else ""
         samples = f"{chosen[0]} and {chosen[1]} samples per pixel{fewest}"
         say(f"{folder}: took {total:.1f} s of {seconds:g} s with {samples}")
     spent = {"within": seconds, "asked": requested, "seconds": total, "chosen": dict(zip(KEYS, chosen, strict=True))}
-    return _finish(setup, folder, watch, report, spent)
+    return _finish(setup, folder, observer, report, spent)
 
 
 def _with_samples(setup: Setup, rendering: Samples, calibration: Samples) -> Setup:
@@ -187,9 +187,9 @@ class MeasuredRun:
         return max(self.wall - self.sampled - self.seconds("reconstruct"), 0.0)
 
 
-def _measured_run(setup: Setup, samples: int, folder: Path, watch: RunObserver, clock: Clock) -> MeasuredRun:
+def _measured_run(setup: Setup, samples: int, folder: Path, observer: RunObserver, clock: Clock) -> MeasuredRun:
     start = clock()
-    report = stages.results(_with_samples(setup, samples, samples), folder, watch)
+    report = stages.results(_with_samples(setup, samples, samples), folder, observer)
     wall = clock() - start
     model = model_file.read(folder / "model.npz")
     from_model = model.prior_variance_from_model(np.ones(model.unknowns)) if model.variance.any() else np.zeros(1)
@@ -198,12 +198,12 @@ def _measured_run(setup: Setup, samples: int, folder: Path, watch: RunObserver, 
 
 
 def _adaptive_run(
-    setup: Setup, folder: Path, watch: RunObserver, few: MeasuredRun, remaining: float
+    setup: Setup, folder: Path, observer: RunObserver, few: MeasuredRun, remaining: float
 ) -> tuple[tuple[Samples, Samples], RunReport]:
     """Run with 'auto' if its first round fits into the remaining seconds, else keep the run with few samples."""
     if remaining <= FIRST_ROUND * few.sampled + few.seconds("reconstruct") + few.other:
         return (FEW, FEW), few.report
-    return ("auto", "auto"), stages.results(_with_samples(setup, "auto", "auto"), folder, watch)
+    return ("auto", "auto"), stages.results(_with_samples(setup, "auto", "auto"), folder, observer)
 
 
 def _better(error: ErrorReport, curves: Curves, seconds: float) -> TimeAllocation | None:
@@ -213,10 +213,10 @@ def _better(error: ErrorReport, curves: Curves, seconds: float) -> TimeAllocatio
     return allocation if allocation is not None and allocation.predicted_mse < error.predicted_mse else None
 
 
-def _page_seconds(setup: Setup, folder: Path, watch: RunObserver, clock: Clock) -> float:
+def _page_seconds(setup: Setup, folder: Path, observer: RunObserver, clock: Clock) -> float:
     """Write the page of the present results, and return the seconds that it took, as the final one will."""
     start = clock()
-    stages.write_page(setup.camera, folder, watch)
+    stages.write_page(setup.camera, folder, observer)
     return clock() - start
 
 
@@ -253,9 +253,11 @@ def _earlier_run(folder: Path, setup: Setup, requested: dict[str, Any]) -> TimeR
     return earlier if same_scene and earlier.asked == RequestedTime(**requested) else None
 
 
-def _finish(setup: Setup, folder: Path, watch: RunObserver, report: RunReport, spent: dict[str, Any]) -> dict[str, Any]:
+def _finish(
+    setup: Setup, folder: Path, observer: RunObserver, report: RunReport, spent: dict[str, Any]
+) -> dict[str, Any]:
     """Add the request and the times to run.json and to the page, and return the description."""
     report = report.with_changes(spent=TimeReport.model_validate({**report.spent.plain(), **spent}))
     run_json.write(folder, report)
-    stages.write_page(setup.camera, folder, watch)
+    stages.write_page(setup.camera, folder, observer)
     return report.plain()

@@ -42,7 +42,7 @@ class ExactNumbers:
 
 @dataclass(frozen=True)
 class ExactAnswer:
-    """The exact u, (K,), as `coefficients`, the `image` f0 + L u, (N,), the posterior `variance`, (N,), and the bits.
+    """The exact u, (K,), as `coefficients`, the `image` f0 + L u, (N,), and the posterior `variance`, (N,).
 
     If measurements without noise contradict one another, this is the limit of small noise proportional to the signal
     |(H L)_i| of each; `contradiction` is the largest remaining |g - H f^|_i / (|g| + |H| |f^|)_i among them.
@@ -52,7 +52,6 @@ class ExactAnswer:
     image: ExactNumbers
     variance: ExactNumbers
     contradiction: float
-    bits: int
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def exact_answer(problem: Problem, recorded: FloatArray) -> ExactAnswer:
     try:
         while bits <= MOST_BITS:
             ctx.prec = bits
-            answer = _answer_in_balls(problem, recorded, rows, residues, bits)
+            answer = _answer_in_balls(problem, recorded, rows, residues)
             if answer is not None:
                 return answer
             bits *= 2
@@ -159,9 +158,7 @@ def _consistent(matrix: Any, residual: Any, rows: _Rows) -> Any:
     return consistent
 
 
-def _answer_in_balls(
-    problem: Problem, recorded: FloatArray, rows: _Rows, residues: _Answer, bits: int
-) -> ExactAnswer | None:
+def _answer_in_balls(problem: Problem, recorded: FloatArray, rows: _Rows, residues: _Answer) -> ExactAnswer | None:
     """Return the answer at the current precision, None if it is too low."""
     try:
         balls = _answer(_balls, problem, recorded, rows)
@@ -181,7 +178,7 @@ def _answer_in_balls(
     size = np.abs(recorded) + abs(problem.matrix) @ np.abs(image.high)
     compared = (problem.noise_variance == 0) & (size > 0)
     relative = np.divide(np.abs(misfit), size, out=np.zeros_like(size), where=compared)
-    return ExactAnswer(coefficients, image, variance, float(relative.max(initial=0.0)), bits)
+    return ExactAnswer(coefficients, image, variance, float(relative.max(initial=0.0)))
 
 
 def _exact_numbers(balls: list[Any], residues: list[Any], *, norm: bool) -> ExactNumbers | None:

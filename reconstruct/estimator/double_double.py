@@ -86,13 +86,6 @@ def sparse_rows(matrix: sparse.csr_array) -> SparseRows:
     return SparseRows(data, index)
 
 
-def dense_rows(matrix: FloatArray) -> SparseRows:
-    """Store a dense matrix."""
-    count = np.arange(matrix.shape[1], dtype=np.intp)
-    columns = np.repeat(count[:, None], matrix.shape[0], axis=1)
-    return SparseRows(np.ascontiguousarray(matrix.T), columns)
-
-
 def _two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     total = a + b
     shadow = total - a

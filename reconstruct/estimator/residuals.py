@@ -19,7 +19,7 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..prior import Prior
 from ..problem import Problem
-from .double_double import ROUNDING, DoubleDouble, SparseRows, dense_rows, exact, sparse_rows
+from .double_double import ROUNDING, DoubleDouble, SparseRows, exact, sparse_rows
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ExactResiduals:
     @cached_property
     def _root(self) -> tuple[SparseRows, SparseRows]:
         root = self.problem.prior.root
-        return dense_rows(root), dense_rows(root.T)
+        return sparse_rows(sparse.csr_array(root)), sparse_rows(sparse.csr_array(root.T))
 
     @cached_property
     def _magnitudes(self) -> tuple[sparse.csr_array, Prior]:

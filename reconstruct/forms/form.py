@@ -63,6 +63,22 @@ class Form(ABC):
         return self.problem.prior.apply_root(u).reshape(self.problem.unknowns, *residual.shape[1:])
 
 
+def check_noise(problem: Problem) -> None:
+    """Raise NotSolvableError if a measurement has no noise."""
+    if not problem.noisy:
+        raise NotSolvableError("it needs noise in every measurement")
+
+
+def whitened_matrix(problem: Problem) -> FloatArray:
+    """Return B = S^-1 H L, (M, K). Raises NotSolvableError without noise, or beyond the range of float64."""
+    check_noise(problem)
+    dense = problem.dense_matrix()
+    whitened = np.divide(dense, problem.deviation[:, None], out=dense)
+    if not np.isfinite(whitened).all():
+        raise NotSolvableError("its matrix leaves the range of double precision")
+    return whitened
+
+
 def multipliers(problem: Problem, u: FloatArray, residual: FloatArray) -> FloatArray:
     """Return l = Rv^-1 (r - H L u): (M, q); needs noise in every measurement."""
     return (residual - problem.forward(u)) / problem.noise_variance[:, None]

@@ -18,7 +18,7 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem
 from .cholesky import Factor, factorise_positive
-from .form import Form, NotSolvableError, multipliers
+from .form import Form, NotSolvableError, check_noise, multipliers, whitened_matrix
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,13 @@ class Information(Form):
 
 def information(problem: Problem) -> Information:
     """Factorise in information form. Raises NotSolvableError without noise, or if float64 does not suffice."""
-    if not problem.noisy:
-        raise NotSolvableError("it needs noise in every measurement")
+    check_noise(problem)
     if problem.prior.independent:
         scaled = sparse.csr_array(problem.matrix.multiply(1 / problem.deviation[:, None]))
         scaled = sparse.csr_array(scaled.multiply(problem.prior.root[None, :]))
         normal = np.asarray((scaled.T @ scaled).toarray())
     else:
-        whitened = problem.whitened_matrix()
+        whitened = whitened_matrix(problem)
         normal = whitened.T @ whitened
     normal[np.diag_indices(normal.shape[0])] += 1.0
     if not np.isfinite(normal).all():

@@ -15,7 +15,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem
-from .form import Form, NotSolvableError, multipliers, root_variance
+from .form import Form, multipliers, root_variance, whitened_matrix
 from .sorted_qr import SortedQr, sorted_qr
 
 
@@ -39,10 +39,5 @@ class SquareRootInformation(Form):
 
 def square_root_information(problem: Problem) -> SquareRootInformation:
     """Factorise in square-root information form. Raises NotSolvableError if a measurement has no noise."""
-    if not problem.noisy:
-        raise NotSolvableError("it needs noise in every measurement")
-    stacked = np.vstack([problem.whitened_matrix(), np.eye(problem.prior.dimension)])
-    if not np.isfinite(stacked).all():
-        raise NotSolvableError("its matrix leaves the range of double precision")
-    normal = sorted_qr(stacked)
+    normal = sorted_qr(np.vstack([whitened_matrix(problem), np.eye(problem.prior.dimension)]))
     return SquareRootInformation(problem, normal.condition, normal)

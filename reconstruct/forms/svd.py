@@ -17,7 +17,7 @@ from scipy import linalg
 from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem
-from .form import Form, NotSolvableError, root_variance
+from .form import Form, root_variance, whitened_matrix
 
 TRUNCATION = 4  # times eps, the longer side and the largest singular value: smaller ones are set to 0
 
@@ -90,11 +90,7 @@ class Svd(Form):
 
 def svd(problem: Problem) -> Svd:
     """Decompose B. Raises NotSolvableError if a measurement has no noise or values exceed the range of float64."""
-    if not problem.noisy:
-        raise NotSolvableError("it needs noise in every measurement")
-    whitened = problem.whitened_matrix()
-    if not np.isfinite(whitened).all():
-        raise NotSolvableError("its matrix leaves the range of double precision")
+    whitened = whitened_matrix(problem)
     measurements, dimension = whitened.shape
     qr: Any = linalg.qr
     decompose: Any = linalg.svd

@@ -21,7 +21,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
 from ommatid.batch import batch
-from ommatid.batch.batch import Batch, Member, Works
+from ommatid.batch.batch import Batch, Member, Runs
 from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
 from ommatid.reconstruct import method_choice
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
@@ -207,18 +207,18 @@ def test_processes_are_limited_by_scenes_processors_and_memory(
     counts: list[int] = []
 
     class Counted(Batch):
-        def _in_processes(self, members: Sequence[Member], count: int) -> Works:
+        def _in_processes(self, members: Sequence[Member], count: int) -> Runs:
             counts.append(min(count, len(members)))
             yield from ()
 
-        def _in_this_process(self, members: Sequence[Member]) -> Works:
+        def _in_this_process(self, members: Sequence[Member]) -> Runs:
             counts.append(min(1, len(members)))
             yield from ()
 
     three = [Member(Path(f"{name}.toml"), Path(name)) for name in "abc"]
     counted = Counted(unused, unused, unused, unused, unused, lambda _: fit)
     for members, count in ((three, None), (three, 1), (three, 7), (three[:1], 7)):
-        assert list(counted.works(members, count=count)) == []
+        assert list(counted.run(members, count=count)) == []
     assert counts == [expected, 1, 3, 1]
 
 

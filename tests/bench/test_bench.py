@@ -19,7 +19,7 @@ from ommatid.bench.resources import CLEAR_REFS, Cost, measure_cost
 from ommatid.bench.scheduler import Job, Journal, Repeat, cell_from_repeats, measure, name_of
 from ommatid.bench.slopes import Slope, excess, recommend, slope
 from ommatid.bench.table import AUTO, CSV, JSON, BenchTable, Cell, Quantiles, Stage, read, row_of, write
-from ommatid.pipeline.stages import opened
+from ommatid.pipeline.stages import open_scene
 from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import no_progress
@@ -117,7 +117,7 @@ def test_adaptive_samples_are_recommended_as_a_scene_asks_for_them() -> None:
     half = recommend([*counted, adaptive[0], estimate], 2.0)
     assert [setting.samples for setting in (half.render, half.calibrate) if setting] == [AUTO, 256]
     assert "calibrate, transport, multijitter, would need about 1000 samples" in half.why
-    tile = opened(GALLERY / "tile19.toml").camera
+    tile = open_scene(GALLERY / "tile19.toml").camera
     assert curves([*counted, *adaptive], tile) == curves(counted, tile)
 
 
@@ -231,7 +231,7 @@ def test_a_table_that_is_read_is_the_one_that_was_written(
 @pytest.fixture
 def subject(here: Path) -> Subject:
     """The tiny scene, to be measured."""
-    setup = opened(here / "tiny.toml")
+    setup = open_scene(here / "tiny.toml")
     return Subject(setup, reference(setup, here))
 
 
@@ -283,7 +283,7 @@ def test_adaptive_samples_leave_the_noise_alone(subject: Subject) -> None:
 
 
 def test_without_noise_no_cell_has_adaptive_samples(here: Path) -> None:
-    setup = opened(here / "tiny.toml", ["noise="])
+    setup = open_scene(here / "tiny.toml", ["noise="])
     listed, left_out = jobs(Subject(setup, reference(setup, here)))
     assert all(job.setting != AUTO for job in listed)
     assert ["noise.variance above 0" in skipped.why for skipped in left_out if "auto" in skipped.what] == [True]
@@ -297,7 +297,7 @@ def test_seeds_differ_between_cells_and_repeats_and_from_the_scenes_own(subject:
 
 @pytest.mark.parametrize(("name", "closed"), [("tile19", True), ("planoconvex", False), ("misaligned", True)])
 def test_which_cameras_have_a_closed_form(name: str, closed: bool) -> None:
-    assert opened(GALLERY / f"{name}.toml").has_closed_form == closed
+    assert open_scene(GALLERY / f"{name}.toml").has_closed_form == closed
 
 
 def check(table: BenchTable, document: dict[str, object]) -> None:

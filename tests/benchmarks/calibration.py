@@ -31,7 +31,6 @@ OVERRIDES = ("target.shape=[119,119]", "target.origin=[98,196]")
 
 
 def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
-<<<<<<< HEAD
     """Return a row for single sources with the same sensors, and one for the whole camera in a single sensor."""
     camera = derive(read(scene_file, OVERRIDES))
     renderer = Renderer(camera, variant, together=False)
@@ -42,18 +41,6 @@ def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
     methods = [lambda seed: from_grids(renderer, seed), lambda seed: from_sources(renderer, sources, seed)]
     names = ["one source per rendering, a sensor per lens type"]
     checks = [f"H of {SOURCES} sources differs by {largest:.2g} at most, {np.count_nonzero(columns)} nonzero entries"]
-=======
-    """Return a row for single sources in the same renderer, and one for the camera in one sensor, where possible."""
-    camera = derive(read(scene_file, OVERRIDES))
-    renderer = Renderer(camera, variant, together=False)
-    sources = np.random.default_rng(1).choice(camera.unknowns, SOURCES, replace=False)
-    matrix = by_grids(renderer, 0)
-    singly = by_sources(renderer, sources, 0)
-    apart = float(np.abs(matrix[:, sources].toarray() - singly).max())
-    ways = [lambda seed: by_grids(renderer, seed), lambda seed: by_sources(renderer, sources, seed)]
-    names = ["one source a rendering, a sensor a lens type"]
-    checks = [f"H of {SOURCES} sources differs by {apart:.2g} at most, {np.count_nonzero(singly)} entries not 0"]
->>>>>>> wt-simulate
     if not variant.startswith("scalar"):
         whole = Renderer(camera, variant)
         from_sources(whole, sources[:2], 0)
@@ -75,34 +62,18 @@ def calibration_rows(scene_file: Path, variant: str) -> list[Row]:
     ]
 
 
-<<<<<<< HEAD
 def from_grids(renderer: Renderer, seed: int) -> sparse.csr_array:
     """Return H, (M, N), from one pass of grids, including the uniform target for its check."""
     rows: list[sparse.csr_array] = []
     for group in renderer.groups:
         sweep = SourceSweep(renderer, group)
-        sweep.one_more(PASS, seed, no_progress)
-        rows.append(entries_of(renderer.camera, sweep.reach, sweep.tally.mean)[0])
+        sweep.add_pass(PASS, seed, no_progress)
+        rows.append(entries_of(renderer.camera, sweep.visible, sweep.tally.mean)[0])
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 
 
 def from_sources(renderer: Renderer, sources: IntArray, seed: int) -> FloatArray:
     """Return columns of H, (M, sources), from a rendering of the whole camera for each source."""
-=======
-def by_grids(renderer: Renderer, seed: int) -> sparse.csr_array:
-    """H, (M, N), by one pass of grids, the uniform target for its check included."""
-    rows: list[sparse.csr_array] = []
-    for group in renderer.groups:
-        swept = SourceSweep(renderer, group)
-        swept.add_pass(PASS, seed, no_progress)
-        tally = swept.tally
-        rows.append(entries_of(renderer.camera, swept.visible, tally.mean)[0])
-    return sparse.csr_array(sparse.vstack(rows, format="csr"))
-
-
-def by_sources(renderer: Renderer, sources: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
-    """Columns of H, (M, sources), by a rendering of the whole camera for each source."""
->>>>>>> wt-simulate
     camera = renderer.camera
     columns = np.empty((camera.measurements, sources.size))
     for index, source in enumerate(sources):
@@ -110,11 +81,6 @@ def by_sources(renderer: Renderer, sources: NDArray[np.int64], seed: int) -> NDA
         image.flat[source] = 1.0
         renderer.set_target(image)
         for group in renderer.groups:
-<<<<<<< HEAD
             seeds = sampler_seeds(seed, "calibration", 0, PASS.passes)
-            columns[renderer.places(group), index] = renderer.expose(group, PASS.samples, seeds)[0]
-=======
-            own = sampler_seeds(seed, "calibration", 0, PASS.passes)
-            columns[renderer.rows(group), place] = renderer.expose(group, PASS.samples, own)[0]
->>>>>>> wt-simulate
+            columns[renderer.rows(group), index] = renderer.expose(group, PASS.samples, seeds)[0]
     return columns

@@ -35,11 +35,7 @@ def camera_rows(scene_file: Path, variant: str, samples: int) -> list[Row]:
     stock = f"{len(camera.sub_imagers)} `perspective` sensors, one by one"
     if variant.startswith("scalar"):
         # There our renderer is a loop of stock sensors itself.
-<<<<<<< HEAD
         methods = {"Renderer: as many stock sensors": ours, stock: loop}
-=======
-        ways = {"Rig: as many stock sensors": ours, stock: loop}
->>>>>>> wt-simulate
     else:
         methods = {"Renderer: all rays at once": ours, stock: loop, f"{len(camera.types)} `batch` sensors": batches}
     images = [method(0) for method in methods.values()]  # also warms them up
@@ -63,22 +59,10 @@ def _ours(camera: Camera, picture: FloatArray, variant: str, samples: int) -> Re
     renderer = Renderer(camera, variant, SAMPLER)
     renderer.set_target(*[picture] * renderer.channels)
 
-<<<<<<< HEAD
     def expose(seed: int) -> FloatArray:
         # A different seed for each sensor, or their noise would be correlated.
         return np.concatenate(
             [renderer.expose(group, samples, lambda index: 1000 * seed + index)[0] for group in renderer.groups]
-=======
-
-def _ours(camera: Camera, picture: NDArray[np.float64], variant: str, samples: int) -> Reader:
-    renderer = Renderer(camera, variant, SAMPLER)
-    renderer.set_target(*[picture] * renderer.channels)
-
-    def expose(seed: int) -> NDArray[np.float64]:
-        # Each sensor a seed of its own, else their noise would be alike.
-        return np.concatenate(
-            [renderer.expose(group, samples, lambda place: 1000 * seed + place)[0] for group in renderer.groups]
->>>>>>> wt-simulate
         )
 
     return expose

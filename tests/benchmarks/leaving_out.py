@@ -71,7 +71,6 @@ def _light_row(rule: str) -> Row:
     return Row(VARIANT, f"without {rule}", "complete", seconds[0], seconds[1], None, check)
 
 
-<<<<<<< HEAD
 def _exposure(camera: Camera, picture: FloatArray, samples: int) -> Callable[[int], FloatArray]:
     renderer = Renderer(camera, VARIANT, SAMPLER)
     renderer.set_target(picture)
@@ -81,15 +80,6 @@ def _exposure(camera: Camera, picture: FloatArray, samples: int) -> Callable[[in
         return np.concatenate(
             [renderer.expose(group, samples, lambda index: 100 * seed + index)[0] for group in groups]
         )
-=======
-def _exposure(camera: Camera, picture: NDArray[np.float64], samples: int) -> Callable[[int], NDArray[np.float64]]:
-    renderer = Renderer(camera, VARIANT, SAMPLER)
-    renderer.set_target(picture)
-
-    def expose(seed: int) -> NDArray[np.float64]:
-        found = [renderer.expose(group, samples, lambda place: 100 * seed + place)[0] for group in renderer.groups]
-        return np.concatenate(found)
->>>>>>> wt-simulate
 
     return expose
 

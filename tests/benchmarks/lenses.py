@@ -103,11 +103,7 @@ def _calibrate(method: Callable[[Setup], Any], setup: Setup, seed: int) -> Any:
     return method(setup)
 
 
-<<<<<<< HEAD
 def _ours(camera: Camera, picture: FloatArray) -> Callable[[int], FloatArray]:
-=======
-def _ours(camera: Camera, picture: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
->>>>>>> wt-simulate
     renderer = Renderer(camera, VARIANT, SAMPLER)
     renderer.set_target(picture)
     return lambda seed: renderer.expose("I", SAMPLES, lambda _: seed)[0].reshape(SIDE, SIDE)

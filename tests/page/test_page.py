@@ -568,7 +568,7 @@ def test_an_index_lists_results_and_failures(finished: Path, tmp_path: Path) -> 
     assert "3 of 4 scenes are finished" in text
     error = data.read_run(finished).report.error
     assert f"<td>{error.mse:.4g}</td><td>{error.predicted_mse:.4g}</td>" in text
-    assert columns(text, "scenes")["mse"] == [error.mse] * 3
+    assert columns(text, "scenes")["measured"] == [error.mse] * 3
     assert not batch_index.cached_index(tmp_path, folders)
     assert not batch_index.cached_index(tmp_path / "nothing", folders)
 

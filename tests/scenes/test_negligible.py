@@ -85,9 +85,9 @@ def test_the_reduced_rendering_draws_fewer_random_numbers(rule: str) -> None:
     for each in (reduced, camera):
         renderer = Renderer(each, "llvm_ad_mono")
         drawn = [0]
-        for eye in renderer._eyes.values():  # pyright: ignore[reportPrivateUsage]
-            eye.sampler = Counting(eye.sampler, drawn)
-            eye.rays(16, 0, eye.blocks(16)[0])
+        for generator in renderer._generators.values():  # pyright: ignore[reportPrivateUsage]
+            generator.sampler = Counting(generator.sampler, drawn)
+            generator.rays(16, 0, generator.blocks(16)[0])
         counts.append(drawn[0] // len(renderer.groups))
     assert counts[0] == 1, "only the position in the pixel"
     assert counts[1] == (3 if rule == "hardly diffracting" else 2)

@@ -23,8 +23,6 @@ from ..scene import Scene
 from . import npz, tiff
 from .exr import Part, read_channels, write
 
-Image = FloatArray  # for modules that still import it
-
 LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
 
 

@@ -180,7 +180,7 @@ VALUES = [
 
 PICTURES = [
     setting("target.image=none.png", "target.image", "none.png", "no picture"),
-    setting("target.image='photo:nobody'", "target.image", "'photo:nobody'", "camera"),
+    setting("target.image='photo:unknown'", "target.image", "'photo:unknown'", "camera"),
     setting("target.image=tiny.toml", "target.image", "tiny.toml", "PNG"),
     setting("target.origin=[505,0]", "target.origin", "[505, 0]", "512 x 512"),
     setting("target.origin=[-1,0]", "target.origin", "got -1"),

@@ -140,12 +140,8 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
             precision = f"within a factor of {exp(number.log_deviation):.3g}"
         lines.append((f"fitted {name.replace('_', ' ')}", f"{number.value:.4g}{unit}, {precision}"))
     if diagnostics.fit_doubtful:
-        lines.append(
-            (
-                "do not trust the fit",
-                "a fitted value lies on the bound of its range, so the stack does not determine it",
-            )
-        )
+        why = "a fitted value lies on the bound of its range, so the stack does not determine it"
+        lines.append(("do not trust the fit", why))
     return lines
 
 

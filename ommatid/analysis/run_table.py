@@ -23,7 +23,7 @@ Row = tuple[str, str]
 
 MAX_NAMES = 5  # sub-imagers named in one row
 SPURIOUS = (
-    "the lens types leave pixels open, and noise of H looks like information on them:"
+    "the lens types leave pixels undetermined, and the noise of H adds spurious information:"
     " raise calibration.samples, or take calibration.method = 'ideal' if the camera is"
 )
 
@@ -140,9 +140,8 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
             precision = f"within a factor of {exp(number.log_deviation):.3g}"
         lines.append((f"fitted {name.replace('_', ' ')}", f"{number.value:.4g}{unit}, {precision}"))
     if diagnostics.fit_doubtful:
-        lines.append(
-            ("do not trust the fit", "a fitted value lies on the bound of its range: the stack does not tell it")
-        )
+        why = "a fitted value lies on the bound of its range, so the stack does not determine it"
+        lines.append(("do not trust the fit", why))
     return lines
 
 

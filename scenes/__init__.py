@@ -1,1 +1,1 @@
-"""Descriptions of a camera and what it looks at, and the files the two halves exchange."""
+"""Descriptions of cameras and targets, and the files that simulation and reconstruction exchange."""

@@ -195,6 +195,7 @@ class Camera:
 
 
 def _slices(sizes: Iterable[int]) -> list[slice]:
+    """Adjacent slices of the given sizes, from 0."""
     return [slice(first, last) for first, last in pairwise(accumulate(sizes, initial=0))]
 
 

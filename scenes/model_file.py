@@ -118,5 +118,6 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
 
 
 def _seal(arrays: dict[str, NDArray[Any]], description: str) -> str:
+    """SHA-256 of all arrays and the description."""
     content = digest(*(arrays[name] for name in sorted(arrays)))
     return hashlib.sha256(f"{content}{description}".encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""A scene together with the camera and the picture that it describes, and what follows from them."""
+"""A scene with its camera and its image, and the quantities derived from them."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class Setup:
 
     @property
     def simulated(self) -> Camera:
-        """The camera without the effects that are too small to matter: the one that is rendered."""
+        """The camera that is rendered, without negligible effects."""
         return self._reduced[0]
 
     @cached_property
     def skipped(self) -> tuple[SkippedEffect, ...]:
-        """Effects that this scene does not need, each with the reason and the size of the change."""
+        """Effects that this scene does not need, each with the reason and a bound on the change."""
         return skipped_effects(self.scene, self.camera)
 
     @cached_property
     def resolved(self) -> Scene:
-        """The scene as a run's folder holds it, which names truth.exr as its picture."""
+        """The scene as a run's folder stores it, with truth.exr as its picture."""
         return resolved(self.scene, self.camera.shape)
 
     @property
@@ -61,7 +61,7 @@ class Setup:
 
     @property
     def has_closed_form(self) -> bool:
-        """True if H of the simulated camera, misaligned as it is, has a closed form."""
+        """True if H of the simulated camera with its misalignments has a closed form."""
         camera = self.simulated
         for lens_type in camera.types:
             if lens_type.optics.surfaces is not None:

@@ -21,7 +21,6 @@ from ommatid.simulate.renderer.variant import unusable_reason
 from ommatid.simulate.sampling.seeds import sampler_seeds
 
 if TYPE_CHECKING:  # a test asserts that scenes of pinholes load no module of lenses
-    from ommatid.simulate.lenses.prescription import Prescription
     from ommatid.simulate.renderer.renderer import Renderer
 
 GALLERY = Path(__file__).parent.parent / "scenes"
@@ -99,6 +98,15 @@ def tile_problem(lens_types: int, noise: float) -> Problem:
     return Problem(ideal_matrix(tile), independent(127.5, 5461.25, 361), np.full(tile.measurements, noise))
 
 
+OPTICS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # for `with_optics`
+    "pinhole": ({}, {}),
+    "out of focus": ({"aperture": "0.4 mm", "focus": "900 mm"}, {}),
+    "diffraction": ({"aperture": "0.8 mm"}, {"wavelength": "550 nm"}),
+    "distortion": ({"distortion": [0.05, 0.02]}, {}),
+    "misaligned": ({}, {"tolerance": {"position": "1 um", "rotation": "1 deg", "tilt": "1 deg"}}),
+}
+
+
 def needs(variant: str) -> None:
     """Skip the test if a variant does not work on this machine."""
     reason = unusable_reason(variant)
@@ -122,20 +130,6 @@ def assert_student(difference: NDArray[np.float64], variance: NDArray[np.float64
     limit = float(stats.t.isf(familywise(difference.size) / 2, passes - 1))
     score = np.abs(difference) / np.sqrt(variance)
     assert score.max() < limit, f"t = {score.max():.1f} at {int(score.argmax())}, the limit is {limit:.1f}"
-
-
-def turned_round(lens: Prescription) -> Prescription:
-    """Return a lens whose surfaces are in reverse order."""
-    from ommatid.simulate.lenses.prescription import Prescription
-
-    return Prescription(
-        radius=-lens.radius[::-1],
-        thickness=np.append(lens.thickness[-2::-1], 0.0),
-        index=lens.index_before[::-1],
-        semi_diameter=lens.semi_diameter[::-1],
-        conic=lens.conic[::-1],
-        stop=lens.radius.size - 1 - lens.stop,
-    )
 
 
 def mean_weights(renderer: Renderer, group: str, samples: int) -> NDArray[np.float64]:

@@ -94,7 +94,7 @@ def _error_rows(error: ErrorReport) -> list[Row]:
 
 def _region_row(region: RegionReport) -> Row:
     (row, column), (rows, columns) = region.corner, region.size
-    return f"mean of {rows} x {columns} pixels at {row}, {column}", f"{region.mean:.4f} ± {region.deviation:.2g}"
+    return f"mean of {rows} x {columns} pixels at {row}, {column}", f"{region.mean:.4f} +/- {region.deviation:.2g}"
 
 
 def _image_quality_rows(error: ErrorReport) -> list[Row]:
@@ -131,7 +131,7 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
     ]
     residual = diagnostics.chi_squared
     if residual is not None:
-        expected = f"expected {residual.expected:.4g} ± {residual.deviation:.2g}"
+        expected = f"expected {residual.expected:.4g} +/- {residual.deviation:.2g}"
         lines.append(("chi-squared of the residual", f"{residual.chi_squared:.4g}, {expected}"))
     for name, number in diagnostics.fit.items():
         unit = " pixels of f" if name == "correlation_length" else ""

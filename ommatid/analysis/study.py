@@ -114,7 +114,7 @@ def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:
         if case.mse is not None:
             words = f"mean squared error {case.mse:.4g}, {words}"
         if case.mse is not None and case.low is not None and case.high is not None:
-            place = "inside" if case.low <= case.mse <= case.high else "OUTSIDE"
-            words += f"; for this picture {case.expected:.4g}, {place} {case.low:.4g} to {case.high:.4g}"
+            position = "inside" if case.low <= case.mse <= case.high else "OUTSIDE"
+            words += f"; for this picture {case.expected:.4g}, {position} {case.low:.4g} to {case.high:.4g}"
         lines.append((LABELS[case.model], words))
     return lines

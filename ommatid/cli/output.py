@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ommatid.batch.remote import RunObserver
+    from ommatid.pipeline.sections import Section
     from ommatid.runtime.progress import Progress
-
-Section = tuple[str, list[tuple[str, str]]]  # a title, and the names and values below it
 
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
 

@@ -15,9 +15,8 @@ from ommatid.batch.sweep_row import summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.page.batch_index import cached_index
 
+from .sections import Section
 from .stages import library_versions, open_member, process_count
-
-Section = tuple[str, list[tuple[str, str]]]
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,6 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem
 
-Vector = FloatArray
-Matrix = FloatArray
-
 
 class NotSolvableError(Exception):
     """The form cannot factorise the problem in float64; another form may."""

@@ -20,8 +20,6 @@ from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval
 from ..prior import Prior, prior_of, spectrum_of
 
-Vector = FloatArray
-
 
 @dataclass(frozen=True)
 class Execution:

@@ -90,6 +90,7 @@ def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
 
 
 def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | None]]:
+    """Name, channels and JSON attribute of each part. Raises InputError if the file cannot be read."""
     import OpenEXR
 
     if not path.is_file():
@@ -141,6 +142,7 @@ def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], at
 
 
 def _seal(channels: dict[str, NDArray[np.float32]]) -> str:
+    """SHA-256 of all channels."""
     return digest(*(channels[name] for name in sorted(channels)))
 
 

@@ -23,8 +23,6 @@ from ..scene import Scene
 from . import npz, tiff
 from .exr import Part, read_channels, write
 
-Image = FloatArray  # for modules that still import it
-
 LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
 
 
@@ -119,6 +117,7 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
 
 
 def _pixels(image: str, where: str) -> NDArray[Any]:
+    """Read the picture that `target.image` names."""
     if image.startswith("photo:"):
         return decode(_photo_path(image.removeprefix("photo:"), where), where)
     path = Path(image)
@@ -128,6 +127,7 @@ def _pixels(image: str, where: str) -> NDArray[Any]:
 
 
 def _photo_path(name: str, where: str) -> Path:
+    """The file of a photograph that scikit-image ships."""
     package = importlib.util.find_spec("skimage")
     if package is None or package.origin is None:
         raise InputError(f"{where}: 'photo:{name}' comes with scikit-image, which is not installed")

@@ -47,6 +47,7 @@ def pages(path: Path) -> list[NDArray[Any]]:
 
 @contextmanager
 def _opened(path: Path) -> Generator[Any]:
+    """A tifffile.TiffFile. Raises InputError for unsupported colours and compressions."""
     import tifffile
 
     log = logging.getLogger("tifffile")

@@ -1,1 +1,1 @@
-"""Recordings of real cameras: frames, point sources and where they belong."""
+"""Recordings of real cameras: frames, point sources, and the noise of both."""

@@ -244,6 +244,7 @@ def corners(
 
 
 def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSettings, *, mosaics: bool) -> SensorLayout:
+    """Find out from the first images if they are mosaics or pictures of single sub-imagers. Raises InputError."""
     first = pictures_of(images[0], "images")
     shape, subs = grey(first[0], str(images[0])).shape, camera.sub_imagers
     count = len(first) + (0 if mosaics else sum(len(pictures_of(path, "images")) for path in images[1:]))

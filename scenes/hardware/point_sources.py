@@ -201,6 +201,7 @@ def _far_readings(outside: BoolArray, source: IntArray, beyond: StrayLight) -> t
 
 
 def _entries(pixel: IntArray, unknown: IntArray, readings: FloatArray, unknowns: int) -> RecordedEntries:
+    """Group readings, (n,) each, of the same sensor pixel and pixel of f."""
     keys, group = np.unique(pixel * unknowns + unknown, return_inverse=True)
     alive = np.isfinite(readings)
     group, readings = group[alive], readings[alive]

@@ -1,1 +1,1 @@
-"""What happens to light between target and pixel, in closed form: footprints, blur, distortion, radiometry."""
+"""Closed forms for the light between target and pixel: footprints, blur, distortion, radiometry."""

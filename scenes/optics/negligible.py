@@ -45,17 +45,6 @@ class SkippedEffect:
         return {"what": self.what, "why": self.why, **({"bound": self.bound} if self.bound else {})}
 
 
-@dataclass(frozen=True)
-class BlurChange:
-    """Change of a row of H without a blur: `most` of a measurement for values from 0 to 255, `mean_square` of H f.
-
-    mean_square : for independent pixels of variance 1
-    """
-
-    most: float
-    mean_square: float
-
-
 def without_negligible_effects(scene: Scene, camera: Camera) -> tuple[Camera, tuple[SkippedEffect, ...]]:
     """The camera without the effects that are negligible in this scene, and what was skipped."""
     if (
@@ -132,10 +121,10 @@ def _negligible_diffraction(
         disk = disk / camera.pixel_pitch
         if disk >= MOST_AIRY:
             return None
-        change = _change(camera, lens_type, replace(blur_of(camera, lens_type), airy=0.0))
-        if prior_variance * change.mean_square > allowed:
+        change, mean_square = _change(camera, lens_type, replace(blur_of(camera, lens_type), airy=0.0))
+        if prior_variance * mean_square > allowed:
             return None
-        widest, most = max(widest, disk), max(most, change.most)
+        widest, most = max(widest, disk), max(most, change)
     why = f"the Airy disk is {widest:.2g} sensor pixels wide, and its effect is far below the noise"
     return SkippedEffect("diffraction", why, most)
 
@@ -159,15 +148,18 @@ def _negligible_aperture(
         return SkippedEffect(what, "it is in focus: all rays of a sensor point meet on the target", WHITE / 2 * falloff)
     if blur.disk >= MOST_DISK:
         return None
-    change = _change(camera, lens_type, Blur())
-    if prior_variance * change.mean_square > allowed:
+    change, mean_square = _change(camera, lens_type, Blur())
+    if prior_variance * mean_square > allowed:
         return None
     why = f"the disk of defocus is {blur.disk:.2g} pixels of f wide, and its effect is far below the noise"
-    return SkippedEffect(what, why, change.most + WHITE / 2 * falloff)
+    return SkippedEffect(what, why, change + WHITE / 2 * falloff)
 
 
-def _change(camera: Camera, lens_type: LensType, reduced: Blur) -> BlurChange:
-    """Change of a row of H, far from the target's edges, if the blur is reduced to `reduced`."""
+def _change(camera: Camera, lens_type: LensType, reduced: Blur) -> tuple[float, float]:
+    """Change of a measurement, far from the target's edges, if the blur is reduced to `reduced`.
+
+    Returns the largest change for values from 0 to 255, and the mean square for independent pixels of variance 1.
+    """
     from .blur import blur_of, matrix
 
     blur = blur_of(camera, lens_type)
@@ -177,7 +169,7 @@ def _change(camera: Camera, lens_type: LensType, reduced: Blur) -> BlurChange:
     small = replace(camera, rows=side, columns=side, types=(single,), lens_columns=None)
     row = sparse.csr_array(matrix(small, single, blur) - matrix(small, single, reduced)).data
     most = WHITE * max(float(row[row > 0].sum()), -float(row[row < 0].sum()))
-    return BlurChange(most, float(np.square(row).sum()))
+    return most, float(np.square(row).sum())
 
 
 def _illumination_change(camera: Camera, lens_type: LensType) -> float:

@@ -1,4 +1,4 @@
-"""What depth adds to the error: disparity against rays through lenses, and errors counted by distance."""
+"""Error due to depth: disparity against rays through lenses, and error by distance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SHAPE = (19, 19)
 
 
 @given(st.floats(50, 1e6), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
-def test_disparity_is_where_rays_through_the_lenses_go(z: float, slope_x: float, slope_y: float) -> None:
+def test_disparity_agrees_with_rays_through_the_lenses(z: float, slope_x: float, slope_y: float) -> None:
     """A point on the ray of a pixel of the truth, seen by every lens: where its ray meets the target's plane."""
     point = np.array([slope_x * z, slope_y * z, z])
     true = point * (CAMERA.distance / z)
@@ -41,10 +41,10 @@ def test_disparity_is_where_rays_through_the_lenses_go(z: float, slope_x: float,
 
 def test_disparity_vanishes_on_the_targets_plane_and_ends_at_the_offset() -> None:
     depth = np.array([CAMERA.distance, np.inf, np.nan])
-    for kind in CAMERA.types:
-        lenses = np.array([sub.lens for sub in CAMERA.sub_imagers if sub.type == kind])
+    for lens_type in CAMERA.types:
+        lenses = np.array([sub.lens for sub in CAMERA.sub_imagers if sub.type == lens_type])
         offset = np.sqrt((lenses**2).sum(axis=1).mean()) / CAMERA.target_pitch
-        np.testing.assert_allclose(disparity(CAMERA, depth)[kind.name], [0, offset, offset])
+        np.testing.assert_allclose(disparity(CAMERA, depth)[lens_type.name], [0, offset, offset])
 
 
 def maps() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -55,37 +55,37 @@ def maps() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64
 
 def test_bins_hold_every_pixel_once_and_their_squares_add_up() -> None:
     depth, error, variance = maps()
-    described = error_by_depth(CAMERA, depth, error, variance)
-    counts = np.array([one.pixels for one in described])
+    bins = error_by_depth(CAMERA, depth, error, variance)
+    counts = np.array([depth_bin.pixels for depth_bin in bins])
     assert counts.sum() == depth.size
     assert counts[-1] == 38
-    assert described[-1].nearest is None
-    assert counts @ [one.rms_error**2 for one in described] == pytest.approx((error**2).sum())
-    assert counts @ [one.expected_deviation**2 for one in described] == pytest.approx(variance.sum())
-    ends = [(one.nearest or 0.0, one.farthest or 0.0) for one in described[:-1]]
+    assert bins[-1].nearest is None
+    assert counts @ [depth_bin.rms_error**2 for depth_bin in bins] == pytest.approx((error**2).sum())
+    assert counts @ [depth_bin.expected_deviation**2 for depth_bin in bins] == pytest.approx(variance.sum())
+    ends = [(depth_bin.nearest or 0.0, depth_bin.farthest or 0.0) for depth_bin in bins[:-1]]
     assert ends[0][0] == np.nanmin(depth)
     assert ends[-1][1] == np.nanmax(depth)
     assert all(before[1] <= after[0] for before, after in pairwise(ends))
     widths = np.array([1 / near - 1 / far for near, far in ends])
     assert widths.max() <= (1 / np.nanmin(depth) - 1 / np.nanmax(depth)) / 10 * (1 + 1e-9)
-    json.dumps([one.plain() for one in described], allow_nan=False)
+    json.dumps([depth_bin.plain() for depth_bin in bins], allow_nan=False)
 
 
 def test_disparity_of_a_bin_is_that_of_its_sub_imagers() -> None:
     depth, error, variance = maps()
     depth[:] = 500.0
-    (one,) = error_by_depth(CAMERA, depth, error, variance)
+    (depth_bin,) = error_by_depth(CAMERA, depth, error, variance)
     lenses = np.array([sub.lens for sub in CAMERA.sub_imagers])
-    assert one.rms_disparity == pytest.approx(float(np.sqrt((lenses**2).sum(axis=1).mean())))  # Z/z - 1 = 1, 1 mm
-    assert one.nearest == one.farthest == 500
-    assert one.pixels == 361
+    assert depth_bin.rms_disparity == pytest.approx(float(np.sqrt((lenses**2).sum(axis=1).mean())))  # Z/z - 1 = 1, 1 mm
+    assert depth_bin.nearest == depth_bin.farthest == 500
+    assert depth_bin.pixels == 361
 
 
 def test_a_world_without_surfaces_has_one_bin() -> None:
     _, error, variance = maps()
-    (one,) = error_by_depth(CAMERA, np.full(SHAPE, np.nan), error, variance)
-    assert (one.nearest, one.farthest, one.pixels) == (None, None, 361)
-    assert rows([one])[0][0] == "no surface"
+    (depth_bin,) = error_by_depth(CAMERA, np.full(SHAPE, np.nan), error, variance)
+    assert (depth_bin.nearest, depth_bin.farthest, depth_bin.pixels) == (None, None, 361)
+    assert rows([depth_bin])[0][0] == "no surface"
 
 
 def test_maps_of_different_shapes_are_refused() -> None:
@@ -111,7 +111,7 @@ def test_a_figure_is_drawn(tmp_path: Path, distance: float | None) -> None:
     assert drawn.std() > 5
 
 
-def test_a_runs_files_are_enough(tmp_path: Path) -> None:
+def test_the_error_of_a_run_comes_from_its_files(tmp_path: Path) -> None:
     depth, error, variance = maps()
     truth = RNG.uniform(0, 255, SHAPE)
     maps_of = {"estimate": truth + error, "truth": truth, "variance": variance}
@@ -119,7 +119,9 @@ def test_a_runs_files_are_enough(tmp_path: Path) -> None:
     write_truth(tmp_path / TRUTH, truth)
     assert depth_error_of_run(tmp_path, CAMERA) == ()
     write_truth(tmp_path / TRUTH, truth, depth)
-    found, expected = depth_error_of_run(tmp_path, CAMERA), error_by_depth(CAMERA, depth, error, variance)
-    assert [one.pixels for one in found] == [one.pixels for one in expected]
-    assert [one.rms_error for one in found] == pytest.approx([one.rms_error for one in expected], rel=1e-5)
+    bins, expected = depth_error_of_run(tmp_path, CAMERA), error_by_depth(CAMERA, depth, error, variance)
+    assert [depth_bin.pixels for depth_bin in bins] == [depth_bin.pixels for depth_bin in expected]
+    assert [depth_bin.rms_error for depth_bin in bins] == pytest.approx(
+        [depth_bin.rms_error for depth_bin in expected], rel=1e-5
+    )
     assert (tmp_path / PICTURE).is_file()

@@ -1,4 +1,4 @@
-"""Estimators that expect misalignment, as a scene asks for them; and studies of several ideas of H."""
+"""Estimators that expect misalignment, and studies of several models of H."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from ommatid.analysis import run_table, study
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
@@ -31,14 +31,14 @@ SMOOTH = {"kind": "exponential", "correlation_length": "25 mm"}
 
 
 def misaligned(how: str = "trust", shape: tuple[int, int] = (18, 18), **tables: Any) -> Scene:
-    told = {"prior": SMOOTH, "noise": {"variance": 1e-2}, "estimator": {"misalignment": how}, **tables}
-    data = scene(shape, ONE, **told).plain()
+    tables = {"prior": SMOOTH, "noise": {"variance": 1e-2}, "estimator": {"misalignment": how}, **tables}
+    data = scene(shape, ONE, **tables).plain()
     data["camera"]["tolerance"] = {"position": "300 nm"}
     return parse(data, Path("test.toml"))
 
 
-def recorded(described: Scene) -> tuple[Stack, Model, NDArray[np.float64]]:
-    """What the misaligned camera records, and the H of the one that was drawn."""
+def recorded(described: Scene) -> tuple[Stack, Model, FloatArray]:
+    """The stack of the misaligned camera, H as designed, and the truth."""
     camera, truth = derive(described), load(described).ravel()
     noise = np.random.default_rng(4).normal(0, 0.1, camera.measurements)
     values = true_matrix(camera) @ truth + noise
@@ -52,33 +52,33 @@ def restored(how: str) -> Reconstruction:
     return restore(*recorded(misaligned(how)))
 
 
-def test_what_a_misaligned_camera_costs_and_what_helps() -> None:
-    """On trust the promise is broken; robust and fitted keep theirs, and fitting comes near the true H."""
-    found = {how: restored(how) for how in ("trust", "robust", "fit")}
+def test_a_misaligned_camera_with_each_estimator() -> None:
+    """With H as designed the error leaves its interval; with a fitted H it is inside, close to that of the true H."""
+    restorations = {how: restored(how) for how in ("trust", "robust", "fit")}
     stack, model, truth = recorded(misaligned())
     camera = derive(misaligned())
     best = restore(stack, exact_model(stack.scene, camera, true_matrix(camera), "true"), truth)
-    errors = {how: one.error.mse for how, one in found.items() if one.error is not None}
+    errors = {how: one.error.mse for how, one in restorations.items() if one.error is not None}
     assert best.error is not None
-    assert found["trust"].interval is not None
-    assert errors["trust"] > found["trust"].interval.high
-    assert errors["robust"] < found["robust"].expected.mse * 1.5
-    assert found["fit"].interval is not None
-    assert errors["fit"] < found["fit"].interval.high
+    assert restorations["trust"].interval is not None
+    assert errors["trust"] > restorations["trust"].interval.high
+    assert errors["robust"] < restorations["robust"].expected.mse * 1.5
+    assert restorations["fit"].interval is not None
+    assert errors["fit"] < restorations["fit"].interval.high
     assert errors["fit"] < 0.5 * errors["trust"]
     assert errors["fit"] < 1.5 * best.error.mse
     for how in ("robust", "fit"):
-        assert sum(found[how].budget().values()) == pytest.approx(found[how].expected.mse, rel=1e-6)
-        assert found[how].budget()["misalignment"] > 0
-        assert found[how].choice.method == how
-        lines = dict(run_table.rows(report_of(stack, model, found[how])))
+        assert sum(restorations[how].budget().values()) == pytest.approx(restorations[how].expected.mse, rel=1e-6)
+        assert restorations[how].budget()["misalignment"] > 0
+        assert restorations[how].choice.method == how
+        lines = dict(run_table.rows(report_of(stack, model, restorations[how])))
         assert "    from misalignment" in lines
-    residual = found["robust"].residual
+    residual = restorations["robust"].residual
     assert residual is not None
     assert residual.chi_squared < residual.expected + 4 * residual.deviation
 
 
-def test_a_region_knows_of_misalignment() -> None:
+def test_the_deviation_of_a_region_includes_misalignment() -> None:
     fitted = restored("fit")
     mean, deviation = fitted.region((4, 4), (6, 6))
     assert fitted.truth is not None
@@ -86,7 +86,7 @@ def test_a_region_knows_of_misalignment() -> None:
 
 
 @pytest.mark.parametrize("how", ["robust", "fit"])
-def test_what_cannot_be_done_is_refused_in_a_sentence(how: str) -> None:
+def test_unsuitable_cameras_are_refused(how: str) -> None:
     plain = scene((18, 18), ONE, estimator={"misalignment": how})
     with pytest.raises(InputError, match=r"needs to know what may be misaligned, got no \[camera.tolerance\]"):
         restore(Stack(plain, derive(plain), np.zeros(576), np.ones(576), {}), ideal_model(plain, derive(plain)))
@@ -96,25 +96,25 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(how: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("keys", "message"),
     [
         ({"method": "tiles"}, "takes a dense form, got estimator.method 'tiles'"),
         ({"memory": "1 MB"}, "are allowed; raise estimator.memory"),
     ],
 )
-def test_other_keys_of_the_estimator_still_count(told: dict[str, Any], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        restore(*recorded(misaligned(estimator={"misalignment": "robust", **told})))
+def test_other_keys_of_the_estimator_are_obeyed(keys: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        restore(*recorded(misaligned(estimator={"misalignment": "robust", **keys})))
 
 
-def test_a_calibrated_h_is_not_thrown_away_in_silence() -> None:
+def test_a_calibrated_h_is_refused() -> None:
     stack, model, truth = recorded(misaligned("fit"))
     calibrated = replace(model, record={**model.record, "method": "points"})
     with pytest.raises(InputError, match="starts from H as designed, got a calibrated one"):
         restore(stack, calibrated, truth)
 
 
-def test_a_study_that_cannot_end_does_not_begin() -> None:
+def test_an_impossible_study_is_refused_before_it_starts() -> None:
     for models, lens, words in (
         (["ideal", "fitted"], {"aperture": "0.4 mm", "focus": "600 mm"}, "serves pinholes and thin lenses in focus"),
         (["ideal", "true"], {"aperture": "0.4 mm", "focus": "600 mm"}, "the 'true' H of misaligned lenses"),
@@ -127,7 +127,7 @@ def test_a_study_that_cannot_end_does_not_begin() -> None:
             study.check_study(described, derive(described))
 
 
-def test_a_study_is_kept_and_told(tmp_path: Path) -> None:
+def test_a_study_is_cached_and_printed(tmp_path: Path) -> None:
     stack, model, truth = recorded(misaligned())
     made: list[str] = []
 
@@ -139,7 +139,7 @@ def test_a_study_is_kept_and_told(tmp_path: Path) -> None:
     cases, fresh = study.cached_study(tmp_path, stack, models, truth)
     assert (fresh, made) == (True, ["ideal", "robust", "true"])
     assert study.cached_study(tmp_path, stack, models, truth) == (cases, False)
-    assert len(made) == 3, "nothing is made again"
+    assert len(made) == 3, "no model is made again"
     rows = dict(study.rows(cases))
     assert "OUTSIDE" in rows["the ideal H"]
     assert "inside" in rows["the true H"]
@@ -152,7 +152,7 @@ def test_a_study_is_kept_and_told(tmp_path: Path) -> None:
 
 
 def test_a_study_from_the_command_line(tmp_path: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Real lenses: the ideal H promises what it does not keep, and point sources and transport give the same."""
+    """Real lenses: point sources and transport give the same error."""
     needs("llvm_ad_mono")
     monkeypatch.chdir(tmp_path)
     lens = {"aperture": "0.4 mm", "focus": "600 mm"}
@@ -163,9 +163,9 @@ def test_a_study_from_the_command_line(tmp_path: Path, ommatid: Command, monkeyp
     from ommatid.scenes.scene import write
 
     write(tmp_path / "lens.toml", parse(data, tmp_path / "lens.toml"))
-    found = document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]
-    by_name = {case["model"]: case for case in found["study"]}
+    report = document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]
+    by_name = {case["model"]: case for case in report["study"]}
     assert by_name["points"]["mse"] == pytest.approx(by_name["transport"]["mse"], rel=1e-9)
     kept = json.loads((tmp_path / "out" / "lens" / "run.json").read_text(encoding="utf-8"))
-    assert kept["study"] == found["study"]
-    assert document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]["study"] == found["study"]
+    assert kept["study"] == report["study"]
+    assert document(ommatid("run", "lens.toml", "-o", "out", "--json"))[0]["study"] == report["study"]

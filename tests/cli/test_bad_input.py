@@ -1,4 +1,4 @@
-"""Whatever is wrong with the input: one sentence that helps, the right exit code, and no file left behind."""
+"""Invalid input yields one sentence, exit code 2, and no new file."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ RUN = ("run", "tiny.toml", "-o", "new")
 RECONSTRUCT = ("reconstruct", "out/tiny/stack.exr", "out/tiny/model.npz", "-o", "new.exr")
 
 
-def nothing(folder: Path) -> None:
-    """The files are fine; it is the command that is not."""
+def unchanged(folder: Path) -> None:
+    """Leave the files as they are, where the command itself is wrong."""
     del folder
 
 
 @dataclass(frozen=True)
 class Case:
-    """A command that has to be refused, words that its one sentence has to contain, and what was done to the files."""
+    """A command that must be refused, words of its error message, and the preparation of the files."""
 
     name: str
     arguments: tuple[str, ...]
     words: tuple[str, ...]
-    prepare: Callable[[Path], None] = nothing
+    prepare: Callable[[Path], None] = unchanged
 
 
-def told(setting: str, *words: str) -> Case:
-    """A run of the tiny scene with one key changed on the command line."""
-    return Case(setting, (*RUN, "--set", setting), words)
+def setting(change: str, *words: str) -> Case:
+    """Run the tiny scene with one key changed on the command line."""
+    return Case(change, (*RUN, "--set", change), words)
 
 
-def text(old: str, new: str, *words: str) -> Case:
-    """A run of the tiny scene with another text in its file."""
+def edited(old: str, new: str, *words: str) -> Case:
+    """Run the tiny scene with a part of its file replaced."""
     assert old in TINY
 
     def prepare(folder: Path) -> None:
@@ -49,7 +49,7 @@ def text(old: str, new: str, *words: str) -> Case:
 
 
 def picture(name: str, fill: Callable[[Path], None], *words: str) -> Case:
-    """A run with a whole picture of one's own as its target."""
+    """Run with the picture that `fill` writes as the whole target."""
     settings = ("--set", f"target.image={name}", "--set", "target.origin=")
     return Case(f"picture {name}", (*RUN, *settings), words, lambda folder: fill(folder / name))
 
@@ -69,7 +69,7 @@ def with_nan(path: Path) -> None:
 
 
 def cut(name: str, part: float) -> Callable[[Path], None]:
-    """Keep the first part of a file, as a copy that was interrupted does."""
+    """Truncate a file, as an interrupted copy does."""
 
     def prepare(folder: Path) -> None:
         whole = (folder / name).read_bytes()
@@ -78,28 +78,28 @@ def cut(name: str, part: float) -> Callable[[Path], None]:
     return prepare
 
 
-def flip(name: str, place: int) -> Callable[[Path], None]:
-    """Flip a bit of one byte, counted from the end."""
+def flip(name: str, offset: int) -> Callable[[Path], None]:
+    """Flip a bit of one byte; `offset` counts from the end."""
 
     def prepare(folder: Path) -> None:
         altered = bytearray((folder / name).read_bytes())
-        altered[-place] ^= 4
+        altered[-offset] ^= 4
         (folder / name).write_bytes(altered)
 
     return prepare
 
 
-class _Trap:
-    """Pickled, it writes a file when somebody loads it."""
+class _WritesFile:
+    """Writes a file when it is unpickled."""
 
     def __reduce__(self) -> tuple[Callable[..., None], tuple[Path, bytes]]:
-        return Path.write_bytes, (Path("sprung"), b"")  # type: ignore[return-value]
+        return Path.write_bytes, (Path("unpickled"), b"")  # type: ignore[return-value]
 
 
 def pickled(folder: Path) -> None:
-    trap = np.array([_Trap()], dtype=object)
+    array = np.array([_WritesFile()], dtype=object)
     names = ("indices", "indptr", "data", "shape", "variance", "batches", "ommatid")
-    np.savez(folder / "out/tiny/model.npz", **dict.fromkeys(names, trap))  # type: ignore[arg-type]
+    np.savez(folder / "out/tiny/model.npz", **dict.fromkeys(names, array))  # type: ignore[arg-type]
 
 
 def other_arrays(folder: Path) -> None:
@@ -111,11 +111,11 @@ def one_array(folder: Path) -> None:
         np.save(stream, np.eye(3))
 
 
-def latin(folder: Path) -> None:
+def latin_1(folder: Path) -> None:
     (folder / "tiny.toml").write_bytes(TINY.replace("Tiny", "Für Käfer").encode("latin-1"))
 
 
-def gone(name: str) -> Callable[[Path], None]:
+def removed(name: str) -> Callable[[Path], None]:
     return lambda folder: (folder / name).unlink()
 
 
@@ -128,63 +128,63 @@ pixels = [3, 3]
 [noise]"""
 
 KEYS = [
-    text("[render]", "[render]\nsede = 1", "'render.sede'", "'render.seed'"),
-    text('distance = "1 m"', 'distnace = "1 m"', "unknown key 'target.distnace'", "'target.distance'"),
-    text("[noise]", "[nois]", "unknown key 'nois'", "'noise'"),
-    text("[noise]", '[noise]\n"read noise" = 1', "unknown key 'noise.read noise'"),
-    text("array = [3, 3]", "arrays = [3, 3]", "unknown key 'camera.lens.I.arrays'", "'camera.lens.array'"),
-    text('distance = "1 m"', "", "'target.distance' is missing"),
-    text("[noise]", SECOND_LENS, "camera", "'I' twice"),
-    text("samples = 16", "samples = 8", "render.samples", "16", "got 8"),
-    text("variance = 1e-2", "variance = ", "not valid TOML"),
-    text("[target]", "[target", "TOML"),
+    edited("[render]", "[render]\nsede = 1", "'render.sede'", "'render.seed'"),
+    edited('distance = "1 m"', 'distnace = "1 m"', "unknown key 'target.distnace'", "'target.distance'"),
+    edited("[noise]", "[nois]", "unknown key 'nois'", "'noise'"),
+    edited("[noise]", '[noise]\n"read noise" = 1', "unknown key 'noise.read noise'"),
+    edited("array = [3, 3]", "arrays = [3, 3]", "unknown key 'camera.lens.I.arrays'", "'camera.lens.array'"),
+    edited('distance = "1 m"', "", "'target.distance' is missing"),
+    edited("[noise]", SECOND_LENS, "camera", "'I' twice"),
+    edited("samples = 16", "samples = 8", "render.samples", "16", "got 8"),
+    edited("variance = 1e-2", "variance = ", "not valid TOML"),
+    edited("[target]", "[target", "TOML"),
 ]
 
 VALUES = [
-    told("target.distance=1", "target.distance", "length with its unit", "bare number 1"),
-    told("target.distance='1'", "target.distance", "length with its unit"),
-    told("target.distance=1 s", "target.distance", "length with its unit", "'1 s'"),
-    told("target.distance=1 parsnip", "target.distance", "'1 parsnip'"),
-    told("target.distance=0 m", "target.distance", "above zero"),
-    told("target.distance=-1 m", "target.distance", "above zero"),
-    told("camera.pixel_pitch=true", "camera.pixel_pitch", "length with its unit"),
-    told("camera.lens.I.magnification=2", "camera.lens.I.magnification", "at most 1", "got 2"),
-    told("camera.lens.I.magnification=0", "camera.lens.I.magnification", "above 0", "got 0"),
-    told("camera.lens.I.magnification='-1/3'", "camera.lens.I.magnification", "above 0"),
-    told("camera.lens.I.magnification='abc'", "camera.lens.I.magnification", "ratio", "'abc'"),
-    told("camera.lens.I.magnification='1/0'", "camera.lens.I.magnification", "ratio", "'1/0'"),
-    told("camera.lens.I.array=[13,3]", "camera.lens.I.array", "13 x 3", "12 x 12"),
-    told("camera.lens.I.array=[3,true]", "camera.lens.I.array", "integer"),
-    told("camera.lens.I.array=[0,3]", "camera.lens.I.array", "got 0"),
-    told("camera.lens.I.array=[3]", "camera.lens.I.array"),
-    told("camera.lens.I.pixels=[4,3]", "camera.lens.I.pixels", "4 x 3", "at most 3 x 3"),
-    told("camera.lens.I.pixels='fill'", "camera.lens.I.pixels", '"fit"'),
-    told("camera.lens.I.step=-1", "camera.lens.I.step", "0 or more"),
-    told("camera.lens.I.name='I.b'", "name", "'I.b'"),
-    told("camera.lens.I.name=[1]", "name"),
-    told("camera.lens=[]", "camera.lens"),
-    told("camera.lens_pitch=10 um", "camera.lens_pitch", "I.00.00", "overlap"),
-    told("noise.bits=true", "noise.bits", "integer", "True"),
-    told("noise.bits=0", "noise.bits", "got 0"),
-    told("noise.variance=-1", "noise.variance", "got -1"),
-    told("noise.variance=nan", "noise.variance", "finite"),
-    told("prior.variance=0", "prior.variance", "got 0"),
-    told("render.seed=true", "render.seed", "integer", "True"),
-    told("render.seed=1.5", "render.seed", "integer", "1.5"),
-    told("render.samples=8", "render.samples", "16", "got 8"),
-    told("render.variant='fast'", "render.variant", "'scalar_rgb'", "'fast'"),
-    told("target.image=5", "target.image", "string", "got 5"),
-    told("target.shape=[0,12]", "target.shape", "got 0"),
-    told("target=", "'target' is missing"),
+    setting("target.distance=1", "target.distance", "length with its unit", "bare number 1"),
+    setting("target.distance='1'", "target.distance", "length with its unit"),
+    setting("target.distance=1 s", "target.distance", "length with its unit", "'1 s'"),
+    setting("target.distance=1 parsnip", "target.distance", "'1 parsnip'"),
+    setting("target.distance=0 m", "target.distance", "above zero"),
+    setting("target.distance=-1 m", "target.distance", "above zero"),
+    setting("camera.pixel_pitch=true", "camera.pixel_pitch", "length with its unit"),
+    setting("camera.lens.I.magnification=2", "camera.lens.I.magnification", "at most 1", "got 2"),
+    setting("camera.lens.I.magnification=0", "camera.lens.I.magnification", "above 0", "got 0"),
+    setting("camera.lens.I.magnification='-1/3'", "camera.lens.I.magnification", "above 0"),
+    setting("camera.lens.I.magnification='abc'", "camera.lens.I.magnification", "ratio", "'abc'"),
+    setting("camera.lens.I.magnification='1/0'", "camera.lens.I.magnification", "ratio", "'1/0'"),
+    setting("camera.lens.I.array=[13,3]", "camera.lens.I.array", "13 x 3", "12 x 12"),
+    setting("camera.lens.I.array=[3,true]", "camera.lens.I.array", "integer"),
+    setting("camera.lens.I.array=[0,3]", "camera.lens.I.array", "got 0"),
+    setting("camera.lens.I.array=[3]", "camera.lens.I.array"),
+    setting("camera.lens.I.pixels=[4,3]", "camera.lens.I.pixels", "4 x 3", "at most 3 x 3"),
+    setting("camera.lens.I.pixels='fill'", "camera.lens.I.pixels", '"fit"'),
+    setting("camera.lens.I.step=-1", "camera.lens.I.step", "0 or more"),
+    setting("camera.lens.I.name='I.b'", "name", "'I.b'"),
+    setting("camera.lens.I.name=[1]", "name"),
+    setting("camera.lens=[]", "camera.lens"),
+    setting("camera.lens_pitch=10 um", "camera.lens_pitch", "I.00.00", "overlap"),
+    setting("noise.bits=true", "noise.bits", "integer", "True"),
+    setting("noise.bits=0", "noise.bits", "got 0"),
+    setting("noise.variance=-1", "noise.variance", "got -1"),
+    setting("noise.variance=nan", "noise.variance", "finite"),
+    setting("prior.variance=0", "prior.variance", "got 0"),
+    setting("render.seed=true", "render.seed", "integer", "True"),
+    setting("render.seed=1.5", "render.seed", "integer", "1.5"),
+    setting("render.samples=8", "render.samples", "16", "got 8"),
+    setting("render.variant='fast'", "render.variant", "'scalar_rgb'", "'fast'"),
+    setting("target.image=5", "target.image", "string", "got 5"),
+    setting("target.shape=[0,12]", "target.shape", "got 0"),
+    setting("target=", "'target' is missing"),
 ]
 
 PICTURES = [
-    told("target.image=none.png", "target.image", "none.png", "no picture"),
-    told("target.image='photo:nobody'", "target.image", "'photo:nobody'", "camera"),
-    told("target.image=tiny.toml", "target.image", "tiny.toml", "PNG"),
-    told("target.origin=[505,0]", "target.origin", "[505, 0]", "512 x 512"),
-    told("target.origin=[-1,0]", "target.origin", "got -1"),
-    told("target.origin=", "target.shape", "12 x 12", "512 x 512", "target.origin"),
+    setting("target.image=none.png", "target.image", "none.png", "no picture"),
+    setting("target.image='photo:nobody'", "target.image", "'photo:nobody'", "camera"),
+    setting("target.image=tiny.toml", "target.image", "tiny.toml", "PNG"),
+    setting("target.origin=[505,0]", "target.origin", "[505, 0]", "512 x 512"),
+    setting("target.origin=[-1,0]", "target.origin", "got -1"),
+    setting("target.origin=", "target.shape", "12 x 12", "512 x 512", "target.origin"),
     Case(
         "an empty crop",
         (*RUN, "--set", "target.origin=[512,0]", "--set", "target.shape="),
@@ -199,7 +199,7 @@ PICTURES = [
     picture("complex.npy", save(np.ones((12, 12), complex)), "complex128"),
     picture("cube.npy", save(np.ones((12, 12, 7))), "(12, 12, 7)"),
     picture("empty.npy", save(np.ones((0, 12))), "(0, 12)"),
-    picture("object.npy", save(np.array([[_Trap()]], dtype=object)), "could not be read as a picture"),
+    picture("object.npy", save(np.array([[_WritesFile()]], dtype=object)), "could not be read as a picture"),
     Case(
         "a picture cut short",
         (*RUN, "--set", "target.image=out/tiny/overview.png"),
@@ -211,19 +211,19 @@ PICTURES = [
 FILES = [
     Case("a missing scene", ("run", "none.toml", "-o", "new"), ("none.toml", "ommatid init")),
     Case("a folder for a scene", ("run", "out", "-o", "new"), ("out", "scene file")),
-    Case("a scene that is not UTF-8", RUN, ("tiny.toml", "utf-8"), latin),
+    Case("a scene that is not UTF-8", RUN, ("tiny.toml", "utf-8"), latin_1),
     *[
         Case(f"a stack cut at {part}", RECONSTRUCT, ("out/tiny/stack.exr",), cut("out/tiny/stack.exr", part))
         for part in (0, 0.01, 0.1, 0.3, 0.6, 0.9, 0.97, 0.999)
     ],
     *[
         Case(
-            f"a stack altered {place} bytes from its end",
+            f"a stack altered {offset} bytes from its end",
             RECONSTRUCT,
             ("stack.exr",),
-            flip("out/tiny/stack.exr", place),
+            flip("out/tiny/stack.exr", offset),
         )
-        for place in (1, 20, 40, 75)  # the pixels of the last sub-image, compressed
+        for offset in (1, 20, 40, 75)  # the pixels of the last sub-image, compressed
     ],
     *[
         Case(f"a model cut at {part}", RECONSTRUCT, ("out/tiny/model.npz",), cut("out/tiny/model.npz", part))
@@ -231,18 +231,18 @@ FILES = [
     ],
     *[
         Case(
-            f"a model altered {place} bytes from its end",
+            f"a model altered {offset} bytes from its end",
             RECONSTRUCT,
             ("model.npz",),
-            flip("out/tiny/model.npz", place),
+            flip("out/tiny/model.npz", offset),
         )
-        for place in (1200, 2000, 4000)
+        for offset in (1200, 2000, 4000)
     ],
     Case("a model with pickled objects", RECONSTRUCT, ("out/tiny/model.npz", "pickled"), pickled),
     Case("another kind of .npz", RECONSTRUCT, ("out/tiny/model.npz", "a model that ommatid wrote"), other_arrays),
     Case("an array that is no archive", RECONSTRUCT, ("out/tiny/model.npz", "a model that ommatid wrote"), one_array),
-    Case("a missing stack", RECONSTRUCT, ("out/tiny/stack.exr", "no such file"), gone("out/tiny/stack.exr")),
-    Case("a missing model", RECONSTRUCT, ("out/tiny/model.npz", "no such file"), gone("out/tiny/model.npz")),
+    Case("a missing stack", RECONSTRUCT, ("out/tiny/stack.exr", "no such file"), removed("out/tiny/stack.exr")),
+    Case("a missing model", RECONSTRUCT, ("out/tiny/model.npz", "no such file"), removed("out/tiny/model.npz")),
     Case(
         "a model for a stack",
         ("reconstruct", "out/tiny/model.npz", "out/tiny/model.npz", "-o", "new.exr"),
@@ -263,9 +263,9 @@ FILES = [
 OPTIONS = [
     Case("--set without =", (*RUN, "--set", "noise.variance"), ("--set noise.variance", "KEY=VALUE")),
     Case("--set without a key", (*RUN, "--set", "=1"), ("--set =1", "KEY=VALUE")),
-    told("camera.lens.X.step=1", "no lens type is called 'X'", "'I'"),
-    told("title.x=1", "title"),
-    told("noise.varaince=1", "unknown key 'noise.varaince'", "'noise.variance'"),
+    setting("camera.lens.X.step=1", "no lens type is called 'X'", "'I'"),
+    setting("title.x=1", "title"),
+    setting("noise.varaince=1", "unknown key 'noise.varaince'", "'noise.variance'"),
     Case("--lens with an unknown name", (*RUN, "--lens", "I,X"), ("--lens I,X", "no lens type is called 'X'", "'I'")),
     Case("--lens for a stack without it", (*RECONSTRUCT, "--lens", "X"), ("--lens X", "I")),
     *[
@@ -295,9 +295,9 @@ OPTIONS = [
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, hidden ones too, and every folder."""
-    found = sorted(folder.rglob("*"))
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in found}
+    """Return every file and folder below a folder, hidden ones included, with its bytes."""
+    paths = sorted(folder.rglob("*"))
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
 
 
 def assert_refused(ended: Ended, *words: str, code: int = 2) -> None:
@@ -311,7 +311,7 @@ def assert_refused(ended: Ended, *words: str, code: int = 2) -> None:
 
 
 @pytest.mark.parametrize("case", [*KEYS, *VALUES, *PICTURES, *FILES, *OPTIONS], ids=lambda case: case.name)
-def test_one_sentence_and_nothing_left_behind(case: Case, here: Path, kept: Path, ommatid: Command) -> None:
+def test_invalid_input_yields_one_sentence_and_no_file(case: Case, here: Path, kept: Path, ommatid: Command) -> None:
     assert kept.is_dir()
     case.prepare(here)
     before = contents(here)
@@ -319,16 +319,16 @@ def test_one_sentence_and_nothing_left_behind(case: Case, here: Path, kept: Path
     assert contents(here) == before
 
 
-def test_the_trap_in_the_pickles_works(here: Path, kept: Path) -> None:
+def test_the_pickled_file_would_run_code_if_it_were_loaded(here: Path, kept: Path) -> None:
     pickled(here)
-    with np.load(kept / "model.npz", allow_pickle=True) as trapped:
-        assert trapped["data"].size == 1
-    assert (here / "sprung").exists()
+    with np.load(kept / "model.npz", allow_pickle=True) as archive:
+        assert archive["data"].size == 1
+    assert (here / "unpickled").exists()
 
 
 @pytest.mark.parametrize("name", ["note.png", "note.jpg"])
-def test_a_text_called_a_picture(name: str, here: Path) -> None:
-    # The decoders that try their luck leave the file open: a process of its own, where nobody minds.
+def test_a_text_file_with_the_suffix_of_a_picture_is_refused(name: str, here: Path) -> None:
+    # In a process of its own, since decoders that fail leave the file open, which is a warning here.
     note(here / name)
     before = contents(here)
     ended = shell(*RUN, "--set", f"target.image={name}", cwd=here)
@@ -349,7 +349,7 @@ def test_a_text_called_a_picture(name: str, here: Path) -> None:
         ("target.distance=2 m", "target.distance"),
     ],
 )
-def test_a_stack_and_a_model_that_do_not_belong_together(
+def test_a_stack_and_a_model_of_different_cameras_are_refused(
     setting: str, key: str, here: Path, kept: Path, ommatid: Command
 ) -> None:
     options = ("--set", "calibration.method=ideal", "--set", setting)
@@ -360,7 +360,7 @@ def test_a_stack_and_a_model_that_do_not_belong_together(
     assert contents(here) == before
 
 
-def test_one_model_serves_stacks_of_other_pictures_noise_and_seeds(here: Path, kept: Path, ommatid: Command) -> None:
+def test_a_model_fits_stacks_of_other_pictures_noise_and_seeds(here: Path, kept: Path, ommatid: Command) -> None:
     other = ("target.origin=[10,20]", "noise.bits=8", "render.seed=5", "prior.mean=100", "title=Other")
     settings = [word for setting in other for word in ("--set", setting)]
     assert ommatid("render", "tiny.toml", "-o", "new", *settings).code == 0
@@ -368,13 +368,13 @@ def test_one_model_serves_stacks_of_other_pictures_noise_and_seeds(here: Path, k
 
 
 def full_after(size: int) -> str:
-    """Python that lets no file of its process grow beyond a size, as a disk without room does."""
+    """Return Python code that limits the size of files, as a full disk does."""
     return f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))"
 
 
-def test_a_full_disk_for_the_stack_leaves_the_old_one(here: Path, kept: Path) -> None:
+def test_a_full_disk_leaves_the_old_stack(here: Path, kept: Path) -> None:
     old = contents(kept)
-    room = max(len(old["scene.toml"]), len(old["truth.exr"])) + 100  # they come first, and find their place
+    room = max(len(old["scene.toml"]), len(old["truth.exr"])) + 100  # written first, and small enough
     assert room < len(old["stack.exr"])
     arguments = ("render", "tiny.toml", "-o", "out", "--set", "render.seed=1")
     ended = shell(*arguments, cwd=here, before=full_after(room))
@@ -405,12 +405,12 @@ def test_a_full_disk_leaves_no_file(arguments: tuple[str, ...], file: str, room:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 @pytest.mark.parametrize("options", [(), ("--json",)], ids=["table", "json"])
-def test_a_full_disk_for_what_is_printed(options: tuple[str, ...], here: Path) -> None:
+def test_output_that_cannot_be_printed_is_an_error(options: tuple[str, ...], here: Path) -> None:
     before = "import os; os.dup2(os.open('/dev/full', os.O_WRONLY), 1)"
     assert_refused(shell("show", "tiny.toml", *options, cwd=here, before=before), "No space left", code=1)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_may_not_be_written_to(here: Path, ommatid: Command) -> None:
+def test_a_folder_without_write_permission_is_refused(here: Path, ommatid: Command) -> None:
     (here / "locked").mkdir(mode=0o500)
     assert_refused(ommatid("run", "tiny.toml", "-o", "locked"), "locked", "could not be created", code=1)

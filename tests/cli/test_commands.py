@@ -1,4 +1,4 @@
-"""The command line as a user meets it: what it prints, what it writes, what it does not do twice."""
+"""The commands: their output, the files of a run, and the reuse of finished stages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def assert_same_light(one: Path, other: Path) -> None:
     np.testing.assert_array_equal(first.variance, second.variance)
 
 
-# --- what is printed
+# --- output
 
 
 @pytest.mark.parametrize("option", ["--help", "-h"])
@@ -47,7 +47,7 @@ def test_help_lists_every_command_and_loads_nothing_heavy(option: str, tmp_path:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_says_what_it_does(command: str, ommatid: Command) -> None:
+def test_every_command_has_help(command: str, ommatid: Command) -> None:
     ended = ommatid(command, "--help")
     assert ended.code == 0
     assert "--json" in ended.out
@@ -90,8 +90,8 @@ def arguments(command: str, finished: Path) -> list[str | Path]:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_json_is_all_there_is_on_stdout(command: str, here: Path, finished: Path) -> None:
-    # A new process: libraries like to greet when they are loaded, and to say goodbye when they are unloaded.
+def test_json_is_the_only_output_on_stdout(command: str, here: Path, finished: Path) -> None:
+    # A new process, since libraries may print when they are loaded and unloaded.
     ended = shell(*arguments(command, finished), "--json", cwd=here)
     assert isinstance(document(ended), list if command in ("run", "render") else dict)
     assert "Traceback" not in ended.err
@@ -116,7 +116,7 @@ def test_a_title_is_printed_as_it_is(title: str, here: Path, ommatid: Command) -
     assert title in ended.out
 
 
-def test_show_names_what_is_left_out_and_what_is_not_seen(here: Path, ommatid: Command) -> None:
+def test_show_lists_skipped_effects_and_unseen_pixels(here: Path, ommatid: Command) -> None:
     assert here.is_dir()
     shown = document(ommatid("show", "tiny.toml", "--json", "--set", "noise="))
     assert "sensor noise and quantisation" in [skip["what"] for skip in shown["skipped"]]
@@ -130,7 +130,7 @@ def test_lens_keeps_types_and_takes_one_named_twice_twice(ommatid: Command) -> N
     assert [kind["name"] for kind in shown["lens_types"]] == ["III", "I", "III-2"]
 
 
-# --- what is imported
+# --- imports
 
 
 @pytest.mark.parametrize("command", ["predict", "reconstruct"])
@@ -139,7 +139,7 @@ def test_works_where_mitsuba_is_not_installed(command: str, here: Path, finished
     assert ended.code == 0, ended.err
 
 
-def test_the_trap_for_imports_works(here: Path) -> None:
+def test_the_import_check_detects_mitsuba(here: Path) -> None:
     ended = shell("render", "tiny.toml", "-o", "out", cwd=here, before=without("mitsuba", "drjit"))
     assert ended.code == FORBIDDEN
 
@@ -168,18 +168,18 @@ def test_run_json_keeps_the_contract(finished: Path) -> None:
     assert run["seeds"]
 
 
-def test_run_json_says_what_the_pictures_say(finished: Path) -> None:
+def test_run_json_agrees_with_the_images(finished: Path) -> None:
     error = json.loads((finished / "run.json").read_text(encoding="utf-8"))["error"]
-    found = {name: pixels.astype(np.float64) for name, pixels in channels(finished / "estimate.exr").items()}
-    measured = float(np.mean((found["estimate"] - found["truth"]) ** 2))
+    maps = {name: pixels.astype(np.float64) for name, pixels in channels(finished / "estimate.exr").items()}
+    measured = float(np.mean((maps["estimate"] - maps["truth"]) ** 2))
     single = 1e-5  # float32 keeps seven digits, of values that are some times larger than their differences
     assert error["mse"] == pytest.approx(measured, rel=single)
     assert error["psnr"] == pytest.approx(10 * np.log10(255**2 / measured), rel=single)
-    assert error["predicted_mse"] == pytest.approx(found["variance"].mean(), rel=single)
-    np.testing.assert_array_equal(found["truth"], channels(finished / "truth.exr")["Y"])
+    assert error["predicted_mse"] == pytest.approx(maps["variance"].mean(), rel=single)
+    np.testing.assert_array_equal(maps["truth"], channels(finished / "truth.exr")["Y"])
 
 
-def test_the_scene_in_the_folder_makes_the_same_stack_again(here: Path, finished: Path, ommatid: Command) -> None:
+def test_the_scene_in_the_folder_reproduces_the_stack(here: Path, finished: Path, ommatid: Command) -> None:
     for name in ("scene.toml", "truth.exr"):
         shutil.copy(finished / name, here / name)
     assert ommatid("render", "scene.toml", "-o", "again").code == 0
@@ -206,7 +206,7 @@ def test_reconstruct_without_the_truth_gives_the_same_estimate(here: Path, finis
     np.testing.assert_array_equal(after["estimate"], channels(finished / "estimate.exr")["estimate"])
 
 
-# --- what is not done twice
+# --- reuse of finished stages
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -214,19 +214,19 @@ def stamps(folder: Path) -> dict[str, int]:
 
 
 def done(ended: Ended) -> dict[str, bool]:
-    """Which stages had to be done, by what stderr says."""
+    """Return which stages were done rather than up to date, from stderr."""
     assert ended.code == 0, ended.err
     lines = dict(line.split(": ", 1) for line in ended.err.splitlines())
     assert set(lines) == {"render", "calibrate", "reconstruct", "report"}
-    assert all(said.startswith(("done", "up to date")) for said in lines.values())
-    return {stage: said.startswith("done") for stage, said in lines.items()}
+    assert all(line.startswith(("done", "up to date")) for line in lines.values())
+    return {stage: line.startswith("done") for stage, line in lines.items()}
 
 
 NOTHING = {"render": False, "calibrate": False, "reconstruct": False, "report": False}
-TOLD = {"reconstruct", "report"}  # what a page shows is new whenever the reconstruction is
+REPEATED = {"reconstruct", "report"}  # the page shows the reconstruction
 
 
-def test_a_repeated_run_does_nothing_again(kept: Path, ommatid: Command) -> None:
+def test_a_repeated_run_repeats_no_stage(kept: Path, ommatid: Command) -> None:
     before = stamps(kept)
     ended = ommatid("run", "tiny.toml", "-o", "out", "--json")
     assert done(ended) == NOTHING
@@ -239,32 +239,32 @@ def test_a_repeated_run_does_nothing_again(kept: Path, ommatid: Command) -> None
 def test_another_expected_noise_redoes_the_reconstruction_alone(
     kept: Path, finished: Path, here: Path, ommatid: Command
 ) -> None:
-    told = ("--set", "estimator.noise_variance=25")
+    options = ("--set", "estimator.noise_variance=25")
     model = stamps(kept)["model.npz"]
-    ended = ommatid("run", "tiny.toml", "-o", "out", *told)
-    assert done(ended) == {**NOTHING, **dict.fromkeys(TOLD, True)}
+    ended = ommatid("run", "tiny.toml", "-o", "out", *options)
+    assert done(ended) == {**NOTHING, **dict.fromkeys(REPEATED, True)}
     assert stamps(kept)["model.npz"] == model
     assert_same_light(kept / "stack.exr", finished / "stack.exr")
     estimate = channels(kept / "estimate.exr")["estimate"]
     assert (estimate != channels(finished / "estimate.exr")["estimate"]).any()
-    # The run's folder now stands for itself: files alone give the same, and so does telling the old stack.
-    for source, options in ((kept, ()), (finished, told)):
-        assert ommatid("reconstruct", source / "stack.exr", source / "model.npz", "-o", "again.exr", *options).code == 0
+    # The files of the run give the same estimate, and so does the old stack with the same option.
+    for source, more in ((kept, ()), (finished, options)):
+        assert ommatid("reconstruct", source / "stack.exr", source / "model.npz", "-o", "again.exr", *more).code == 0
         np.testing.assert_array_equal(channels(here / "again.exr")["estimate"], estimate)
 
 
 @pytest.mark.parametrize(
     ("setting", "redone"),
     [
-        ("render.seed=1", {"render", "calibrate"} | TOLD),
-        ("render.samples=32", {"render"} | TOLD),
-        ("noise.variance=1", {"render"} | TOLD),
-        ("calibration.samples=32", {"calibrate"} | TOLD),
-        ("prior.mean=100", TOLD),
-        ("target.origin=[90,200]", {"render"} | TOLD),
+        ("render.seed=1", {"render", "calibrate"} | REPEATED),
+        ("render.samples=32", {"render"} | REPEATED),
+        ("noise.variance=1", {"render"} | REPEATED),
+        ("calibration.samples=32", {"calibrate"} | REPEATED),
+        ("prior.mean=100", REPEATED),
+        ("target.origin=[90,200]", {"render"} | REPEATED),
     ],
 )
-def test_what_is_out_of_date_is_done_again(setting: str, redone: set[str], kept: Path, ommatid: Command) -> None:
+def test_only_outdated_stages_are_repeated(setting: str, redone: set[str], kept: Path, ommatid: Command) -> None:
     assert kept.is_dir()
     ended = ommatid("run", "tiny.toml", "-o", "out", "--set", setting)
     assert {stage for stage, again in done(ended).items() if again} == redone
@@ -274,20 +274,18 @@ def test_what_is_out_of_date_is_done_again(setting: str, redone: set[str], kept:
     ("name", "stage"),
     [("stack.exr", "render"), ("model.npz", "calibrate"), ("run.json", "reconstruct"), ("estimate.exr", "reconstruct")],
 )
-def test_a_damaged_file_is_made_again(name: str, stage: str, kept: Path, finished: Path, ommatid: Command) -> None:
+def test_a_damaged_file_is_replaced(name: str, stage: str, kept: Path, finished: Path, ommatid: Command) -> None:
     whole = (kept / name).read_bytes()
     (kept / name).write_bytes(whole[: len(whole) // 2])
-    # What was made again took another time, which run.json has to say: the reconstruction follows.
-    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True, **dict.fromkeys(TOLD, True)}
+    # The repeated stage took another time, which is part of run.json, so the reconstruction is repeated too.
+    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True, **dict.fromkeys(REPEATED, True)}
     assert_same_light(kept / "stack.exr", finished / "stack.exr")
     described = [json.loads((folder / "run.json").read_text(encoding="utf-8")) for folder in (kept, finished)]
     assert numbers(described[0]) == numbers(described[1])
 
 
 @pytest.mark.parametrize("left", [0, 2000, 100_000])
-def test_a_report_that_is_missing_or_cut_short_is_drawn_again_as_it_was(
-    left: int, kept: Path, ommatid: Command
-) -> None:
+def test_a_missing_or_truncated_report_is_written_again_unchanged(left: int, kept: Path, ommatid: Command) -> None:
     report = kept / "report.html"
     whole = report.read_bytes()
     if left:
@@ -317,7 +315,7 @@ def test_one_bad_scene_does_not_stop_the_others(here: Path, ommatid: Command) ->
         assert {path.name for path in (here / "out" / stem).iterdir()} == FILES
 
 
-def test_two_scenes_of_one_name_would_share_a_folder(here: Path, ommatid: Command) -> None:
+def test_two_scenes_of_one_name_are_refused(here: Path, ommatid: Command) -> None:
     (here / "other").mkdir()
     shutil.copy(here / "tiny.toml", here / "other")
     ended = ommatid("render", "tiny.toml", "other/tiny.toml", "-o", "out")
@@ -341,18 +339,18 @@ def test_init_writes_a_scene_to_start_from_and_never_overwrites(here: Path, omma
 
 
 def _alternatives(schema: Any, root: dict[str, Any]) -> list[dict[str, Any]]:
-    """A schema without references: one dictionary a branch of `anyOf`."""
+    """Resolve references in a schema, and return one dictionary per branch of `anyOf`."""
     if "$ref" in schema:
         return _alternatives(root["$defs"][schema["$ref"].removeprefix("#/$defs/")], root)
     if "anyOf" in schema:
-        return [found for branch in schema["anyOf"] for found in _alternatives(branch, root)]
+        return [option for branch in schema["anyOf"] for option in _alternatives(branch, root)]
     return [schema]
 
 
 def _unknown(data: object, schemas: list[dict[str, Any]], root: dict[str, Any]) -> list[str]:
-    """Keys in `data` that no alternative knows."""
+    """Return the keys in `data` that no alternative has."""
     if isinstance(data, list):
-        inner = [found for schema in schemas if "items" in schema for found in _alternatives(schema["items"], root)]
+        inner = [option for schema in schemas if "items" in schema for option in _alternatives(schema["items"], root)]
         return [key for entry in cast(list[object], data) for key in _unknown(entry, inner, root)]
     if not isinstance(data, dict):
         return []
@@ -361,7 +359,7 @@ def _unknown(data: object, schemas: list[dict[str, Any]], root: dict[str, Any]) 
         tables = [schema["properties"][key] for schema in schemas if key in schema.get("properties", {})]
         if not tables:
             unknown.append(key)
-        unknown += _unknown(value, [found for table in tables for found in _alternatives(table, root)], root)
+        unknown += _unknown(value, [option for table in tables for option in _alternatives(table, root)], root)
     return unknown
 
 
@@ -375,20 +373,20 @@ def test_the_schema_knows_every_key_of_the_gallery(name: str, ommatid: Command) 
     assert all(table["additionalProperties"] is False for table in [schema, *schema["$defs"].values()])
 
 
-# --- what must not be lost
+# --- protection of files
 
 
 @pytest.mark.parametrize("command", ["run", "render"])
 def test_the_scene_that_is_read_is_never_replaced(command: str, here: Path, ommatid: Command) -> None:
     (here / "scene").mkdir()
-    mine = here / "scene" / "scene.toml"
-    mine.write_text("# mine\n" + (here / "tiny.toml").read_text(encoding="utf-8"), encoding="utf-8")
-    before = mine.read_bytes()
+    source = here / "scene" / "scene.toml"
+    source.write_text("# own\n" + (here / "tiny.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    before = source.read_bytes()
     ended = ommatid(command, "scene/scene.toml", "-o", ".")
     assert ended.code == 2
     assert "would replace" in ended.err
-    assert mine.read_bytes() == before
-    assert [path.name for path in mine.parent.iterdir()] == ["scene.toml"]
+    assert source.read_bytes() == before
+    assert [path.name for path in source.parent.iterdir()] == ["scene.toml"]
 
 
 @pytest.mark.parametrize("name", ["stack.exr", "model.npz", "truth.exr"])
@@ -399,8 +397,8 @@ def test_reconstruct_never_replaces_what_it_reads(name: str, kept: Path, ommatid
     assert stamps(kept) == before
 
 
-def test_ctrl_c_ends_in_one_sentence_and_keeps_what_is_done(here: Path) -> None:
-    """Interrupted while it calibrates, a run leaves a whole stack and no part of a model."""
+def test_ctrl_c_yields_one_sentence_and_keeps_finished_files(here: Path) -> None:
+    """A run interrupted during calibration leaves a complete stack and no part of a model."""
     command = [sys.executable, "-m", "ommatid", "run", "tiny.toml", "-o", "out"]
     more = ["--set", "calibration.samples=100000"]
     with subprocess.Popen(
@@ -408,19 +406,19 @@ def test_ctrl_c_ends_in_one_sentence_and_keeps_what_is_done(here: Path) -> None:
         cwd=here,
         stderr=subprocess.PIPE,
         text=True,
-        # A shell's background jobs inherit that SIGINT is ignored, and so would the run.
+        # Background jobs of a shell ignore SIGINT, and child processes inherit this.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as started:
         assert started.stderr is not None
         assert "render: done" in started.stderr.readline()
         started.send_signal(signal.SIGINT)
-        said = started.stderr.read()
+        err = started.stderr.read()
     assert started.returncode == 1
-    assert said.strip() == "ommatid: stopped; finished files stay, the next run carries on from them"
+    assert err.strip() == "ommatid: stopped; finished files stay, the next run carries on from them"
     assert {path.name for path in (here / "out" / "tiny").iterdir()} == {"scene.toml", "truth.exr", "stack.exr"}
 
 
-def test_a_title_with_dollar_signs_is_drawn_as_it_is(here: Path, ommatid: Command) -> None:
+def test_a_title_with_dollar_signs_is_no_formula(here: Path, ommatid: Command) -> None:
     extra = ("--set", "calibration.method=ideal", "--set", 'title="a $^$ b"')
     assert ommatid("run", here / "tiny.toml", "-o", "out", *extra).code == 0
 

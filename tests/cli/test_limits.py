@@ -1,4 +1,4 @@
-"""What a file or an option may ask for: numbers, names, depth and memory, each refused in a sentence beyond that."""
+"""Limits of numbers, names, nesting and memory in files and options, refused in one sentence."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GIBI = 2**30
 
 
 def read(path: Path, *changes: str) -> Any:
-    """The tiny scene with some changes, and its camera."""
+    """Return the tiny scene with some changes, and its camera."""
     file = path / "tiny.toml"
     file.write_text(TINY, encoding="utf-8")
     described = scene.read(file, changes)
@@ -94,7 +94,7 @@ def test_a_ratio_is_one_of_few_digits(key: str, text: str, tmp_path: Path) -> No
     ],
     ids=["digits", "bits", "digits of 64 bits", "open", "closed", "deep", "dotted"],
 )
-def test_numbers_and_tables_that_no_scene_has(value: str, words: str, tmp_path: Path) -> None:
+def test_excessive_numbers_and_nesting_are_refused(value: str, words: str, tmp_path: Path) -> None:
     file = tmp_path / "x.toml"
     file.write_text(f"title = {value}\n{TINY.partition('[target]')[2]}", encoding="utf-8")
     with pytest.raises(InputError, match=words):
@@ -105,25 +105,25 @@ def test_numbers_and_tables_that_no_scene_has(value: str, words: str, tmp_path: 
         lens_file.read_lens(file)
 
 
-def test_a_key_that_goes_too_deep(tmp_path: Path) -> None:
+def test_a_key_of_too_many_tables_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="deeper than 16 tables"):
         read(tmp_path, "a." * 5000 + "b=1")
 
 
 @pytest.mark.parametrize("key", ["target.image", "world.file", "camera.lens.I.surfaces"])
 @pytest.mark.parametrize("name", [r"a\u0000b", "b" * 300, "c/" * 3000, " "], ids=["NUL", "long", "deep", "none"])
-def test_names_that_no_file_can_have(key: str, name: str, tmp_path: Path) -> None:
+def test_impossible_file_names_are_refused(key: str, name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"{key}.*expected the name of a file"):
         read(tmp_path, f'{key}="{name}"')
 
 
-def test_sentences_stay_short(tmp_path: Path) -> None:
+def test_messages_stay_short(tmp_path: Path) -> None:
     assert len(shortened_repr({"a" * 1000: ["b" * 1000] * 1000})) < 700
     assert shortened("a") == "a"
     assert len(shortened("a" * 1000)) < 100
     long = "x" * 9000
-    told = (f"{long}=1", "title=[" + "1," * 9000 + "]", f"prior.kind={long}", f"render.samples={long}", long)
-    for change in told:
+    changes = (f"{long}=1", "title=[" + "1," * 9000 + "]", f"prior.kind={long}", f"render.samples={long}", long)
+    for change in changes:
         with pytest.raises(InputError) as refused:
             read(tmp_path, change)
         assert len(str(refused.value)) < 600
@@ -134,20 +134,20 @@ def test_sentences_stay_short(tmp_path: Path) -> None:
     assert len(str(refused.value)) < 2500
 
 
-def test_a_row_whose_radius_is_almost_none(tmp_path: Path) -> None:
+def test_a_lens_radius_close_to_zero_is_refused(tmp_path: Path) -> None:
     (tmp_path / "lens.dat").write_text("1e-40 1 1.5 2\n-10 0 1 2\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"line 1: radius: expected a radius of curvature"):
         lens_file.read_lens(tmp_path / "lens.dat")
 
 
-def test_blur_that_would_take_for_ever() -> None:
+def test_a_blur_that_cannot_be_computed_is_refused() -> None:
     lens = example().camera.lens[0]
     for update, words in (
         ({"aperture": 1e4, "focus": 1.0}, "its blur reaches"),
         ({"aperture": 9.0, "focus": 1500.0}, "wavelength"),
     ):
-        told = example().camera.model_copy(update={"wavelength": 1e-5, "lens": (lens.model_copy(update=update),)})
-        derived = camera.derive(example().model_copy(update={"camera": told}))
+        table = example().camera.model_copy(update={"wavelength": 1e-5, "lens": (lens.model_copy(update=update),)})
+        derived = camera.derive(example().model_copy(update={"camera": table}))
         with pytest.raises(InputError, match=words):
             blur_of(derived, derived.types[0])
 
@@ -155,8 +155,8 @@ def test_blur_that_would_take_for_ever() -> None:
 # Files
 
 
-def tiff_that_bites_its_tail(path: Path) -> None:
-    """Two pages, the second of which names the first as the next."""
+def write_circular_tiff(path: Path) -> None:
+    """Write two pages, the second of which names the first as the next."""
     import tifffile
 
     page = np.zeros((20, 20), np.uint16)
@@ -165,19 +165,19 @@ def tiff_that_bites_its_tail(path: Path) -> None:
     with tifffile.TiffFile(path) as file:
         first, second = (int(page.offset) for page in file.pages)
     entries = int.from_bytes(data[second : second + 2], "little")
-    place = second + 2 + 12 * entries
-    data[place : place + 4] = first.to_bytes(4, "little")
+    offset = second + 2 + 12 * entries
+    data[offset : offset + 4] = first.to_bytes(4, "little")
     path.write_bytes(data)
 
 
-def test_a_tiff_that_bites_its_tail(tmp_path: Path) -> None:
+def test_a_tiff_with_a_circular_list_of_pages_is_read_once(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
-    tiff_that_bites_its_tail(path)
+    write_circular_tiff(path)
     assert len(frames.pictures_of(path, "images")) == 2
     assert picture.decode(path, "here").shape == (2, 20, 20)
 
 
-def test_a_file_of_many_pages_needs_what_they_are_stored_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_pages_need_the_memory_of_their_own_number_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import tifffile
 
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((40, 1000, 1000), np.uint16), photometric="minisblack")
@@ -191,13 +191,13 @@ def test_a_file_of_many_pages_needs_what_they_are_stored_in(tmp_path: Path, monk
 
 
 def npy_of(shape: str, kind: str = "<f8") -> bytes:
-    """The header of an NPY file that promises a shape, and eight numbers."""
+    """Return an NPY file whose header states a shape, with eight numbers."""
     text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text + bytes(64)
 
 
 @pytest.mark.parametrize("shape", ["(100000, 100000)", "(9223372036854775807, 9)", "(-1, 2)", "x", "[" * 900])
-def test_an_array_that_promises_too_much(shape: str, tmp_path: Path) -> None:
+def test_an_array_smaller_than_its_header_states_is_refused(shape: str, tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(npy_of(shape))
     with pytest.raises(InputError, match="could not be read as a picture"):
         picture.decode(tmp_path / "a.npy", "here")
@@ -209,7 +209,7 @@ def test_an_array_that_promises_too_much(shape: str, tmp_path: Path) -> None:
         model_file.read(tmp_path / "a.npz")
 
 
-def test_headers_of_other_days_are_read_without_a_warning(tmp_path: Path) -> None:
+def test_headers_of_old_versions_are_read_without_a_warning(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(npy_of("(2L, 4L)"))  # as Python 2 wrote them
     assert picture.decode(tmp_path / "a.npy", "here").shape == (2, 4)
     (tmp_path / "a.npy").write_bytes(npy_of("(8,)", "|a8"))
@@ -217,7 +217,7 @@ def test_headers_of_other_days_are_read_without_a_warning(tmp_path: Path) -> Non
 
 
 def png_of(rows: int, columns: int) -> bytes:
-    """A PNG file whose header promises a size, and that holds next to nothing."""
+    """Return a PNG file whose header states a size, with almost no pixels."""
 
     def chunk(name: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
@@ -228,7 +228,7 @@ def png_of(rows: int, columns: int) -> bytes:
     )
 
 
-def test_a_picture_that_memory_does_not_hold(tmp_path: Path) -> None:
+def test_a_picture_beyond_the_memory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(png_of(10**6, 10**6))
     with pytest.raises(InputError, match=r"here: .*a.png: to read it needs 2.4e\+04 GB of memory, .* GB are free"):
         picture.decode(tmp_path / "a.png", "here")
@@ -241,20 +241,20 @@ def test_a_large_picture_is_read_without_a_warning(tmp_path: Path) -> None:
     pixels = np.zeros((9500, 9500), np.uint8)  # from 89 million pixels on Pillow warns
     pixels[3, 5] = 7
     Image.fromarray(pixels).save(tmp_path / "a.png", compress_level=1)
-    found = picture.decode(tmp_path / "a.png", "here")
-    assert (found.shape, int(found[3, 5]), int(found.sum())) == ((9500, 9500), 7, 7)
+    decoded = picture.decode(tmp_path / "a.png", "here")
+    assert (decoded.shape, int(decoded[3, 5]), int(decoded.sum())) == ((9500, 9500), 7, 7)
     assert limit == Image.MAX_IMAGE_PIXELS
 
 
-def test_an_exr_picture_that_memory_does_not_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exr_picture_beyond_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exr.write(tmp_path / "a.exr", [exr.Part("one", {"Y": np.zeros((4000, 4000), np.float32)}, {})])
     monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 10**8)
     with pytest.raises(InputError, match=r"a.exr: to read it needs 0.128 GB of memory, 0.1 GB are free"):
         exr.read_channels(tmp_path / "a.exr")
 
 
-def resealed(path: Path, change: Any) -> None:
-    """Give a stack another record of how it was made, and the seals of it."""
+def with_record(path: Path, change: Any) -> None:
+    """Change the record of a stack, with valid checksums."""
     parts = exr.read(path)
     parts[0].record["record"] = change(parts[0].record["record"])
     exr.write(path, parts)
@@ -265,26 +265,26 @@ def resealed(path: Path, change: Any) -> None:
     [lambda _: 3, lambda _: ["x"], lambda old: {**old, "versions": "1"}, lambda old: {**old, "seconds": float("nan")}],
     ids=["number", "list", "versions", "NaN"],
 )
-def test_a_record_that_is_none(change: Any, kept: Path) -> None:
-    resealed(kept / "stack.exr", lambda old: old)
+def test_an_invalid_record_is_refused(change: Any, kept: Path) -> None:
+    with_record(kept / "stack.exr", lambda old: old)
     assert stack.read(kept / "stack.exr").record["passes"] == 16
-    resealed(kept / "stack.exr", change)
+    with_record(kept / "stack.exr", change)
     with pytest.raises(InputError, match=r"stack.exr: .*; make it again"):
         stack.read(kept / "stack.exr")
 
 
 @pytest.mark.parametrize(
-    ("name", "place", "value"),
+    ("name", "index", "value"),
     [("data", 0, np.nan), ("data", 0, 1e300), ("variance", 0, -1.0), ("indptr", 3, 10**6), ("indices", 0, 10**6)],
 )
-def test_a_matrix_that_is_none(name: str, place: int, value: float, kept: Path) -> None:
+def test_an_invalid_matrix_is_refused(name: str, index: int, value: float, kept: Path) -> None:
     path = kept / "model.npz"
     with np.load(path) as file:
         arrays: dict[str, Any] = {key: file[key] for key in ("shape", "variance", "batches", *model_file.ENTRIES)}
-        told = json.loads(str(file["ommatid"][()]))["description"]
-    arrays[name][place] = value
-    seal = model_file._seal(arrays, told)  # pyright: ignore[reportPrivateUsage]
-    record = json.dumps({"description": told, "sha256": seal})
+        description = json.loads(str(file["ommatid"][()]))["description"]
+    arrays[name][index] = value
+    seal = model_file._seal(arrays, description)  # pyright: ignore[reportPrivateUsage]
+    record = json.dumps({"description": description, "sha256": seal})
     np.savez_compressed(path, format=np.array(b"csr"), ommatid=record, **arrays)
     with pytest.raises(InputError, match="holds no usable observation matrix"):
         model_file.read(path)
@@ -293,7 +293,7 @@ def test_a_matrix_that_is_none(name: str, place: int, value: float, kept: Path) 
 # Memory
 
 
-def test_memory_is_counted_within_the_limit_of_the_process(tmp_path: Path) -> None:
+def test_free_memory_respects_the_limit_of_the_process(tmp_path: Path) -> None:
     before = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({4 * GIBI}, {4 * GIBI}))"
     before += "\nfrom ommatid.runtime.memory import free_memory"
     script = f"{before}\nassert 0 < free_memory() < {4 * GIBI}\nraise SystemExit"
@@ -301,7 +301,7 @@ def test_memory_is_counted_within_the_limit_of_the_process(tmp_path: Path) -> No
     assert free_memory() > 0
 
 
-def test_little_is_never_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_requests_are_never_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 0)
     check_memory(10**6, "it", "do nothing")
     with pytest.raises(InputError, match="it needs 1 GB of memory, 0 GB are free; do nothing"):
@@ -353,7 +353,7 @@ raise SystemExit
 """
 
 
-def test_what_memory_does_not_hold_is_refused_before_it_is_asked_for(here: Path) -> None:
+def test_requests_beyond_the_memory_are_refused_before_allocation(here: Path) -> None:
     (here / "huge.png").write_bytes(png_of(100000, 100000))
     (here / "world.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>', encoding="utf-8")
     commands = [[*command, *(word for change in changes for word in ("--set", change))] for command, changes in CASES]
@@ -370,8 +370,8 @@ def test_what_memory_does_not_hold_is_refused_before_it_is_asked_for(here: Path)
     assert sorted(here.rglob("*")) == before
 
 
-def test_the_least_noise_that_there_is(here: Path, ommatid: Command) -> None:
-    """Its precision squared is beyond float64."""
+def test_the_smallest_noise_is_refused(here: Path, ommatid: Command) -> None:
+    """The square of its inverse exceeds the range of float64."""
     assert (here / "tiny.toml").is_file()
     ended = ommatid("predict", "tiny.toml", "--set", "noise.variance=5e-324")
     assert ended.code == 2

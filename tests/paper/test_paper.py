@@ -39,8 +39,8 @@ class Written:
             return list(csv.DictReader(stream))
 
     def claim(self, beginning: str) -> dict[str, Any]:
-        (found,) = [claim for claim in self.description["claims"] if claim["claim"].startswith(beginning)]
-        return found
+        (match,) = [claim for claim in self.description["claims"] if claim["claim"].startswith(beginning)]
+        return match
 
 
 @pytest.fixture(scope="module")
@@ -205,12 +205,12 @@ VERDICTS = {
 
 @pytest.mark.parametrize("beginning", VERDICTS)
 def test_each_claim_has_the_verdict_measured_beforehand(written: Written, beginning: str) -> None:
-    found = written.claim(beginning)
-    assert found["holds"] == VERDICTS[beginning]
-    assert bool(found["remark"]) or found["holds"] == YES, "a qualification is stated"
-    (row,) = [row for row in written.rows("claims.csv") if row["claim"] == found["claim"]]
-    assert (row["holds"], row["remark"]) == (found["holds"], found["remark"])
-    assert all(name in row["numbers"] for name in found["numbers"])
+    claim = written.claim(beginning)
+    assert claim["holds"] == VERDICTS[beginning]
+    assert bool(claim["remark"]) or claim["holds"] == YES, "a qualification is stated"
+    (row,) = [row for row in written.rows("claims.csv") if row["claim"] == claim["claim"]]
+    assert (row["holds"], row["remark"]) == (claim["holds"], claim["remark"])
+    assert all(name in row["numbers"] for name in claim["numbers"])
 
 
 def test_there_are_no_other_claims(written: Written) -> None:
@@ -237,8 +237,8 @@ def test_there_are_no_other_claims(written: Written) -> None:
 )
 def test_the_numbers_of_the_claims(written: Written, beginning: str, number: str, value: float) -> None:
     exact = isinstance(value, int)
-    found = written.claim(beginning)["numbers"][number]
-    assert found == value if exact else found == pytest.approx(value, rel=digits(value))
+    actual = written.claim(beginning)["numbers"][number]
+    assert actual == value if exact else actual == pytest.approx(value, rel=digits(value))
 
 
 def test_whole_numbers_are_rounded_with_a_third_less_error(written: Written) -> None:
@@ -307,8 +307,8 @@ def test_the_noise_alone_errs_as_predicted(computed: Tiles) -> None:
         s2 = shown.form.values**2 / noise.variance
         weights = s2 / (1 + s2) ** 2
         excess = 12 * np.sum(weights**4) / np.sum(weights**2) ** 2
-        found = trials.from_noise[level].std(ddof=1) / trials.noise_part[level]
-        assert found == pytest.approx(trials.spread[level], rel=3 * np.sqrt((2 + excess) / (4 * count)))
+        deviation = trials.from_noise[level].std(ddof=1) / trials.noise_part[level]
+        assert deviation == pytest.approx(trials.spread[level], rel=3 * np.sqrt((2 + excess) / (4 * count)))
 
 
 def test_noise_is_repeatable_and_independent(computed: Tiles) -> None:
@@ -326,13 +326,15 @@ def test_images_wider_than_the_prior_fail_the_claim_on_photographs(computed: Til
     """Twice the prior's deviation: worse than predicted where the prior decides."""
     shown = computed[35, THREE]
     images = 127.5 + 2 * (from_prior(shown, 6, 8) - 127.5)
-    found = simulate_trials(shown, "prior", TileCrops(images, ((0, 0),) * 6), 0)
-    assert photograph_claims(found)[1].holds == NO
-    assert photograph_claims(broken_quantisation(found))[0].holds == NO
+    photograph = simulate_trials(shown, "prior", TileCrops(images, ((0, 0),) * 6), 0)
+    assert photograph_claims(photograph)[1].holds == NO
+    assert photograph_claims(broken_quantisation(photograph))[0].holds == NO
 
 
-def broken_quantisation(found: Photograph) -> Photograph:
-    return replace(found, quantised=replace(found.quantised, from_noise=1.2 * found.quantised.from_noise))
+def broken_quantisation(photograph: Photograph) -> Photograph:
+    return replace(
+        photograph, quantised=replace(photograph.quantised, from_noise=1.2 * photograph.quantised.from_noise)
+    )
 
 
 @pytest.mark.parametrize("shape", [(70, 105), (105, 70), (35, 210), (210, 35), (71, 300), (512, 512)])

@@ -116,9 +116,9 @@ def test_degrees_of_freedom_and_resolution() -> None:
     assert expected_error(factorise(tile_problem(2, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(329, abs=1e-6)
     matrix = sparse.csr_array(np.diag([1.0, 1.0, 0.0]))
     known = Problem(matrix, Prior(np.zeros(3), np.full(3, 3.0**0.5)), np.array([1.0, 1e-12, 1.0]))
-    found = expected_error(factorise(known)[0], {"noise": known.noise_variance})
-    assert found.resolved == pytest.approx([0.75, 1, 0])
-    assert found.resolution == pytest.approx([(4 / 3) ** 0.5, 1, np.inf])
+    expected = expected_error(factorise(known)[0], {"noise": known.noise_variance})
+    assert expected.resolved == pytest.approx([0.75, 1, 0])
+    assert expected.resolution == pytest.approx([(4 / 3) ** 0.5, 1, np.inf])
 
 
 def test_resolution_of_a_blur_is_its_width() -> None:

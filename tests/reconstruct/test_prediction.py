@@ -1,4 +1,4 @@
-"""Measures of error, predictions, and the paper's numbers by a second method."""
+"""Measured errors, and predictions against the paper's numbers by other methods."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from ommatid.reconstruct.prediction import observability, predict
 from ommatid.reconstruct.prior import independent
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import read
-from ommatid.scenes.tables.estimation import EstimatorTable
-from ommatid.scenes.tables.estimation import PriorTable as PriorTable
+from ommatid.scenes.tables.estimation import EstimatorTable, PriorTable
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import GALLERY
@@ -38,9 +37,11 @@ def test_reference_values_of_extended_precision(
     camera = derive(read(GALLERY / f"{name}.toml", (), lenses))
     matrix = ideal_matrix(camera)
     shape = camera.shape
-    found = predict(matrix, independent(PRIOR.mean, PRIOR.variance, camera.unknowns), 1e-6, EstimatorTable(), shape)
-    assert found.mse == pytest.approx(reference, rel=1e-5)
-    assert (found.rank, found.null_space) == (rank, camera.unknowns - rank)
+    prediction = predict(
+        matrix, independent(PRIOR.mean, PRIOR.variance, camera.unknowns), 1e-6, EstimatorTable(), shape
+    )
+    assert prediction.mse == pytest.approx(reference, rel=1e-5)
+    assert (prediction.rank, prediction.null_space) == (rank, camera.unknowns - rank)
 
 
 @pytest.mark.parametrize(
@@ -57,8 +58,8 @@ def test_reference_values_where_the_expectation_is_wrong(
 ) -> None:
     camera = derive(read(GALLERY / "tile19.toml", (), lenses))
     prior = independent(PRIOR.mean, PRIOR.variance, 361)
-    found = predict(ideal_matrix(camera), prior, actual, EstimatorTable(noise_variance=expected), (19, 19))
-    assert found.mse == pytest.approx(reference, rel=1e-8)
+    prediction = predict(ideal_matrix(camera), prior, actual, EstimatorTable(noise_variance=expected), (19, 19))
+    assert prediction.mse == pytest.approx(reference, rel=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -83,22 +84,22 @@ def test_more_reference_values(
     camera = derive(read(GALLERY / f"{name}.toml", (), lenses))
     prior = independent(PRIOR.mean, PRIOR.variance, camera.unknowns)
     shape = camera.shape
-    found = predict(ideal_matrix(camera), prior, actual, EstimatorTable(noise_variance=expected), shape)
-    assert found.mse == pytest.approx(reference, rel=2.5e-5)
+    prediction = predict(ideal_matrix(camera), prior, actual, EstimatorTable(noise_variance=expected), shape)
+    assert prediction.mse == pytest.approx(reference, rel=2.5e-5)
     if trimmed_reference is not None:
-        assert found.trimmed_mse == pytest.approx(trimmed_reference, rel=5e-6)
+        assert prediction.trimmed_mse == pytest.approx(trimmed_reference, rel=5e-6)
 
 
 @pytest.mark.parametrize("form", ["square-root-information", "svd", "dual"])
 @pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I", "I")])
-def test_the_sturdy_forms_predict_the_same(form: str, lenses: tuple[str, ...]) -> None:
+def test_every_stable_form_predicts_the_same(form: str, lenses: tuple[str, ...]) -> None:
     camera = derive(read(GALLERY / "tile19.toml", (), lenses))
     matrix, prior = ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361)
     references = {0: 2.79776586e-4, 2: 484.100274, 1: 2057.42393}
-    told = EstimatorTable.model_validate({"method": form})
-    found = predict(matrix, prior, 1e-6, told, (19, 19))
-    assert found.mse == pytest.approx(references[len(set(lenses))], rel=3e-9)
-    assert found.method == form
+    settings = EstimatorTable.model_validate({"method": form})
+    prediction = predict(matrix, prior, 1e-6, settings, (19, 19))
+    assert prediction.mse == pytest.approx(references[len(set(lenses))], rel=3e-9)
+    assert prediction.method == form
 
 
 @pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I",)])
@@ -111,19 +112,21 @@ def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> Non
     values = np.linalg.svd(matrix.toarray(), compute_uv=False)
     singular[: values.size] = values
     by_values = np.mean(noise * PRIOR.variance / (noise + singular**2 * PRIOR.variance))
-    found = predict(matrix, independent(PRIOR.mean, PRIOR.variance, 361), noise, EstimatorTable(), (19, 19))
-    assert found.mse == pytest.approx(by_values, rel=1e-6)
-    assert found.rank == np.linalg.matrix_rank(matrix.toarray(), tol=1e-9)
-    seen = values[: found.rank]
-    assert found.condition == pytest.approx(seen[0] / seen[-1], rel=1e-6)
+    prediction = predict(matrix, independent(PRIOR.mean, PRIOR.variance, 361), noise, EstimatorTable(), (19, 19))
+    assert prediction.mse == pytest.approx(by_values, rel=1e-6)
+    assert prediction.rank == np.linalg.matrix_rank(matrix.toarray(), tol=1e-9)
+    seen = values[: prediction.rank]
+    assert prediction.condition == pytest.approx(seen[0] / seen[-1], rel=1e-6)
 
 
 @pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I", "I")])
 def test_without_noise_the_error_is_the_null_space(lenses: tuple[str, ...]) -> None:
     camera = derive(read(GALLERY / "tile19.toml", (), lenses))
-    found = predict(ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361), 0.0, EstimatorTable(), (19, 19))
-    assert found.null_space is not None
-    assert found.mse == pytest.approx(PRIOR.variance * found.null_space / 361, rel=1e-9, abs=1e-12)
+    prediction = predict(
+        ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361), 0.0, EstimatorTable(), (19, 19)
+    )
+    assert prediction.null_space is not None
+    assert prediction.mse == pytest.approx(PRIOR.variance * prediction.null_space / 361, rel=1e-9, abs=1e-12)
 
 
 def test_the_papers_claims_that_two_and_one_type_are_worse() -> None:
@@ -141,7 +144,7 @@ def test_the_papers_claims_that_two_and_one_type_are_worse() -> None:
     assert mse[0, 1e-6] < 1e-3 * mse[0, 1e-2]
 
 
-def test_the_identity_sees_everything() -> None:
+def test_the_identity_has_full_rank() -> None:
     seen = observability(sparse.csr_array(np.eye(5)))
     assert (seen.rank, seen.null_space, seen.condition) == (5, 0, pytest.approx(1))
 
@@ -150,11 +153,11 @@ def test_measures_of_error() -> None:
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 255, (20, 20))
     noisy = truth + rng.normal(0, 2, truth.shape)
-    found = measure_error(noisy.ravel(), truth.ravel(), (20, 20))
-    assert found.mse == pytest.approx(np.mean((noisy - truth) ** 2))
-    assert found.psnr == pytest.approx(10 * np.log10(255**2 / found.mse))
-    assert found.ssim is not None
-    assert 0.9 < found.ssim < 1
+    error = measure_error(noisy.ravel(), truth.ravel(), (20, 20))
+    assert error.mse == pytest.approx(np.mean((noisy - truth) ** 2))
+    assert error.psnr == pytest.approx(10 * np.log10(255**2 / error.mse))
+    assert error.ssim is not None
+    assert 0.9 < error.ssim < 1
     same = measure_error(truth.ravel(), truth.ravel(), (20, 20))
     assert (same.mse, same.psnr, same.ssim) == (0, None, pytest.approx(1))
     assert measure_error(np.zeros(4), np.ones(4), (2, 2)).trimmed_mse is None

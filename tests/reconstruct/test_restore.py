@@ -1,4 +1,4 @@
-"""The whole chain: rendered, calibrated, reconstructed; the error that comes is the error that was expected."""
+"""Rendering, calibration and reconstruction together: the measured error is the expected one."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def chain(described: Scene) -> tuple[Stack, Model, Reconstruction]:
     ],
 )
 def test_the_measured_error_is_the_expected_one(name: str, changes: list[str]) -> None:
-    """In the 99 % interval of its expectation given the image and everything known of the noise."""
+    """Inside the 99 % interval given the image and everything known of the noise."""
     _, _, restoration = chain(read(GALLERY / f"{name}.toml", changes))
     assert restoration.error is not None
     assert restoration.interval is not None
@@ -59,21 +59,21 @@ def test_fewer_lens_types_are_worse() -> None:
     assert errors[1] < errors[2]
 
 
-def test_noise_of_h_that_feigns_information_is_told() -> None:
-    """Two types leave a null space, which a noisy H seems to see: Eq. 5 then promises half of the real error."""
-    told: list[float] = []
+def test_spurious_information_of_h_is_reported() -> None:
+    """Two types leave a null space, which a noisy H seems to see: Eq. 5 then predicts half of the actual error."""
+    shares: list[float] = []
     for lenses in ((), ("I", "II")):
         stack, model, restoration = chain(read(GALLERY / "tile19.toml", ["calibration.samples=1024"], lenses))
-        told.append(restoration.spurious_information)
+        shares.append(restoration.spurious_information)
         lines = run_table.rows(report_of(stack, model, restoration))
         warned = any(line.startswith("do not trust") for line, _ in lines)
         assert warned == bool(lenses)
-    assert told[1] > 10 * told[0]
+    assert shares[1] > 10 * shares[0]
     _, _, exact = chain(read(GALLERY / "tile19.toml", ["calibration.method=ideal"], ("I", "II")))
     assert exact.spurious_information == 0
 
 
-def test_the_budget_says_what_is_there_and_adds_up() -> None:
+def test_the_parts_of_the_budget_add_up() -> None:
     render = {"variant": "scalar_rgb", "samples": 64}
     noise = {"variance": 1.0, "bits": 6}
     _, _, whole = chain(scene(lenses=THREE, calibration={"samples": 64}, noise=noise, render=render))
@@ -84,12 +84,12 @@ def test_the_budget_says_what_is_there_and_adds_up() -> None:
     assert [bare.budget()[name] for name in ("noise", "quantisation", "calibration")] == [0, 0, 0]
 
 
-def test_more_noise_than_expected_is_in_the_variance_whatever_the_estimator_was_told() -> None:
+def test_the_actual_noise_is_in_the_variance_whatever_the_estimator_expects() -> None:
     described = scene(lenses=THREE, noise={"variance": 4.0}, calibration={"method": "ideal"})
-    stack, model, honest = chain(described)
-    told = restore(with_estimator_changes(stack, ["estimator.noise_variance=1e-4"], GALLERY), model)
-    assert told.expected.mse > honest.expected.mse
-    assert told.budget()["noise"] > 100 * 4.0 / 361
+    stack, model, matched = chain(described)
+    mismatched = restore(with_estimator_changes(stack, ["estimator.noise_variance=1e-4"], GALLERY), model)
+    assert mismatched.expected.mse > matched.expected.mse
+    assert mismatched.budget()["noise"] > 100 * 4.0 / 361
 
 
 def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
@@ -113,7 +113,7 @@ def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
         (scene(lenses=(THREE[0], THREE[2], THREE[1])), "camera.lens.B"),
     ],
 )
-def test_strangers_are_refused_with_the_first_difference(other: Scene, key: str) -> None:
+def test_a_stack_and_a_model_of_different_cameras_are_refused(other: Scene, key: str) -> None:
     described = scene(lenses=THREE, render={"samples": 16})
     camera = derive(described)
     stack = render(Setup(described, camera))
@@ -130,7 +130,7 @@ def test_pitches_are_compared_too() -> None:
         check_match(stack, model, ("stack.exr", "model.npz"))
 
 
-def test_without_the_truth_nothing_is_claimed_of_the_error() -> None:
+def test_without_the_truth_there_is_no_measured_error() -> None:
     described = scene(lenses=THREE, calibration={"method": "ideal"}, render={"samples": 16})
     stack, model, _ = chain(described)
     blind = restore(stack, model)

@@ -1,4 +1,4 @@
-"""What a sensor really delivers: dead and saturated pixels, nothing at all; and the priors that it is read with.
+"""Stacks of real sensors: dead and saturated pixels, no pixels at all; and the priors they are reconstructed with.
 
 Stacks come from the ideal model with known noise, so that nothing has to be rendered.
 """
@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from ommatid.analysis import run_table
 from ommatid.reconstruct.noise import usable_pixels
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks
 from ommatid.scenes.camera import derive
@@ -35,8 +35,8 @@ from ..runs import document
 SENSOR = {"variance": 1.0}
 
 
-def recorded(described: Scene) -> tuple[Stack, Model, NDArray[np.float64]]:
-    """What a perfect camera records of the scene's picture, with the scene's noise."""
+def recorded(described: Scene) -> tuple[Stack, Model, FloatArray]:
+    """The stack that an ideal camera records of the scene's picture with the scene's noise, its H, and the truth."""
     camera, truth = derive(described), load(described).ravel()
     model = ideal_model(described, camera)
     assert described.noise is not None
@@ -55,40 +55,40 @@ def rows(restoration: Reconstruction, stack: Stack, model: Model) -> dict[str, s
 
 
 def test_dead_pixels_are_left_out_and_counted() -> None:
-    """The estimate is that of a camera without these pixels, to the last digit, whatever stood in them."""
+    """The estimate is that of a camera without these pixels, to the last digit, whatever their values."""
     stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR))
     dead = np.zeros(stack.values.size, dtype=bool)
     dead[[0, 17, 400]] = True
     broken = replace(stack, values=np.where(dead, np.nan, stack.values))
-    found = restore(broken, model, truth)
-    assert (found.usable.dead, found.usable.saturated, int(found.usable.used.sum())) == (3, 0, 703)
+    restoration = restore(broken, model, truth)
+    assert (restoration.usable.dead, restoration.usable.saturated, int(restoration.usable.used.sum())) == (3, 0, 703)
     whole = restore(stack, model, truth)
-    assert found.expected.mse > whole.expected.mse
-    assert np.isfinite(found.estimate).all()
-    assert found.error is not None
-    assert found.interval is not None
-    assert found.interval.low < found.error.mse < found.interval.high
-    assert "3 dead" in rows(found, broken, model)["sensor pixels left out"]
+    assert restoration.expected.mse > whole.expected.mse
+    assert np.isfinite(restoration.estimate).all()
+    assert restoration.error is not None
+    assert restoration.interval is not None
+    assert restoration.interval.low < restoration.error.mse < restoration.interval.high
+    assert "3 dead" in rows(restoration, broken, model)["sensor pixels left out"]
     assert "sensor pixels left out" not in rows(whole, stack, model)
 
 
 @pytest.mark.parametrize("bits", [None, 6])
 def test_saturated_pixels_are_left_out(bits: int | None) -> None:
-    """Believed, they show in the residual; left out, the error stays inside its interval."""
+    """Used, they raise chi-squared of the residual; left out, the error stays inside its interval."""
     noise = {"variance": 1.0, "saturation": 30.3} | ({} if bits is None else {"bits": bits})
     stack, model, truth = recorded(scene(lenses=THREE, noise=noise))
     assert stack.values.max() == 30.3
-    found = restore(stack, model, truth)
-    assert found.usable.saturated > 30
-    assert found.error is not None
-    assert found.interval is not None
-    assert found.error.mse < found.interval.high
-    blind = replace(stack, scene=stack.scene.model_copy(update={"noise": NoiseTable(variance=1.0, bits=bits)}))
-    believed = restore(blind, model, truth).residual
-    assert believed is not None
-    assert found.residual is not None
-    assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
-    assert abs(believed.chi_squared - believed.expected) > 4 * believed.deviation
+    restoration = restore(stack, model, truth)
+    assert restoration.usable.saturated > 30
+    assert restoration.error is not None
+    assert restoration.interval is not None
+    assert restoration.error.mse < restoration.interval.high
+    without_level = replace(stack, scene=stack.scene.model_copy(update={"noise": NoiseTable(variance=1.0, bits=bits)}))
+    used = restore(without_level, model, truth).residual
+    assert used is not None
+    assert restoration.residual is not None
+    assert abs(restoration.residual.chi_squared - restoration.residual.expected) < 4 * restoration.residual.deviation
+    assert abs(used.chi_squared - used.expected) > 4 * used.deviation
 
 
 def test_saturation_survives_the_file(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_saturation_survives_the_file(tmp_path: Path) -> None:
     assert usable_pixels(stacks.read(tmp_path / "stack.exr")).saturated == usable_pixels(stack).saturated > 0
 
 
-def test_a_stack_of_which_nothing_is_left_gives_the_prior_and_says_so() -> None:
+def test_a_stack_without_usable_pixels_gives_the_prior_and_a_warning() -> None:
     stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR, prior={"mean": 99.0, "variance": 16.0}))
     for kind in ("independent", "fit"):
         prior = stack.scene.prior.model_copy(update={"kind": kind})
@@ -107,11 +107,11 @@ def test_a_stack_of_which_nothing_is_left_gives_the_prior_and_says_so() -> None:
             values=np.full(706, np.nan),
             scene=stack.scene.model_copy(update={"prior": prior}),
         )
-        found = restore(nothing, model, truth)
-        assert found.estimate == pytest.approx(np.full(361, 99.0))
-        assert found.expected.variance == pytest.approx(np.full(361, 16.0))
-        assert found.usable.dead == 706
-        assert "no sensor pixel is left" in rows(found, nothing, model)["this is the prior, not an image"]
+        restoration = restore(nothing, model, truth)
+        assert restoration.estimate == pytest.approx(np.full(361, 99.0))
+        assert restoration.expected.variance == pytest.approx(np.full(361, 16.0))
+        assert restoration.usable.dead == 706
+        assert "no sensor pixel is left" in rows(restoration, nothing, model)["this is the prior, not an image"]
 
 
 def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:
@@ -120,12 +120,12 @@ def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:
     values = stack.values.copy()
     values[5] = np.nan
     stacks.write(kept / "stack.exr", replace(stack, values=values))
-    found = document(ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "dead.exr", "--json"))
-    assert found["diagnostics"]["pixels_dead"] == 1
-    assert found["diagnostics"]["pixels_used"] == found["measurements"] - 1
+    report = document(ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "dead.exr", "--json"))
+    assert report["diagnostics"]["pixels_dead"] == 1
+    assert report["diagnostics"]["pixels_used"] == report["measurements"] - 1
 
 
-def test_chi_squared_of_the_residual_tells_a_wrong_noise() -> None:
+def test_chi_squared_of_the_residual_detects_a_wrong_noise() -> None:
     right = restored(scene(lenses=THREE, noise=SENSOR))
     assert right.residual is not None
     assert abs(right.residual.chi_squared - right.residual.expected) < 4 * right.residual.deviation
@@ -135,17 +135,17 @@ def test_chi_squared_of_the_residual_tells_a_wrong_noise() -> None:
 
 
 def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
-    """On a photograph: the error falls to a fraction, the noise is found, and both stand in the report."""
+    """On a photograph the error falls below a third, the noise is fitted, and both are in the table."""
     paper = restored(scene(lenses=THREE, noise=SENSOR))
-    told: dict[str, Any] = {"prior": {"kind": "fit"}, "estimator": {"noise_variance": "fit"}}
-    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR, **told))
-    found = restore(stack, model, truth)
+    tables: dict[str, Any] = {"prior": {"kind": "fit"}, "estimator": {"noise_variance": "fit"}}
+    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR, **tables))
+    restoration = restore(stack, model, truth)
     assert paper.error is not None
-    assert found.error is not None
-    assert found.error.mse < paper.error.mse / 3
-    assert found.fit is not None
-    assert found.fit.noise_variance == pytest.approx(1.0, rel=4 * found.fit.spread[2])
-    lines = rows(found, stack, model)
+    assert restoration.error is not None
+    assert restoration.error.mse < paper.error.mse / 3
+    assert restoration.fit is not None
+    assert restoration.fit.noise_variance == pytest.approx(1.0, rel=4 * restoration.fit.spread[2])
+    lines = rows(restoration, stack, model)
     assert {"fitted variance", "fitted correlation length", "fitted noise variance"} <= set(lines)
     known = restored(scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}))
     assert known.fit is not None
@@ -174,28 +174,28 @@ def test_correlated_priors_help_on_photographs(prior: dict[str, object]) -> None
 
 
 def test_the_mean_of_a_region() -> None:
-    """Within four of its deviations of the true mean, and far better known than a pixel."""
+    """Within four standard deviations of the true mean, and far more precise than one pixel."""
     stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR))
-    found = restore(stack, model, truth)
-    mean, deviation = found.region((4, 5), (6, 3))
+    restoration = restore(stack, model, truth)
+    mean, deviation = restoration.region((4, 5), (6, 3))
     assert abs(mean - truth.reshape(19, 19)[4:10, 5:8].mean()) < 4 * deviation
-    assert deviation < 0.3 * float(np.sqrt(found.expected.variance).mean())
+    assert deviation < 0.3 * float(np.sqrt(restoration.expected.variance).mean())
     with pytest.raises(InputError, match="does not lie inside an image of 19 x 19"):
-        found.region((18, 0), (2, 1))
+        restoration.region((18, 0), (2, 1))
 
 
 def test_a_region_from_the_command_line(kept: Path, ommatid: Command) -> None:
     files = (kept / "stack.exr", kept / "model.npz", "-o", "region.exr", "--region")
-    found = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["region"]
-    assert (found["corner"], found["size"]) == ([2, 3], [4, 5])
-    assert found["deviation"] > 0
+    report = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["region"]
+    assert (report["corner"], report["size"]) == ([2, 3], [4, 5])
+    assert report["deviation"] > 0
     assert "mean of 4 x 5 pixels at 2, 3" in ommatid("reconstruct", *files, "2,3,4,5").out
     for wrong in ("2,3", "a,b,c,d", "0,0,99,99"):
         assert ommatid("reconstruct", *files, wrong).code == 2
 
 
-def test_nothing_that_is_no_number_is_printed(kept: Path, ommatid: Command) -> None:
-    """What a scene file may hold stays inside float32: beyond it is refused, and JSON has no Infinity."""
+def test_settings_beyond_float32_are_refused(kept: Path, ommatid: Command) -> None:
+    """Files hold float32, and JSON has no Infinity."""
     files = ("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "far.exr", "--json", "--set")
     for setting in ("prior.mean=1e300", "prior.variance=1e300", "estimator.noise_variance=1e300"):
         ended = ommatid(*files, setting)
@@ -204,7 +204,7 @@ def test_nothing_that_is_no_number_is_printed(kept: Path, ommatid: Command) -> N
     document(ommatid(*files, "prior.mean=1e12"))
 
 
-def test_variances_below_nothing_are_refused(kept: Path, ommatid: Command) -> None:
+def test_negative_variances_are_refused(kept: Path, ommatid: Command) -> None:
     stack = stacks.read(kept / "stack.exr")
     variance = stack.variance.copy()
     variance[0] = -1.0
@@ -216,16 +216,16 @@ def test_variances_below_nothing_are_refused(kept: Path, ommatid: Command) -> No
 
 def test_without_noise_there_is_no_chi_squared() -> None:
     stack, model, truth = recorded(scene(lenses=THREE, noise={"variance": 0.0}, estimator={"noise_variance": 0.0}))
-    found = restore(stack, model, truth)
-    assert found.residual is None
-    assert "chi-squared of the residual" not in rows(found, stack, model)
-    assert found.estimate == pytest.approx(truth, rel=1e-6)
+    restoration = restore(stack, model, truth)
+    assert restoration.residual is None
+    assert "chi-squared of the residual" not in rows(restoration, stack, model)
+    assert restoration.estimate == pytest.approx(truth, rel=1e-6)
 
 
-@pytest.mark.parametrize("told", [{"noise_variance": "fit"}, {}])
-def test_a_fit_with_an_uncertain_h(told: dict[str, Any]) -> None:
-    """What the uncertainty of H adds is taken at the fitted image: chi-squared is as expected."""
-    described = scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}, estimator=told)
+@pytest.mark.parametrize("estimator", [{"noise_variance": "fit"}, {}])
+def test_a_fit_with_an_uncertain_h(estimator: dict[str, Any]) -> None:
+    """The variance due to H is computed at the fitted image: chi-squared is as expected."""
+    described = scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}, estimator=estimator)
     stack, model, truth = recorded(described)
     rng = np.random.default_rng(0)
     spread = 0.002 * rng.normal(size=model.matrix.nnz)
@@ -235,8 +235,8 @@ def test_a_fit_with_an_uncertain_h(told: dict[str, Any]) -> None:
         + type(model.matrix)((spread, model.matrix.indices, model.matrix.indptr), model.matrix.shape),
         variance=np.full(model.matrix.nnz, 0.002**2),
     )
-    found = restore(stack, uncertain, truth)
-    assert found.residual is not None
-    assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
-    assert found.fit is not None
-    assert not found.fit.doubtful
+    restoration = restore(stack, uncertain, truth)
+    assert restoration.residual is not None
+    assert abs(restoration.residual.chi_squared - restoration.residual.expected) < 4 * restoration.residual.deviation
+    assert restoration.fit is not None
+    assert not restoration.fit.doubtful

@@ -1,4 +1,4 @@
-"""Spending only what is needed: rendering until its variance is small, calibration until H is known well enough."""
+"""Adaptive numbers of samples: rendering to a target variance, calibration to a target precision of H."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ommatid.simulate.sampling.passes import Plan, cells_of, on_grid, rounding_v
 from ..conftest import Command
 from ..examples import THREE, VARIANTS, needs, scene
 
-ODD = (("2/5", [2, 2], [5, 5]), ("3/8", [2, 2], [4, 4]))  # whose pixels see pixels of f in part
+FRACTIONAL = (("2/5", [2, 2], [5, 5]), ("3/8", [2, 2], [4, 4]))  # pixels see pixels of f in part
 
 
 def auto(shape: tuple[int, int] = (19, 19), lenses: Any = THREE, **render: Any) -> Scene:
@@ -54,7 +54,7 @@ def lit(described: Scene, **more: Any) -> AdaptiveRendering:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("sampler", ["multijitter", "independent", "ldsampler"])
-def test_the_goal_is_reached_in_every_pixel(variant: str, sampler: str) -> None:
+def test_the_target_variance_is_reached_in_every_pixel(variant: str, sampler: str) -> None:
     needs(variant)
     described = scene(
         (12, 12),
@@ -71,19 +71,19 @@ def test_the_goal_is_reached_in_every_pixel(variant: str, sampler: str) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_grid_that_fits_the_pixels_of_f_leaves_no_error(variant: str) -> None:
-    """But for rays that float32 rounds over an edge, at most one in a pass: 255 / (16 x 16) here."""
+    """Except for rays that float32 rounds across an edge, at most one in a pass: 255 / (16 x 16) here."""
     needs(variant)
     described = auto(variant=variant)
     camera, image = derive(described), load(described)
     found = render_until(Setup(described, camera, image))
-    assert found.how["samples"] < 1024, "where a fixed number takes ten thousand"
+    assert found.details["samples"] < 1024, "a fixed number would take ten thousand"
     away = np.abs(found.mean - ideal_matrix(camera) @ image.ravel())
     assert np.median(away) < 1e-4
     assert away.max() < 1.0
 
 
-def test_stated_variance_is_that_of_the_error() -> None:
-    """Over seeds: sum of squared errors over sum of stated variances, against its own scatter; no less is stated."""
+def test_the_stated_variance_is_that_of_the_error() -> None:
+    """Over seeds: the sum of squared errors over the sum of stated variances is 1 within its own scatter (t test)."""
     ratios: list[float] = []
     for seed in range(16):
         described = auto((19, 19), (("2/5", [2, 2], [5, 5]),), seed=seed, sampler="independent")
@@ -99,7 +99,7 @@ def test_stated_variance_is_that_of_the_error() -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_other_sub_imagers_change_no_numbers(variant: str) -> None:
+def test_values_do_not_depend_on_other_sub_imagers(variant: str) -> None:
     needs(variant)
     both = auto(lenses=THREE, variant=variant, sampler="stratified")
     alone = auto(lenses=THREE[:1], variant=variant, sampler="stratified")
@@ -110,11 +110,11 @@ def test_other_sub_imagers_change_no_numbers(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_threads_change_no_numbers(variant: str) -> None:
+def test_values_do_not_depend_on_the_number_of_threads(variant: str) -> None:
     needs(variant)
     import drjit as dr
 
-    described = auto(variant=variant, lenses=ODD)
+    described = auto(variant=variant, lenses=FRACTIONAL)
     before, found = dr.thread_count(), list[AdaptiveRendering]()
     try:
         for threads in (1, 5):
@@ -124,34 +124,36 @@ def test_threads_change_no_numbers(variant: str) -> None:
         dr.set_thread_count(before)
     assert found[0].mean.tobytes() == found[1].mean.tobytes()
     assert found[0].variance.tobytes() == found[1].variance.tobytes()
-    assert found[0].how == found[1].how
+    assert found[0].details == found[1].details
 
 
-def test_time_ends_it_after_a_round_for_every_pixel() -> None:
+def test_the_time_limit_ends_rendering_after_the_first_round() -> None:
     ticks = iter(range(10**6))
     described = auto(sampler="independent", time="3 s")
     found = lit(described, clock=lambda: float(next(ticks)))
-    assert not found.how["reached"]
-    assert set(found.how["not_reached"].values()) == {TIME}
+    assert not found.details["reached"]
+    assert set(found.details["not_reached"].values()) == {TIME}
     assert (found.variance > 0).all()
-    assert found.how["fewest_samples"] >= LEAST
+    assert found.details["fewest_samples"] >= LEAST
     endless = lit(auto(lenses=THREE[:1], time="1e9 s"), clock=lambda: 0.0)
-    assert endless.mean.tobytes() == lit(auto(lenses=THREE[:1])).mean.tobytes(), "time that is not over does nothing"
+    assert endless.mean.tobytes() == lit(auto(lenses=THREE[:1])).mean.tobytes(), "an unused time limit changes nothing"
 
 
-def test_what_cannot_be_reached_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    silent = scene((14, 14), ODD[:1], render={"samples": "auto", "variant": "scalar_rgb"}, noise={"variance": 1e-12})
-    assert set(lit(silent).how["not_reached"].values()) <= {FLOAT32, SAMPLES}
-    assert lit(silent).how["not_reached"], "float32 does not tell 1e-6 of 255"
+def test_an_unreachable_target_is_recorded_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    silent = scene(
+        (14, 14), FRACTIONAL[:1], render={"samples": "auto", "variant": "scalar_rgb"}, noise={"variance": 1e-12}
+    )
+    assert set(lit(silent).details["not_reached"].values()) <= {FLOAT32, SAMPLES}
+    assert lit(silent).details["not_reached"], "float32 does not resolve 1e-6 of 255"
     monkeypatch.setattr("ommatid.simulate.adaptive_render.MOST", 2048)
-    few = auto((14, 14), ODD[:1], sampler="independent")
+    few = auto((14, 14), FRACTIONAL[:1], sampler="independent")
     found = lit(few)
-    assert set(found.how["not_reached"].values()) == {SAMPLES}
-    assert found.how["samples"] <= 2 * 2048 + LEAST
+    assert set(found.details["not_reached"].values()) == {SAMPLES}
+    assert found.details["samples"] <= 2 * 2048 + LEAST
 
 
 @pytest.mark.parametrize("sets", [["noise.variance="], ["noise.variance=0"]], ids=["no noise", "noise of 0"])
-def test_without_noise_it_is_refused_before_any_work(here: Path, ommatid: Command, sets: list[str]) -> None:
+def test_a_scene_without_noise_is_refused_before_any_work(here: Path, ommatid: Command, sets: list[str]) -> None:
     told = [part for one in [*sets, "render.samples=auto"] for part in ("--set", one)]
     ended = ommatid("run", "tiny.toml", "-o", "out", *told)
     assert ended.code == 2
@@ -164,7 +166,7 @@ def test_without_noise_it_is_refused_before_any_work(here: Path, ommatid: Comman
 
 
 @pytest.mark.usefixtures("here")
-def test_time_belongs_to_auto(ommatid: Command) -> None:
+def test_a_time_limit_requires_auto(ommatid: Command) -> None:
     ended = ommatid("show", "tiny.toml", "--set", "render.time=3 s")
     assert ended.code == 2
     assert "render" in ended.err
@@ -178,16 +180,16 @@ def test_time_belongs_to_auto(ommatid: Command) -> None:
     assert "time" in keys
 
 
-def test_a_broken_off_rendering_goes_on(tmp_path: Path) -> None:
-    described = auto(lenses=ODD)
+def test_an_interrupted_rendering_continues(tmp_path: Path) -> None:
+    described = auto(lenses=FRACTIONAL)
     camera, image = derive(described), load(described)
 
-    def patience(done: float) -> None:
+    def interrupt(done: float) -> None:
         if done >= 0.5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), patience)
+        cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), interrupt)
     assert [path.name for path in tmp_path.iterdir()] == [".stack.exr.partial.npz"]
     found, _ = cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), no_progress)
     whole, _ = cached_stack(tmp_path / "whole.exr", Setup(described, camera, image), no_progress)
@@ -196,15 +198,15 @@ def test_a_broken_off_rendering_goes_on(tmp_path: Path) -> None:
     assert found.record["spent"] == whole.record["spent"]
 
 
-def test_foreseen_samples_divide_the_variance_as_asked() -> None:
+def test_predicted_samples_divide_the_variance_by_the_factor() -> None:
     for exponent in (1.0, 1.5, 2.0):
-        course = SubImagerProgress(Plan(16, 16), exponent, last=Plan(16, 64))
-        for too_large, most in ((10.0, 10**6), (1e4, 512)):
-            total = course.predicted_samples(too_large, most)
+        progress = SubImagerProgress(Plan(16, 16), exponent, last=Plan(16, 64))
+        for factor, most in ((10.0, 10**6), (1e4, 512)):
+            total = progress.predicted_samples(factor, most)
             each = min(total / 16, most)
             ratio = (each / 64) ** exponent * total / (16 * each)
-            bound = max(course.last.total * 2, min(total, course.last.total * 64))
-            assert ratio == pytest.approx(too_large, rel=0.01) or total == bound
+            bound = max(progress.last.total * 2, min(total, progress.last.total * 64))
+            assert ratio == pytest.approx(factor, rel=0.01) or total == bound
 
 
 def test_grids_fit_and_rounding_inverts() -> None:
@@ -224,7 +226,7 @@ def test_grids_fit_and_rounding_inverts() -> None:
 
 
 @pytest.mark.parametrize(("variant", "method"), [("scalar_rgb", "points"), ("llvm_ad_mono", "transport")])
-def test_calibration_goes_on_until_h_adds_little(tmp_path: Path, variant: str, method: str) -> None:
+def test_calibration_continues_until_h_adds_little(tmp_path: Path, variant: str, method: str) -> None:
     needs(variant)
     described = scene(
         (14, 14),
@@ -235,21 +237,21 @@ def test_calibration_goes_on_until_h_adds_little(tmp_path: Path, variant: str, m
     )
     camera, image = derive(described), load(described)
     stack = render(Setup(described, camera, image))
-    judge = for_stack(stack)
-    model, made = cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)
+    rule = for_stack(stack)
+    model, made = cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, rule)
     assert made
     assert model.record["auto"]["reached"]
-    assert judge.added_error(model) == pytest.approx(model.record["auto"]["adds"])
+    assert rule.added_error(model) == pytest.approx(model.record["auto"]["adds"])
     budget = restore(stack, model).budget()
     assert budget["calibration"] <= GOAL * (sum(budget.values()) - budget["calibration"])
     assert model.scene.calibration.samples == "auto"
-    assert not cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)[1], "up to date"
+    assert not cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, rule)[1], "up to date"
     fixed = described.model_copy(update={"calibration": described.calibration.model_copy(update={"samples": 256})})
-    assert cached_model(tmp_path / "model.npz", Setup(fixed, camera), no_progress, judge)[1], "another model"
+    assert cached_model(tmp_path / "model.npz", Setup(fixed, camera), no_progress, rule)[1], "another model"
 
 
 def endless() -> tuple[Scene, Camera]:
-    """A small camera whose calibration goes on for as long as it is told to."""
+    """Return a small camera with an open number of samples."""
     described = scene(
         (9, 9),
         (("1/3", [1, 1], [3, 3]),),
@@ -260,49 +262,51 @@ def endless() -> tuple[Scene, Camera]:
     return described, derive(described)
 
 
-def test_a_calibration_whose_writing_failed_comes_out_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The round that was good enough is done again: no further one follows it."""
+def test_a_calibration_that_could_not_be_written_is_repeated_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The accepted round is repeated, and no further one follows."""
     described, camera = endless()
-    judge = StoppingRule(lambda model: 0.0 if model.record["samples"] > 1000 else 1.0, "step", "a step")
+    rule = StoppingRule(lambda model: 0.0 if model.record["samples"] > 1000 else 1.0, "step", "a step")
 
-    def full(*told: object) -> None:
-        raise MachineError(f"{told[0]}: could not be written")
+    def full(*arguments: object) -> None:
+        raise MachineError(f"{arguments[0]}: could not be written")
 
     with monkeypatch.context() as patched:
         patched.setattr("ommatid.scenes.model_file.write", full)
         with pytest.raises(MachineError):
-            cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)
-    found, _ = cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, judge)
-    whole, _ = cached_model(tmp_path / "whole.npz", Setup(described, camera), no_progress, judge)
+            cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, rule)
+    found, _ = cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, rule)
+    whole, _ = cached_model(tmp_path / "whole.npz", Setup(described, camera), no_progress, rule)
     assert len(whole.record["auto"]["tried"]) > 1
     assert found.record["auto"] == whole.record["auto"]
     np.testing.assert_array_equal(found.matrix.data, whole.matrix.data)
 
 
-def test_jumps_are_few_and_what_cannot_be_reached_is_said() -> None:
-    """Judged by a law: what H adds falls like 1 / samples^1.5 from 100, as the total in the record says."""
+def test_few_rounds_reach_the_goal_and_an_unreachable_one_is_recorded() -> None:
+    """With a stopping rule by which the addition of H falls like 1 / samples^1.5."""
     described, camera = endless()
 
-    def judged(first: float) -> dict[str, Any]:
-        judge = StoppingRule(lambda model: first * (model.record["samples"] / 256) ** -1.5, "law", "a law")
-        return calibrate(Setup(described, camera), stopping_rule=judge).record
+    def calibrated(first: float) -> dict[str, Any]:
+        rule = StoppingRule(lambda model: first * (model.record["samples"] / 256) ** -1.5, "law", "a law")
+        return calibrate(Setup(described, camera), stopping_rule=rule).record
 
-    record = judged(1.0)
+    record = calibrated(1.0)
     assert record["auto"]["reached"]
     assert len(record["auto"]["tried"]) == 2, "one jump by the exponent"
-    never = judged(1e9)
+    never = calibrated(1e9)
     assert not never["auto"]["reached"]
     assert len(never["auto"]["tried"]) <= 5
 
 
-def test_without_a_stack_it_is_judged_by_the_prior() -> None:
-    """What H adds to Eq. 5 falls as H is known better, though its part of the error alone may rise at first."""
+def test_without_a_stack_the_prior_decides() -> None:
+    """The addition to Eq. 5 falls with the precision of H, though its part of the error alone may rise at first."""
     described = auto((12, 12), (("1/3", [3, 3], [3, 3]),), sampler="independent")
     camera = derive(described)
-    judge, found = for_prior(Setup(described, camera)), list[float]()
+    rule, found = for_prior(Setup(described, camera)), list[float]()
     for samples in (64, 256, 1024):
         told = described.calibration.model_copy(update={"samples": samples})
-        found.append(judge.added_error(calibrate(Setup(described.model_copy(update={"calibration": told}), camera))))
+        found.append(rule.added_error(calibrate(Setup(described.model_copy(update={"calibration": told}), camera))))
     assert found[0] > found[1] > found[2] > 0
 
 

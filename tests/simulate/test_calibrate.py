@@ -1,4 +1,4 @@
-"""Calibration: rows, grids, and uncertainties that are what they say."""
+"""Calibration: rows, grids, and stated uncertainties against real errors."""
 
 from __future__ import annotations
 
@@ -34,34 +34,34 @@ def test_no_two_sources_of_a_grid_reach_one_sensor_pixel() -> None:
     camera = derive(described)
     ideal = ideal_matrix(camera)
     start = 0
-    for kind in camera.types:
-        rows = ideal[start : start + kind.measurements]
-        start += kind.measurements
-        apart = of_pinholes(camera, kind).spacing
+    for lens_type in camera.types:
+        rows = ideal[start : start + lens_type.measurements]
+        start += lens_type.measurements
+        spacing = of_pinholes(camera, lens_type).spacing
         lit = np.zeros((23, 23))
-        for row in range(apart):
-            for column in range(apart):
-                sources = point_sources.grid(camera, apart, row, column)
+        for row in range(spacing):
+            for column in range(spacing):
+                sources = point_sources.grid(camera, spacing, row, column)
                 lit += sources
                 seen = (rows != 0).astype(np.float64) @ sources.ravel()
                 assert seen.max() <= 1
-        assert (lit == 1).all(), "every pixel of f has its turn once"
+        assert (lit == 1).all(), "every pixel of f is lit once"
 
 
-def test_rows_sum_to_what_a_uniform_target_reads() -> None:
+def test_rows_sum_to_the_reading_of_a_uniform_target() -> None:
     described = small()
     found = point_sources.responses_from_points(Setup.from_scene(described))
     np.testing.assert_allclose(found.matrix.sum(axis=1), 1, atol=2e-6)
 
 
-def test_a_source_given_to_the_wrong_pixel_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_assigned_to_the_wrong_pixel_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     described = small()
     camera = derive(described)
     right = point_sources.visible_pixels
 
-    def wrong(rig: Any, group: str) -> VisiblePixels:
-        found = right(rig, group)
-        return replace(found, row=found.row + 3, column=found.column + 3)
+    def wrong(renderer: Any, group: str) -> VisiblePixels:
+        visible = right(renderer, group)
+        return replace(visible, row=visible.row + 3, column=visible.column + 3)
 
     monkeypatch.setattr(point_sources, "visible_pixels", wrong)
     with pytest.raises(MachineError, match="uniform"):
@@ -69,7 +69,7 @@ def test_a_source_given_to_the_wrong_pixel_is_noticed(monkeypatch: pytest.Monkey
 
 
 def test_the_stated_uncertainty_of_h_is_its_real_error() -> None:
-    """Over thirty seeds: of its entries, and of what they do to the measurements of a photograph."""
+    """Over thirty seeds: for its entries, and for their effect on the measurements of a photograph."""
     ideal = ideal_matrix(derive(small()))
     image = load(small())
     entries: list[float] = []
@@ -85,7 +85,7 @@ def test_the_stated_uncertainty_of_h_is_its_real_error() -> None:
         assert abs(np.mean(ratios) - 1) < 4 * np.std(ratios, ddof=1) / 30**0.5 + 0.05
 
 
-def test_agreement_with_the_ideal_model_is_tested_and_can_fail() -> None:
+def test_a_wrong_entry_disagrees_with_the_ideal_model() -> None:
     described = small(samples=1024)
     camera = derive(described)
     found = calibrate.calibrate(Setup(described, camera))
@@ -108,7 +108,7 @@ def test_ideal_calibration_has_no_uncertainty() -> None:
     assert not found.variance_from_model(load(described)).any()
 
 
-def test_model_files(tmp_path: Path) -> None:
+def test_a_model_file_gives_the_same_model(tmp_path: Path) -> None:
     described = small()
     found = calibrate.calibrate(Setup.from_scene(described))
     model_file.write(tmp_path / "model.npz", found)

@@ -64,8 +64,8 @@ def exposed(told: SensorTable, camera: Camera, light: float | Vector, seed: int,
     return record(everywhere, np.full(camera.measurements, electrons), told, camera, seed)
 
 
-def test_a_photon_transfer_curve_gives_back_the_sensor() -> None:
-    """K from temporal variance against mean, noise of the dark from the least of it, DSNU and PRNU from the spatial."""
+def test_a_photon_transfer_curve_recovers_the_sensor() -> None:
+    """Gain from temporal variance against mean, dark noise from its intercept, DSNU and PRNU from spatial variance."""
     camera, told = field(160), sensor(bits=14)
     pixels = camera.measurements
     pairs = [[exposed(told, camera, light, 2 * n + i).digital for i in (0, 1)] for n, light in enumerate(LEVELS)]
@@ -93,7 +93,7 @@ LEVELS = tuple(np.linspace(0, 300, 13))
 
 
 def test_photons_are_poisson() -> None:
-    """Without anything else the numbers are the counts: their shares are those of the law."""
+    """Without other noise the numbers are the counts, with Poisson frequencies (chi-squared)."""
     camera = field(150)
     bare = sensor(**dict.fromkeys(("dark_current", "read_noise", "dsnu", "prnu", "black_level"), 0.0), gain=1.0)
     counts = exposed(bare, camera, 1.0, 3, electrons=6.0).digital
@@ -110,7 +110,7 @@ def test_photons_are_poisson() -> None:
     [({"bits": 10}, 1023), ({"bits": 14}, 0.45 * 8000 + 40), ({"bits": 14, "saturation": 2000}, None)],
 )
 def test_full_pixels(changes: dict[str, Any], largest: float | None) -> None:
-    """Numbers end where the bits or the well do, noise or not; `saturation` only says from where on they count."""
+    """Numbers are limited by the bits or the well, with or without noise; `saturation` only marks them as full."""
     told, camera = sensor(**changes), field(40)
     found = exposed(told, camera, 1e9, 0)
     assert found.saturated.all()
@@ -131,7 +131,7 @@ def test_full_pixels(changes: dict[str, Any], largest: float | None) -> None:
         ({"frames": 16, "read_noise": 10.0, "gain": 0.05, "dark_current": 0.0}, 1.0, 10.0),  # a good deal of rounding
     ],
 )
-def test_the_scatter_of_a_value_is_what_is_said_of_it(
+def test_the_scatter_of_values_is_their_stated_variance(
     changes: dict[str, Any], electrons: float, brightest: float
 ) -> None:
     """Over 400 exposures, each with frames of its own: every pixel (chi-squared), all of them, and their means."""
@@ -153,7 +153,7 @@ def test_the_scatter_of_a_value_is_what_is_said_of_it(
     assert np.abs(away).max() < float(stats.norm.isf(familywise(25) / 2))
 
 
-def test_frames_drawn_as_their_mean_are_like_frames_drawn_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_means_of_frames_are_distributed_like_frames_drawn_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     coarse = {"gain": 0.1, "read_noise": 5.0}  # rounding counts, and errs in all frames alike by next to nothing
     camera, told = field(60), sensor(dsnu=0.0, prnu=0.0, frames=9, **coarse)
     found: list[Recording] = []
@@ -170,7 +170,7 @@ def test_frames_drawn_as_their_mean_are_like_frames_drawn_one_by_one(monkeypatch
 
 
 def test_averaging_does_not_help_against_rounding_without_noise() -> None:
-    """Dark signals all over a step, hardly any noise: the mean of many frames errs like one, by a step / sqrt(12)."""
+    """With dark signals spread over a step and hardly any noise, the mean of many frames errs by a step / sqrt(12)."""
     told = sensor(read_noise=0.5, dark_current=0.0, gain=0.01, dsnu=60.0, prnu=0.0, black_level=20.0, frames=400)
     found = exposed(told, field(28), 0.0, 0)
     exact = 20 + 0.01 * np.concatenate([_offsets(told, field(28))])
@@ -181,12 +181,12 @@ def test_averaging_does_not_help_against_rounding_without_noise() -> None:
 
 
 def _offsets(told: SensorTable, camera: Camera) -> Vector:
-    """The dark signals themselves, from a sensor that rounds to 1/50 of an electron."""
+    """Return the dark signals, from a sensor that rounds to 1/50 of an electron."""
     fine = told.model_copy(update={"gain": 50.0, "black_level": 1e5, "bits": 24, "read_noise": 0.0, "frames": 2})
     return (exposed(fine, camera, 0.0, 0).dark - 1e5) / 50
 
 
-def test_the_pattern_belongs_to_the_camera_and_all_else_to_the_exposure() -> None:
+def test_the_fixed_pattern_belongs_to_the_camera_and_the_rest_to_the_exposure() -> None:
     quiet = sensor(read_noise=0.0, dark_current=0.0, bits=16, gain=5.0, black_level=100.0, frames=256)
     two, one = field(24, 2), field(24)
     first, again = exposed(quiet, two, 200.0, 0), exposed(quiet, two, 200.0, 1)
@@ -202,7 +202,7 @@ def test_the_pattern_belongs_to_the_camera_and_all_else_to_the_exposure() -> Non
     assert abs(np.corrcoef(halves)[0, 1]) < 4 / halves.shape[1] ** 0.5
 
 
-def test_no_two_streams_are_the_same() -> None:
+def test_all_streams_differ() -> None:
     subs = field(4, 2).sub_imagers
     purposes: list[emva1288.Purpose] = ["dark signal", "response", "exposure", "dark frames", "flat frames"]
     drawn = {emva1288.generator(seed, what, sub).random() for seed in (0, 1) for what in purposes for sub in subs}
@@ -218,7 +218,7 @@ def test_no_two_streams_are_the_same() -> None:
     assert abs(np.corrcoef(flats[1], flats[2])[0, 1]) < 0.1 + 4 / plain.flat.size**0.5  # frames' noise is the same
 
 
-def test_a_first_idea_of_the_light() -> None:
+def test_smoothed_light_of_a_uniform_target() -> None:
     """Of a uniform target the target, one electron more in nine pixels, less uncertain by as many; never nothing."""
     camera, told = field(60), sensor(dsnu=0.0, prnu=0.0)
     found = exposed(told, camera, 5.0, 0)
@@ -232,7 +232,7 @@ def test_a_first_idea_of_the_light() -> None:
     assert float(np.nanmean(holes.smoothed_light(camera))) == pytest.approx(5.0, abs=2 * chance + 1 / 4 / 20)
 
 
-def test_pixels_that_see_nothing_are_dead_and_negative_light_is_refused() -> None:
+def test_pixels_without_response_are_dead_and_negative_light_is_refused() -> None:
     camera, told = field(12), sensor()
     response = np.full(144, 10.0)
     response[:12] = 0.0
@@ -277,7 +277,7 @@ def test_the_measured_error_is_the_expected_one(lux: float) -> None:
     assert found.budget()["noise"] > found.budget()["quantisation"] > 0
 
 
-def test_the_second_look_at_the_noise_is_nearer_to_the_truth_and_as_good_a_weight() -> None:
+def test_the_second_estimate_of_the_noise_is_more_accurate_and_as_good_a_weight() -> None:
     """Few electrons, where a reading alone says little of the noise it has; against that, and against the truth."""
     errors: list[list[float]] = []
     for seed in range(6):

@@ -1,4 +1,4 @@
-"""The exported scene, rendered by Mitsuba's own command without us, shows what our camera shows."""
+"""The exported scene, rendered by Mitsuba's own command, gives the sub-images of the camera."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def test_mitsubas_own_command_renders_the_same(tmp_path: Path) -> None:
             str(picture.parent / "camera.xml"),
         ]
         subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
-        shown = next(iter(read_channels(output).values()))
+        rendered = next(iter(read_channels(output).values()))
         pixels = camera.sub_imagers[number].type.pixels
-        assert shown.shape == pixels
-        # 4096 stratified samples of steps of at most 255 err by about 255 / 4096^(3/4) = 0.5 at the very worst.
-        np.testing.assert_allclose(shown, ideal[slices[number]].reshape(pixels), atol=0.5)
+        assert rendered.shape == pixels
+        # 4096 stratified samples of steps of at most 255 err by 255 / 4096^(3/4) = 0.5 at most.
+        np.testing.assert_allclose(rendered, ideal[slices[number]].reshape(pixels), atol=0.5)
 
 
-def test_the_name_must_be_a_scenes(tmp_path: Path) -> None:
+def test_the_file_name_must_end_in_xml(tmp_path: Path) -> None:
     described = scene()
     with pytest.raises(InputError, match=r"\.xml"):
         export(Setup.from_scene(described), tmp_path / "camera.json")

@@ -1,4 +1,4 @@
-"""The sensor: noise of the right size from streams of its own, and quantisation as added noise."""
+"""The ideal sensor: noise of the requested variance from independent streams, and quantisation as noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ommatid.simulate.sensor.gaussian import expose, generators, quantise
 from ..examples import THREE, camera
 
 
-def test_noise_has_the_variance_asked_for() -> None:
+def test_noise_has_the_requested_variance() -> None:
     rng = np.random.default_rng(0)
     size = 40_000
     noise = expose(np.full(size, 100.0), NoiseTable(variance=0.25), [rng], [slice(0, size)]) - 100

@@ -18,7 +18,7 @@ from ..examples import THREE, camera
 
 
 def by_supersampling(one: Camera, fine: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """H by counting points of a fine grid, whose points lie inside cells that a common denominator makes."""
+    """Return H by counting points of a fine grid, in the cells of a common denominator."""
     rows: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
     for sub in one.sub_imagers:
         m = float(sub.type.ratio)
@@ -102,5 +102,5 @@ def test_null_space_of_two_coprime_types_and_of_three() -> None:
     assert np.linalg.matrix_rank(dense, tol=1e-9) == 29**2
 
 
-def test_three_types_are_the_papers() -> None:
+def test_three_types_have_the_rank_of_the_paper() -> None:
     assert ideal_matrix(camera((19, 19), THREE)).shape == (706, 361)

@@ -1,4 +1,4 @@
-"""Whole runs through lenses and sensors that are more than the paper's: what is measured is what was promised."""
+"""Whole runs through lenses and sensors beyond the paper's: measured errors against predicted ones."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SENSOR = {"illuminance": "300 lux", "exposure": "10 ms", "read_noise": 3, "gain"
 
 
 def built(lens: dict[str, Any], lenses: Lenses = THREE, shape: tuple[int, int] = (19, 19), **tables: Any) -> Scene:
-    """A scene whose every lens type is this one, calibrated by transport."""
+    """Return a scene whose lens types all have these keys, calibrated by transport."""
     calibration = {"method": "transport", "samples": 1024}
     data = scene(shape, lenses, render={"samples": 1024}, calibration=calibration).plain()
     for described in data["camera"]["lens"]:
@@ -53,7 +53,7 @@ def built(lens: dict[str, Any], lenses: Lenses = THREE, shape: tuple[int, int] =
     ],
     ids=["defocus", "distortion", "sensor", "surfaces and sensor"],
 )
-def test_the_measured_error_is_the_promised_one(lens: dict[str, Any], tables: dict[str, Any], tmp_path: Path) -> None:
+def test_the_measured_error_is_the_expected_one(lens: dict[str, Any], tables: dict[str, Any], tmp_path: Path) -> None:
     needs("llvm_ad_mono")
     described = built(lens, **tables)
     camera, truth = derive(described), load(described)
@@ -67,7 +67,7 @@ def test_the_measured_error_is_the_promised_one(lens: dict[str, Any], tables: di
 
 
 def test_pixels_that_no_light_can_reach_are_dead() -> None:
-    """A baffle cuts the corners off the field: they are NaN, their rows of H are empty, and the estimate knows."""
+    """A baffle vignettes the corners of the field: NaN in the stack, empty rows of H, unused by the estimate."""
     needs("llvm_ad_mono")
     described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
     camera, truth = derive(described), load(described)
@@ -90,7 +90,7 @@ def test_pixels_that_no_light_can_reach_are_dead() -> None:
     assert np.isnan(counted.values[dark]).all()
 
 
-def test_what_a_lens_type_collects_is_what_the_rendering_shows() -> None:
+def test_electrons_follow_the_rendered_light() -> None:
     """Electrons from traced solid angles against the light that rendered rays bring: within 1 per cent."""
     needs("llvm_ad_mono")
     from ommatid.simulate.renderer.renderer import Renderer
@@ -107,7 +107,7 @@ def test_what_a_lens_type_collects_is_what_the_rendering_shows() -> None:
     assert max(means) / min(means) == pytest.approx(1, abs=0.05)
 
 
-def test_what_has_no_closed_form_is_calibrated_all_the_same() -> None:
+def test_lenses_without_a_closed_form_are_calibrated() -> None:
     """Distortion with defocus: H is there, only nothing to compare it with; and points see it as transport does."""
     needs("llvm_ad_mono")
     lens = {"aperture": "0.4 mm", "focus": "700 mm", "distortion": [0.05, 0.0]}
@@ -117,8 +117,8 @@ def test_what_has_no_closed_form_is_calibrated_all_the_same() -> None:
     assert model.matrix.sum(axis=1).max() == pytest.approx(1)
 
 
-def test_lens_types_that_are_left_out_leave_the_others_where_they_are() -> None:
-    """And a model of a camera that was made without them is not taken for theirs."""
+def test_omitted_lens_types_do_not_move_the_others() -> None:
+    """A model of a camera without them does not match the stack."""
     described = built({"distortion": [0.05, 0.0]})
     camera = derive(described)
     some, kept = camera.restrict(("B",))
@@ -134,7 +134,7 @@ def test_lens_types_that_are_left_out_leave_the_others_where_they_are() -> None:
     assert pinholes.restrict(("B",))[0].describe() == derive(scene(lenses=THREE)).restrict(("B",))[0].describe()
 
 
-def test_more_than_pinholes_cannot_be_exported(tmp_path: Path) -> None:
+def test_only_pinholes_can_be_exported(tmp_path: Path) -> None:
     described = built({"aperture": "0.4 mm"})
     with pytest.raises(InputError, match="cannot be exported"):
         export(Setup.from_scene(described), tmp_path / "lens.xml")
@@ -153,7 +153,7 @@ def test_more_than_pinholes_cannot_be_exported(tmp_path: Path) -> None:
         ('camera.tolerance.rotation="1 deg"', "need Mitsuba's fast backend"),
     ],
 )
-def test_what_cannot_work_is_refused_before_there_is_a_file(
+def test_unsuitable_lenses_are_refused_before_any_file_is_written(
     told: str, words: str, here: Path, ommatid: Command
 ) -> None:
     """The tiny scene renders on the slow backend. One sentence, which names the scene file."""
@@ -166,7 +166,7 @@ def test_what_cannot_work_is_refused_before_there_is_a_file(
     assert [path.name for path in here.iterdir()] == ["tiny.toml"]
 
 
-def test_a_corner_without_light_is_said_and_is_no_number() -> None:
+def test_a_corner_without_light_has_no_spot_size() -> None:
     """JSON has no NaN, and a table no `nan um`."""
     described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
     (found,) = sharpness.describe(derive(described))

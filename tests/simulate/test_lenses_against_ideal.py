@@ -1,7 +1,7 @@
-"""Traced H against H in closed form, entry by entry, wherever there is one: defocus, diffraction, distortion, poses.
+"""Traced H against H in closed form, entry by entry: defocus, diffraction, distortion, misalignment.
 
-With independent samples an entry is a share of n rays, so that its variance is H (1 - H) / n whatever was drawn: the
-statistic is normal, its standard error known, and not taken from the data. Entries that few rays meet count together.
+With independent samples an entry is a share of n rays, with the variance H (1 - H) / n: the statistic is normal with a
+known standard error, not one estimated from the data. Entries that few rays meet are summed.
 """
 
 from __future__ import annotations
@@ -18,21 +18,20 @@ from ommatid.simulate.calibration.ray_transport import responses_from_rays
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.render import light
 
-from ..examples import assert_student, familywise, needs
-from .test_ray_transport import KINDS, TWO, built
+from ..examples import OPTICS, TWO, assert_student, familywise, needs, with_optics
 
 SAMPLES = 2**14
 FEWEST = 25  # rays expected in an entry, above which their number is normal
-CLOSED = KINDS | {
+CLOSED = OPTICS | {
     "a thin lens in focus": ({"aperture": "0.4 mm"}, {}),
     "far out of focus": ({"aperture": "0.4 mm", "focus": "700 mm"}, {}),
     "diffraction out of focus": ({"aperture": "0.8 mm", "focus": "900 mm"}, {"wavelength": "550 nm"}),
-    "distorted and misaligned": ({"distortion": [-0.04, 0.02]}, KINDS["misaligned"][1]),
+    "distorted and misaligned": ({"distortion": [-0.04, 0.02]}, OPTICS["misaligned"][1]),
 }
 
 
 def scores(found: sparse.csr_array, expected: sparse.csr_array, rays: int) -> np.ndarray:
-    """How many standard errors each entry lies from its expectation, and each row's sum over its rare ones."""
+    """Return the deviation of each entry in standard errors, and of each row's sum over its rare entries."""
     dense, known = found.toarray(), expected.toarray()
     rare = known * rays < FEWEST
     many = ~rare
@@ -44,10 +43,10 @@ def scores(found: sparse.csr_array, expected: sparse.csr_array, rays: int) -> np
 
 
 @pytest.mark.parametrize("kind", CLOSED)
-def test_h_is_that_of_the_closed_form(kind: str) -> None:
+def test_traced_h_is_the_closed_form(kind: str) -> None:
     needs("llvm_ad_mono")
     render = {"sampler": "independent", "complete": True}
-    described, camera = built(*CLOSED[kind], calibration={"samples": SAMPLES}, render=render)
+    described, camera = with_optics(*CLOSED[kind], calibration={"samples": SAMPLES}, render=render)
     traced = responses_from_rays(Setup(described, camera))
     found = scores(traced.matrix, true_matrix(camera), traced.passes * traced.samples)
     assert found.size > 5000
@@ -56,22 +55,22 @@ def test_h_is_that_of_the_closed_form(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", CLOSED)
-def test_the_same_test_sees_a_camera_that_is_another_one(kind: str) -> None:
-    """Nothing of this passes for a pinhole where it should: but a lens in focus is one."""
+def test_the_statistic_detects_another_camera(kind: str) -> None:
+    """No other optics pass for an ideal pinhole, except a lens in focus, which is one."""
     if kind in ("pinhole", "a thin lens in focus"):
         return
-    _, camera = built(*CLOSED[kind])
-    _, pinholes = built(*KINDS["pinhole"])
+    _, camera = with_optics(*CLOSED[kind])
+    _, pinholes = with_optics(*OPTICS["pinhole"])
     found = scores(ideal_matrix(pinholes), true_matrix(camera), SAMPLES)
     assert np.abs(found).max() > 2 * stats.norm.isf(familywise(found.size) / 2)
 
 
 @pytest.mark.parametrize("kind", ["out of focus", "diffraction", "distortion", "misaligned"])
 def test_rendered_sub_images_of_a_photograph(kind: str) -> None:
-    """What Mitsuba renders of the picture, its edge and the black around it included, is H f."""
+    """The rendering, with the picture's edge and the black around it, is H f."""
     needs("llvm_ad_mono")
     tables: dict[str, Any] = {"render": {"samples": 4096, "complete": True}}
-    described, camera = built(*CLOSED[kind], TWO, **tables)
+    described, camera = with_optics(*CLOSED[kind], TWO, **tables)
     image = load(described)
     rendered = light(Setup(described, camera, image))
     difference = rendered.mean - true_matrix(camera) @ image.ravel()

@@ -1,4 +1,4 @@
-"""Passes: how samples are divided, running moments, and the floor that float32 sets."""
+"""Passes: division of samples, running moments, and the rounding of float32."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def test_tally_agrees_with_numpy_even_far_from_zero() -> None:
 
 
 @pytest.mark.parametrize("samples", [16, 256, 4096])
-def test_rounding_covers_what_float32_sums_do(samples: int) -> None:
-    """Sums of equal float32 values, taken one after the other, as a film does."""
+def test_the_rounding_variance_bounds_that_of_float32_sums(samples: int) -> None:
+    """Sums of equal float32 values one after the other, as in a film."""
     values = np.random.default_rng(1).uniform(1, 255, 200).astype(np.float32)
     total = np.zeros(200, np.float32)
     for _ in range(samples):

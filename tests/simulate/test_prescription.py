@@ -13,68 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.scene import parse, read, write
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import read, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface
 from ommatid.scenes.tables.lens_file import read_lens
 from ommatid.simulate.lenses.prescription import Prescription, prescribe, prescription_of
 
-from ..examples import GALLERY, turned_round
-
-# A double Gauss lens of 50 mm, f/2, after United States patent 2673491 (Tronnier, 1954).
-DOUBLE_GAUSS = """# f/2
-50
-29.475   3.76   1.67   25.2
-84.83    0.12   1      25.2   # air
-19.275   4.025  1.67   23
-40.77    3.275  1.699  23
-
-12.75    5.705  1      18
-0        4.5    0      17.1
--14.495  1.18   1.603  17
-40.77    6.065  1.658  20
--20.385  0.19   1      20
-437.065  3.22   1.717  20
--39.73   36.77  1      20
-"""
-
-
-def lens(
-    radius: list[float],
-    thickness: list[float],
-    index: list[float],
-    semi_diameter: float | list[float] = 1.0,
-    conic: list[float] | None = None,
-    stop: int = 0,
-) -> Prescription:
-    """A lens from numbers; the thickness of the last surface is left out."""
-    count = len(radius)
-    return Prescription(
-        radius=np.array(radius),
-        thickness=np.append(thickness, 0.0),
-        index=np.array(index),
-        semi_diameter=np.broadcast_to(np.array(semi_diameter), count),
-        conic=np.zeros(count) if conic is None else np.array(conic),
-        stop=stop,
-    )
-
-
-def ball(radius: float = 1.0, index: float = 1.5) -> Prescription:
-    return lens([radius, -radius], [2 * radius], [index, 1.0], radius)
-
-
-def camera_with(surfaces: Any, **more: Any) -> Camera:
-    """The paper's tile with such lenses of type I."""
-    data = read(GALLERY / "tile19.toml", (), ["I"]).plain()
-    data["camera"]["lens"][0] |= {"surfaces": surfaces, **more}
-    return derive(parse(data, Path("test.toml")))
-
-
-BICONVEX = [
-    {"radius": "1 mm", "thickness": "0.2 mm", "glass": "N-BK7", "semi_diameter": "0.15 mm", "stop": True},
-    {"radius": "-1 mm", "semi_diameter": "0.2 mm"},
-]
+from ..examples import GALLERY
+from ..lenses import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens, turned_round
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,8 @@ from ommatid.simulate.lenses.ray_trace import (
     trace,
 )
 
-from ..examples import GALLERY, needs, turned_round
-from .test_prescription import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens
+from ..examples import GALLERY, needs
+from ..lenses import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens, turned_round
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Rendering as a whole: what a stack holds, repeatable to the bit whatever the number of threads."""
+"""Rendering to a stack: repeatable to the bit on any number of threads, with variances and fingerprints."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from ..modules import existing
 
 
 def recorded(described: Scene) -> Stack:
+    """Render and record a scene."""
     return render(Setup.from_scene(described))
 
 
@@ -52,19 +53,19 @@ def test_another_seed_gives_other_noise() -> None:
 
 def test_progress_ends_at_one_and_never_falls() -> None:
     described = scene(render={"variant": "scalar_rgb", "samples": 16})
-    seen: list[float] = []
-    render(Setup.from_scene(described), seen.append)
-    assert seen == sorted(seen)
-    assert seen[-1] == 1.0
+    fractions: list[float] = []
+    render(Setup.from_scene(described), fractions.append)
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
 
 
 def test_variances_are_stored_and_never_zero() -> None:
     stack = recorded(scene((19, 19), THREE, render={"variant": "scalar_rgb", "samples": 256}))
     assert (stack.variance > 0).all()
-    assert stack.variance.astype(np.float32).min() > 0, "not in the file's precision either"
+    assert stack.variance.astype(np.float32).min() > 0, "in the file's precision too"
 
 
-def test_a_scene_without_noise_runs_no_noise_code(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_without_noise_imports_no_noise_module(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
     [noise] = existing("ommatid.simulate.sensor.gaussian")
@@ -73,7 +74,7 @@ def test_a_scene_without_noise_runs_no_noise_code(monkeypatch: pytest.MonkeyPatc
     assert noise not in sys.modules
 
 
-def test_fingerprint_changes_with_what_the_values_depend_on_and_only_with_that() -> None:
+def test_the_fingerprint_changes_with_the_inputs_of_the_values_only() -> None:
     plain = scene()
     camera, image = derive(plain), load(plain)
     first = made_from(Setup(plain, camera, image))

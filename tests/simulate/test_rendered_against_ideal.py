@@ -1,4 +1,4 @@
-"""What Mitsuba renders against the closed form, pixel by pixel, to the statistical limit.
+"""Renderings in Mitsuba against the closed form, pixel by pixel, to the statistical limit.
 
 The variance of each pixel's mean comes from its 16 passes alone, so Student's t with 15 degrees of freedom applies,
 corrected for the number of pixels (Sidak); where all passes agree, float32's rounding is the limit.
@@ -6,98 +6,114 @@ corrected for the number of pixels (Sidak); where all passes agree, float32's ro
 
 from __future__ import annotations
 
+from math import log
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 
-from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.formats.picture import load
-from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import Sampler, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.point_sources import responses_from_points
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, light
 from ommatid.simulate.sampling.passes import rounding_variance
+from ommatid.simulate.sampling.samplers import corners, fitting
 
-from ..examples import THREE, VARIANTS, assert_student, needs, scene
+from ..examples import THREE, VARIANTS, assert_student, familywise, needs, scene
 
 UNUSUAL = (("2/5", [2, 2], [4, 3]), ("3/10", [1, 2], [2, 3]), (1, [1, 1], [9, 8]))
+CUT = slice(450)  # pixels of three_types whose strata are cut by edges of pixels of f: those of 1/4 are not
 
 
-def three_types(variant: str, samples: int, sampler: str = "multijitter", seed: int = 11) -> tuple[Scene, Camera]:
+def three_types(variant: str, samples: int, sampler: str = "multijitter", seed: int = 11) -> Setup:
+    """Return a tile with three lens types, rendered and calibrated with these samples per pixel."""
     render = {"variant": variant, "samples": samples, "sampler": sampler, "seed": seed}
-    described = scene((19, 19), THREE, render=render, calibration={"samples": samples})
-    return described, derive(described)
+    return Setup.from_scene(scene((19, 19), THREE, render=render, calibration={"samples": samples}))
 
 
-def floored(rendering: Rendering) -> NDArray[np.float64]:
+def ideal(setup: Setup) -> NDArray[np.float64]:
+    """Return the light of the setup's image in closed form, (M,)."""
+    return ideal_matrix(setup.camera) @ setup.image.ravel()
+
+
+def variance_of(rendering: Rendering) -> NDArray[np.float64]:
+    """Return the variance of a rendering from its passes, never below float32's rounding, (M,)."""
     return np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
 
 
-@pytest.mark.parametrize("sampler", ["multijitter", "independent"])
+def effective_number(variance: NDArray[np.float64]) -> float:
+    """Return the effective number of terms in a sum of squares of unequal variances, (sum v)^2 / sum v^2.
+
+    variance : from 16 passes, whose squares are 1 + 2/15 times too large on average
+    """
+    return float(variance.sum() ** 2 / (np.square(variance).sum() / (1 + 2 / 15)))
+
+
+@pytest.mark.parametrize("sampler", get_args(Sampler))
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_sub_images_of_a_photograph(variant: str, sampler: str) -> None:
+def test_sub_images_of_a_photograph(variant: str, sampler: Sampler) -> None:
     needs(variant)
-    described, camera = three_types(variant, 4096, sampler)
-    image = load(described)
-    rendering = light(Setup(described, camera, image))
-    difference = rendering.mean - ideal_matrix(camera) @ image.ravel()
-    assert {sub.type.name for sub in camera.sub_imagers} == {"A", "B", "C"}
-    assert_student(difference, floored(rendering), rendering.passes)
+    samples = 4096 if sampler in ("multijitter", "independent") else 1024
+    setup = three_types(variant, samples, sampler)
+    rendering = light(setup)
+    assert rendering.passes == 16
+    assert rendering.record()["samples"] == 16 * fitting(sampler, samples // 16)
+    assert_student(rendering.mean - ideal(setup), variance_of(rendering), rendering.passes)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_calibrated_h(variant: str) -> None:
     needs(variant)
-    described, camera = three_types(variant, 4096)
-    found = responses_from_points(Setup(described, camera))
-    dense, ideal = found.matrix.toarray(), ideal_matrix(camera).toarray()
-    assert (dense[ideal > 0] > 0).all(), "light comes from everywhere where the closed form says"
-    assert dense[ideal == 0].sum() < 1e-5 * dense.sum(), "but for rays rounded over an edge, only from there"
-    rows = np.repeat(np.arange(camera.measurements), np.diff(found.matrix.indptr))
-    difference = found.matrix.data - ideal[rows, found.matrix.indices]
-    variance = np.maximum(found.variance, rounding_variance(found.matrix.data, found.samples))
-    assert_student(difference, variance, found.passes)
+    setup = three_types(variant, 4096)
+    responses = responses_from_points(setup)
+    matrix, exact = responses.matrix, ideal_matrix(setup.camera).toarray()
+    dense = matrix.toarray()
+    assert (dense[exact > 0] > 0).all(), "every entry of the closed form is seen"
+    assert dense[exact == 0].sum() < 1e-5 * dense.sum(), "no other is, except by rays rounded over an edge"
+    rows = np.repeat(np.arange(setup.camera.measurements), np.diff(matrix.indptr))
+    variance = np.maximum(responses.variance, rounding_variance(matrix.data, responses.samples))
+    assert_student(matrix.data - exact[rows, matrix.indices], variance, responses.passes)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_calibrated_h_of_ratios_that_are_no_whole_numbers(variant: str) -> None:
-    """Footprints cut through pixels of f; one type's edges stand a hair from them, where float32 rounds either way."""
+def test_calibrated_h_of_fractional_ratios(variant: str) -> None:
+    """Footprints cut through pixels of f; the edges of one type almost coincide with theirs, to float32's rounding."""
     needs(variant)
     lenses = (("2/7", [2, 2], [3, 2]), ("333333/1000000", [2, 2], [3, 4]), ("1/3", [1, 1], [4, 4]))
     data = scene((13, 14), lenses, render={"variant": variant, "seed": 2}, calibration={"samples": 4096}).plain()
     data["camera"]["lens"][0]["step"] = "1/3"
-    described = parse(data, Path("test.toml"))
-    camera = derive(described)
-    found = responses_from_points(Setup(described, camera))
-    dense, ideal = found.matrix.toarray(), ideal_matrix(camera).toarray()
-    rows = np.repeat(np.arange(camera.measurements), np.diff(found.matrix.indptr))
-    # Slivers thinner than one ray in a hundred passes are no matter of Student's t.
-    thick = ideal[rows, found.matrix.indices] > 1e-3
-    difference = (found.matrix.data - ideal[rows, found.matrix.indices])[thick]
-    variance = np.maximum(found.variance, rounding_variance(found.matrix.data, found.samples))[thick]
-    assert_student(difference, variance, found.passes)
-    assert np.abs(dense - ideal)[ideal <= 1e-3].sum() < 1e-4 * dense.sum()
+    setup = Setup.from_scene(parse(data, Path("test.toml")))
+    responses = responses_from_points(setup)
+    matrix, exact = responses.matrix, ideal_matrix(setup.camera).toarray()
+    rows = np.repeat(np.arange(setup.camera.measurements), np.diff(matrix.indptr))
+    # Slivers that less than one ray in a hundred passes hits are not normally distributed.
+    thick = exact[rows, matrix.indices] > 1e-3
+    difference = (matrix.data - exact[rows, matrix.indices])[thick]
+    variance = np.maximum(responses.variance, rounding_variance(matrix.data, responses.samples))[thick]
+    assert_student(difference, variance, responses.passes)
+    dense = matrix.toarray()
+    assert np.abs(dense - exact)[exact <= 1e-3].sum() < 1e-4 * dense.sum()
     np.testing.assert_allclose(dense.sum(axis=1), 1, atol=1e-4)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_ratios_that_are_no_whole_numbers(variant: str) -> None:
+def test_fractional_ratios(variant: str) -> None:
     """Footprints whose edges cut through pixels of the target, arrays that are not square, and magnification 1."""
     needs(variant)
     render = {"variant": variant, "samples": 16384, "seed": 5}
-    described = scene((13, 15), UNUSUAL, render=render)
-    camera = derive(described)
-    image = load(described)
-    rendering = light(Setup(described, camera, image))
-    assert_student(rendering.mean - ideal_matrix(camera) @ image.ravel(), floored(rendering), rendering.passes)
+    setup = Setup.from_scene(scene((13, 15), UNUSUAL, render=render))
+    rendering = light(setup)
+    assert_student(rendering.mean - ideal(setup), variance_of(rendering), rendering.passes)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_letter_f_comes_out_upright(variant: str) -> None:
-    """One lens of magnification 1 shows the picture itself; neighbours see it shifted to the left and up."""
+def test_a_letter_f_is_upright(variant: str) -> None:
+    """A lens of magnification 1 records the picture itself; its neighbours see it shifted to the left and up."""
     needs(variant)
     letter = np.zeros((12, 12))
     letter[2:10, 3] = letter[2, 3:8] = letter[5, 3:6] = 200.0
@@ -105,7 +121,7 @@ def test_a_letter_f_comes_out_upright(variant: str) -> None:
     camera = derive(described)
     assert camera.types[0].origin == (1, 1)
     rendering = light(Setup(described, camera, letter))
-    pictures = [rendering.mean[place].reshape(9, 9) for place in camera.slices()]
+    pictures = [rendering.mean[rows].reshape(9, 9) for rows in camera.slices()]
     for sub, picture in zip(camera.sub_imagers, pictures, strict=True):
         window = letter[1 + sub.k : 10 + sub.k, 1 + sub.l : 10 + sub.l]
         np.testing.assert_allclose(picture, window, atol=1e-3)
@@ -113,65 +129,65 @@ def test_a_letter_f_comes_out_upright(variant: str) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_uniform_target_reads_its_own_value(variant: str) -> None:
-    """To the rounding of a float32 film; a pinhole of finite depth does not darken towards the edge."""
+    """To the rounding of a float32 film; a pinhole at a finite distance does not darken towards the edge."""
     needs(variant)
-    described, camera = three_types(variant, 256)
-    rendering = light(Setup(described, camera, np.full((19, 19), 100.0)))
+    setup = three_types(variant, 256)
+    rendering = light(Setup(setup.scene, setup.camera, np.full((19, 19), 100.0)))
     np.testing.assert_allclose(rendering.mean, 100.0, rtol=2e-6)
 
 
 @pytest.mark.parametrize(("sampler", "power"), [("independent", 0.5), ("multijitter", 0.75)])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_the_error_falls_as_the_sampler_promises(variant: str, sampler: str, power: float) -> None:
-    """Independent samples: n^-1/2. Stratified ones of an image of steps, whose strata along an edge err: n^-3/4."""
+def test_the_error_falls_by_the_law_of_the_sampler(variant: str, sampler: str, power: float) -> None:
+    """n^-1/2 for independent samples; n^-3/4 for stratified ones and edges, up to the bound of `corners`.
+
+    The logarithm of a root mean square over n pixels has the variance 1 / (2 n).
+    """
     needs(variant)
-    error: dict[int, float] = {}
-    for samples in (256, 256 * 16):
-        described, camera = three_types(variant, samples, sampler)
-        image = load(described)
-        rendering = light(Setup(described, camera, image))
-        difference = (rendering.mean - ideal_matrix(camera) @ image.ravel())[:450]  # 1/4 fills its strata exactly
-        error[samples] = float(np.sqrt(np.mean(difference**2)))
-    fell = error[256] / error[4096]
-    assert fell == pytest.approx(16**power, rel=0.25), "each error of 450 pixels is known to 3 %, their ratio to 5 %"
+    logarithms: list[float] = []
+    variance = 0.0
+    for samples in (256, 4096):
+        setup = three_types(variant, samples, sampler)
+        rendering = light(setup)
+        errors = (rendering.mean - ideal(setup))[CUT]
+        logarithms.append(0.5 * log(np.mean(errors**2)))
+        variance += 0.5 / effective_number(rendering.variance[CUT])
+    slope = (logarithms[1] - logarithms[0]) / log(16)
+    limit = float(stats.norm.isf(familywise(4) / 2)) * variance**0.5 / log(16)
+    systematic = 0.0 if sampler == "independent" else corners(derive(scene((19, 19), THREE)), 16, 256)
+    assert abs(slope + power) < limit + systematic
 
 
 @pytest.mark.parametrize("sampler", ["multijitter", "independent"])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_the_variance_of_the_mean_is_the_real_one(variant: str, sampler: str) -> None:
+def test_the_stated_variance_is_the_mean_squared_error(variant: str, sampler: str) -> None:
+    """The ratio of both, over n pixels, has the variance 2 / n (1 + 1/15): of the errors, and of 16 passes."""
     needs(variant)
-    described, camera = three_types(variant, 1024, sampler)
-    image = load(described)
-    rendering = light(Setup(described, camera, image))
-    difference = (rendering.mean - ideal_matrix(camera) @ image.ravel())[:450]
-    # The mean of 450 squares over their variances, weighted by what both have in common.
-    assert np.sum(difference**2) / np.sum(rendering.variance[:450]) == pytest.approx(1, abs=0.4)
+    setup = three_types(variant, 1024, sampler)
+    rendering = light(setup)
+    errors, variance = (rendering.mean - ideal(setup))[CUT], rendering.variance[CUT]
+    deviation = (2 / effective_number(variance) * (1 + 1 / 15)) ** 0.5
+    limit = float(stats.norm.isf(familywise(4) / 2)) * deviation
+    assert np.sum(errors**2) / np.sum(variance) == pytest.approx(1, abs=limit)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_noise_of_data_calibration_and_seeds_is_uncorrelated(variant: str) -> None:
+def test_errors_of_data_calibration_and_seeds_are_uncorrelated(variant: str) -> None:
     needs(variant)
-    described, camera = three_types(variant, 64)
-    image = load(described)
-    ideal = ideal_matrix(camera) @ image.ravel()
-    other, _ = three_types(variant, 64, seed=12)
-    errors = [
-        light(Setup(described, camera, image)).mean - ideal,
-        light(Setup(other, camera, image)).mean - ideal,
-        responses_from_points(Setup(described, camera)).matrix @ image.ravel() - ideal,
-    ]
-    for one, another in ((0, 1), (0, 2), (1, 2)):
-        pair = np.array([errors[one][:450], errors[another][:450]])
-        pair /= np.sqrt(ideal[:450] + 1)
-        assert abs(np.corrcoef(pair)[0, 1]) < 4 / 450**0.5
+    setup, other = three_types(variant, 64), three_types(variant, 64, seed=12)
+    exact = ideal(setup)[CUT]
+    measured = (light(setup).mean, light(other).mean, responses_from_points(setup).matrix @ setup.image.ravel())
+    errors = np.array([(values[CUT] - exact) / np.sqrt(exact + 1) for values in measured])
+    correlations = np.corrcoef(errors)[np.triu_indices(3, 1)]
+    assert np.abs(correlations).max() < stats.norm.isf(familywise(6) / 2) / exact.size**0.5
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_no_ray_slips_into_another_sub_imager(variant: str) -> None:
+def test_no_ray_is_assigned_to_another_sub_imager(variant: str) -> None:
     """Film coordinates are float32 and round up to the next pixel's once in some hundred thousand rays.
 
-    Every one of 256 sub-imagers looks into a block of one value, with a rim around its window: what a slipped ray
-    brings from another block would show against the rounding of 256 equal values.
+    Each of 256 sub-imagers looks into a block of one value, with a rim around its window: a ray from another block
+    would be visible against the rounding of 256 equal values.
     """
     needs(variant)
     data = scene((98, 98), ((1, [16, 16], [4, 4]),), render={"variant": variant, "samples": 4096}).plain()

@@ -1,4 +1,4 @@
-"""Rays from sensor points through ideal lenses: where they go and how much light they bring, in closed form."""
+"""Rays from sensor points through ideal lenses: directions and weights in closed form."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PLACES = st.floats(-1, 1)
 
 
 @given(st.integers(0, 49), st.floats(0, 1), st.floats(0, 1))
-def test_a_ray_meets_the_target_where_the_magnification_says(number: int, down: float, across: float) -> None:
+def test_a_ray_meets_the_target_at_the_magnified_position(number: int, down: float, across: float) -> None:
     """From sensor through pinhole to target: pixel (i + u, j + v) looks at window + m (i + u, j + v)."""
     one = camera()
     sub = one.sub_imagers[number]
@@ -79,7 +79,7 @@ def test_light_through_a_wide_lens_onto_its_axis() -> None:
     assert mean == pytest.approx(d**2 / (d**2 + a**2), rel=1e-9)
 
 
-def test_rendered_light_of_a_lens_type_is_that_of_its_solid_angle() -> None:
+def test_rendered_light_follows_the_solid_angle() -> None:
     """Every pixel's mean weight against the solid angle of the lens in closed form: within the noise and 1 per cent."""
     needs("llvm_ad_mono")
     from ommatid.simulate.renderer.renderer import Renderer

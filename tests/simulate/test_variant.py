@@ -1,4 +1,4 @@
-"""Choice of a backend: a broken LLVM must never be touched, let alone kill the process."""
+"""Choice of a backend: a broken LLVM is never loaded, since it kills the process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BROKEN = [path for version in (15, 16) for path in Path("/usr/lib").glob(f"*/lib
 
 @pytest.fixture
 def llvm(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Let Dr.Jit claim to have an LLVM of some version."""
+    """Simulate a version of LLVM in Dr.Jit."""
     import drjit as dr
 
     def claim(version: tuple[int, int, int] | None) -> None:
@@ -49,7 +49,7 @@ def test_a_good_llvm_is_chosen(llvm: Any) -> None:
     assert choose("auto") == "llvm_ad_mono"
 
 
-def test_a_version_that_cannot_be_found_out_is_not_trusted(llvm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_version_is_not_chosen(llvm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     import drjit as dr
 
     llvm((19, 1, 7))
@@ -69,7 +69,7 @@ def test_a_real_broken_llvm_does_not_kill_the_process() -> None:
     assert probed == why
 
 
-def test_a_probe_that_dies_is_a_reason_and_not_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_probe_is_reported_as_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variant, "_PROBE", "import os; os.abort()")
     assert "trial rendering failed" in probe("llvm_ad_mono").reason
 
@@ -78,7 +78,7 @@ def test_the_working_backend_renders_in_its_probe() -> None:
     assert probe("scalar_rgb").speed > 0
 
 
-def test_the_advice_names_one_command() -> None:
+def test_the_remedy_is_one_command() -> None:
     slow = [BackendStatus("llvm_ad_mono", "none", 0), BackendStatus("scalar_rgb", "", 1e6)]
     assert "slow" in diagnosis(slow)
     assert "nothing to repair" in diagnosis([BackendStatus("llvm_ad_mono", "", 1e7)])

@@ -1,4 +1,4 @@
-"""What the camera sees of a world: against flat targets, closed forms of perspective and of occlusion, and itself."""
+"""Renderings of worlds, against flat targets and closed forms of perspective and occlusion."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def glow(radiance: object) -> str:
 
 
 def rectangle(width: float, height: float, x: float, y: float, z: float, rest: str) -> str:
-    """One that faces the camera, and what it is made of."""
+    """Return a rectangle that faces the camera; `rest` is its material."""
     return f"""<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/>
         <scale x="{width / 2}" y="{height / 2}"/><translate x="{x}" y="{y}" z="{z}"/></transform>{rest}</shape>"""
 
@@ -51,7 +51,7 @@ def cube(x: float, y: float, z: float, half: float, rest: str) -> str:
 def world(
     folder: Path, content: str, lenses: Lenses = THIRDS, target: dict[str, Any] | None = None, **more: Any
 ) -> tuple[Scene, Camera]:
-    """A scene of 12 x 12 pixels of 1 mm at 1 m that looks into a world of this content."""
+    """Return a scene of 12 x 12 pixels of 1 mm at 1 m in front of a world of this content, and its camera."""
     path = folder / "world.xml"
     path.write_text(f'<scene version="3.0.0">{content}</scene>', encoding="utf-8")
     data = flat_scene((12, 12), lenses, render={"variant": more.pop("variant", FAST), "samples": 256}).plain()
@@ -76,7 +76,7 @@ CHECKS = (
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_glowing_checkerboard_is_the_flat_target_with_that_picture(tmp_path: Path, variant: str) -> None:
+def test_an_emissive_checkerboard_equals_the_flat_target_with_that_picture(tmp_path: Path, variant: str) -> None:
     needs(variant)
     board = rectangle(12, 12, 0, 0, Z, CHECKS)
     described, camera = world(tmp_path, board, variant=variant, white=2.0)
@@ -92,8 +92,8 @@ def test_a_glowing_checkerboard_is_the_flat_target_with_that_picture(tmp_path: P
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_the_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: str) -> None:
-    """A glowing rectangle whose edges cut pixels at three quarters and at a half: what shines is the covered share."""
+def test_the_ground_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: str) -> None:
+    """An emissive rectangle whose edges cut pixels at three quarters and at a half gives the covered shares."""
     needs(variant)
     described, camera = world(tmp_path, rectangle(5.5, 7, 0.25, 0, Z, glow(0.5)), variant=variant)
     found = truth(Setup(described, camera))
@@ -108,7 +108,7 @@ def test_the_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: str) -> 
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_ball_hides_what_is_behind_it(tmp_path: Path, variant: str) -> None:
+def test_a_ball_occludes_the_background(tmp_path: Path, variant: str) -> None:
     needs(variant)
     x, y, z, radius = 0.7, 0.4, 500.0, 1.2
     ball = f'<shape type="sphere"><point name="center" x="{x}" y="{y}" z="{z}"/>'
@@ -145,8 +145,8 @@ def test_a_letter_f_of_cubes_is_upright_and_not_mirrored(tmp_path: Path, variant
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_disparity_is_how_far_a_near_square_moves(tmp_path: Path, variant: str) -> None:
-    """At half the target's distance, by as much as the lens stands beside the centre, and to the same side."""
+def test_a_near_square_moves_by_the_disparity(tmp_path: Path, variant: str) -> None:
+    """At half the target's distance, by the lens's own offset from the centre, to the same side."""
     needs(variant)
     square = rectangle(2, 2, 0, 0, Z / 2, glow(1))
     lens_pitch = {"camera": {"lens_pitch": "3 mm"}}
@@ -166,8 +166,8 @@ def test_disparity_is_how_far_a_near_square_moves(tmp_path: Path, variant: str) 
     assert rms == pytest.approx(float(disparity(camera, Z / 2)["A"]), abs=0.01)
 
 
-def test_a_picture_stands_before_its_world(tmp_path: Path) -> None:
-    """The flat target keeps its own values, whatever is called white; what is before it hides it."""
+def test_the_target_is_part_of_its_world(tmp_path: Path) -> None:
+    """The flat target keeps its own values for any radiance of white; objects in front of it occlude it."""
     needs(FAST)
     content = '<emitter type="constant"/>' + rectangle(2, 2, 0, 0, Z / 2, glow(3))
     picture = {"image": "photo:camera", "origin": [96, 224]}
@@ -181,7 +181,7 @@ def test_a_picture_stands_before_its_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.depth, np.where(hidden, Z / 2, Z), rtol=1e-6)
 
 
-def test_every_lens_reads_a_uniform_world_as_it_is(tmp_path: Path) -> None:
+def test_every_lens_reads_the_value_of_a_uniform_world(tmp_path: Path) -> None:
     needs(FAST)
     described, _ = world(tmp_path, '<emitter type="constant"><float name="radiance" value="0.4"/></emitter>')
     data = described.plain()
@@ -192,7 +192,7 @@ def test_every_lens_reads_a_uniform_world_as_it_is(tmp_path: Path) -> None:
     assert np.isnan(truth(Setup(blurred, camera)).depth).all()
 
 
-def test_an_aperture_blurs_what_is_not_in_focus(tmp_path: Path) -> None:
+def test_an_aperture_blurs_objects_out_of_focus(tmp_path: Path) -> None:
     """At half the focused distance by a disk as wide as the aperture, less bright towards its rim.
 
     Variances along an axis add: of a square of 2 pixels, 2^2/12, of a pixel, 1/12, and of the disk: with u the squared
@@ -222,7 +222,7 @@ LIT = (
 
 
 def test_interreflections_are_the_same_on_both_backends(tmp_path: Path) -> None:
-    """Shadows and light from wall to ball and back; different seeds, so independent noise."""
+    """Shadows and interreflections between wall and ball; different seeds, so independent noise."""
     needs(FAST)
     found: list[Rendering] = []
     for variant in VARIANTS:
@@ -249,8 +249,8 @@ def test_interreflections_exist_unless_all_is_black(tmp_path: Path, content: str
     assert has_interreflections(stage(described, "scalar_rgb", None).scene) is expected
 
 
-def test_light_that_cannot_bounce_is_left_out_to_the_last_digit(tmp_path: Path) -> None:
-    """The bound is 0: with and without it every pixel is the same, and the record says what was left out."""
+def test_omitting_absent_interreflections_changes_no_digit(tmp_path: Path) -> None:
+    """With and without them every pixel is the same, and the record says that they were left out."""
     needs(FAST)
     content = rectangle(6, 6, 1, 2, Z, CHECKS + '<bsdf type="diffuse"><float name="reflectance" value="0"/></bsdf>')
     found: list[Rendering] = []
@@ -261,13 +261,13 @@ def test_light_that_cannot_bounce_is_left_out_to_the_last_digit(tmp_path: Path) 
     np.testing.assert_allclose(found[0].mean, found[1].mean, rtol=1e-6)
 
 
-def test_the_gallerys_still_life_has_bouncing_light_and_its_corridor_none() -> None:
+def test_the_still_life_has_interreflections_and_the_corridor_none() -> None:
     for name, expected in (("still_life", True), ("corridor", False)):
         data = flat_scene().plain() | {"world": {"file": str(GALLERY / "worlds" / f"{name}.xml")}}
         assert has_interreflections(stage(parse(data, Path("test.toml")), "scalar_rgb", None).scene) is expected
 
 
-def test_a_world_is_rendered_again_where_it_or_what_it_names_has_changed(tmp_path: Path) -> None:
+def test_a_changed_world_or_file_of_it_is_rendered_again(tmp_path: Path) -> None:
     needs(FAST)
     part = tmp_path / "part.xml"
 
@@ -307,7 +307,7 @@ def test_a_world_is_rendered_again_where_it_or_what_it_names_has_changed(tmp_pat
         ('<emitter type="constant"/><integrator type="ptracer"/>', "does not follow rays from a camera"),
     ],
 )
-def test_a_world_that_cannot_be_built_is_refused_in_a_sentence(tmp_path: Path, content: str, complaint: str) -> None:
+def test_a_world_that_cannot_be_built_is_refused(tmp_path: Path, content: str, complaint: str) -> None:
     described, camera = world(tmp_path, content, variant="scalar_rgb")
     with pytest.raises(InputError, match=complaint) as told:
         truth(Setup(described, camera))

@@ -189,6 +189,9 @@ def _draw_curves(
             [x for x, _ in known], [y.median for _, y in known], yerr=[below, above],
             elinewidth=0.8, capsize=1.5, zorder=3, **styles[key].line(),
         )  # fmt: skip
+    values = {x for cells in groups.values() for x in map(x_of, cells) if x is not None}
+    if len(values) == 1:  # around a single value, Matplotlib's limits of a logarithmic axis may coincide
+        panel.update_datalim([(factor * value, 1.0) for value in values for factor in (0.5, 2.0)], updatey=False)
 
 
 def _draw_adaptive(panel: Any, cells: Sequence[Cell], styles: dict[Key, Style], x_of: Abscissa, y_of: Ordinate) -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from ommatid.bench.bench import curves, rows
+from ommatid.bench.figure import write_figures
 from ommatid.bench.jobs import SAMPLERS, Subject, jobs
 from ommatid.bench.reference import reference, sample_plan
 from ommatid.bench.resources import CLEAR_REFS, Cost, measure_cost
@@ -226,6 +227,14 @@ def test_a_table_that_is_read_is_the_one_that_was_written(
     assert list(row) == list(row_of(measured))
     assert float(row["error"]) == measured.error.median
     assert row["mse_high"] == ("" if measured.mse is None else str(measured.mse.high))
+
+
+@pytest.mark.parametrize("seconds", [0.01, 0.023146497000197996, 1.0])
+def test_a_single_cell_is_drawn_whatever_its_time(tmp_path: Path, seconds: float) -> None:
+    """Matplotlib's limits of a logarithmic axis coincide around some single values."""
+    single = cell("reconstruct", way="covariance", error=exactly(1e-10), seconds=exactly(seconds))
+    write_figures(tmp_path, bench_table(derive(scene()), [single]))
+    assert (tmp_path / "reconstruct.png").is_file()
 
 
 @pytest.fixture

@@ -236,7 +236,7 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
 
     Raises InputError for a wrong scene, MachineError for a full disk.
     """
-    stages.run(_setup(scene), Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda *_: None))
+    stages.run(_setup(scene), Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
     return read_run(folder)
 
 

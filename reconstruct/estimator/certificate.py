@@ -222,7 +222,7 @@ class _Certifier:
         values: Residuals = shift, right[1].high
         for _ in range(REPRODUCTION_STEPS):
             solution = self._corrected(solution, values)
-            residuals = self.system.residuals(*solution, *right)
+            residuals: Solution = self.system.residuals(*solution, *right)
             values = residuals[0].high, residuals[1].high
         rounding = self.system.rounding_errors(solution[0].high, solution[1].high, shift, right[1].high)[1]
         noise_free = self.system.problem.noise_variance == 0

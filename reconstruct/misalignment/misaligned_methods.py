@@ -79,6 +79,10 @@ class AlignedMethod(Method):
         result, alignment = self._dense.result(noise, truth), self.alignment
         added = float(alignment.variance.mean())
         expected = result.expected
+
+        def variance_of_sum(weights: FloatArray) -> float:
+            return result.variance_of_sum(weights) + alignment.variance_of_sum(weights)
+
         return replace(
             result,
             expected=ExpectedError(
@@ -88,7 +92,7 @@ class AlignedMethod(Method):
                 expected.resolved,
             ),
             interval=None if result.interval is None else _wider(result.interval, added),
-            variance_of_sum=lambda weights: result.variance_of_sum(weights) + alignment.variance_of_sum(weights),
+            variance_of_sum=variance_of_sum,
         )
 
 

@@ -218,7 +218,11 @@ def documents_of(swept: dict[str, list[str]]) -> list[dict[str, Any]]:
 def test_every_row_of_a_sweep_is_drawn_and_read_again(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keys = {"noise.variance": list(NOISES), "prior.variance": ["1", "2"], "render.seed": ["1", "2"]}
+    keys: dict[str, list[str]] = {
+        "noise.variance": list(NOISES),
+        "prior.variance": ["1", "2"],
+        "render.seed": ["1", "2"],
+    }
     rows = [summary(description) for description in documents_of(dict(list(keys.items())[:count]))]
     panels: list[Any] = []
     monkeypatch.setattr(sweep_figure, "_label_axes", lambda *arguments: panels.append(arguments[0]))

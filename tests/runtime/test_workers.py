@@ -101,7 +101,8 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("options", [{}, {"threads": 3}, {"count": 2}, {"scheduler": "address"}], ids=str)
 def test_results_are_in_the_order_of_the_items(options: dict[str, Any], address: str) -> None:
     progress: list[float] = []
-    with worker_pool(**({"scheduler": address} if "scheduler" in options else options)) as pool:
+    arguments: dict[str, Any] = {"scheduler": address} if "scheduler" in options else options
+    with worker_pool(**arguments) as pool:
         results = pool.map(digits_and_process, range(8), progress.append, 8)
     assert [values for values, _ in results] == [digits(seed) for seed in range(8)]
     assert progress == [(count + 1) / 8 for count in range(8)]

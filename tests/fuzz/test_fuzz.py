@@ -14,7 +14,8 @@ from .campaign import REFUSED, UNCHANGED, VERDICTS, campaign, command_for, damag
 from .file_types import FILE_TYPES
 
 SEED = 0
-INPUTS = 30  # of each type
+INPUTS = 100  # of each type, but of those in containers written anew, many of which are valid and reconstructed:
+RESEALED_INPUTS = 40
 FAMILIES = (("scene", "settings"), ("lens", "places", "world"), ("stack", "model"), ("picture", "frames"))
 
 
@@ -23,16 +24,16 @@ def test_damaged_inputs_are_refused_with_a_message_or_read_for_what_they_hold(
     family: tuple[str, ...], finished: Path
 ) -> None:
     names = [name for name in FILE_TYPES if name.startswith(family)]
-    results = campaign(dict.fromkeys(names, range(INPUTS)), SEED, finished)
+    numbers = {name: range(RESEALED_INPUTS if "resealed" in name else INPUTS) for name in names}
+    results = campaign(numbers, SEED, finished)
     assert not [f"{command_for(result, SEED)}: {result.verdict}" for result in results if result.wrong]
     for name in names:
         group = [result for result in results if result.kind == name]
         verdicts = {result.verdict for result in group}
-        assert [result.number for result in group] == list(range(INPUTS))
-        assert REFUSED in verdicts
+        assert [result.number for result in group] == list(numbers[name])
+        assert {REFUSED} < verdicts, "some damage is detected, some is harmless"
         if FILE_TYPES[name].sealed:
-            assert verdicts <= {REFUSED, UNCHANGED}
-    assert {result.verdict for result in results} == set(VERDICTS)  # the originals of every type were read before
+            assert verdicts == {REFUSED, UNCHANGED}
 
 
 def test_every_file_type_is_in_a_family() -> None:

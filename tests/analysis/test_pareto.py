@@ -16,3 +16,5 @@ def test_no_point_beats_the_front_and_none_of_it_is_beaten(points: list[tuple[fl
     for cost, error in front:
         assert not any(other[0] < cost and other[1] <= error for other in points)
     assert front == sorted(front)
+    errors = [error for _, error in front]
+    assert errors == sorted(set(errors), reverse=True), "each costs more for a smaller error"

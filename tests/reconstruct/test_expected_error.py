@@ -10,7 +10,7 @@ from scipy import sparse, stats
 
 from ommatid.reconstruct.estimator.estimate import FORMS, factorise
 from ommatid.reconstruct.expected_error import expected_error, expected_given, variance_of_sum
-from ommatid.reconstruct.prior import Prior
+from ommatid.reconstruct.prior import Prior, exponential
 from ommatid.reconstruct.problem import Problem
 from ommatid.simulate.ideal import ideal_matrix
 
@@ -73,6 +73,32 @@ def test_the_error_with_more_noise_than_expected_is_predicted() -> None:
     error = mean + form.gain(recorded - known.matrix @ mean) - images
     mse = np.mean(error**2, axis=0)
     assert abs(mse.mean() - expected.mse) < 4 * mse.std(ddof=1) / draws**0.5
+
+
+def test_the_error_under_another_prior_than_expected_is_predicted() -> None:
+    """Eq. 5 with a correlated prior and four times the noise: the mean over images of the error given the image.
+
+    Against trace((I - A H) P (I - A H)^T + A Rv A^T) / N in dense matrices, column by column of the root of P, and
+    against errors of images drawn from that prior, within four standard errors.
+    """
+    known, actual = tile_problem(3, 1.0), exponential(127.5, 1000.0, (19, 19), 4.0)
+    noise, unknowns = np.full(known.measurements, 4.0), known.unknowns
+    form, _ = factorise(known)
+    gain, root = form.gain(np.eye(known.measurements)), actual.apply_root(np.eye(actual.dimension))
+    bias = root - gain @ (known.matrix @ root)
+    predicted = float(np.sum(bias**2) + 4.0 * np.sum(gain**2)) / unknowns
+    without_image = expected_given(form, actual.mean, noise).mse
+    directions = [0, 150, 360]
+    given = [expected_given(form, actual.mean + root[:, column], noise).mse for column in directions]
+    excess = (np.array(given) - without_image) * unknowns
+    assert excess == pytest.approx(np.sum(bias[:, directions] ** 2, axis=0), rel=1e-6)
+    assert without_image == pytest.approx(4.0 * np.sum(gain**2) / unknowns, rel=1e-9)
+    rng, draws = np.random.default_rng(8), 300
+    images = actual.mean[:, None] + actual.apply_root(rng.normal(size=(actual.dimension, draws)))
+    recorded = known.matrix @ images + rng.normal(0, 2.0, (known.measurements, draws))
+    estimates = actual.mean[:, None] + form.gain(recorded - known.matrix @ actual.mean[:, None])
+    mse = np.mean((estimates - images) ** 2, axis=0)
+    assert abs(mse.mean() - predicted) < 4 * mse.std(ddof=1) / draws**0.5
 
 
 @pytest.mark.parametrize("wide", [False, True])

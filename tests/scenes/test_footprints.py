@@ -237,10 +237,10 @@ def shares_by_points(cam: Camera, sub: SubImager, pose: Pose, pixel: tuple[int, 
 
 @pytest.mark.parametrize("k", [(-0.15, 0.02), (0.3, 0.3)])
 def test_distortion_against_points(k: tuple[float, float]) -> None:
-    """An edge crosses at most 2 n of n x n cells, each of which is then counted misalignment by at most 1/n^2."""
+    """An edge crosses at most 2 n of n x n cells, each of which then errs by at most 1/n^2."""
     cam = distorted(camera(), *k)
-    for pixels, pixel in ((0, (0, 0)), (20, (2, 1)), (49, (3, 0))):
-        sub = cam.sub_imagers[pixels]
+    for index, pixel in ((0, (0, 0)), (20, (2, 1)), (49, (3, 0))):
+        sub = cam.sub_imagers[index]
         pose = pose_of(sub, NUDGED)
         exact = sub_matrix(cam, sub, pose).toarray()[pixel[0] * sub.type.pixels[1] + pixel[1]]
         coarse, fine = (shares_by_points(cam, sub, pose, pixel, count) - exact for count in (50, 1000))
@@ -270,6 +270,14 @@ def test_entries_are_shares_within_the_bounds_of_footprints(drawn: list[float]) 
         assert ((left[pixel] <= column) & (column < right[pixel])).all()
         inside = (top >= 0) & (bottom <= cam.rows) & (left >= 0) & (right <= cam.columns)
         np.testing.assert_allclose(sums[inside], 1, atol=1e-12)
+
+
+def test_bounds_of_footprints_are_tight() -> None:
+    """A footprint of m pixels meets m + 1 at most, and the margin for rounding adds one."""
+    cam = camera()
+    for sub in cam.sub_imagers[::7]:
+        top, bottom, left, right = reach(cam, sub, pose_of(sub))
+        assert max((bottom - top).max(), (right - left).max()) <= int(sub.type.ratio) + 2
 
 
 def test_a_steep_patch_has_valid_shares() -> None:

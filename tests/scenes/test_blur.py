@@ -167,7 +167,7 @@ def lattice(ratio: Fraction, unit: int, reach: float) -> NDArray[np.int64]:
 
 @pytest.mark.parametrize(("ratio", "blur"), [(Fraction(5, 2), Blur(disk=1.3)), (Fraction(3), Blur(disk=4.2))])
 def test_second_moments_add(ratio: Fraction, blur: Blur) -> None:
-    """Of a texel and a footprint, 1/12 and m^2/12, and of the disk, c^2/16, along each axis."""
+    """The sum of 1/12 for a texel, m^2/12 for a footprint and c^2/16 for the disk, along each axis."""
     unit = 16
     positions = lattice(ratio, unit, blur.reach)
     density = transfer(float(ratio), positions, unit, blur).sum(axis=0) / unit**2

@@ -81,7 +81,7 @@ def test_a_smaller_magnification_collects_more_light() -> None:
 
 @pytest.mark.parametrize("aperture", [1e-3, 1.0, 5.0, 1e6])
 def test_the_solid_angle_is_the_integral_over_the_cone(aperture: float) -> None:
-    """Of cos sin over the cone of the disk; a hemisphere is pi."""
+    """The integral of cos sin over the cone of the disk; it is pi for a hemisphere."""
     edge = np.arctan2(aperture / 2, 2.0)
     whole, _ = integrate.quad(lambda angle: 2 * pi * np.cos(angle) * np.sin(angle), 0, edge)
     assert solid_angle(aperture, 2.0) == pytest.approx(whole, rel=1e-9)
@@ -89,7 +89,7 @@ def test_the_solid_angle_is_the_integral_over_the_cone(aperture: float) -> None:
 
 
 def test_illumination_falls_with_the_fourth_power_of_the_cosine() -> None:
-    """Of the angle between a pixel's chief ray and the axis."""
+    """The cosine is that of the angle between a pixel's chief ray and the axis."""
     camera = derive(real())
     for sub in camera.sub_imagers[:3]:
         rows_, columns = sub.type.pixels
@@ -124,7 +124,7 @@ def test_illumination_of_misaligned_patches() -> None:
     assert np.std(ratio) == pytest.approx(0.02, abs=5 * standard_error), "twice that of the focal length"
 
 
-def test_with_apertureswith_surfaces_use_given_solid_angles() -> None:
+def test_lenses_with_surfaces_use_given_solid_angles() -> None:
     described = real()
     camera = derive(described)
     optics = replace(camera.types[1].optics, aperture=None, surfaces=())

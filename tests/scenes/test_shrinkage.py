@@ -57,7 +57,7 @@ def test_too_few_or_zero_variances_are_unchanged() -> None:
 
 @pytest.mark.parametrize(("spread", "bound"), [(0.5, 1.05), (1.0, 1.1), (2.0, 1.25)])
 def test_lognormal_variances_are_not_underestimated(spread: float, bound: float) -> None:
-    """Of another distribution than the assumed one, sums may be too large, up to a bound, but not too small."""
+    """With another distribution than the assumed one, sums may be too large, up to a bound, but not too small."""
     rng = np.random.default_rng(6)
     ratios: list[float] = []
     for _ in range(50):

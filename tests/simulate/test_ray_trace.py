@@ -51,7 +51,7 @@ def straight(lens: Prescription, height: Any) -> tuple[Array, Array, Any]:
 
 
 def crossing(lens: Prescription, height: Any) -> Array:
-    """How far in front of the lens's first vertex such rays cross the axis."""
+    """Return the distance in front of the first vertex at which such rays cross the axis."""
     x, slope, passed = straight(lens, height)
     assert np.all(passed)
     return -x / slope
@@ -148,7 +148,7 @@ def test_an_ellipsoid_brings_light_into_glass_to_a_point() -> None:
 
 @pytest.mark.parametrize("curved_first", [True, False])
 def test_spherical_aberration_of_a_plano_convex_lens(curved_first: bool) -> None:
-    """Of third order, both ways round: F. Jenkins, H. White, Fundamentals of Optics, chapter 9, a far point,
+    """Third order, in both orientations: F. Jenkins, H. White, Fundamentals of Optics, chapter 9, a far point,
 
     1/s_h - 1/s_p = h^2 / (8 f^3 n (n-1)) ((n+2)/(n-1) q^2 - 4 (n+1) q + (3n+2)(n-1) + n^3/(n-1)).
     """

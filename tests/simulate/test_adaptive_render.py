@@ -222,7 +222,7 @@ def test_grids_fit_and_rounding_inverts() -> None:
     assert cells_of(derive(auto()).types[0].ratio) == 3
     for samples in (64, 1024, 4096):
         variance = rounding_variance(values, samples)
-        assert samples_within(values, variance) == pytest.approx(samples, abs=8)
+        assert samples - 1 <= samples_within(values, variance) <= samples, "rounded down"
 
 
 @pytest.mark.parametrize(("variant", "method"), [("scalar_rgb", "points"), ("llvm_ad_mono", "transport")])

@@ -87,7 +87,7 @@ def test_an_emissive_checkerboard_equals_the_flat_target_with_that_picture(tmp_p
     assert_student(seen.mean - ideal_matrix(camera) @ picture.ravel(), floored(seen), seen.passes)
     assert_student(seen.mean - shown.mean, floored(seen) + floored(shown), seen.passes)
     exact = truth(Setup(described, camera))
-    np.testing.assert_allclose(exact.image, picture, atol=0.5)
+    np.testing.assert_allclose(exact.image, picture, rtol=1e-5)
     np.testing.assert_allclose(exact.depth, Z, rtol=1e-6)
 
 
@@ -100,7 +100,7 @@ def test_the_ground_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: s
     across, along = np.zeros(12), np.zeros(12)
     across[3:9] = 1, 1, 1, 1, 1, 0.5  # x from 3 to -2.5 mm, which is to the right
     along[2:10] = 0.5, 1, 1, 1, 1, 1, 1, 0.5
-    np.testing.assert_allclose(found.image, 127.5 * np.outer(along, across), atol=0.5)
+    np.testing.assert_allclose(found.image, 127.5 * np.outer(along, across), rtol=1e-5)
     assert np.isnan(found.depth[0, 0])
     assert np.isfinite(found.depth[5, 5])
     assert found.variance.mean() < 0.01
@@ -139,9 +139,11 @@ def test_a_letter_f_of_cubes_is_upright_and_not_mirrored(tmp_path: Path, variant
     needs(variant)
     cubes = "".join(cube(5.5 - column, 5.5 - row, Z + 0.05, 0.5, glow(0.8)) for row, column in np.argwhere(LETTER))
     described, camera = world(tmp_path, cubes, ((1, [1, 1], [12, 12]),), variant=variant)
-    np.testing.assert_allclose(truth(Setup(described, camera)).image, LETTER * 204.0, atol=0.5)
+    exact = truth(Setup(described, camera))
+    # Float32 may put a few rays on an edge on the wrong side of it.
+    np.testing.assert_allclose(exact.image, LETTER * 204.0, atol=4 * 204 / exact.samples)
     rendering = light(Setup(described, camera))
-    np.testing.assert_allclose(rendering.mean.reshape(12, 12), LETTER * 204.0, atol=0.5)
+    np.testing.assert_allclose(rendering.mean.reshape(12, 12), LETTER * 204.0, rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -164,7 +166,6 @@ def test_a_near_square_moves_by_the_disparity(tmp_path: Path, variant: str) -> N
         centre = centroid + [float(start) for start in sub.window[:2]]
         assert centre == pytest.approx(np.array(expected), abs=limit), "within five standard errors"
         moved.append(float(((centre - 6) ** 2).sum()))
-    assert limit < 0.05, "pixels"
     assert np.mean(moved) ** 0.5 == pytest.approx(float(disparity(camera, Z / 2)["A"]), abs=limit)
 
 
@@ -178,7 +179,7 @@ def test_the_target_is_part_of_its_world(tmp_path: Path) -> None:
     found = truth(Setup(described, camera, image))
     hidden = np.zeros((12, 12), dtype=bool)
     hidden[4:8, 4:8] = True
-    np.testing.assert_allclose(found.image[~hidden], image[~hidden], rtol=1e-4, atol=0.5)
+    np.testing.assert_allclose(found.image[~hidden], image[~hidden], rtol=1e-5)
     np.testing.assert_allclose(found.image[hidden], 255, rtol=1e-4)
     np.testing.assert_allclose(found.depth, np.where(hidden, Z / 2, Z), rtol=1e-6)
 

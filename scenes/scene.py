@@ -56,7 +56,7 @@ class WorldTable(Table):
 
 
 class RenderTable(Table):
-    """How the sub-images are rendered."""
+    """Settings of the rendering of the sub-images."""
 
     samples: Samples = Field(
         default=256,
@@ -85,7 +85,7 @@ class RenderTable(Table):
 
 
 class CalibrationTable(Table):
-    """How the observation matrix H is determined."""
+    """Settings of the calibration, which determines the observation matrix H."""
 
     method: Literal["points", "transport", "ideal"] = "points"
     samples: Samples = Field(

@@ -115,7 +115,7 @@ class ParameterDerivatives:
 
     @cached_property
     def gradient(self) -> FloatArray:
-        """Of the value, by the scores: (K,)."""
+        """The gradient of the value with respect to the scores, (K,)."""
         point = self.point
         table = np.zeros_like(point.recording.tolerances)
         for parameter, change in self.by_parameter.items():

@@ -38,7 +38,7 @@ class PriorTable(Table):
 
 
 class EstimatorTable(Table):
-    """How the image is estimated."""
+    """Settings of the estimate of the image."""
 
     noise_variance: ExpectedNoise | None = Field(
         default=None, description='that the estimator assumes; "fit": fitted to the stack; absent: all known noise'

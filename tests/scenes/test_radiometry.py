@@ -124,7 +124,7 @@ def test_illumination_of_misaligned_patches() -> None:
     assert np.std(ratio) == pytest.approx(0.02, abs=5 * standard_error), "twice that of the focal length"
 
 
-def test_with_apertureswith_surfaces_use_given_solid_angles() -> None:
+def test_lenses_with_surfaces_use_given_solid_angles() -> None:
     described = real()
     camera = derive(described)
     optics = replace(camera.types[1].optics, aperture=None, surfaces=())
@@ -141,7 +141,7 @@ def test_with_apertureswith_surfaces_use_given_solid_angles() -> None:
     assert even[0] == pytest.approx(float(thin[pixels].max()), rel=1e-2)
     with pytest.raises(ValueError, match="'B' has no aperture"):
         electrons(described, camera)
-    with pytest.raises(ValueError, match="it has none"):
+    with pytest.raises(ValueError, match="got one without"):
         electrons(described.model_copy(update={"sensor": None}), camera)
 
 

@@ -1,4 +1,4 @@
-"""The scene file: the camera, its target and what is to be computed.
+"""The scene file: the camera, its target and the settings of the computation.
 
 TOML in, a frozen and validated `Scene` out. Lengths carry a unit ("6 um"); a bare number where a length is expected
 and an unknown key are errors.
@@ -111,7 +111,7 @@ class CalibrationTable(Table):
 
 
 class Scene(Table):
-    """A camera, its target and what is to be computed."""
+    """A camera, its target and the settings of the computation."""
 
     title: str = ""
     target: TargetTable

@@ -177,7 +177,7 @@ def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
 class JobSettings:
     """Samples per pixel of a cell: the number, None if it is adaptive, and its expectation.
 
-    setting : the same in words
+    setting : the same as text
     """
 
     samples: int | None

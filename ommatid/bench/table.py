@@ -150,7 +150,7 @@ class Recommendation(_SparseRecord):
 class BenchTable(_Record):
     """Content of bench.json.
 
-    scene : fingerprint of what is measured;  fingerprint : of the same and of the versions of the libraries
+    scene : fingerprint of the measured scene;  fingerprint : that of the scene and of the versions of the libraries
     against : description of the reference for renderings and calibrations
     noise_deviation : standard deviation of the sensor's noise, in pixel values of f
     budget : time limit in seconds;  seconds : duration of all measurements

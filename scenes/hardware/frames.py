@@ -200,7 +200,7 @@ def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
 
 
 def _pages(path: Path) -> list[NDArray[Any]]:
-    """The pages of a TIFF that has several; of any other file none, as it is read as a single picture."""
+    """Return the pages of a TIFF file with several; none for other files, which are read as a single picture."""
     try:
         pages = tiff.pages(path)
     except InputError:

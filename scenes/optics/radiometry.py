@@ -2,7 +2,7 @@
 
 A pixel of the target of value f reflects f / 255 of the illuminance E equally into all directions (Lambert), so that
 its luminance is E / pi f / 255. The light is monochromatic and is converted at the peak of the eye's sensitivity, 683
-lm/W, whatever its wavelength. (Lux of a colour to which the eye is less sensitive would bring more photons.) Lengths
+lm/W, whatever its wavelength. (Lux of a colour to which the eye is less sensitive corresponds to more photons.) Lengths
 are millimetres.
 """
 

@@ -6,7 +6,7 @@ All of them are ordinary runs in the scene's own folder, so that it holds comple
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -110,7 +110,7 @@ def run_within(
     requested = asdict(TimeRequest(seconds) if request is None else request)
     earlier = _earlier_run(folder, setup, requested)
     if earlier is not None:
-        report = stages.results(_with_samples(setup, *(earlier.chosen[key] for key in KEYS)), folder, observer)
+        report = stages.results(_with_samples(setup, *_samples_of(earlier.chosen)), folder, observer)
         same = earlier.model_dump(include={"within", "asked", "seconds", "chosen"})
         return _finish(setup, folder, observer, report, same)
 
@@ -187,6 +187,10 @@ class MeasuredRun:
         return max(self.wall - self.sampled - self.seconds("reconstruct"), 0.0)
 
 
+def _samples_of(chosen: Mapping[str, Samples]) -> tuple[Samples, Samples]:
+    return chosen[KEYS[0]], chosen[KEYS[1]]
+
+
 def _measured_run(setup: Setup, samples: int, folder: Path, observer: RunObserver, clock: Clock) -> MeasuredRun:
     start = clock()
     report = stages.results(_with_samples(setup, samples, samples), folder, observer)
@@ -246,7 +250,7 @@ def _earlier_run(folder: Path, setup: Setup, requested: dict[str, Any]) -> TimeR
     """Return the times of the run in `folder` if it was of the same scene with the same request."""
     try:
         earlier = run_json.read(folder).spent
-        scene = _with_samples(setup, *(earlier.chosen[key] for key in KEYS)).resolved.plain()
+        scene = _with_samples(setup, *_samples_of(earlier.chosen)).resolved.plain()
         same_scene = tomllib.loads((folder / "scene.toml").read_text("utf-8")) == scene
     except (InputError, OSError, ValueError, KeyError):
         return None

@@ -222,8 +222,8 @@ class _Certifier:
         values: Residuals = shift, right[1].high
         for _ in range(REPRODUCTION_STEPS):
             solution = self._corrected(solution, values)
-            residuals: Solution = self.system.residuals(*solution, *right)
-            values = residuals[0].high, residuals[1].high
+            coefficients, multipliers = self.system.residuals(solution[0], solution[1], right[0], right[1])
+            values = coefficients.high, multipliers.high
         rounding = self.system.rounding_errors(solution[0].high, solution[1].high, shift, right[1].high)[1]
         noise_free = self.system.problem.noise_variance == 0
         return bool((np.abs(values[1]) <= ROUNDING_MARGIN * rounding)[noise_free].all())

@@ -220,7 +220,7 @@ def test_a_small_lens_collects_its_area_over_the_square_of_the_distance() -> Non
 
 @pytest.mark.parametrize("sine", [0.2, 0.7, 0.95])
 def test_on_the_axis_a_wide_cone_gives_pi_times_its_sine_squared(sine: float) -> None:
-    """Here: a bare stop behind a lens that blocks no rays."""
+    """The result does not depend on the optics in front: here a stop behind a lens that blocks no rays."""
     depth, gap = 5.0, 2.0
     stop = (depth - gap) * sine / sqrt(1 - sine**2)
     one = lens([1e4, -1e4, inf], [0.0, gap], [1.5, 1.0, 1.0], [1e3, 1e3, stop], stop=2)

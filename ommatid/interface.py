@@ -1,4 +1,4 @@
-"""The Python interface: what the commands do, for notebooks and scripts, with arrays in place of files.
+"""The Python interface: the commands as functions for notebooks and scripts, with arrays in place of files.
 
 Images are (rows, columns) float64 arrays in the units of the target, 0 to 255, row 0 at the top. There are M
 measurements and N = rows x columns unknowns. A wrong scene, option or file raises InputError, and what the machine

@@ -25,7 +25,7 @@ Picture = tuple[str, NDArray[np.float64], tuple[float, float] | None]  # caption
 
 
 def show_in_notebooks() -> None:
-    """Give the classes of scenes their HTML. They cannot bring it along: it needs modules that stand above them."""
+    """Add the HTML display to the classes of `scenes`, which cannot import this module: imports run one way."""
     for shown, html in ((Scene, scene_html), (Stack, stack_html), (Model, model_html)):
         setattr(shown, DISPLAY, html)
 

@@ -1,4 +1,4 @@
-"""The scene file: the camera, its target and what is to be computed.
+"""The scene file: the camera, its target and the settings of the computation.
 
 TOML in, a frozen and validated `Scene` out. Lengths carry a unit ("6 um"); a bare number where a length is expected
 and an unknown key are errors.
@@ -36,31 +36,31 @@ class TargetTable(Table):
 
     image: FileName | None = Field(
         default=None,
-        description='"photo:NAME" for one that scikit-image ships, or a PNG, TIFF, EXR or NPY file; absent: a [world]',
+        description='"photo:NAME" for a picture of scikit-image, or a PNG, TIFF, EXR or NPY file; absent: a [world]',
     )
     origin: Corner | None = Field(
         default=None, description="row and column where the crop starts; absent: the whole picture"
     )
     shape: Pair | None = Field(default=None, description="rows and columns of the crop")
     pixel_pitch: Length = Field(description="side of one pixel of the target")
-    distance: Length = Field(description="from the plane of the lenses to the target")
+    distance: Length = Field(description="distance from the plane of the lenses to the target")
 
 
 class WorldTable(Table):
     """A Mitsuba scene behind the target or, where the target has no picture, in its place."""
 
     file: FileName = Field(
-        description="a Mitsuba scene file: millimetres, the camera at the origin looking along +z, +y up"
+        description="a Mitsuba scene file, in millimetres, with the camera at the origin looking along +z, +y up"
     )
-    white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that becomes a value of 255")
+    white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that corresponds to a value of 255")
 
 
 class RenderTable(Table):
-    """How the sub-images are rendered."""
+    """Settings of the rendering of the sub-images."""
 
     samples: Samples = Field(
         default=256,
-        description='per sensor pixel, in 16 passes or more; "auto": until their variance is a tenth of the sensor\'s',
+        description='rays per sensor pixel, in 16 passes or more; "auto": until their variance is 0.1 of the sensor\'s',
     )
     time: Time | None = Field(
         default=None, description='time limit of samples = "auto", at whatever variance; absent: no limit'
@@ -85,12 +85,12 @@ class RenderTable(Table):
 
 
 class CalibrationTable(Table):
-    """How the observation matrix H is determined."""
+    """Settings of the calibration, which determines the observation matrix H."""
 
     method: Literal["points", "transport", "ideal"] = "points"
     samples: Samples = Field(
         default=256,
-        description='per sensor pixel, in 16 passes or more; "auto": until H adds under a tenth to the expected error',
+        description='rays per sensor pixel, in 16 passes or more; "auto": until H adds less than 10 % to the error',
     )
     fit: Literal["geometry"] | None = Field(
         default=None, description='"geometry": fit a few parameters per sub-imager in place of noisy entries'
@@ -111,7 +111,7 @@ class CalibrationTable(Table):
 
 
 class Scene(Table):
-    """A camera, its target and what is to be computed."""
+    """A camera, its target and the settings of the computation."""
 
     title: str = ""
     target: TargetTable
@@ -131,9 +131,9 @@ class Scene(Table):
     @model_validator(mode="after")
     def _check_combination(self) -> Scene:
         if self.noise is not None and self.sensor is not None:
-            raise ValueError("expected [noise], an ideal sensor's, or [sensor], a real one's, got both; remove one")
+            raise ValueError("expected [noise] for an ideal sensor or [sensor] for a real one, got both; remove one")
         if self.target.image is None and self.world is None:
-            raise ValueError("expected a picture to look at, target.image, or a Mitsuba scene, world.file, got neither")
+            raise ValueError("expected a picture, target.image, or a Mitsuba scene, world.file, got neither")
         if self.target.image is None and self.target.shape is None:
             raise ValueError("a target without a picture needs target.shape, the grid to reconstruct, got none")
         if self.sensor is not None:

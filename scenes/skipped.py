@@ -8,7 +8,7 @@ from .scene import Scene
 
 
 def skipped_effects(scene: Scene, camera: Camera) -> tuple[SkippedEffect, ...]:
-    """Everything skipped in rendering, recording, calibration and reconstruction, from the scene alone."""
+    """Return the effects skipped in rendering, recording, calibration and reconstruction, from the scene alone."""
     return (*_in_rendering(scene, camera), *_in_recording(scene, camera), *_in_estimation(scene))
 
 

@@ -140,7 +140,7 @@ def render_until(
     checkpoint: Checkpoint | None = None,
     clock: Callable[[], float] = perf_counter,
 ) -> AdaptiveRendering:
-    """Render until every sub-imager's variance is small beside the sensor's, or `render.time` is over.
+    """Render until every sub-imager's variance is small compared with the sensor's, or `render.time` is over.
 
     The first round is rendered whatever the time, so that every pixel has a value. Raises InputError if the sensor
     adds no noise, or if the requested variant does not work here.
@@ -194,7 +194,7 @@ class AdaptiveRounds:
     def render_round(self, index: int, seconds: float = inf, speed: float = inf) -> None:
         """Render the next round of a sub-imager and plan the one after it, or end it.
 
-        seconds : that the round may take at `speed` rays a second; too little time for a useful round ends it instead
+        seconds : time limit of the round at `speed` rays per second; too little for a useful round ends it instead
         """
         sub, start = self.sub_imagers[index], self._slices[index].start
         pixels = np.flatnonzero(self._open[self._slices[index]])

@@ -1,7 +1,7 @@
 """The ground truth of a world: its image through an ideal camera in the centre of the array.
 
 A pinhole at the origin, whose pixels are those of f: each is the mean over its square on the target's plane. It is
-rendered with the same integrator as the sub-images, with seeds of its own, and with more samples.
+rendered with the same integrator as the sub-images, with separate seeds, and with more samples.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What the program says of a scene and of its results: predictions, designs, studies, summaries."""
+"""Predictions, designs, studies and summaries of a scene and of its results."""

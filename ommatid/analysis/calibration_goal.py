@@ -78,7 +78,7 @@ def for_prior(setup: Setup) -> StoppingRule:
 
 
 def _negligible_bound(stack: Stack, model: Model) -> float | None:
-    """Return a bound on what the uncertainty of H adds where it is negligible beside the other noise; else None.
+    """Return a bound on the part due to the uncertainty of H if it is small against the other noise, else None.
 
     It saves a reconstruction. Both are compared measurement by measurement, for images of white noise from 0 to 255: by
     the maximum where it is negligible everywhere, by the mean where a few rows are spoilt by stray rays.

@@ -122,7 +122,7 @@ def draw(path: Path, camera: Camera, bins: Sequence[DepthBin], title: str = "") 
     figure.suptitle(title, parse_math=False)
     above, below = figure.subplots(2, 1, sharex=True)
     below.set_xscale("log")
-    known = [(one.nearest, one.farthest, one) for one in bins if one.nearest is not None and one.farthest is not None]
+    known = [(row.nearest, row.farthest, row) for row in bins if row.nearest is not None and row.farthest is not None]
     middles = [2 / (1 / near + 1 / far) for near, far, _ in known]
     reach = [
         [max(0.0, middle - near) for middle, (near, _, _) in zip(middles, known, strict=True)],

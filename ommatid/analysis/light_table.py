@@ -18,7 +18,7 @@ def rows(light: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _lens_words(row: dict[str, Any]) -> str:
     if row["noise"] is None:
-        return "too little light arrives to stand out from the dark signal"
+        return "too little light: the readings do not exceed the dark signal"
     text = (
         f"{row['white']:.4g} electrons per pixel at 255, {row['mean']:.4g} at the prior's mean,"
         f" where the standard deviation of a value is {row['noise']:.3g}"

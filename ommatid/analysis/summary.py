@@ -1,4 +1,4 @@
-"""The geometry of a scene's lens types, what they see, and the plan of a run, as JSON and as tables."""
+"""The geometry of a scene's lens types, the pixels that they see, and the plan of a run, as JSON and as tables."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
 
 
 def skipped_words(why: str, bound: float | None) -> str:
-    """Return the reason for skipping an effect, with the bound on what it changes."""
+    """Return the reason for skipping an effect, with the bound on its effect."""
     return why if bound is None else f"{why}; no measurement changes by more than {bound:.2g}"
 
 

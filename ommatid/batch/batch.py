@@ -51,7 +51,7 @@ class Batch:
     stages : runs it and returns its description
     observe : creates the observer for a folder
     report : reports a description to the user, and returns it
-    versions : versions that have to agree on all machines; True as argument adds the variant that `auto` stands for
+    versions : versions that have to agree on all machines; True as argument adds the variant that `auto` selects
     count : number of scenes that are best run at once
     """
 

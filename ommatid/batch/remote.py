@@ -87,7 +87,7 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
 
 
 def outcome_of(work: Callable[[RunObserver], dict[str, Any]]) -> SceneOutcome:
-    """Execute `work` and return what it did until it ended or failed, without files."""
+    """Execute `work`; return its finished stages and its results or its error, without files."""
     done: dict[str, bool] = {}
     try:
         return SceneOutcome({}, done, work(RunObserver(lambda _: nullcontext(no_progress), done.__setitem__)))

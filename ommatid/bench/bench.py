@@ -146,13 +146,13 @@ def _noise_deviation(subject: Subject) -> float:
 
 def curves(cells: Sequence[Cell], camera: Camera) -> list[ConvergenceCurve]:
     """Return the slope of each method of rendering and calibration, and its theoretical slope."""
-    found: list[ConvergenceCurve] = []
+    fitted: list[ConvergenceCurve] = []
     for stage, limit in ROUNDING.items():
         counted = [cell for cell in cells if cell.stage == stage and cell.counted]
         for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in counted):
             used = [cell for cell in counted if (cell.way, cell.variant) == (way, variant)]
-            found.append(_curve([cell for cell in used if cell.error.median > limit], camera, stage, way, variant))
-    return found
+            fitted.append(_curve([cell for cell in used if cell.error.median > limit], camera, stage, way, variant))
+    return fitted
 
 
 def _curve(cells: Sequence[Cell], camera: Camera, stage: Stage, way: str, variant: str | None) -> ConvergenceCurve:

@@ -164,20 +164,20 @@ def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
     if not subject.camera.is_ideal_pinhole and "scalar_rgb" in working:
         working.remove("scalar_rgb")
         left_out.append(SkippedJob(what="scalar_rgb", why="lenses other than pinholes need a fast backend"))
-    found = [*_renderings(subject, working), *_calibrations(subject, working)]
+    measurable = [*_renderings(subject, working), *_calibrations(subject, working)]
     try:
-        found += _adaptive_jobs(subject, working)
+        measurable += _adaptive_jobs(subject, working)
     except InputError as error:
         left_out.append(SkippedJob(what="samples 'auto'", why=str(error)))
     estimates, unsolvable = _estimates(subject)
-    return [*found, *estimates], [*left_out, *unsolvable]
+    return [*measurable, *estimates], [*left_out, *unsolvable]
 
 
 @dataclass(frozen=True)
 class JobSettings:
     """Samples per pixel of a cell: the number, None if it is adaptive, and its expectation.
 
-    setting : the same in words
+    setting : the same as text
     """
 
     samples: int | None
@@ -195,22 +195,22 @@ def _adaptive_jobs(subject: Subject, variants: list[str]) -> list[Job]:
     scene = subject.scene
     expected = reference.expected_samples(subject.setup, subject.reference)
     work = JobSettings(None, expected, AUTO)
-    found: list[Job] = []
+    adaptive: list[Job] = []
     for variant in variants:
-        found.append(_rendering(subject, variant, scene.render.sampler, AUTO, work))
+        adaptive.append(_rendering(subject, variant, scene.render.sampler, AUTO, work))
         methods: tuple[Method, ...] = () if variant.startswith("scalar") else ("points", "transport")
-        found += [_calibration(subject, variant, method, scene.render.sampler, AUTO, work) for method in methods]
-    return found
+        adaptive += [_calibration(subject, variant, method, scene.render.sampler, AUTO, work) for method in methods]
+    return adaptive
 
 
 def _renderings(subject: Subject, variants: list[str]) -> list[Job]:
-    found: dict[str, Job] = {}
+    by_name: dict[str, Job] = {}
     for variant in variants:
         for sampler in SAMPLERS:
             for samples in SAMPLES:
                 job = _rendering(subject, variant, sampler, samples, _fixed_samples(samples, sampler))
-                found.setdefault(job.name, job)  # several numbers may be rounded up to the same
-    return list(found.values())
+                by_name.setdefault(job.name, job)  # several numbers may be rounded up to the same
+    return list(by_name.values())
 
 
 def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Samples, work: JobSettings) -> Job:
@@ -232,7 +232,7 @@ def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Sample
 
 
 def _calibrations(subject: Subject, variants: list[str]) -> list[Job]:
-    own_sampler, found = subject.scene.render.sampler, dict[str, Job]()
+    own_sampler, by_name = subject.scene.render.sampler, dict[str, Job]()
     for variant in variants:
         transport: tuple[Sampler, ...] = () if variant.startswith("scalar") else SAMPLERS
         methods: list[tuple[Method, Sampler]] = [
@@ -242,8 +242,8 @@ def _calibrations(subject: Subject, variants: list[str]) -> list[Job]:
         for method, sampler in methods:
             for samples in SAMPLES[1:]:  # the first is less than the number of passes, which a calibration refuses
                 job = _calibration(subject, variant, method, sampler, samples, _fixed_samples(samples, sampler))
-                found.setdefault(job.name, job)
-    return list(found.values())
+                by_name.setdefault(job.name, job)
+    return list(by_name.values())
 
 
 def _calibration(
@@ -285,8 +285,8 @@ def _estimates(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
 
         return Job("reconstruct", setting.method, None, None, setting.setting, setting.guess, repeated)
 
-    found, unsolvable = solver_settings(solution(0)[0])
-    return [job(setting) for setting in found], [SkippedJob(what=what, why=why) for what, why in unsolvable]
+    settings, unsolvable = solver_settings(solution(0)[0])
+    return [job(setting) for setting in settings], [SkippedJob(what=what, why=why) for what, why in unsolvable]
 
 
 def _measured(work: Callable[[], Result]) -> tuple[Result, Cost]:

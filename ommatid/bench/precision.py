@@ -81,7 +81,7 @@ def exact_solution(task: EstimationTask, deviation: FloatArray | None = None) ->
 
 def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tuple[str, str]]]:
     """Return the settings that can be measured for this task, and those that cannot, with the reason."""
-    found, left_out = _form_settings(task), list[tuple[str, str]]()
+    measurable, left_out = _form_settings(task), list[tuple[str, str]]()
     sliding = all(is_sliding(lens_type) for lens_type in task.model.camera.types)
     has_frame = sliding and bool((task.expected_noise > 0).all())
     if not is_dense(task):
@@ -89,27 +89,27 @@ def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tup
         if not has_frame:
             why = "too many pixels for a dense form, and a frame does not apply: there is no exact solution"
             return [], [("reconstruct", why)]
-    found += [_tile_setting(size, overlap) for size, overlap in TILE_SIZES if size < min(task.shape)]
+    measurable += [_tile_setting(size, overlap) for size, overlap in TILE_SIZES if size < min(task.shape)]
     if has_frame:
-        found += [_frame_setting(task, accuracy) for accuracy in ACCURACIES]
+        measurable += [_frame_setting(task, accuracy) for accuracy in ACCURACIES]
     else:
         left_out.append(("frame", "it needs noise in every measurement, and lens types with the same view everywhere"))
-    return found, left_out
+    return measurable, left_out
 
 
 def _form_settings(task: EstimationTask) -> list[SolverSetting]:
     """Return each dense form without refinement, and refined until its bound is below the tolerance."""
     if not is_dense(task):
         return []
-    found: list[SolverSetting] = []
+    settings: list[SolverSetting] = []
     correlated = task.prior.kind != "independent"
     for name in FORMS:
         needed = needed_memory(name, task.model.measurements, task.model.unknowns, correlated=correlated)
         guess = SECONDS_PER_WORK * (needed / 8) ** 1.5
         refined = f"refined, tolerance {task.settings.tolerance:g}"
-        found.append(SolverSetting(name, ALONE, guess, partial(_unrefined_image, name=name)))
-        found.append(SolverSetting(name, refined, 2 * guess, partial(_refined_image, name=name)))
-    return found
+        settings.append(SolverSetting(name, ALONE, guess, partial(_unrefined_image, name=name)))
+        settings.append(SolverSetting(name, refined, 2 * guess, partial(_refined_image, name=name)))
+    return settings
 
 
 def _problem(task: EstimationTask) -> tuple[Problem, FloatArray]:

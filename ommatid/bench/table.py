@@ -150,7 +150,7 @@ class Recommendation(_SparseRecord):
 class BenchTable(_Record):
     """Content of bench.json.
 
-    scene : fingerprint of what is measured;  fingerprint : of the same and of the versions of the libraries
+    scene : fingerprint of the measured scene;  fingerprint : that of the scene and of the versions of the libraries
     against : description of the reference for renderings and calibrations
     noise_deviation : standard deviation of the sensor's noise, in pixel values of f
     budget : time limit in seconds;  seconds : duration of all measurements
@@ -198,9 +198,9 @@ def read(path: Path) -> BenchTable:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); run `ommatid bench` to create it") from error
     except ValidationError as error:
-        place = ".".join(map(str, error.errors()[0]["loc"])) or "the file"
+        field = ".".join(map(str, error.errors()[0]["loc"])) or "the file"
         raise InputError(
-            f"{path}: expected the output of `ommatid bench`, but {place} is not valid ({error.errors()[0]['msg']});"
+            f"{path}: expected the output of `ommatid bench`, but {field} is not valid ({error.errors()[0]['msg']});"
             " run `ommatid bench` again"
         ) from error
 

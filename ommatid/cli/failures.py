@@ -1,6 +1,6 @@
-"""How a command ends: every failure becomes one sentence on stderr and an exit code.
+"""Convert every failure of a command into one sentence on stderr and an exit code.
 
-Exit codes are 0, 2 for a scene, option or file to correct, and 1 for what the machine refuses.
+Exit codes are 0, 2 for a scene, option or file to correct, and 1 for a failure of the machine.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ Sets = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key, as in noise.variance=1e-6; empty removes it."),
 ]
 Lenses = Annotated[
-    str, typer.Option("--lens", metavar="NAME,...", help="Keep these lens types; one named twice counts twice.")
+    str, typer.Option("--lens", metavar="NAME,...", help="Use these lens types only; a type named twice is used twice.")
 ]
 Complete = Annotated[
     bool, typer.Option("--complete", help="Simulate every effect, however small: render.complete=true.")
@@ -35,7 +35,7 @@ Sweeps = Annotated[
     typer.Option(
         "--sweep",
         metavar="KEY=VALUE,...",
-        help="A scene for each of these values, as in noise.variance=1e-6,1e-4; several options: every combination.",
+        help="One scene per value, as in noise.variance=1e-6,1e-4; several options: every combination.",
     ),
 ]
 Scheduler = Annotated[
@@ -78,8 +78,8 @@ Upright = Annotated[
     bool | None,
     typer.Option(
         "--upright/--turned",
-        help="Sub-images are upright, or turned by 180 degrees as lenses turn them"
-        " (default: turned in a mosaic, upright in one picture per sub-imager).",
+        help="Sub-images are upright, or rotated by 180 degrees as by lenses"
+        " (default: rotated in a mosaic, upright in one picture per sub-imager).",
         show_default=False,
     ),
 ]

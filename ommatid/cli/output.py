@@ -1,4 +1,4 @@
-"""What commands print: tables and JSON documents on stdout, sentences and progress bars on stderr."""
+"""Print tables and JSON documents on stdout, and messages and progress bars on stderr."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ TileScheduler = Annotated[
 ]
 TileWorkers = Annotated[
     int | None,
-    typer.Option("--workers", metavar="N", min=1, help="Share the tiles of a frame among N processes."),
+    typer.Option("--workers", metavar="N", min=1, help="Distribute the tiles of a frame over N processes."),
 ]
 
 

@@ -237,7 +237,7 @@ def _renumbered(content: Any, numbers: dict[str, str]) -> Any:
 
 
 def decoded(low: float, step: float, missing: int) -> Any:
-    """Return a formatter for the value that a code stands for."""
+    """Return a formatter for the value that a code represents."""
     code = "return value == missing ? 'none (dead pixel)' : (low + step * value).toPrecision(5)"
     return CustomJSHover(args={"low": low, "step": step, "missing": missing}, code=code)
 

@@ -93,7 +93,7 @@ def mosaic(stack: Stack, most: int = MOST_VALUES) -> Mosaic:
     block = 1
     while _value_count(camera, block) > most and block < max(max(lens_type.pixels) for lens_type in camera.types):
         block += 1
-    places, packed, slices = patches(camera), _packed_corners(camera), camera.slices()
+    positions, packed, slices = patches(camera), _packed_corners(camera), camera.slices()
     shown: list[Patch] = []
     for index in _shown(camera):
         sub = camera.sub_imagers[index]
@@ -105,7 +105,7 @@ def mosaic(stack: Stack, most: int = MOST_VALUES) -> Mosaic:
                 l=sub.l,
                 size=sub.type.pixels,
                 image=reduced(upright[::-1, ::-1], block).astype(np.float64),
-                place=(float(places[index][0]), float(places[index][1])),
+                place=(float(positions[index][0]), float(positions[index][1])),
                 packed=packed[index],
             )
         )

@@ -137,14 +137,14 @@ def numbers(run: Run) -> PageTable:
 
 def further(run: Run) -> list[tuple[str, PageTable]]:
     """Return names and tables of error against distance and of the study, where the run has them."""
-    found: list[tuple[str, PageTable]] = []
+    tables: list[tuple[str, PageTable]] = []
     if run.report.depth:
         rows = depth_error.rows(run.report.depth)
-        found.append(("Depth", PageTable("Error against distance", ("distance", "error"), rows)))
+        tables.append(("Depth", PageTable("Error against distance", ("distance", "error"), rows)))
     if run.report.study:
         rows = study.rows(run.report.study)
-        found.append(("Study", PageTable("The same stack with other models of H", ("H", "error"), rows)))
-    return found
+        tables.append(("Study", PageTable("The same stack with other models of H", ("H", "error"), rows)))
+    return tables
 
 
 def origins(run: Run) -> list[PageTable]:

@@ -92,7 +92,7 @@ def cautions(report: RunReport) -> list[str]:
 
 
 def key_numbers(report: RunReport) -> list[tuple[str, str, str]]:
-    """Return the numbers at the top of the page: name, value, and what it compares with."""
+    """Return the numbers at the top of the page: name, value, and the value to compare it with."""
     error = report.error
     numbers: list[tuple[str, str, str]] = []
     if error.mse is None:

@@ -90,11 +90,11 @@ def _two_types(tiles: Tiles) -> Claim:
     numbers: dict[str, float] = {}
     better, never_cross = True, False
     for side in COMPLETE_SIDES:
-        one, two = ([tiles[side, lenses].line(expected) for expected in EXPECTED] for lenses in (TWICE, TWO))
-        crossings = [first.crossing(second) for first, second in zip(one, two, strict=True)]
+        one_type, two_types = ([tiles[side, lenses].line(expected) for expected in EXPECTED] for lenses in (TWICE, TWO))
+        crossings = [first.crossing(second) for first, second in zip(one_type, two_types, strict=True)]
         crossed = [noise for noise in crossings if isfinite(noise)]
         better &= min(crossings) > QUIET and all(
-            first.prior.mean() > second.prior.mean() for first, second in zip(one, two, strict=True)
+            first.prior.mean() > second.prior.mean() for first, second in zip(one_type, two_types, strict=True)
         )
         never_cross |= len(crossed) < len(crossings)
         if crossed:

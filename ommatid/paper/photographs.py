@@ -160,7 +160,7 @@ def _spread(values: FloatArray) -> float:
 
 
 def seeds(seed: int, experiment: int) -> Callable[[int, int], int]:
-    """Return a function that gives every level of noise and every tile of an experiment a seed of its own."""
+    """Return a function that gives every level of noise and every tile of an experiment a separate seed."""
 
     def seed_of(level: int, image: int) -> int:
         sequence = np.random.SeedSequence(seed, spawn_key=(experiment, level, image))

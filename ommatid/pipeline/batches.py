@@ -65,7 +65,7 @@ def run_batch(
     index_folder: Path | None = None,
     with_folders: bool = True,
 ) -> BatchOutcome:
-    """Do every scene of a batch, whatever happens to the others.
+    """Run every scene of a batch, even if others fail.
 
     report_failure : returns the exit code of an exception;  with_folders : documents of a sweep name the folders
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere

@@ -1,4 +1,4 @@
-"""The observation matrix H of a scene file, simulated or from recorded point sources, as a file of its own."""
+"""The observation matrix H of a scene file, simulated or from recorded point sources, as a separate file."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class PointRecording:
 
     @property
     def files(self) -> list[Path]:
-        """All files that are read."""
+        """All input files."""
         frames = (*self.images, *self.settings.dark, *self.settings.flat)
         return [*(file for path in frames for file in files_in(path)), *([self.positions] if self.positions else [])]
 
 
 @dataclass(frozen=True)
 class CalibrationOutcome:
-    """A model, True if it had to be made, and sentences about what is doubtful in the recorded frames."""
+    """A model, True if it had to be made, and warnings about the recorded frames."""
 
     model: Model
     made: bool

@@ -79,7 +79,7 @@ def compare_lens_types(
 
 
 def describe_backends() -> dict[str, Any]:
-    """Render a little on each backend, in a process of its own, and describe them in JSON's types."""
+    """Render a small image on each backend in a separate process, and describe the backends in JSON's types."""
     probes = [variant.probe(name) for name in variant.PREFERENCE]
     backends = [
         {"variant": status.variant, "reason": status.reason, "samples_per_second": status.speed} for status in probes

@@ -1,4 +1,4 @@
-"""Recorded frames of a scene file's camera, cut into a stack and written as a file of its own."""
+"""Recorded frames of a scene file's camera, cut into a stack and written to a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ommatid.scenes.stack import Stack
 
 @dataclass(frozen=True)
 class ImportOutcome:
-    """The stack, how far sub-images lie beside whole pixels of the mosaic (sensor pixels), and warnings."""
+    """The stack, the distance of sub-images from whole pixels of the mosaic (sensor pixels), and warnings."""
 
     stack: Stack
     beside: float

@@ -1,4 +1,4 @@
-"""A reconstruction from the files of a stack and a model, written beside its picture."""
+"""A reconstruction from the files of a stack and a model, written together with its picture."""
 
 from __future__ import annotations
 

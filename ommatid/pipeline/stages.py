@@ -159,12 +159,12 @@ def export_scene(path: Path, output: Path, changes: Sequence[str] = (), lenses: 
 def library_versions(with_variant: bool) -> dict[str, str]:
     """Return the versions that have to agree on all machines for equal results.
 
-    with_variant : True adds the variant that 'auto' stands for
+    with_variant : True adds the variant that 'auto' selects
     """
-    found = versions("mitsuba", "drjit", "scipy")
+    required = versions("mitsuba", "drjit", "scipy")
     if with_variant:
-        found["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
-    return found
+        required["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
+    return required
 
 
 def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> Stack:

@@ -4,8 +4,9 @@ The expected mean squared error of a run with n samples per pixel for rendering 
 
     floor + R n^-a + C k^-b,
 
-the floor set by the prior and the sensor's noise, plus what each stage adds; its time as fixed + r n + c k. R, C and
-the times come from runs with few samples, the exponents from the decrease of each part between two such runs.
+the floor set by the prior and the sensor's noise, plus the contribution of each stage. The time of a run is modelled as
+fixed + r n + c k. R, C and the times come from runs with few samples, the exponents from the decrease of each part
+between two such runs.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class ErrorCurve:
     each: float
 
     def error(self, samples: Number) -> Number:
-        """Return what the stage adds to the expected error."""
+        """Return the contribution of the stage to the expected error."""
         return cast(Number, self.part * (self.samples / samples) ** self.exponent)
 
     def seconds(self, samples: Number) -> Number:

@@ -31,7 +31,7 @@ from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, error_cu
 
 FEW, MORE = 256, 1024  # samples per pixel of the two measuring runs
 MOST = 2**20  # samples per pixel of either stage
-RESERVE = 0.15  # fraction of the remaining time that is kept back, since times vary
+RESERVE = 0.15  # fraction of the remaining time that is held in reserve, since times vary
 FIRST_ROUND = 3.0  # cost of the first round of 'auto', in runs with FEW samples
 COMPILATION = 1.0  # seconds that Mitsuba takes for a number of samples that it has not met
 KEYS = ("render.samples", "calibration.samples")
@@ -211,7 +211,7 @@ def _adaptive_run(
 
 
 def _better(error: ErrorReport, curves: Curves, seconds: float) -> TimeAllocation | None:
-    """Return the best allocation of these seconds if it promises less than the present error."""
+    """Return the best allocation of these seconds if its predicted error is below the present one."""
     floor = error.predicted_mse - sum(error.budget[part] for part in STAGES.values())
     allocation = allocate_time(*curves, floor, seconds, (MOST, MOST))
     return allocation if allocation is not None and allocation.predicted_mse < error.predicted_mse else None

@@ -127,7 +127,7 @@ class _Worker:
             return self._pipe
 
     def _discard(self) -> None:
-        """Forget a process that has closed its pipe."""
+        """Terminate a process that has closed its pipe."""
         with self._lock:
             self._pipe.close()
             self._process.kill()

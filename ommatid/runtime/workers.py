@@ -1,7 +1,7 @@
 """Parallel execution of independent tasks.
 
 A task is a function defined in a module, applied to one item; both are sent as pickles. Results do not depend on which
-worker executes a task, nor on how many workers die meanwhile.
+worker executes a task, nor on how many workers fail meanwhile.
 """
 
 from __future__ import annotations

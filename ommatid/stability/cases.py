@@ -39,7 +39,7 @@ LENSES = {"three": ("I", "II", "III"), "two": ("I", "III"), "one": ("I",)}
 
 @dataclass(frozen=True)
 class StabilityCase:
-    """H, prior, noise and measurements of a case, and what is required of the estimator.
+    """H, prior, noise and measurements of a case, and the result that is required of the estimator.
 
     required : "solve", "solve or refuse" at the limits of float64, or "refuse"
     """

@@ -26,12 +26,12 @@ from .selected_inverse import inverse_diagonal
 FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
 DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
 STEP = 1e-4  # relative step of a finite difference, and the largest relative error it causes
-SIDE = 44  # pixels of a small frame whose middle stands for any interior; the cost grows with the sixth power
+SIDE = 44  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
 
 
 @dataclass(frozen=True)
 class VarianceMap:
-    """Of every pixel: the diagonal of C, and the parts of Eq. 5 that come from the prior and from the noise."""
+    """Maps over the pixels: the diagonal of C, and the parts of Eq. 5 due to the prior and due to the noise."""
 
     posterior: FloatArray
     missing: FloatArray

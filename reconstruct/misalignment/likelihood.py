@@ -35,7 +35,7 @@ from ..prior import Prior
 
 @dataclass(frozen=True)
 class MisalignedRecording:
-    """The measurements used, and what is known of them and of the image.
+    """The measurements used, with their noise and the prior of the image.
 
     recorded, noise_variance : (m,), noise above 0;  owner : (m,) index of the sub-imager
     matrix_of : from a table of misalignments, (sub-imagers, 6), to H, (m, N);  tolerances : of that table
@@ -115,7 +115,7 @@ class ParameterDerivatives:
 
     @cached_property
     def gradient(self) -> FloatArray:
-        """Of the value, by the scores: (K,)."""
+        """The gradient of the value with respect to the scores, (K,)."""
         point = self.point
         table = np.zeros_like(point.recording.tolerances)
         for parameter, change in self.by_parameter.items():

@@ -61,7 +61,7 @@ class AlignedMethod(Method):
 
     @cached_property
     def alignment(self) -> Alignment:
-        """Fitted misalignments, and what is left unknown of them."""
+        """Fitted misalignments and their remaining uncertainty."""
         task = self.task
         prior = task.prior_on(task.shape)
         return align(task.model.camera, task.recorded[task.used], task.expected_noise, prior, task.used)

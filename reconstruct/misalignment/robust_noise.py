@@ -64,7 +64,7 @@ def tolerances(camera: Camera) -> FloatArray:
 
 def as_table(misalignments: tuple[Misalignment, ...]) -> FloatArray:
     """Return misalignments as an array: (sub-imagers, 6)."""
-    return np.array([[*one.position, *one.tilt, one.rotation, one.focal_length] for one in misalignments])
+    return np.array([[*each.position, *each.tilt, each.rotation, each.focal_length] for each in misalignments])
 
 
 def as_misalignments(table: FloatArray) -> tuple[Misalignment, ...]:

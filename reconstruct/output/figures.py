@@ -1,4 +1,4 @@
-"""Images of a result: the estimate by itself, and an overview with its error and its standard deviation.
+"""Images of a result: the estimate alone, and an overview with its error and its standard deviation.
 
 Maps are drawn upright with pixels of the target along both axes; values are in the target's units, 0 to 255.
 """

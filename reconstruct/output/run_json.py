@@ -29,7 +29,7 @@ class Record(BaseModel):
 
 
 class StageReport(Record):
-    """How one stage was done, and how long it took when it was."""
+    """Method and settings of a stage, and its duration when it ran."""
 
     method: str | None = None
     seconds: float = 0.0
@@ -103,7 +103,7 @@ class FittedNumber(Record):
 
 
 class DiagnosticsReport(Record):
-    """Numbers to judge an estimate by."""
+    """Numbers that assess an estimate."""
 
     pixels_used: int
     pixels_dead: int

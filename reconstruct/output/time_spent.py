@@ -17,7 +17,7 @@ def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibra
 
     calibrated : whether H took samples
     Errors with more samples are those of the estimator as it is. An estimator that expects the smaller noise does
-    better, most of all where much of its error is in what the lens types hardly see.
+    better, most of all where much of its error is in components that the lens types hardly measure.
     """
     seconds = {name: stage.seconds for name, stage in stages.items()}
     parts = [error.budget[part] for part in STAGES.values()]

@@ -79,9 +79,9 @@ class FootprintAssignment:
         both_inside = repeated & (distance[1:] < 0.5 - TIE)  # the source before is nearer, so it is inside too
         if both_inside.any():
             first = int(np.flatnonzero(both_inside)[0])
-            one, other = (tuple(positions[source[first + step]].tolist()) for step in (0, 1))
+            nearer, farther = (tuple(positions[source[first + step]].tolist()) for step in (0, 1))
             raise InputError(
-                f"{file}: the points at {one} and {other}, row and column of f, lie in the footprint of one sensor"
+                f"{file}: the points at {nearer} and {farther}, row and column of f, lie in the footprint of one sensor"
                 " pixel; record them in two images"
             )
         nearest = np.concatenate([[True], ~repeated])

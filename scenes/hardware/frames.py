@@ -34,7 +34,7 @@ COLOURS = 4  # most channels of a picture; a longer last axis is columns
 
 @dataclass(frozen=True)
 class AcquisitionSettings:
-    """How frames were recorded.
+    """Calibration frames, position and orientation of recorded frames.
 
     dark, flat : frames without light and of a uniform target of value `flat_value`;  none: numbers are values of f
     origin : row and column in a mosaic of the top left pixel of the first sub-imager's patch; None: from the middle
@@ -48,15 +48,16 @@ class AcquisitionSettings:
     upright: bool | None = None
 
     def describe(self) -> dict[str, Any]:
-        """The settings without the files, in JSON's types; part of fingerprints."""
+        """Return the settings without the files, in JSON's types; part of fingerprints."""
         return {"flat_value": self.flat_value, "origin": self.origin, "upright": self.upright}
 
 
 @dataclass(frozen=True)
 class SensorLayout:
-    """How the pictures of one exposure are arranged to (M,) numbers.
+    """The arrangement of the pictures of one exposure, which become (M,) numbers.
 
-    shapes : of the pictures of an exposure;  corners : (sub-imagers, 2) top left pixels of the patches in a mosaic,
+    shapes : shapes of the pictures of an exposure
+    corners : (sub-imagers, 2) top left pixels of the patches in a mosaic,
         None if every sub-imager has its own picture;  rotated : True if sub-images are upside down
     beside : largest distance, in sensor pixels along one axis, between a patch and the whole pixels cut out for it
     """
@@ -199,7 +200,7 @@ def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
 
 
 def _pages(path: Path) -> list[NDArray[Any]]:
-    """The pages of a TIFF that has several; of any other file none, as it is read as a single picture."""
+    """Return the pages of a TIFF file with several; none for other files, which are read as a single picture."""
     try:
         pages = tiff.pages(path)
     except InputError:

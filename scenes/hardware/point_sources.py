@@ -142,7 +142,7 @@ def _check_separable(camera: Camera, positions: list[IntArray], places: Path | N
     if not ideal and any(len(of_exposure) > 1 for of_exposure in positions):
         raise InputError(
             f"{places}: several points in an image are separated by the footprints of pinholes, which this camera's"
-            " lenses do not have; record one point an image"
+            " lenses do not have; record one point per image"
         )
 
 

@@ -17,7 +17,7 @@ COLUMNS = ("image", "row", "column")
 
 
 def positions_by_rows(camera: Camera, files: Sequence[Path]) -> list[IntArray]:
-    """One source per exposure, at pixel after pixel of f by rows, once or several times: (1, 2) each."""
+    """Return the positions, (1, 2) each, of a source that scans f row by row, once or several times."""
     count = len(files)
     if count == 0 or count % camera.unknowns:
         raise InputError(

@@ -139,23 +139,23 @@ def _density_of(disk: float, airy: float, weight: float) -> _RadialDensity:
 def _expect(
     radial: _RadialDensity,
     positions: FloatArray,
-    one: Callable[..., FloatArray],
+    single: Callable[..., FloatArray],
     both: Callable[..., FloatArray],
     symmetric: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Means of one(r, x), which is 0 for r < x, and of both(r, y, x), which is 0 for r^2 < x^2 + y^2.
+    """Means of single(r, x), which is 0 for r < x, and of both(r, y, x), which is 0 for r^2 < x^2 + y^2.
 
     symmetric : True if both(r, y, x) equals both(r, x, y)
     """
     line, plane = np.zeros(positions.size), np.zeros((positions.size, positions.size))
     inside = np.flatnonzero(positions < radial.breaks[-1])
     near = positions[inside]
-    line[inside] = _mean(radial, near, near, lambda r, at: one(r, near[at, None]))
+    line[inside] = _mean(radial, near, near, lambda r, at: single(r, near[at, None]))
     pairs = np.tril(np.ones((inside.size, inside.size))) if symmetric else np.ones((inside.size, inside.size))
     rows, columns = (inside[indices] for indices in pairs.nonzero())
     y, x = positions[rows], positions[columns]
-    kept = np.hypot(y, x) < radial.breaks[-1]
-    rows, columns, y, x = rows[kept], columns[kept], y[kept], x[kept]
+    lit = np.hypot(y, x) < radial.breaks[-1]
+    rows, columns, y, x = rows[lit], columns[lit], y[lit], x[lit]
     means = _mean(radial, np.hypot(y, x), np.maximum(y, x), lambda r, at: both(r, y[at, None], x[at, None]))
     plane[rows, columns] = means
     if symmetric:

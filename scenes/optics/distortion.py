@@ -78,7 +78,7 @@ def field(camera: Camera, sub: SubImager, pose: Pose) -> float:
 
 
 def _fault(k1: float, k2: float, limit: float) -> str:
-    """What a distortion does that cannot be simulated up to r = `limit`, as part of a message; empty if nothing."""
+    """Return why a distortion cannot be simulated up to r = `limit`, as part of a message; empty if it can."""
     turning = -3 * k1 / (10 * k2) if k2 > 0 else 0.0  # r^2 where the derivative, a parabola in r^2, is least
     squares = np.array([limit**2, min(max(turning, 0.0), limit**2)])
     if (1 + squares * (3 * k1 + squares * 5 * k2)).min() <= 0:

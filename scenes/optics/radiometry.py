@@ -2,7 +2,7 @@
 
 A pixel of the target of value f reflects f / 255 of the illuminance E equally into all directions (Lambert), so that
 its luminance is E / pi f / 255. The light is monochromatic and is converted at the peak of the eye's sensitivity, 683
-lm/W, whatever its wavelength. (Lux of a colour to which the eye is less sensitive would bring more photons.) Lengths
+lm/W, whatever its wavelength. (Lux of a colour to which the eye is less sensitive corresponds to more photons.) Lengths
 are millimetres.
 """
 
@@ -72,7 +72,7 @@ def electrons(
     Raises ValueError without a sensor, or if a solid angle of a lens with surfaces is missing.
     """
     if scene.sensor is None:
-        raise ValueError("electrons are counted by a scene's [sensor], and it has none")
+        raise ValueError("numbers of electrons need a scene with a [sensor], got one without")
     unit = electrons_per_steradian(scene, scene.sensor)
     response = np.empty(camera.measurements)
     for sub, pixels, pose in zip(camera.sub_imagers, camera.slices(), poses(camera), strict=True):
@@ -98,7 +98,7 @@ def expected_noise(scene: Scene, camera: Camera, response: FloatArray) -> FloatA
     response : (M,) electrons per unit of f
     """
     if scene.sensor is None:
-        raise ValueError("this noise is a scene's [sensor]'s, and it has none")
+        raise ValueError("the noise of a sensor needs a scene with a [sensor], got one without")
     values = np.full(camera.measurements, max(scene.prior.mean, 0.0))
     return expected_recording(scene.sensor, camera, response, values).noise_variance(values)
 
@@ -128,7 +128,7 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
     cut_off : True if noise of the dark reaches below a digital number of 0 (EMVA 1288 asks for a higher black level)
     """
     if scene.sensor is None:
-        raise ValueError("electrons are counted by a scene's [sensor], and it has none")
+        raise ValueError("numbers of electrons need a scene with a [sensor], got one without")
     sensor, noise = scene.sensor, expected_noise(scene, camera, response)
     lens_types: list[dict[str, Any]] = []
     for lens_type, pixels in zip(camera.types, camera.type_slices(), strict=True):

@@ -20,14 +20,14 @@ class Surface(Table):
     """One surface of a lens; surfaces are listed from the target to the sensor."""
 
     radius: Radius | None = Field(
-        default=None, description="of curvature, positive if its centre lies towards the sensor; absent: flat"
+        default=None, description="radius of curvature, positive if its centre lies towards the sensor; absent: flat"
     )
-    thickness: Length | None = Field(default=None, description="to the next surface; of the last one absent")
-    glass: str | None = Field(default=None, description="behind the surface, by name, such as N-BK7; absent: air")
-    index: float | None = Field(default=None, ge=1, le=5, description="of refraction behind it, instead of a glass")
+    thickness: Length | None = Field(default=None, description="distance to the next surface; absent for the last one")
+    glass: str | None = Field(default=None, description="glass behind the surface, such as N-BK7; absent: air")
+    index: float | None = Field(default=None, ge=1, le=5, description="refractive index, in place of a glass")
     semi_diameter: Length = Field(description="half the diameter of its clear aperture")
     conic: float = Field(default=0.0, ge=-100, le=100, description="0: a sphere, -1: a paraboloid")
-    stop: bool = Field(default=False, description="true for the aperture stop, which is one surface at most")
+    stop: bool = Field(default=False, description="true for the aperture stop; for one surface only")
 
     @model_validator(mode="after")
     def _check_medium(self) -> Surface:
@@ -39,13 +39,16 @@ class Surface(Table):
 class ToleranceTable(Table):
     """Standard deviations of the misalignment of each sub-imager, which is drawn once per camera."""
 
-    position: Length | None = Field(default=None, description="of a lens in its plane, in x and in y")
-    tilt: Angle | None = Field(default=None, description="of a sub-imager's sensor patch, about x and about y")
-    rotation: Angle | None = Field(default=None, description="of a sub-imager's sensor patch, about the axis")
+    position: Length | None = Field(default=None, description="displacement of a lens in its plane, in x and in y")
+    tilt: Angle | None = Field(default=None, description="tilt of a sub-imager's sensor patch, about x and about y")
+    rotation: Angle | None = Field(default=None, description="rotation of a sub-imager's sensor patch, about the axis")
     focal_length: float | None = Field(
-        default=None, gt=0, lt=0.2, description="relative, of the distance between lens and sensor, so of magnification"
+        default=None,
+        gt=0,
+        lt=0.2,
+        description="relative, of the distance from lens to sensor, and so of the magnification",
     )
-    seed: int = Field(default=0, ge=0, lt=2**63, description="of the camera: another seed draws other misalignments")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the random draw: another seed is another camera")
 
 
 class LensTable(Table):
@@ -55,17 +58,22 @@ class LensTable(Table):
     magnification: Magnification = Field(description="image size over object size, at most 1")
     array: Pair = Field(description="rows and columns of sub-imagers")
     pixels: Literal["fit"] | Pair = Field(description='rows and columns of a sub-image, or "fit"')
-    step: Step = Field(default=Fraction(1), description="pixels of the target from one sub-imager's window to the next")
+    step: Step = Field(
+        default=Fraction(1),
+        description="pixels of the target between windows of neighbours",
+    )
     aperture: Length | None = Field(default=None, description="diameter of a thin lens; absent: a pinhole")
-    focus: Length | None = Field(default=None, description="distance in focus; absent: the target's")
+    focus: Length | None = Field(default=None, description="distance of sharp focus; absent: the target's")
     distortion: Annotated[tuple[Distortion, Distortion], BeforeValidator(pair)] | None = Field(
         default=None, description="k1, k2: magnification times 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner"
     )
     surfaces: Annotated[tuple[Surface, ...], BeforeValidator(pair), Field(min_length=1)] | str | None = Field(
-        default=None, description="of a real lens, from the target to the sensor, or the file that holds them"
+        default=None,
+        description="surfaces of a real lens, from the target to the sensor, or the file with them",
     )
     scale: Literal["fit"] | Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        default=None, description='factor on the surfaces; "fit": to the focal length that the magnification requires'
+        default=None,
+        description='scale of the surfaces; "fit": to the focal length that the magnification requires',
     )
 
     @field_validator("pixels", mode="before")
@@ -105,7 +113,8 @@ class CameraTable(Table):
     pixel_pitch: Length = Field(description="side of one sensor pixel")
     lens_pitch: Length = Field(description="distance between the centres of neighbouring lenses")
     wavelength: Length | None = Field(
-        default=None, description="of light; with it apertures diffract; absent: rays only, glass and sensor at 550 nm"
+        default=None,
+        description="wavelength of the light; absent: no diffraction, 550 nm for glasses and sensors",
     )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]

@@ -20,10 +20,10 @@ class PriorTable(Table):
     mean: float = Field(default=127.5, ge=-LARGEST, le=LARGEST)
     variance: float = Field(default=5461.25, gt=0, le=LARGEST**2, description="of every pixel; fitted by kind fit")
     correlation_length: Length | None = Field(
-        default=None, description="on the target, of kind exponential; fitted by kind fit"
+        default=None, description="length on the target, for kind exponential; fitted by kind fit"
     )
     exponent: float | None = Field(
-        default=None, ge=0, le=8, description="a of a power spectrum 1/frequency^a, of kind power; absent: 2"
+        default=None, ge=0, le=8, description="a of a power spectrum 1/frequency^a, for kind power; absent: 2"
     )
 
     @model_validator(mode="after")
@@ -38,10 +38,11 @@ class PriorTable(Table):
 
 
 class EstimatorTable(Table):
-    """How the image is estimated."""
+    """Settings of the estimate of the image."""
 
     noise_variance: ExpectedNoise | None = Field(
-        default=None, description='that the estimator assumes; "fit": fitted to the stack; absent: all known noise'
+        default=None,
+        description='assumed noise variance; "fit": fitted to the stack; absent: all known noise',
     )
     method: Literal[
         "auto",
@@ -57,13 +58,13 @@ class EstimatorTable(Table):
         default="auto",
         description="a dense form, tiles, or a whole frame; auto: the cheapest accurate one",
     )
-    tolerance: float = Field(default=1e-8, gt=0, le=1, description="largest relative error of a dense form")
+    tolerance: float = Field(default=1e-8, gt=0, le=1, description="maximum relative error of a dense form")
     accuracy: float = Field(
         default=0.01, gt=0, le=1, description="largest numerical error of a frame, in posterior standard deviations"
     )
     misalignment: Literal["trust", "robust", "fit"] = Field(
         default="trust",
-        description='of camera.tolerance: none expected; "robust": as more noise; "fit": H is fitted to the stack',
+        description='camera.tolerance is "trust": ignored, "robust": treated as noise, "fit": fitted to the stack',
     )
     memory: Memory | None = Field(default=None, description='limit, such as "4 GB"; absent: half of the free memory')
 

@@ -23,7 +23,7 @@ def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]
 
 
 def known_keys(model: type[BaseModel], prefix: str = "") -> list[str]:
-    """All keys of the scene file in dotted form, those of lens types without the type's name."""
+    """Return all keys of the scene file in dotted form, those of lens types without the type's name."""
     keys: list[str] = []
     for name, field in model.model_fields.items():
         keys.append(prefix + name)

@@ -14,14 +14,17 @@ class NoiseTable(Table):
     """Noise and range of an ideal sensor, which measures in units of f."""
 
     variance: float = Field(
-        default=0.0, ge=0, le=LARGEST**2, description="Gaussian, in squared units of the target's values"
+        default=0.0,
+        ge=0,
+        le=LARGEST**2,
+        description="variance of Gaussian noise, squared units of the target's values",
     )
-    bits: int | None = Field(default=None, ge=1, le=24, description="of the recorded values; absent: no quantisation")
+    bits: int | None = Field(default=None, ge=1, le=24, description="bits of recorded values; absent: no quantisation")
     saturation: float | None = Field(
         default=None,
         ge=-LARGEST,
         le=LARGEST,
-        description="largest recorded value; pixels that reach it are ignored; absent: no limit",
+        description="largest recorded value; saturated pixels are excluded; absent: no limit",
     )
 
     @property
@@ -38,17 +41,22 @@ class NoiseTable(Table):
 class SensorTable(Table):
     """A real sensor in the terms of EMVA 1288; electrons and digital numbers (DN) are counts."""
 
-    illuminance: Illuminance = Field(description="of the target, whose pixels of value 255 reflect all light (Lambert)")
+    illuminance: Illuminance = Field(
+        description="of the target, whose pixels of value 255 reflect all light (Lambertian)"
+    )
     exposure: Time = Field(description="exposure time")
     quantum_efficiency: float = Field(default=1.0, gt=0, le=1, description="electrons per photon")
     full_well: float = Field(default=10000.0, gt=0, le=1e9, description="largest number of electrons in a pixel")
     dark_current: float = Field(default=0.0, ge=0, le=1e9, description="electrons per second without light")
-    read_noise: float = Field(default=0.0, ge=0, le=1e6, description="electrons, standard deviation of a reading")
+    read_noise: float = Field(default=0.0, ge=0, le=1e6, description="standard deviation of a reading, in electrons")
     dsnu: float = Field(
-        default=0.0, ge=0, le=1e6, description="electrons, deviation between dark signals of pixels (DSNU1288)"
+        default=0.0,
+        ge=0,
+        le=1e6,
+        description="deviation between dark signals of pixels, electrons (DSNU1288)",
     )
     prnu: float = Field(
-        default=0.0, ge=0, lt=0.5, description="relative deviation between responses of pixels (PRNU1288)"
+        default=0.0, ge=0, lt=0.5, description="relative standard deviation between the responses of pixels (PRNU1288)"
     )
     gain: float = Field(default=1.0, gt=0, le=1e6, description="DN per electron, the system gain K")
     black_level: float = Field(default=0.0, ge=0, le=1e6, description="DN without light")

@@ -1,8 +1,9 @@
 """Calibration with as many samples as the use of H justifies: rounds with more and more samples.
 
-A stopping rule says what a round's uncertainty of H adds to the expected error; this module chooses the samples that
-bring it below a tenth of all the rest, by the exponent with which it has fallen. Each round stands alone. Grids of
-samples fit the edges of pixels of f where the lens types allow it, see `passes.on_grid`.
+A stopping rule yields the contribution of a round's uncertainty of H to the expected error. This module chooses the
+samples that reduce it below a tenth of the other contributions, from the exponent with which it has decreased. Rounds
+are independent of each other. Grids of samples fit the edges of pixels of f where the lens types allow it, see
+`passes.on_grid`.
 """
 
 from __future__ import annotations

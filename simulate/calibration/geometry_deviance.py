@@ -1,7 +1,7 @@
 """Deviance between measured entries of H and those of a geometry, and its minimisation.
 
 The rays of a pixel are a draw from its row of H, so the measure is the multinomial deviance of all cells: the entries,
-those that are zero included, and the light that lands beside the target. Each share, h measured and p of the model, is
+those that are zero included, and the light that misses the target. Each share, h measured and p of the model, is
 raised by c, half a ray of them all,
 
     D = 2 n sum of (h + c) ln((h + c) / (p + c)) - (h - p),
@@ -33,7 +33,7 @@ PAIRS = 3  # of displacements, for derivatives of a blur that is not wide: they 
 
 @dataclass(frozen=True)
 class EntryTable:
-    """Shares of light by cell: `keys` rise, pixel * (N + 1) + texel, texel N for the light beside the target."""
+    """Shares of light by cell: `keys` rise, pixel * (N + 1) + texel, texel N for the light that misses the target."""
 
     keys: IntArray
     values: FloatArray

@@ -198,7 +198,7 @@ def separate_sources(readings: FloatArray, samples: int, levels: IntArray) -> Fl
     sums = readings * samples
     whole = np.rint(sums)
     if np.abs(sums - whole).max(initial=0.0) > 0.3:
-        raise MachineError("calibration: rays bring back parts of point sources; this should not happen here")
+        raise MachineError("calibration: a ray carries a fraction of a point source; please report this")
     base = int(levels[1])
     return (whole.astype(np.int64)[:, None] // levels % base) / samples
 

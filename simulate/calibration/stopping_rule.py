@@ -12,7 +12,7 @@ from ommatid.scenes.model import Model
 class StoppingRule:
     """Decides whether H is known precisely enough for the reconstruction that will use it.
 
-    added_error : from a model to what the uncertainty of its H adds to the expected error, relative to all the rest
+    added_error : maps a model to the expected error due to the uncertainty of its H, relative to all other error
     fingerprint : of the reconstruction;  description : of the same for people
     """
 

@@ -87,7 +87,7 @@ class Prescription:
 
     @property
     def focal_length(self) -> float:
-        """In air; negative for a diverging lens. Raises InputError if it is afocal."""
+        """The focal length in air, negative for a diverging lens. Raises InputError if it is afocal."""
         power = -self._whole[1, 0]
         if abs(power) <= 1e-12 * np.sum(np.abs((self.index - self.index_before) / self.radius)):
             raise InputError("the surfaces are afocal: they have no focal length and form no image; bend one of them")

@@ -47,7 +47,7 @@ def describe(camera: Camera) -> list[dict[str, Any]]:
 
 
 def words(lens: dict[str, Any]) -> str:
-    """Format the description of a lens in lines of text."""
+    """Format the description of a lens as lines of text."""
 
     def mm(value: float | None) -> str:
         return "infinity" if value is None else f"{value:.4g} mm"

@@ -54,7 +54,7 @@ class Renderer:
     ) -> None:
         """Build the Mitsuba scene; the target is black until `set_target` puts a picture on it.
 
-        together : False renders every lens type by itself
+        together : False renders every lens type separately
         world : scene with a [world] around the target or, if that has no picture, instead of it
         Raises InputError for a camera that this variant cannot render, or a world that cannot be built.
         """
@@ -191,7 +191,7 @@ class Renderer:
     def hits(
         self, group: str, samples: int, seed: Callable[[int], int], block: slice
     ) -> tuple[IntArray, FloatArray | None]:
-        """Return the pixel of f that each ray of a block meets, (pixels, samples), -1 beside the target; and weights.
+        """Return the pixel of f that each ray of a block meets, (pixels, samples), -1 off the target; and weights.
 
         The rays are those of `expose` with the same samples and seed. Only on the fast backends.
         """

@@ -119,7 +119,7 @@ def stage(scene: Scene, variant: str, target: Any | None) -> StagedWorld:
         reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
         raise InputError(f"{where} is no scene that Mitsuba can build: {reason}") from error
     if not built.emitters():
-        raise InputError(f"{where} has no emitter, so all is black; add one, such as <emitter type='constant'/>")
+        raise InputError(f"{where} has no emitter, so the image is black; add one, such as <emitter type='constant'/>")
     if not has_integrator:
         direct_only = not (scene.render.complete or has_interreflections(built))
         path = {"type": "path", "max_depth": 1 if direct_only else DEEPEST, "block_size": BLOCK}

@@ -1,4 +1,4 @@
-"""Rendering in passes with seeds of their own, so that every mean comes with the variance of its own error."""
+"""Rendering in passes with independent seeds, so that every mean has an estimated variance."""
 
 from __future__ import annotations
 

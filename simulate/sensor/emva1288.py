@@ -121,6 +121,6 @@ def _check_light(light: FloatArray) -> None:
     if least < -ROUNDED * float(light.max(initial=0.0)) or not np.isfinite(light).all():
         count = int(np.sum(~(light >= 0)))
         raise InputError(
-            f"a [sensor] counts the electrons of light, got light below 0 (least {least:.4g}) or no number on {count}"
+            f"a [sensor] counts the electrons of light, got light below 0 (least {least:.4g}) or NaN on {count}"
             " of its pixels; take a target.image without negative values, or an ideal sensor's [noise]"
         )

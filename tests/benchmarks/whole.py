@@ -90,7 +90,7 @@ def compile_all() -> None:
 def deviations(size: int) -> FloatArray:
     """Return the posterior standard deviations of a frame of 60 k - 1 pixels a side, (size, size).
 
-    They are those of a small frame with the same border, whose central pixel, 29 pixels from it, stands for all others.
+    They are those of a small frame with the same border, whose central pixel, 29 pixels from it, represents all others.
     """
     matrix = ideal_matrix(whole_camera(SMALL))
     precision = (matrix.T @ matrix).toarray() / NOISE

@@ -242,5 +242,5 @@ def test_several_points_need_the_footprints_of_pinholes() -> None:
     point_sources._check_separable(paper_camera, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]
     optics = replace(paper_camera.types[0].optics, distortion=(0.1, 0.0))
     distorted = replace(paper_camera, types=(replace(paper_camera.types[0], optics=optics),))
-    with pytest.raises(InputError, match="record one point an image"):
+    with pytest.raises(InputError, match="record one point per image"):
         point_sources._check_separable(distorted, several, Path("places.csv"))  # pyright: ignore[reportPrivateUsage]

@@ -324,7 +324,7 @@ def test_saturated_and_dead_pixels_are_left_out() -> None:
     assert found.error.mse < found.interval.high
 
 
-def test_what_the_estimator_is_told() -> None:
+def test_assumed_noise_variance_with_a_sensor() -> None:
     stack, model = taken(500.0)
     told = stack.scene.estimator.model_copy(update={"noise_variance": "fit"})
     with pytest.raises(InputError, match="differs from pixel to pixel"):

@@ -108,7 +108,7 @@ def test_the_working_f_number_is_the_exit_pupil_s_distance_over_its_diameter() -
     pupil = found.exit_pupil
     distance = 12.0 + found.rear_principal - pupil.position
     assert found.working_f_number(12.0) == pytest.approx(distance / (2 * pupil.radius))
-    telecentric = thin(10.0, 10.0, 0.5, before=True)  # the cone has the same slope wherever the sensor stands
+    telecentric = thin(10.0, 10.0, 0.5, before=True)  # the cone has the same slope for any position of the sensor
     assert telecentric.working_f_number(12.0) == pytest.approx(10.0) == telecentric.working_f_number(30.0)
 
 

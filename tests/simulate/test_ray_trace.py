@@ -220,7 +220,7 @@ def test_a_small_lens_collects_its_area_over_the_square_of_the_distance() -> Non
 
 @pytest.mark.parametrize("sine", [0.2, 0.7, 0.95])
 def test_on_the_axis_a_wide_cone_gives_pi_times_its_sine_squared(sine: float) -> None:
-    """Whatever stands before it: here a bare stop behind a lens that cuts nothing."""
+    """The result does not depend on the optics in front: here a stop behind a lens that blocks no rays."""
     depth, gap = 5.0, 2.0
     stop = (depth - gap) * sine / sqrt(1 - sine**2)
     one = lens([1e4, -1e4, inf], [0.0, gap], [1.5, 1.0, 1.0], [1e3, 1e3, stop], stop=2)
@@ -254,7 +254,7 @@ def test_a_camera_s_lenses_collect_what_their_f_numbers_say() -> None:
 
 
 def test_numpy_and_dr_jit_agree_to_float32() -> None:
-    """Numbers of two lenses with surfaces of their own count stand in one table, and are looked up by the ray."""
+    """One table holds two lenses with different numbers of surfaces; each ray looks up its own."""
     needs("llvm_ad_mono")
     from ommatid.simulate.renderer.variant import activate
 

@@ -24,7 +24,7 @@ from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.reconstruct.restore import Reconstruction
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError, MachineError, naming_source
+from ommatid.runtime.errors import InputError, MachineError, naming_source, shortened_repr
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file
 from ommatid.scenes import scene as scene_file
@@ -209,7 +209,10 @@ def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
         if stack is None:
             model, _ = stages.calibrated_model(setup, path, no_progress)
         else:
+            _check_type("stack", stack, Stack, "read_stack")
             check_scene(setup)
+            if stack.camera.describe() != setup.camera.describe():
+                raise InputError(f"{setup.scene.source}: expected a stack of this scene's camera, got one of another")
             model, _ = cached_model(path, setup, no_progress, for_stack(stack))
     return replace(model, scene=setup.resolved)
 
@@ -220,9 +223,9 @@ def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> 
     truth : (rows, columns) or (N,), with which the estimate is compared, such as `target_image(scene)`
     Raises InputError if stack and model are of different cameras, or if memory does not suffice.
     """
-    flat = None if truth is None else np.asarray(truth, dtype=np.float64).ravel()
-    if flat is not None and flat.size != model.unknowns:
-        raise InputError(f"truth: expected {model.camera.rows} x {model.camera.columns} pixels, got {flat.size}")
+    _check_type("stack", stack, Stack, "read_stack")
+    _check_type("model", model, Model, "read_model")
+    flat = None if truth is None else _flat_truth(truth, model)
     names = Path("the stack"), Path("the model")
     outcome, report = result_files.reconstruct(stack, model, flat, names)
     report = report.with_changes(fingerprint=result_files.fingerprint_of(stack, model))
@@ -238,6 +241,28 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
     """
     stages.run(_setup(scene), Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
     return read_run(folder)
+
+
+def _check_type(name: str, value: object, expected: type, reader: str) -> None:
+    """Raise InputError for an argument of another type, such as a path."""
+    if not isinstance(value, expected):
+        raise InputError(
+            f"{name}: expected a {expected.__name__}, got {shortened_repr(value)}; read files with ommatid.{reader}"
+        )
+
+
+def _flat_truth(truth: FloatArray, model: Model) -> FloatArray:
+    """Return the truth as (N,). Raises InputError for another shape, and for values that are not finite numbers."""
+    camera = model.camera
+    try:
+        image = np.asarray(truth, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"truth: expected an array of numbers, got {shortened_repr(truth)}") from error
+    if image.shape not in (camera.shape, (camera.unknowns,)):
+        raise InputError(f"truth: expected {camera.rows} x {camera.columns} pixels, got an array of {image.shape}")
+    if not np.isfinite(image).all():
+        raise InputError("truth: expected finite values, got NaN or infinity; leave out a truth that is not known")
+    return image.ravel()
 
 
 def _scene(scene: Scene | str | Path) -> Scene:

@@ -251,12 +251,39 @@ def test_what_is_wrong_is_said(wrong: Callable[[], object], words: str) -> None:
         wrong()
 
 
-def test_what_does_not_belong_together_is_said(stack: ommatid.Stack, model: ommatid.Model) -> None:
+def test_what_does_not_belong_together_is_said(stack: ommatid.Stack) -> None:
     other = ommatid.calibrate(ommatid.read_scene("tile35", set=["calibration.method=ideal"]))
     with pytest.raises(ommatid.InputError, match="the stack and the model do not belong together"):
         ommatid.reconstruct(stack, other)
-    with pytest.raises(ommatid.InputError, match="truth: expected 19 x 19 pixels, got 9"):
-        ommatid.reconstruct(stack, model, np.zeros((3, 3)))
+    with pytest.raises(ommatid.InputError, match="expected a stack of this scene's camera"):
+        ommatid.calibrate(ommatid.read_scene("tile35"), stack)
+    wrong: Any = stack
+    path: Any = "stack.exr"
+    with pytest.raises(ommatid.InputError, match="stack: expected a Stack, got 'stack"):
+        ommatid.reconstruct(path, wrong)
+    with pytest.raises(ommatid.InputError, match="model: expected a Model, got"):
+        ommatid.reconstruct(stack, wrong)
+
+
+@pytest.mark.parametrize(
+    ("truth", "words"),
+    [
+        (np.zeros((3, 3)), "expected 19 x 19 pixels"),
+        (np.zeros((1, 361)), "expected 19 x 19 pixels"),
+        (np.full((19, 19), np.nan), "expected finite values"),
+        ("truth.exr", "expected an array of numbers"),
+    ],
+)
+def test_a_truth_that_is_none_is_said(stack: ommatid.Stack, model: ommatid.Model, truth: Any, words: str) -> None:
+    with pytest.raises(ommatid.InputError, match=f"truth: {words}"):
+        ommatid.reconstruct(stack, model, truth)
+
+
+def test_a_run_with_another_estimate_is_said(tmp_path: Path) -> None:
+    ommatid.run(ommatid.read_scene("tile19", set=FEW), tmp_path)
+    (tmp_path / "estimate.exr").write_bytes((tmp_path / "stack.exr").read_bytes())
+    with pytest.raises(ommatid.InputError, match=r"estimate\.exr: expected the estimate and its variance"):
+        ommatid.read_run(tmp_path)
 
 
 @pytest.fixture(name="ommatid_command")

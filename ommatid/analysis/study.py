@@ -54,12 +54,10 @@ def _with_misalignment(scene: Scene, name: str) -> Scene:
     return scene.model_copy(update={"estimator": estimator})
 
 
-def study_case(
-    stack: Stack, name: str, model: Model, truth: FloatArray | None, progress: Progress = no_progress
-) -> StudyCase:
+def study_case(stack: Stack, name: str, model: Model, truth: FloatArray | None) -> StudyCase:
     """Reconstruct a stack with one model of H. Raises what `restore` raises."""
     stack = replace(stack, scene=_with_misalignment(stack.scene, name))
-    restoration = restore(stack, model, truth, None, progress)
+    restoration = restore(stack, model, truth)
     given = restoration.interval
     return StudyCase(
         model=name,

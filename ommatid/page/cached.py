@@ -11,8 +11,6 @@ from ommatid.reconstruct.output import run_json
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
-from ommatid.scenes.model import Model
-from ommatid.scenes.stack import Stack
 
 from .data import read_run
 from .point_response import IdealMatrix
@@ -22,15 +20,13 @@ HERE = Path(__file__).parent
 HEAD = 4096  # characters at the beginning of a page that contain its stamp
 
 
-def cached_page(
-    folder: Path, ideal: IdealMatrix | None, recorded: Stack | None = None, calibrated: Model | None = None
-) -> bool:
+def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
     """Write report.html of a finished run unless it is up to date, and return True if it was written.
 
-    ideal : H of one sub-imager as designed;  recorded, calibrated : the folder's stack and model, read if not given
+    ideal : H of one sub-imager as designed
     Raises InputError for missing or damaged files, MachineError for a full disk.
     """
-    recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
+    recorded = stack.read(folder / "stack.exr")
     bench = next(bench_tables(folder, recorded.camera.describe()), None)
     described = None if bench is None else bench.describe()
     stamp = fingerprint([run_json.read(folder).plain(), described, versions("bokeh"), sources_digest()])
@@ -38,7 +34,7 @@ def cached_page(
     def make() -> str:
         from .document import page  # imports Bokeh
 
-        return page(read_run(folder, recorded, calibrated), ideal, bench, stamp)
+        return page(read_run(folder, recorded), ideal, bench, stamp)
 
     return cached(folder / REPORT, stamp, read_stamp, make, write_text)[1]
 

@@ -17,6 +17,7 @@ from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import ESTIMATE
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.arrays import Float32Array, FloatArray
+from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 from ommatid.scenes.model import Model
@@ -66,10 +67,18 @@ class ResultMaps:
 def read_run(folder: Path, recorded: Stack | None = None, calibrated: Model | None = None) -> Run:
     """Read the run in a folder; stack and model are read only if they are not given. Raises InputError."""
     channels = exr.read(folder / ESTIMATE)[0].channels
+    report = run_json.read(folder)
+    recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
+    shapes = {name: channels[name].shape for name in ("estimate", "variance") if name in channels}
+    if shapes != dict.fromkeys(("estimate", "variance"), recorded.camera.shape):
+        raise InputError(
+            f"{folder / ESTIMATE}: expected the estimate and its variance of {recorded.camera.shape} pixels, got"
+            f" {shapes or ', '.join(channels)}; run the scene again"
+        )
     return Run(
         folder=folder,
-        report=run_json.read(folder),
-        stack=stack.read(folder / "stack.exr") if recorded is None else recorded,
+        report=report,
+        stack=recorded,
         model=model_file.read(folder / "model.npz") if calibrated is None else calibrated,
         estimate=channels["estimate"],
         variance=channels["variance"],

@@ -17,6 +17,7 @@ from ommatid.scenes.hardware.point_sources import from_recorded_points
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.gallery import find_scene
 
 from .stages import calibrated_model
 
@@ -78,7 +79,7 @@ def calibrate_file(
 
     Raises InputError for a wrong scene, option or frame, MachineError for a full disk.
     """
-    check_output(output, path)
+    check_output(output, find_scene(path))
     setup = Setup.from_scene(read(path, changes, lenses))
     if recording is not None:
         if lenses:

@@ -16,6 +16,7 @@ from ommatid.scenes.hardware.stack_import import import_stack
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.gallery import find_scene
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def import_file(
     Raises InputError for a wrong scene or frame, MachineError for a full disk.
     """
     frames = (*images, *settings.dark, *settings.flat)
-    check_output(output, path, *(file for frame in frames for file in files_in(frame)))
+    check_output(output, find_scene(path), *(file for frame in frames for file in files_in(frame)))
     setup = Setup.from_scene(read(path, changes))  # with all lens types, since all of them are on the sensor
     if lenses and not setup.camera.is_ideal_pinhole:
         raise InputError(

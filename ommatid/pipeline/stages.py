@@ -20,6 +20,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.gallery import find_scene
 from ommatid.simulate.cache import cached_model, cached_stack
 from ommatid.simulate.calibrate import is_adaptive
 from ommatid.simulate.renderer.variant import check_transport_variant
@@ -148,7 +149,7 @@ def export_scene(path: Path, output: Path, changes: Sequence[str] = (), lenses: 
     from ommatid.runtime.files import check_output
     from ommatid.simulate.renderer.export import export
 
-    check_output(output, path)
+    check_output(output, find_scene(path))
     setup = open_scene(path, changes, lenses)
     if setup.scene.world is not None:
         raise InputError(f"{path}: world.file is a Mitsuba scene already; export serves flat targets, remove [world]")

@@ -14,8 +14,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from ommatid.pipeline.calibration import calibrate_file
+from ommatid.pipeline.stages import export_scene
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.progress import no_progress
 from ommatid.scenes import stack
 from ommatid.scenes.formats import exr
+from ommatid.scenes.tables import gallery
 
 from ..conftest import TINY, Command, Ended, shell
 from ..runs import FILES, FORBIDDEN, MADE, document, numbers, without
@@ -430,3 +435,13 @@ def test_too_large_a_reconstruction_is_refused_before_anything_is_rendered(here:
     assert ended.code == 2
     assert "GB" in ended.err
     assert not (here / "out").exists()
+
+
+def test_a_gallery_scene_is_not_replaced_by_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tmp_path / "tile19.toml"
+    scene.write_bytes((gallery.GALLERY / scene.name).read_bytes())
+    monkeypatch.setattr(gallery, "GALLERY", tmp_path)
+    with pytest.raises(InputError, match="would replace the file that is read"):
+        export_scene(Path("tile19"), scene)
+    with pytest.raises(InputError, match="would replace the file that is read"):
+        calibrate_file(Path("tile19"), scene, (), (), None, no_progress)

@@ -314,7 +314,7 @@ def test_a_whole_run(here: Path, ommatid: Command) -> None:
     told = ["--set", "render.samples=auto", "--set", "calibration.samples=auto"]
     ended = ommatid("run", "tiny.toml", "-o", "out", *told)
     assert ended.code == 0, ended.err
-    assert "samples a pixel" in " ".join(ended.out.split())
+    assert "samples per pixel" in " ".join(ended.out.replace("│", " ").split())
     run = json.loads((here / "out/tiny/run.json").read_text("utf-8"))
     assert run["stages"]["render"]["reached"]
     assert run["stages"]["render"]["fewest_samples"] >= LEAST

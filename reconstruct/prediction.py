@@ -90,16 +90,14 @@ def predict(
         the estimator expects noise
     Raises InputError where the noise is to be fitted to a stack, or where no form is right.
     """
-    noise = actual if isinstance(actual, np.ndarray) else np.full(matrix.shape[0], actual)
+    noise = np.broadcast_to(actual, matrix.shape[0])
     used = np.isfinite(noise)
-    noise = noise[used]
-    matrix = matrix if used.all() else sparse.csr_array(matrix[used])
-    measurements, unknowns = matrix.shape
+    matrix, noise = matrix if used.all() else sparse.csr_array(matrix[used]), noise[used]
     seen = observability(matrix)
     if estimator.noise_variance == "fit":
         raise InputError("estimator.noise_variance 'fit' takes a recorded stack; set a number to predict without one")
     setting = estimator.noise_variance
-    expected_noise = noise if setting is None else np.full(measurements, float(setting))
+    expected_noise = noise if setting is None else np.full(noise.size, float(setting))
     added = None
     if (expected_noise > 0).all():
         form, solver = factorise(Problem(matrix, prior, expected_noise), estimator.method, estimator.tolerance)
@@ -107,12 +105,12 @@ def predict(
         method, variance, resolved = solver.method, expected.variance, expected.resolved
         added = None if misalignment_variance is None else misalignment_variance(form, used)
     else:
-        limit = svd(Problem(matrix, prior, np.ones(measurements)))
+        limit = svd(Problem(matrix, prior, np.ones(noise.size)))
         method, variance, resolved = limit.name, _noiseless_limit(limit, noise), limit.resolved()
     variance = variance if added is None else variance + added
     return Prediction(
-        measurements,
-        unknowns,
+        noise.size,
+        prior.mean.size,
         seen.rank,
         seen.null_space,
         seen.condition,

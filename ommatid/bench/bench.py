@@ -42,45 +42,32 @@ SETUP_SHARE = 0.02  # of the progress, for the reference and the noise floor
 def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
     """Return the bench table of a scene, and True if anything had to be measured for it.
 
-    Cells that are already in `folder` are not measured again; those that do not fit into the time limit are left out.
-
-    seconds : time limit
+    Cells that are already in `folder` are not measured again; those that do not fit into `seconds` are left out.
     Raises InputError for a scene that cannot be measured, and if `folder` holds the table of another scene.
     """
     start = perf_counter()
-    if setup.scene.world is not None:
-        raise InputError(
-            f"{setup.scene.source}: bench measures flat targets, got a [world]; remove it, or choose another scene"
-        )
+    _check_flat(setup.scene)
     setup = replace(setup, scene=_with_exact_assumptions(setup.scene), given_image=setup.image)
     scene, camera = setup.scene, setup.camera
     check_scene(setup, calibrates=False)
     subject_print = _fingerprint(setup)
     made_from = fingerprint([subject_print, versions("mitsuba", "drjit", "scipy")])
     previous = _previous(folder, subject_print)
-    if previous is not None and previous.fingerprint == made_from:
-        if previous.budget >= seconds or not any(job.late for job in previous.left_out):
-            return previous, False
-    else:
+    if previous is not None and previous.fingerprint != made_from:
         previous = None
-    make_folder(folder)
-    journal = Journal(folder / PARTIAL, made_from)
-    if previous is not None:
-        for cell in previous.cells:
-            journal.cells.setdefault(name_of(cell), cell)
-        journal.seconds = max(journal.seconds, previous.seconds)
+    if previous is not None and (previous.budget >= seconds or not any(job.late for job in previous.left_out)):
+        return previous, False
+    journal = _open_journal(folder, made_from, previous)
     seconds_before = journal.seconds
     with naming_source(scene.source):
         right = reference(setup, folder, lambda share: progress(SETUP_SHARE * share))
         subject = Subject(setup, right, FLOOR_SHARE * seconds)
         listed, left_out = jobs(subject)
-    late = measure(
-        listed,
-        seconds,
-        journal,
-        lambda share: progress(SETUP_SHARE + (1 - SETUP_SHARE) * share),
-        perf_counter() - start,
-    )
+
+    def measured(share: float) -> None:
+        progress(SETUP_SHARE + (1 - SETUP_SHARE) * share)
+
+    late = measure(listed, seconds, journal, measured, perf_counter() - start)
     left_out += [SkippedJob(what=name, why=why) for name, why in journal.refused.items()]
     cells = tuple(journal.cells[job.name] for job in listed if job.name in journal.cells)
     table = BenchTable(
@@ -99,11 +86,34 @@ def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tup
         recommended=recommend(cells, subject.noise_floor),
         left_out=(*left_out, *late),
     )
+    _finish(folder, table, journal)
+    return table, True
+
+
+def _check_flat(scene: Scene) -> None:
+    if scene.world is not None:
+        raise InputError(
+            f"{scene.source}: bench measures flat targets, got a [world]; remove it, or choose another scene"
+        )
+
+
+def _open_journal(folder: Path, made_from: str, previous: BenchTable | None) -> Journal:
+    """Open the journal of an interrupted bench, or begin one with the cells of a table that needs more time."""
+    make_folder(folder)
+    journal = Journal(folder / PARTIAL, made_from)
+    if previous is not None:
+        for cell in previous.cells:
+            journal.cells.setdefault(name_of(cell), cell)
+        journal.seconds = max(journal.seconds, previous.seconds)
+    return journal
+
+
+def _finish(folder: Path, table: BenchTable, journal: Journal) -> None:
+    """Write the figures and the table, and remove the files of the unfinished bench."""
     write_figures(folder, table)
     bench_file.write(folder, table)
     journal.remove()
     (folder / REFERENCE).unlink(missing_ok=True)
-    return table, True
 
 
 def _with_exact_assumptions(scene: Scene) -> Scene:

@@ -102,9 +102,8 @@ def from_recorded_points(
     step = np.nan_to_num(frames.scale / value)
     photons = step * (0.0 if scene.sensor is None else scene.sensor.gain)
     variance = _variance(camera, entries, beyond, step if frames.whole else 0.0 * step, photons)
-    shape = (camera.measurements, camera.unknowns)
-    starts = np.searchsorted(entries.pixel, np.arange(shape[0] + 1))
-    matrix = sparse.csr_array((entries.mean, entries.unknown, starts), shape=shape)
+    starts = np.searchsorted(entries.pixel, np.arange(camera.measurements + 1))
+    matrix = sparse.csr_array((entries.mean, entries.unknown, starts), shape=(camera.measurements, camera.unknowns))
     made_from = {
         "camera": camera.describe(),
         "source": frames.sources,
@@ -120,10 +119,9 @@ def from_recorded_points(
         "seconds": perf_counter() - start,
         "versions": versions("scipy", "scikit-image", "OpenEXR"),
     }
-    batches = np.zeros((0, entries.mean.size), dtype=np.float32)
     once = scene.sensor is None and not (entries.count > 1).any()
-    model = Model(setup.resolved, camera, matrix, variance, batches, record)
-    return RecordedCalibration(model, frames, stray, once)
+    batches = np.zeros((0, entries.mean.size), dtype=np.float32)
+    return RecordedCalibration(Model(setup.resolved, camera, matrix, variance, batches, record), frames, stray, once)
 
 
 def _check_complete(camera: Camera, positions: list[IntArray], places: Path | None) -> None:

@@ -63,39 +63,67 @@ def independent(mean: float, variance: float, unknowns: int) -> Prior:
 
 def exponential(mean: float, variance: float, shape: tuple[int, int], length: float) -> Prior:
     """Return the isotropic prior P0 = variance exp(-distance / length); `length` in pixels."""
-    return _stationary(mean, variance, shape, np.exp(-lag_distances(shape) / length))
+    return _stationary(mean, shape, variance * np.exp(-lag_distances(shape) / length))
 
 
-def prior_of(table: estimation.PriorTable, shape: tuple[int, int], pitch: float) -> Prior:
+def prior_of(table: estimation.PriorTable, shape: tuple[int, int], pitch: float, detail: int = 1) -> Prior:
     """Return the prior of a scene's [prior] table for an image of `shape` with a pixel pitch of `pitch` millimetres.
 
+    detail : a correlated prior is that of a world so many times finer, of which the image is the average
     Raises InputError for kind "fit", which needs a stack.
     """
     if table.kind == "independent":
         return independent(table.mean, table.variance, shape[0] * shape[1])
-    if table.kind == "exponential" and table.correlation_length is not None:
-        return exponential(table.mean, table.variance, shape, table.correlation_length / pitch)
-    if table.kind == "power":
-        return _stationary(table.mean, table.variance, shape, _power_correlation(shape, table.exponent))
-    raise InputError(NEEDS_FIT)
+    return _stationary(table.mean, shape, _image_lags(table, shape, pitch, detail))
 
 
-def spectrum_of(table: estimation.PriorTable, shape: tuple[int, int], pitch: float) -> float | FloatArray:
+def spectrum_of(
+    table: estimation.PriorTable, shape: tuple[int, int], pitch: float, detail: int = 1
+) -> float | FloatArray:
     """Return the diagonal form of P0: the variance of independent pixels, else its spectrum under the DCT-II.
 
-    The DCT reflects the image at its edges. Inside, this prior equals the stationary one of `prior_of`; within a
+    Arguments as of `prior_of`. The DCT reflects the image at its edges. Inside, this prior equals the stationary one of `prior_of`; within a
     correlation length of an edge the variance is larger. Raises InputError for kind "fit", which needs a stack.
     """
     if table.kind == "independent":
         return table.variance
+    lags = _image_lags(table, shape, pitch, detail)
+    spectrum: FloatArray = np.fft.fft2(lags).real[: shape[0], : shape[1]]
+    return np.maximum(spectrum, LEAST_POWER * float(spectrum.max()))
+
+
+def covariance_lags(table: estimation.PriorTable, shape: tuple[int, int], pitch: float) -> FloatArray:
+    """Return the covariance at every lag, (2 rows, 2 columns), of a correlated prior; index -1 is a lag of -1.
+
+    Raises InputError for kind "fit", which needs a stack, ValueError for independent pixels.
+    """
     if table.kind == "exponential" and table.correlation_length is not None:
-        correlation = np.exp(-lag_distances(shape) * pitch / table.correlation_length)
-    elif table.kind == "power":
-        correlation = _power_correlation(shape, table.exponent)
-    else:
-        raise InputError(NEEDS_FIT)
-    spectrum = np.fft.fft2(correlation).real[: shape[0], : shape[1]]
-    return table.variance * np.maximum(spectrum, LEAST_POWER * float(spectrum.max()))
+        return table.variance * np.exp(-lag_distances(shape) * pitch / table.correlation_length)
+    if table.kind == "power":
+        return table.variance * _power_correlation(shape, table.exponent)
+    if table.kind == "independent":
+        raise ValueError("expected a correlated prior, got one of independent pixels")
+    raise InputError(NEEDS_FIT)
+
+
+def averaged_lags(lags: FloatArray, detail: int) -> FloatArray:
+    """Return the covariance at every lag of averages over detail x detail pixels: A P A^T for box averages A.
+
+    lags : (2 detail rows, 2 detail columns) of the pixels that are averaged; the result is (2 rows, 2 columns)
+    """
+    if detail == 1:
+        return lags
+    waves = np.fft.rfft2(lags)
+    for axis, size in enumerate(lags.shape):
+        frequency = np.fft.fftfreq(size) if axis == 0 else np.fft.rfftfreq(size)
+        box = np.exp(-2j * np.pi * np.outer(frequency, np.arange(detail))).mean(axis=1)
+        waves *= np.expand_dims(np.square(np.abs(box)), 1 - axis)
+    return np.ascontiguousarray(np.fft.irfft2(waves, s=lags.shape)[::detail, ::detail])
+
+
+def _image_lags(table: estimation.PriorTable, shape: tuple[int, int], pitch: float, detail: int) -> FloatArray:
+    fine = shape[0] * detail, shape[1] * detail
+    return averaged_lags(covariance_lags(table, fine, pitch / detail), detail)
 
 
 def lag_distances(shape: tuple[int, int]) -> FloatArray:
@@ -122,9 +150,8 @@ def _covariance_root(covariance: FloatArray) -> FloatArray:
         return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _stationary(mean: float, variance: float, shape: tuple[int, int], correlation: FloatArray) -> Prior:
-    root = _covariance_root(stationary_matrix(correlation, shape))
-    return Prior(np.full(shape[0] * shape[1], mean), variance**0.5 * root)
+def _stationary(mean: float, shape: tuple[int, int], lags: FloatArray) -> Prior:
+    return Prior(np.full(shape[0] * shape[1], mean), _covariance_root(stationary_matrix(lags, shape)))
 
 
 def _power_correlation(shape: tuple[int, int], exponent: float | None) -> FloatArray:

@@ -36,6 +36,7 @@ class Camera:
     """All lens types, and the target's grid on which the image is reconstructed.
 
     lens_columns : columns of sub-imagers on the sensor, those of types left out by `restrict` included
+    detail : the world's grid is so many times finer than f along both axes
     """
 
     rows: int
@@ -48,6 +49,31 @@ class Camera:
     wavelength: float | None = None
     tolerance: ToleranceTable | None = None
     lens_columns: int | None = None
+    detail: int = 1
+
+    @property
+    def world(self) -> Camera:
+        """The same camera described on the grid of the world, `detail` times finer than f along both axes."""
+        if self.detail == 1:
+            return self
+        types = tuple(lens_type.finer(self.detail) for lens_type in self.types)
+        rows, columns, pitch = self.rows * self.detail, self.columns * self.detail, self.target_pitch / self.detail
+        return replace(self, rows=rows, columns=columns, target_pitch=pitch, types=types, detail=1)
+
+    @property
+    def with_grid_of_matrix(self) -> Camera:
+        """The camera on the grid of H's columns: the world's, or f's where its detail does not matter."""
+        return replace(self, detail=1) if self.covers_whole_pixels else self.world
+
+    @property
+    def covers_whole_pixels(self) -> bool:
+        """True if every sensor pixel averages whole pixels of f, so that detail finer than f changes no measurement."""
+        if self.tolerance is not None or not self.has_box_footprints:
+            return False
+        return all(
+            lens_type.optics.surfaces is None and lens_type.ratio.denominator == lens_type.step.denominator == 1
+            for lens_type in self.types
+        )
 
     @property
     def unknowns(self) -> int:
@@ -187,6 +213,8 @@ class Camera:
             }
         if not self.is_ideal_pinhole:  # sub-images of ideal pinholes do not depend on where the lenses are
             description["camera.places"] = [self.lens_columns, *(lens_type.left for lens_type in self.types)]
+        if self.detail != 1:
+            description["target.detail"] = self.detail
         if self.wavelength is not None:
             description["camera.wavelength"] = self.wavelength
         if self.tolerance is not None:
@@ -218,6 +246,7 @@ def derive(scene: Scene) -> Camera:
         wavelength=scene.camera.wavelength,
         tolerance=scene.camera.tolerance,
         lens_columns=lefts[-1],
+        detail=scene.target.detail,
     )
     for lens_type in types:
         if lens_type.count > MOST_SUB_IMAGERS:
@@ -225,7 +254,7 @@ def derive(scene: Scene) -> Camera:
                 f"{scene.source}: camera.lens.{lens_type.name}.array has {lens_type.count} sub-imagers, expected at"
                 f" most {MOST_SUB_IMAGERS} per lens type; use fewer"
             )
-    needed = PLANES * 8 * (camera.unknowns + camera.measurements)
+    needed = PLANES * 8 * (camera.unknowns * camera.detail**2 + camera.measurements)
     check_memory(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
     if camera.measurements > MOST_MEASUREMENTS:
         raise InputError(

@@ -5,7 +5,7 @@ Lengths are millimetres; positions on the target are in pixels of f, from its to
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -68,6 +68,11 @@ class LensType:
     def measurements(self) -> int:
         """Number of sensor pixels of all sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
+
+    def finer(self, detail: int) -> LensType:
+        """The same lens type on a grid of the target that is `detail` times finer along both axes."""
+        origin = self.origin[0] * detail, self.origin[1] * detail
+        return replace(self, ratio=self.ratio * detail, step=self.step * detail, origin=origin)
 
     def middle(self, window: tuple[Fraction, Fraction]) -> tuple[float, float]:
         """Row and column of f in the middle of the view of a sub-imager whose view begins at `window`."""

@@ -87,6 +87,10 @@ class Model:
             return self.boxes.forward(image)
         return self.stored @ np.asarray(image, dtype=np.float64).ravel()
 
+    def light(self, image: FloatArray) -> FloatArray:
+        """Expected light on every sensor pixel for an image: (N,) to (M,)."""
+        return self.forward(image)
+
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """H^T g: (M,) to (N,)."""
         if self.stored is None:

@@ -63,7 +63,7 @@ def read(path: Path) -> Model:
         scene = parse(content["scene"], path)
         record = checked(content["record"])
         method = record["method"]
-        camera = derive(scene)
+        camera = derive(scene).with_grid_of_matrix
         matrix, shape = None, tuple(arrays["shape"].tolist())
         if "data" in arrays:
             matrix = _matrix(arrays, shape)

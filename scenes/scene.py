@@ -27,6 +27,7 @@ from .tables.table import Table
 from .tables.units import Corner, FileName, Length, Pair, Samples, Time
 
 TRUTH = "truth.exr"
+PICTURE = "target.exr"  # beside it, where the world is finer than f
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
 IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where render.samples is "auto"
 
@@ -41,7 +42,13 @@ class TargetTable(Table):
     origin: Corner | None = Field(
         default=None, description="row and column where the crop starts; absent: the whole picture"
     )
-    shape: Pair | None = Field(default=None, description="rows and columns of the crop")
+    shape: Pair | None = Field(default=None, description="rows and columns of f, the grid of the reconstruction")
+    detail: int = Field(
+        default=1,
+        ge=1,
+        le=16,
+        description="the picture and the world are so many times finer than f; f is the average of their pixels",
+    )
     pixel_pitch: Length = Field(description="side of one pixel of the target")
     distance: Length = Field(description="distance from the plane of the lenses to the target")
 
@@ -158,9 +165,10 @@ class Scene(Table):
 def resolved(scene: Scene, shape: tuple[int, int]) -> Scene:
     """The scene as a run's folder stores it: the target is the whole picture `truth.exr` beside the scene file.
 
-    With a world, `truth.exr` shows the world too, so the target keeps its own picture, if it has one.
+    Where the world is finer than f, its picture is `target.exr`, and `truth.exr` its average. With a [world], `truth.exr` shows the world too, so the target keeps its own picture, if it has one.
     """
-    update: dict[str, Any] = {"image": TRUTH, "origin": None, "shape": shape}
+    picture = TRUTH if scene.target.detail == 1 else PICTURE
+    update: dict[str, Any] = {"image": picture, "origin": None, "shape": shape}
     if scene.world is not None:
         update = {"shape": shape}
     return with_tables(scene, target=scene.target.model_copy(update=update))

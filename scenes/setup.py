@@ -18,12 +18,14 @@ from .skipped import skipped_effects
 class Setup:
     """A scene and its camera; derived quantities are computed when they are first used, and once.
 
-    given_image : (rows, columns), used instead of the picture that the scene names; None: load that one
+    given_image : used instead of the picture that the scene names, of the same shape; None: load that one
+    coarse_shape : rows and columns of f, where `camera` is on another grid; None: those of `camera`
     """
 
     scene: Scene
     camera: Camera
     given_image: FloatArray | None = None
+    coarse_shape: tuple[int, int] | None = None
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Setup:
@@ -31,9 +33,27 @@ class Setup:
         return cls(scene, derive(scene))
 
     @cached_property
-    def image(self) -> FloatArray:
-        """Image on the target, (rows, columns). Raises InputError if the scene's picture cannot be loaded."""
+    def picture(self) -> FloatArray:
+        """Picture on the target, on the world's grid. Raises InputError if the scene's picture cannot be loaded."""
         return picture.load(self.scene) if self.given_image is None else self.given_image
+
+    @cached_property
+    def image(self) -> FloatArray:
+        """Image on the target, (rows, columns), on the camera's grid. Raises InputError as `picture` does."""
+        return picture.averaged(self.picture, self.picture.shape[0] // self.camera.rows)
+
+    @cached_property
+    def world(self) -> Setup:
+        """The setup on the grid of the world, which is rendered."""
+        return self if self.camera.detail == 1 else self._on_grid(self.camera.world)
+
+    @cached_property
+    def calibrated(self) -> Setup:
+        """The setup on the grid of H's columns, which is calibrated."""
+        return self if self.camera.detail == 1 else self._on_grid(self.camera.with_grid_of_matrix)
+
+    def _on_grid(self, camera: Camera) -> Setup:
+        return Setup(self.scene, camera, self.given_image, self.camera.shape)
 
     @cached_property
     def _reduced(self) -> tuple[Camera, tuple[SkippedEffect, ...]]:
@@ -52,7 +72,7 @@ class Setup:
     @cached_property
     def resolved(self) -> Scene:
         """The scene as a run's folder stores it, with truth.exr as its picture."""
-        return resolved(self.scene, self.camera.shape)
+        return resolved(self.scene, self.coarse_shape or self.camera.shape)
 
     @property
     def has_structured_matrix(self) -> bool:

@@ -148,8 +148,8 @@ def render_until(
     scene = setup.scene
     allowed, variant = allowed_variance(setup), choose(scene.render.variant)
     world = None if scene.world is None else scene
-    renderer = Renderer(setup.simulated, variant, scene.render.sampler, world=world)
-    renderer.set_target(setup.image)
+    renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=world)
+    renderer.set_target(setup.world.image)
     rounds = AdaptiveRounds(setup, renderer, allowed)
     state = State() if checkpoint is None else checkpoint.state()
     rounds.resume(state)

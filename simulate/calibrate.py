@@ -21,6 +21,7 @@ from .sampling.checkpoint import Checkpoint
 
 def made_from(setup: Setup, stopping_rule: StoppingRule | None = None) -> str:
     """Return the fingerprint of everything that H depends on."""
+    setup = setup.calibrated
     scene = setup.scene
     description: dict[str, Any] = {"camera": setup.camera.describe(), "calibration": scene.calibration.model_dump()}
     if stopping_rule is not None and is_adaptive(scene):
@@ -44,7 +45,8 @@ def calibrate(
     stopping_rule : needed where the scene leaves the number of samples open
     Raises InputError if the requested variant does not work here, MachineError if a row fails its check.
     """
-    scene, start = setup.scene, perf_counter()
+    setup, start = setup.calibrated, perf_counter()
+    scene = setup.scene
     record: dict[str, Any] = {"fingerprint": made_from(setup, stopping_rule), "method": scene.calibration.method}
     if scene.calibration.method == "ideal":
         model = ideal_model(setup.resolved, setup.camera)

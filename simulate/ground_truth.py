@@ -64,8 +64,8 @@ def truth(setup: Setup) -> Truth:
 
     scene, camera = setup.scene, setup.camera
     variant, work = choose(scene.render.variant), _plan(setup)
-    renderer = Renderer(ideal_camera(camera), variant, scene.render.sampler, world=scene)
-    renderer.set_target(setup.image)
+    renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=scene)
+    renderer.set_target(setup.world.image)
     start = int(np.random.SeedSequence(scene.render.seed, spawn_key=(zlib.crc32(b"truth"),)).generate_state(1)[0])
     tally = Tally(camera.unknowns)
     for number in range(work.passes):
@@ -98,7 +98,7 @@ def truth_from(setup: Setup) -> str:
     return fingerprint(
         {
             **{name: camera[name] for name in ("target.shape", "target.pixel_pitch", "target.distance")},
-            "picture": digest(setup.image.astype(np.float32)),
+            "picture": digest(setup.picture.astype(np.float32)),
             "world": describe(setup.scene),
             "render": setup.scene.render.model_dump(exclude_none=True),
             "versions": versions("mitsuba"),

@@ -54,8 +54,8 @@ def made_from(setup: Setup) -> str:
         {
             **world,
             "camera": setup.camera.describe(),
-            "simulated": setup.simulated.describe(),
-            "target": digest(setup.image.astype(np.float32)),
+            "simulated": setup.world.simulated.describe(),
+            "target": digest(setup.picture.astype(np.float32)),
             "noise": scene.noise.model_dump() if scene.noise else None,
             "sensor": scene.sensor.model_dump() if scene.sensor else None,
             "render": scene.render.model_dump(exclude_none=True),
@@ -83,8 +83,8 @@ def light(
     variant = choose(scene.render.variant)
     work = plan(scene.render.samples, scene.render.sampler) if work is None else work
     world = None if scene.world is None else scene
-    renderer = Renderer(setup.simulated, variant, scene.render.sampler, world=world)
-    renderer.set_target(setup.image)
+    renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=world)
+    renderer.set_target(setup.world.image)
     tally = Tally(camera.measurements)
     if checkpoint is not None:
         tally.resume("light", checkpoint.state())

@@ -29,7 +29,7 @@ def check_scene(setup: Setup, calibrates: bool = True) -> None:
         check_scene_memory(setup, calibrates)
         variant = choose(scene.render.variant)
         check_lenses(setup.camera)
-        check_fast_variant(setup.simulated, variant)
+        check_fast_variant(setup.world.simulated, variant)
         if scene.render.samples == "auto":
             check_noise_target(scene)
         if calibrates and scene.calibration.method == "transport":
@@ -38,8 +38,8 @@ def check_scene(setup: Setup, calibrates: bool = True) -> None:
 
 def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
     """Raise InputError if memory does not hold a rendering or, if it `calibrates`, H with its uncertainty."""
-    scene, camera = setup.scene, setup.camera
-    rendering = SENSOR * camera.measurements + TARGET * camera.unknowns
+    scene, camera, world = setup.scene, setup.calibrated.camera, setup.world.camera
+    rendering = SENSOR * camera.measurements + TARGET * world.unknowns
     check_memory(rendering, "rendering", "make target.shape or the lens arrays smaller")
     if not calibrates or setup.has_structured_matrix:
         return

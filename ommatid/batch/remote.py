@@ -64,7 +64,7 @@ class SceneOutcome:
 
 def packed(setup: Setup, folder: Path) -> ScenePackage:
     """Pack a scene and the content of its folder."""
-    return ScenePackage(setup.resolved.plain(), str(setup.scene.source), setup.image, str(folder), _contents(folder))
+    return ScenePackage(setup.resolved.plain(), str(setup.scene.source), setup.picture, str(folder), _contents(folder))
 
 
 def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:

@@ -27,7 +27,7 @@ LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray wei
 
 
 def load(scene: Scene) -> FloatArray:
-    """Load the target, (rows, columns), cropped as the scene says, rounded to float32.
+    """Load the target's picture, cropped as the scene says and rounded to float32: (detail rows, detail columns).
 
     A target without a picture, of a scene with a world, is zero: its image is not known before it is rendered.
     Raises InputError if the picture is missing, unreadable, too small for the crop or contains NaN.
@@ -37,17 +37,19 @@ def load(scene: Scene) -> FloatArray:
     if target.image is None:
         if target.shape is None:
             raise InputError(f"{where} and target.shape are absent; name a picture, or give the shape for a [world]")
-        check_memory(prod(target.shape) * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one")
-        return np.zeros(target.shape)
+        check_memory(
+            prod(target.shape) * target.detail**2 * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one"
+        )
+        return np.zeros(finer(target.shape, target.detail))
     picture = luminance(_pixels(target.image, where), where)
     if target.origin is None:
-        if target.shape not in (None, picture.shape):
-            rows, columns = target.shape
+        if target.shape is not None and finer(target.shape, target.detail) != picture.shape:
+            rows, columns = finer(target.shape, target.detail)
             raise InputError(
                 f"{scene.source}: target.shape asks for {rows} x {columns} pixels, but the picture has"
                 f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it"
             )
-        crop = picture
+        crop = picture[tuple(slice(size - size % target.detail) for size in picture.shape)]
     else:
         crop = _crop(picture, scene)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -62,7 +64,18 @@ def target_shape(scene: Scene) -> tuple[int, int]:
     if scene.target.shape is not None:
         return scene.target.shape
     rows, columns = load(scene).shape
-    return rows, columns
+    return rows // scene.target.detail, columns // scene.target.detail
+
+
+def finer(shape: tuple[int, int], detail: int) -> tuple[int, int]:
+    """Rows and columns of the picture of a target of `shape` pixels of f."""
+    return shape[0] * detail, shape[1] * detail
+
+
+def averaged(picture: FloatArray, detail: int) -> FloatArray:
+    """f, (rows, columns), as the average of a picture `detail` times finer along both axes."""
+    rows, columns = picture.shape[0] // detail, picture.shape[1] // detail
+    return picture if detail == 1 else picture.reshape(rows, detail, columns, detail).mean(axis=(1, 3))
 
 
 def write_truth(
@@ -107,7 +120,9 @@ def grey(pixels: NDArray[Any], where: str) -> FloatArray:
 def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
     target = scene.target
     row, column = target.origin or (0, 0)
-    rows, columns = target.shape or (picture.shape[0] - row, picture.shape[1] - column)
+    left = picture.shape[0] - row, picture.shape[1] - column
+    shape = (left[0] // target.detail, left[1] // target.detail) if target.shape is None else target.shape
+    rows, columns = finer(shape, target.detail)
     if rows <= 0 or columns <= 0 or row + rows > picture.shape[0] or column + columns > picture.shape[1]:
         raise InputError(
             f"{scene.source}: target.origin: the crop of {max(rows, 0)} x {max(columns, 0)} pixels at"

@@ -20,7 +20,7 @@ def export(setup: Setup, path: Path) -> Path:
     Returns the picture's path. Raises InputError for lenses that stock sensors do not have, and unless `path` ends in
     .xml; MachineError for a full disk.
     """
-    scene, camera = setup.scene, setup.camera
+    scene, camera = setup.scene, setup.world.camera
     if not camera.is_ideal_pinhole:
         raise InputError(
             f"{scene.source}: stock sensors of Mitsuba are pinholes at their designed positions, so other lenses or a"
@@ -32,7 +32,7 @@ def export(setup: Setup, path: Path) -> Path:
     import mitsuba as mi
 
     picture = path.with_name(f"{path.stem}.target.exr")
-    write_truth(picture, setup.image)
+    write_truth(picture, setup.world.image)
     plugins = scene_of(target_of(camera, texture_of({"filename": picture.name})))
     for sub in camera.sub_imagers:
         name = sub.name.replace(".", "_")  # a dot would be a path into the scene

@@ -1,0 +1,167 @@
+"""H on the world's grid as a model of f: the best linear description of the measurements by f's pixels.
+
+Let the world w have mean w0 and covariance P on a grid F times finer than f, f = A w, and g = Hf w + v. Then
+
+    g = G f + (Hf w0 - G f0) + e + v,   G = Hf P A^T (A P A^T)^-1,   cov e = Hf P Hf^T - G (A P A^T) G^T,
+
+where e, the detail that f does not hold, is not correlated with f: Eq. 4 and 5 of Wood et al. with G in place of H and
+Rv + cov e in place of Rv give the best linear estimate of f. A prior of independent pixels says nothing of detail: the
+world is then taken as made of f's pixels, and e is zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.model import Model
+from ommatid.scenes.tables.estimation import PriorTable
+
+from .local import WINDOW, local_interpolation, unexplained_variance
+from .world_prior import WorldPrior, averaging, repetition
+
+MAX_WORLD = 32_000  # pixels of the world, and
+MAX_MEASUREMENTS = 5_000  # measurements, up to which the exact moments take seconds
+CAUSE = "detail"  # in the error budget
+
+
+@dataclass(frozen=True)
+class DetailedModel(Model):
+    """G as `matrix`, on f's grid, with the moments of the detail that f does not hold.
+
+    fine : the model on the world's grid;  interpolation : B, (pixels of the world, N);  prior_mean : of every pixel
+    offset : (M,) Hf w0 - G f0
+    unresolved : variance of every pixel of the world given f, (pixels of the world,)
+    detail_variance : (M,) the diagonal of cov e;  detail_covariance : (M, M), None where it is too large
+    """
+
+    fine: Model
+    interpolation: sparse.csr_array | FloatArray
+    prior_mean: float
+    offset: FloatArray
+    unresolved: FloatArray
+    detail_variance: FloatArray
+    detail_covariance: FloatArray | None
+
+    @property
+    def is_exact(self) -> bool:
+        """False: G has no box footprints."""
+        return False
+
+    def light(self, image: FloatArray) -> FloatArray:
+        """Return the expected light on every sensor pixel given f: (N,) to (M,)."""
+        return self.forward(image) + self.offset
+
+    def world_given(self, image: FloatArray) -> FloatArray:
+        """Return the expected world given f: (N,) to (pixels of the world,)."""
+        return self.prior_mean + self.interpolation @ (np.asarray(image).ravel() - self.prior_mean)
+
+    def variance_from_model(self, image: FloatArray) -> FloatArray:
+        """Variance that the uncertainty of H adds to each measurement of `image` and of the detail it leaves open."""
+        of_detail = self.fine.prior_variance_from_model(self.unresolved)
+        return self.fine.variance_from_model(self.world_given(image)) + of_detail
+
+    def prior_variance_from_model(self, prior_variance: FloatArray) -> FloatArray:
+        """Variance that the uncertainty of H adds to each measurement under the prior: (M,)."""
+        detail = self.camera.detail
+        return self.fine.prior_variance_from_model(repetition(self.camera.shape, detail) @ prior_variance)
+
+
+def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
+    """Return the model of f from one whose H may be on the grid of a world finer than f.
+
+    camera : of the stack, on f's grid;  prior : "fit" counts as independent pixels
+    """
+    if camera.detail == 1 or model.camera.detail > 1:
+        return model
+    if camera.covers_whole_pixels:
+        return replace(model, camera=camera)
+    if prior.kind in ("independent", "fit"):
+        return _without_detail(model, camera, prior.mean)
+    world = WorldPrior.of(prior, camera.shape, camera.target_pitch, camera.detail)
+    if model.unknowns <= MAX_WORLD and model.measurements <= MAX_MEASUREMENTS:
+        return _exact(model, camera, prior.mean, world)
+    sides = min(camera.rows, WINDOW), min(camera.columns, WINDOW)
+    return _local(model, camera, prior, world, WorldPrior.of(prior, sides, camera.target_pitch, camera.detail))
+
+
+def _fine_matrix(model: Model) -> sparse.csr_array:
+    if model.stored is not None:
+        return model.stored
+    return model.boxes.submatrix(slice(0, model.camera.rows), slice(0, model.camera.columns))
+
+
+def _without_detail(model: Model, camera: Camera, mean: float) -> DetailedModel:
+    expansion = repetition(camera.shape, camera.detail)
+    zeros = np.zeros(model.measurements)
+    matrix = sparse.csr_array(_fine_matrix(model) @ expansion)
+    return _detailed(model, camera, mean, matrix, expansion, np.zeros(model.unknowns), zeros, None)
+
+
+def _exact(model: Model, camera: Camera, mean: float, world: WorldPrior) -> DetailedModel:
+    fine = _fine_matrix(model)
+    gain: FloatArray = fine @ world.interpolation
+    spread = world.apply(np.asarray(fine.T.toarray(), dtype=np.float64))
+    left: FloatArray = fine @ spread - gain @ (averaging(camera.shape, camera.detail) @ spread)
+    covariance = (left + left.T) / 2
+    variance = np.maximum(np.diagonal(covariance), 0.0)
+    matrix = sparse.csr_array(gain)
+    return _detailed(model, camera, mean, matrix, world.interpolation, world.unresolved, variance, covariance)
+
+
+def _local(model: Model, camera: Camera, prior: PriorTable, world: WorldPrior, window: WorldPrior) -> DetailedModel:
+    fine, interpolation = _fine_matrix(model), local_interpolation(world, window)
+    matrix = sparse.csr_array(fine @ interpolation)
+    variance = unexplained_variance(world, fine, matrix)
+    middle = tuple(slice(n // 2 * camera.detail, (n // 2 + 1) * camera.detail) for n in window.shape)
+    phases = window.unresolved.reshape(window.fine_shape)[middle]
+    unresolved = np.tile(phases, camera.shape).ravel()
+    return _detailed(model, camera, prior.mean, matrix, interpolation, unresolved, variance, None)
+
+
+def _detailed(
+    model: Model,
+    camera: Camera,
+    mean: float,
+    matrix: sparse.csr_array,
+    interpolation: sparse.csr_array | FloatArray,
+    unresolved: FloatArray,
+    variance: FloatArray,
+    covariance: FloatArray | None,
+) -> DetailedModel:
+    fine = _fine_matrix(model)
+    offset: FloatArray = fine @ np.full(fine.shape[1], mean) - matrix @ np.full(matrix.shape[1], mean)
+    entries: dict[str, Any] = {"variance": np.zeros(matrix.nnz), "batches": np.zeros((0, matrix.nnz), np.float32)}
+    if model.variance.any():
+        entries["variance"] = _entry_variance(model, matrix, interpolation)
+    return DetailedModel(
+        scene=model.scene,
+        camera=camera,
+        stored=matrix,
+        record=model.record,
+        fine=model,
+        interpolation=interpolation,
+        prior_mean=mean,
+        offset=offset,
+        unresolved=unresolved,
+        detail_variance=variance,
+        detail_covariance=covariance,
+        **entries,
+    )
+
+
+def _entry_variance(
+    model: Model, matrix: sparse.csr_array, interpolation: sparse.csr_array | FloatArray
+) -> FloatArray:
+    """Return the variance of every entry of G, (nnz,), as if the errors of H's entries were independent."""
+    fine = model.matrix
+    variance = sparse.csr_array((model.variance, fine.indices, fine.indptr), shape=fine.shape)
+    squares = interpolation.power(2) if isinstance(interpolation, sparse.csr_array) else np.square(interpolation)
+    spread: Any = variance @ squares
+    rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    return np.asarray(sparse.csr_array(spread)[rows, matrix.indices], dtype=np.float64).ravel()

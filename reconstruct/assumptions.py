@@ -16,6 +16,8 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
+from .detail.detailed_model import CAUSE as DETAIL
+from .detail.detailed_model import DetailedModel, model_of_f
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
@@ -23,6 +25,7 @@ from .methods.method import EstimationTask, Execution, Method, total_variance
 from .noise import (
     Noise,
     UsablePixels,
+    at_used,
     check_noise_fit,
     depends_on_light,
     initial_noise,
@@ -33,7 +36,7 @@ from .noise import (
 
 Result = TypeVar("Result")
 
-CERTAIN = ("rendering", "calibration")  # noise that stays known when the rest of it is to be fitted
+CERTAIN = ("rendering", "calibration", DETAIL)  # noise that stays known when the rest of it is to be fitted
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def method_for(stack: Stack, model: Model) -> Method:
 def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Result]) -> Result:
     """Return work(choice) for the chosen method, or for tiles where a frame chosen by "auto" does not converge."""
     check_noise_fit(stack)
-    choice = choose_method(stack.scene, model.camera, model.is_exact)
+    choice = choose_method(stack.scene, stack.camera, model_of_f(model, stack.camera, stack.scene.prior).is_exact)
     try:
         return work(choice)
     except NotReachedError as error:
@@ -73,67 +76,104 @@ def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Res
         return work(replace(choice, method="tiles", why=str(error)))
 
 
+@dataclass(frozen=True)
+class _Observation:
+    """A stack with the prior of f, and the model that this prior makes of H where the world is finer than f."""
+
+    stack: Stack
+    model: Model
+    usable: UsablePixels
+    prior: PriorTable
+
+    def with_prior(self, prior: PriorTable, model: Model) -> _Observation:
+        """Return the same stack under another prior; model : as calibrated."""
+        return replace(self, prior=prior, model=model_of_f(model, self.stack.camera, prior))
+
+    def initial_noise(self) -> Noise:
+        """Return the noise before there is an estimate."""
+        return self.with_detail(initial_noise(self.stack, self.model, self.usable, self.prior))
+
+    def noise_for(self, image: FloatArray, noise: Noise) -> Noise:
+        """Return the noise with the parts that depend on the light for an estimate, (N,)."""
+        return self.with_detail(noise_for_image(image, self.stack, self.model, self.usable, noise))
+
+    def with_detail(self, noise: Noise) -> Noise:
+        """Add the variance of detail finer than f, unless the method knows its covariance."""
+        noise = {name: values for name, values in noise.items() if name != DETAIL}
+        model = self.model
+        if isinstance(model, DetailedModel) and model.detail_covariance is None and model.detail_variance.any():
+            noise[DETAIL] = at_used(model.detail_variance, self.usable.used)
+        return noise
+
+    def expected_noise(self, noise: Noise) -> FloatArray:
+        """Return the variance that the estimator assumes, (pixels used,)."""
+        setting = self.stack.scene.estimator.noise_variance
+        used = int(self.usable.used.sum())
+        return uniform(setting, used) if isinstance(setting, float) else total_variance(noise)
+
+    def task(self, expected_noise: FloatArray) -> EstimationTask:
+        """Return the task of an estimation method; the offset of detail's mean is taken off the measurements."""
+        scene, model, recorded = self.stack.scene, self.model, self.stack.values
+        if isinstance(model, DetailedModel):
+            recorded = recorded - model.offset
+        return EstimationTask(
+            model, recorded, self.usable.used, expected_noise, self.prior, scene.estimator, scene.tiles
+        )
+
+
 def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution: Execution) -> Assumptions:
     """Collect prior and noise as known or fitted, estimating the image beforehand only where they depend on it."""
-    usable = usable_pixels(stack, model)
-
-    def method_with(prior: PriorTable, noise: Noise) -> Method:
-        expected = _expected_noise(stack, usable, noise)
-        return METHODS[choice.method](_task(stack, model, usable, prior, expected), execution)
-
     prior = stack.scene.prior
     if prior.kind == "fit":
         prior = prior.model_copy(update={"kind": "independent"})
-    noise, method = initial_noise(stack, model, usable, prior), None
+    first = _Observation(stack, model_of_f(model, stack.camera, prior), usable_pixels(stack, model), prior)
+
+    def method_with(observation: _Observation, noise: Noise) -> Method:
+        return METHODS[choice.method](observation.task(observation.expected_noise(noise)), execution)
+
+    observation, noise, method = first, first.initial_noise(), None
     if depends_on_light(stack, model):
-        method = method_with(prior, noise)
-        noise = noise_for_image(method.image, stack, model, usable, noise)
-    fit = _fit(stack, model, usable, prior, noise)
+        method = method_with(first, noise)
+        noise = first.noise_for(method.image, noise)
+    fit = _fit(first, noise)
     if fit is not None and model.variance.any():
         # The uncertainty of H was taken at an image that the first prior had left noisy.
-        better = method_with(*_with_fit(stack, prior, noise, fit))
-        noise = noise_for_image(better.image, stack, model, usable, noise)
-        fit = _fit(stack, model, usable, prior, noise)
+        better, fitted = _with_fit(first, model, noise, fit)
+        noise = first.with_detail(better.noise_for(method_with(better, fitted).image, noise))
+        fit = _fit(first, noise)
     if fit is not None:
-        prior, noise = _with_fit(stack, prior, noise, fit)
+        observation, noise = _with_fit(first, model, noise, fit)
     if method is None or fit is not None or stack.scene.estimator.noise_variance is None:
-        method = method_with(prior, noise)
-    return Assumptions(method, usable, prior, noise, fit)
-
-
-def _expected_noise(stack: Stack, usable: UsablePixels, noise: Noise) -> FloatArray:
-    setting = stack.scene.estimator.noise_variance
-    return uniform(setting, int(usable.used.sum())) if isinstance(setting, float) else total_variance(noise)
-
-
-def _task(
-    stack: Stack, model: Model, usable: UsablePixels, prior: PriorTable, expected_noise: FloatArray
-) -> EstimationTask:
-    scene = stack.scene
-    return EstimationTask(model, stack.values, usable.used, expected_noise, prior, scene.estimator, scene.tiles)
+        method = method_with(observation, noise)
+    return Assumptions(method, observation.usable, observation.prior, noise, fit)
 
 
 def _certain(noise: Noise) -> Noise:
     return {name: noise[name] for name in CERTAIN if name in noise}
 
 
-def _fit(stack: Stack, model: Model, usable: UsablePixels, prior: PriorTable, noise: Noise) -> PriorFit | None:
+def _fit(observation: _Observation, noise: Noise) -> PriorFit | None:
     """Return prior and noise, as far as they are to be fitted, of largest evidence; None where neither is."""
-    prior_known = stack.scene.prior.kind != "fit"
-    noise_known = stack.scene.estimator.noise_variance != "fit"
-    if not usable.used.any() or (noise_known and prior_known):
+    scene = observation.stack.scene
+    prior_known, noise_known = scene.prior.kind != "fit", scene.estimator.noise_variance != "fit"
+    if not observation.usable.used.any() or (noise_known and prior_known):
         return None
-    known = _expected_noise(stack, usable, noise) if noise_known else total_variance(_certain(noise))
-    task = _task(stack, model, usable, prior, known)
+    known = observation.expected_noise(noise) if noise_known else total_variance(_certain(noise))
+    task = observation.task(known)
+    if isinstance(task.model, DetailedModel):  # detail tells of the prior as well: it is fitted to the world
+        task = replace(task, model=task.model.fine, recorded=observation.stack.values)
     return fit_prior(*evidence_of(task, prior_known=prior_known, noise_known=noise_known))
 
 
-def _with_fit(stack: Stack, prior: PriorTable, noise: Noise, fit: PriorFit) -> tuple[PriorTable, Noise]:
-    """Return prior and noise with the fitted values; a fitted noise replaces the noise that the scene describes."""
+def _with_fit(observation: _Observation, model: Model, noise: Noise, fit: PriorFit) -> tuple[_Observation, Noise]:
+    """Return prior and noise with the fitted values; a fitted noise replaces the noise that the scene describes.
+
+    model : as calibrated
+    """
     if fit.variance is not None and fit.length is not None:
-        length = fit.length * stack.camera.target_pitch
-        update = {"kind": "exponential", "variance": fit.variance, "correlation_length": length}
-        prior = prior.model_copy(update=update)
+        update = {"kind": "exponential", "variance": fit.variance}
+        update["correlation_length"] = fit.length * model.camera.target_pitch
+        observation = observation.with_prior(observation.prior.model_copy(update=update), model)
     if fit.noise_variance is not None:
         noise = {**_certain(noise), "noise": uniform(fit.noise_variance, noise["rendering"].size)}
-    return prior, noise
+    return observation, observation.with_detail(noise)

@@ -11,6 +11,8 @@ from ommatid.runtime.processors import processors
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
 
+from .detail.detail_method import DetailMethod
+from .detail.detailed_model import is_exact_for
 from .estimator.memory import needed_memory
 from .frame.frame_method import FrameMethod
 from .frame.preconditioner import is_sliding
@@ -25,6 +27,7 @@ TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on a
 
 METHODS: dict[str, type[Method]] = {
     "dense": DenseMethod,
+    "detail": DetailMethod,
     "robust": RobustMethod,
     "fit": AlignedMethod,
     "tiles": TileMethod,
@@ -52,6 +55,8 @@ def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
     if scene.estimator.misalignment != "trust":
         return _misaligned(scene, camera, exact, allowed)
     names, why = _candidates(scene, camera, exact)
+    if names[0] == "dense" and is_exact_for(scene, camera):
+        names = ["detail", *names[1:]]
     memory = {name: _memory(name, scene, camera, exact) for name in names}
     for name in names:
         if memory[name] <= allowed:
@@ -91,6 +96,8 @@ def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Meth
         raise InputError(f"{key} needs to know what may be misaligned, got no [camera.tolerance]; add one")
     if camera.unknowns > MAX_DENSE_PIXELS:
         raise InputError(f"{key} serves up to {MAX_DENSE_PIXELS} pixels of f, got {camera.unknowns}; crop the target")
+    if camera.detail > 1:
+        raise InputError(f"{key} takes a world made of f's pixels, got target.detail {camera.detail}; remove it")
     if not (camera.has_box_footprints and camera.has_sharp_footprints):
         raise InputError(f"{key} serves pinholes and thin lenses in focus, got blurred or distorted ones; calibrate")
     if form in ("tiles", "frame"):
@@ -124,7 +131,7 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
     """Return an upper estimate of the bytes that a method needs."""
     widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
     entries = 0 if exact else 12 * 10 * camera.measurements * widest**2
-    if method == "dense":
+    if method in ("dense", "detail"):
         form = scene.estimator.method
         if form == "auto":
             form = "covariance" if camera.measurements < camera.unknowns else "information"
@@ -146,7 +153,7 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
 def _seconds(method: str, scene: Scene, camera: Camera, exact: bool) -> float:
     """Return the time that a method takes on two cores, measured to within a factor of two or so."""
     count = camera.unknowns
-    if method == "dense":
+    if method in ("dense", "detail"):
         return max(0.1, 7e-11 * count**3 * (10 if scene.prior.kind != "independent" else 1))
     per_pixel = 0.15 * (scene.tiles.size / 35) ** 6 / (scene.tiles.size - 2 * scene.tiles.overlap) ** 2
     if method == "tiles":

@@ -73,7 +73,7 @@ def noise_for_image(image: FloatArray, stack: Stack, model: Model, usable: Usabl
     """Return the same noise with the parts that depend on the light replaced by those for an estimate, (N,)."""
     noise = dict(noise)
     if stack.recording is not None:
-        recorded = stack.recording.noise(model.forward(image))
+        recorded = stack.recording.noise(model.light(image))
         noise |= {name: at_used(variances, usable.used) for name, variances in recorded.items()}
     if model.variance.any():
         noise["calibration"] = model.variance_from_model(image)[usable.used]

@@ -82,8 +82,9 @@ def spectrum_of(
 ) -> float | FloatArray:
     """Return the diagonal form of P0: the variance of independent pixels, else its spectrum under the DCT-II.
 
-    Arguments as of `prior_of`. The DCT reflects the image at its edges. Inside, this prior equals the stationary one of `prior_of`; within a
-    correlation length of an edge the variance is larger. Raises InputError for kind "fit", which needs a stack.
+    Arguments as of `prior_of`. The DCT reflects the image at its edges. Inside, this prior equals the stationary one
+    of `prior_of`; within a correlation length of an edge the variance is larger. Raises InputError for kind "fit",
+    which needs a stack.
     """
     if table.kind == "independent":
         return table.variance

@@ -13,6 +13,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
@@ -27,7 +28,7 @@ from .methods.method import Execution, MethodResult
 from .noise import Noise, UsablePixels
 
 MAX_SPURIOUS_INFORMATION = 0.05  # share above which the expected error is not to be trusted
-BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
+BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration", "detail")
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,14 @@ def check_region(corner: tuple[int, int], size: tuple[int, int], shape: tuple[in
 
 def check_match(stack: Stack, model: Model, names: tuple[Path | str, Path | str]) -> None:
     """Raise InputError, naming the first difference, unless a stack and a model are of one camera and target grid."""
-    recorded, calibrated = stack.camera.describe(), model.camera.describe()
+    if model.camera.shape != stack.camera.with_grid_of_matrix.shape:
+        rows, columns = stack.camera.with_grid_of_matrix.shape
+        raise InputError(
+            f"{names[0]} and {names[1]} do not belong together: target.shape {list(stack.camera.shape)} and"
+            f" target.detail {stack.camera.detail} of the stack need H on {rows} x {columns} pixels, the model has"
+            f" {model.camera.rows} x {model.camera.columns}; calibrate with the stack's scene"
+        )
+    recorded, calibrated = stack.camera.with_grid_of_matrix.describe(), model.camera.describe()
     for key in [*recorded, *(key for key in calibrated if key not in recorded)]:
         if recorded.get(key) != calibrated.get(key):
             raise InputError(
@@ -132,7 +140,7 @@ def restore(
 ) -> Reconstruction:
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 
-    truth : (N,) or None;  workers : for tiles, absent: threads of this process
+    truth : (N,) or (pixels of the world,), or None;  workers : for tiles, absent: threads of this process
     Raises InputError if memory does not suffice, if no method reaches the tolerance of the scene, or if the noise of a
     [sensor] is to be fitted.
     """
@@ -143,10 +151,14 @@ def restore(
 def _restored(
     stack: Stack, model: Model, truth: FloatArray | None, choice: MethodChoice, execution: Execution
 ) -> Reconstruction:
-    start = perf_counter()
+    start, shape = perf_counter(), stack.camera.shape
     assumed = assumptions_for(stack, model, choice, execution)
-    result, expected_noise = assumed.method.result(assumed.noise, truth), assumed.method.task.expected_noise
-    shape = model.camera.shape
+    given = truth
+    if truth is not None and truth.size > stack.camera.unknowns:
+        truth = averaged(truth.reshape(stack.camera.world.shape), stack.camera.detail).ravel()
+        given = given if choice.method == "detail" else truth
+    result, task = assumed.method.result(assumed.noise, given), assumed.method.task
+    expected_noise = task.expected_noise
     return Reconstruction(
         result=result,
         choice=choice,
@@ -157,7 +169,7 @@ def _restored(
         usable=assumed.usable,
         noise=assumed.noise,
         fit=assumed.fit,
-        spurious_information=_spurious_information(model, assumed.usable, expected_noise, result.expected),
+        spurious_information=_spurious_information(task.model, assumed.usable, expected_noise, result.expected),
         seconds=perf_counter() - start,
         truth=truth,
         error=None if truth is None else measure_error(result.image, truth, shape),

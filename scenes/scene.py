@@ -27,7 +27,7 @@ from .tables.table import Table
 from .tables.units import Corner, FileName, Length, Pair, Samples, Time
 
 TRUTH = "truth.exr"
-PICTURE = "target.exr"  # beside it, where the world is finer than f
+WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
 IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where render.samples is "auto"
 
@@ -165,9 +165,10 @@ class Scene(Table):
 def resolved(scene: Scene, shape: tuple[int, int]) -> Scene:
     """The scene as a run's folder stores it: the target is the whole picture `truth.exr` beside the scene file.
 
-    Where the world is finer than f, its picture is `target.exr`, and `truth.exr` its average. With a [world], `truth.exr` shows the world too, so the target keeps its own picture, if it has one.
+    Where the world is finer than f, its picture is `target.exr`, and `truth.exr` the average. With a [world],
+    `truth.exr` shows the world too, so the target keeps its own picture, if it has one.
     """
-    picture = TRUTH if scene.target.detail == 1 else PICTURE
+    picture = TRUTH if scene.target.detail == 1 else WORLD_PICTURE
     update: dict[str, Any] = {"image": picture, "origin": None, "shape": shape}
     if scene.world is not None:
         update = {"shape": shape}

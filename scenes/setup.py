@@ -77,7 +77,10 @@ class Setup:
     @property
     def has_structured_matrix(self) -> bool:
         """True if the estimator's H is ideal with box footprints, so that no matrix needs to be stored."""
-        return self.scene.calibration.method == "ideal" and self.camera.has_box_footprints
+        camera = self.camera
+        if camera.detail > 1 and not camera.covers_whole_pixels:
+            return False
+        return self.scene.calibration.method == "ideal" and camera.has_box_footprints
 
     @property
     def has_closed_form(self) -> bool:

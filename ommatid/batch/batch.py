@@ -17,7 +17,7 @@ from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.processors import processors
 from ommatid.runtime.workers import Completed
 from ommatid.scenes.formats.picture import write_truth
-from ommatid.scenes.scene import PICTURE, TRUTH, write
+from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, write
 from ommatid.scenes.setup import Setup
 
 from .remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, outcome_of, packed, unpack
@@ -173,13 +173,13 @@ def prepare(setup: Setup, folder: Path) -> None:
     scene = setup.scene
     make_folder(folder)
     clear_abandoned(folder)
-    for name in ("scene.toml", TRUTH, *([PICTURE] if setup.camera.detail > 1 else [])):
+    for name in ("scene.toml", TRUTH, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
         check_output(folder / name, scene.source, *([Path(scene.target.image)] if scene.target.image else []))
     write(folder / "scene.toml", setup.resolved)
     if scene.world is None:
         write_truth(folder / TRUTH, setup.image)
         if setup.camera.detail > 1:
-            write_truth(folder / PICTURE, setup.picture)
+            write_truth(folder / WORLD_PICTURE, setup.picture)
 
 
 def _raise(error: Exception) -> Description:

@@ -20,6 +20,7 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .local import WINDOW, local_interpolation, unexplained_variance
@@ -70,6 +71,13 @@ class DetailedModel(Model):
         """Variance that the uncertainty of H adds to each measurement under the prior: (M,)."""
         detail = self.camera.detail
         return self.fine.prior_variance_from_model(repetition(self.camera.shape, detail) @ prior_variance)
+
+
+def is_exact_for(scene: Scene, camera: Camera) -> bool:
+    """Return True if the estimator counts with the exact covariance of detail finer than f, where there is any."""
+    if camera.detail == 1 or camera.covers_whole_pixels or scene.prior.kind == "independent":
+        return False
+    return camera.unknowns * camera.detail**2 <= MAX_WORLD and camera.measurements <= MAX_MEASUREMENTS
 
 
 def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
@@ -155,9 +163,7 @@ def _detailed(
     )
 
 
-def _entry_variance(
-    model: Model, matrix: sparse.csr_array, interpolation: sparse.csr_array | FloatArray
-) -> FloatArray:
+def _entry_variance(model: Model, matrix: sparse.csr_array, interpolation: sparse.csr_array | FloatArray) -> FloatArray:
     """Return the variance of every entry of G, (nnz,), as if the errors of H's entries were independent."""
     fine = model.matrix
     variance = sparse.csr_array((model.variance, fine.indices, fine.indptr), shape=fine.shape)

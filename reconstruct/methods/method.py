@@ -55,17 +55,22 @@ class EstimationTask:
         """Rows and columns of f."""
         return self.model.camera.rows, self.model.camera.columns
 
+    @property
+    def _scale(self) -> tuple[float, int]:
+        """Pitch of f, and by how much the world is finer."""
+        return self.model.camera.target_pitch, self.model.camera.detail
+
     def prior_on(self, shape: tuple[int, int]) -> Prior:
         """Return the prior of an image of this shape."""
-        return prior_of(self.prior, shape, self.model.camera.target_pitch)
+        return prior_of(self.prior, shape, *self._scale)
 
     def precision_on(self, shape: tuple[int, int]) -> float | FloatArray:
         """Return 1 / P0 of independent pixels, or 1 / its spectrum under the DCT-II: (rows, columns)."""
-        return 1 / spectrum_of(self.prior, shape, self.model.camera.target_pitch)
+        return 1 / spectrum_of(self.prior, shape, *self._scale)
 
     def prior_variance_of_sum(self, weights: FloatArray) -> float:
         """Return w^T P0 w, the prior variance of a weighted sum of pixels; weights : (N,)."""
-        spectrum = spectrum_of(self.prior, self.shape, self.model.camera.target_pitch)
+        spectrum = spectrum_of(self.prior, self.shape, *self._scale)
         if isinstance(spectrum, float):
             return spectrum * float(weights @ weights)
         waves = fft.dctn(weights.reshape(self.shape), 2, norm="ortho")

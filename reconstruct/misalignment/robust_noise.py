@@ -112,7 +112,7 @@ class Whitening:
     factors: tuple[FloatArray, ...]
 
     def vector(self, recorded: FloatArray) -> FloatArray:
-        """Return K^-1 g: (M,)."""
+        """Return K^-1 g: (M,) or (M, q)."""
         white = np.empty_like(recorded)
         for rows, factor in zip(self.slices, self.factors, strict=True):
             white[rows] = linalg.solve_triangular(factor, recorded[rows], lower=True, check_finite=False)
@@ -170,11 +170,11 @@ def whitening(
     return Whitening(tuple(slices), tuple(factors))
 
 
-def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray]) -> ExpectedError:
-    """Return Eq. 5 of a form of the whitened problem, on average over images and misalignments.
+def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray], cause: str = CAUSE) -> ExpectedError:
+    """Return Eq. 5 of a form of the whitened problem, on average over images and what is correlated in their noise.
 
     noise : named (pixels used,) variances, together the independent part of what was whitened; the rest of the error
-        that measurements bring is put down to misalignment
+        that measurements bring is put down to `cause`
     """
     count = form.problem.unknowns
     by_column = sparse.csc_array(form.problem.matrix)
@@ -192,7 +192,7 @@ def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray]) -> 
         weights += np.square(white.multipliers(negative)).sum(axis=1) / count
     parts = {name: float(weights @ values) for name, values in noise.items()}
     rest = max(from_measurements - sum(parts.values()), 0.0)
-    return ExpectedError(variance, missing, {**parts, CAUSE: rest}, resolved)
+    return ExpectedError(variance, missing, {**parts, cause: rest}, resolved)
 
 
 def _quadrature(free: NDArray[np.bool_]) -> list[list[tuple[float, FloatArray]]]:

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
 from ommatid.scenes.formats import exr
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import TRUTH, with_changes
+from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, with_changes
 from ommatid.scenes.stack import Stack
 
 from ..restore import Reconstruction, check_match, restore
@@ -46,12 +47,25 @@ def with_estimator_changes(stack: Stack, overrides: list[str], path: Path) -> St
 
 
 def truth_beside(path: Path, stack: Stack) -> FloatArray | None:
-    """Read the target, (N,), from truth.exr in the stack's folder; None unless it is the one that was rendered."""
+    """Read the target, (N,), from truth.exr in the stack's folder; None unless it is the one that was rendered.
+
+    Where the world is finer than f and its picture stands beside it, that: (pixels of the world,).
+    """
+    truth = _channel(path.parent / TRUTH)
+    if truth is None or digest(truth) != stack.record.get("truth"):
+        return None
+    world = None if stack.camera.detail == 1 or stack.scene.world is not None else _channel(path.parent / WORLD_PICTURE)
+    if world is None or world.shape != stack.camera.world.shape:
+        return truth.astype(np.float64).ravel()
+    average = averaged(world.astype(np.float64), stack.camera.detail).astype(np.float32)
+    return (world if np.array_equal(average, truth) else truth).astype(np.float64).ravel()
+
+
+def _channel(path: Path) -> Float32Array | None:
     try:
-        truth = exr.read(path.parent / TRUTH)[0].channels["Y"]
+        return exr.read(path)[0].channels["Y"]
     except (InputError, KeyError):
         return None
-    return truth.astype(np.float64).ravel() if digest(truth) == stack.record.get("truth") else None
 
 
 def reconstruct(

@@ -1,0 +1,89 @@
+"""Estimation of f with the exact covariance of the detail that f does not hold."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg
+
+from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.errors import InputError
+
+from ..estimator.estimate import Estimate, estimate
+from ..expected_error import Interval, expected_given, interval, solved_columns, variance_of_sum
+from ..methods.method import Method, MethodResult, total_variance
+from ..misalignment.robust_noise import Whitening, robust_error
+from .detailed_model import CAUSE, DetailedModel
+from .world_prior import averaging
+
+
+class DetailMethod(Method):
+    """Rv holds the covariance of the detail finer than f, which is common to measurements of the same place."""
+
+    @property
+    def _model(self) -> DetailedModel:
+        model = self.task.model
+        if not isinstance(model, DetailedModel):
+            raise TypeError("expected a model of a world finer than f")
+        return model
+
+    @cached_property
+    def _solved(self) -> tuple[Whitening, Estimate]:
+        task, model = self.task, self._model
+        covariance = _of_used(model, task.used) + np.diag(task.expected_noise)
+        try:
+            factor = linalg.cholesky(covariance, lower=True, check_finite=False)
+        except linalg.LinAlgError:
+            raise InputError(
+                "detail finer than f needs noise in every measurement, got some without; set noise.variance or"
+                " estimator.noise_variance to a number above 0, or target.detail to 1"
+            ) from None
+        white = Whitening((slice(0, factor.shape[0]),), (np.asarray(factor),))
+        problem = white.problem(model.matrix[task.used], task.prior_on(task.shape))
+        recorded = white.vector(task.recorded[task.used])
+        return white, estimate(problem, recorded, task.settings.method, task.settings.tolerance)
+
+    def estimate_image(self) -> FloatArray:
+        """Return f^ alone: (N,)."""
+        return self._solved[1].image
+
+    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+        """Return the estimate and its error; truth : (N,), or better (pixels of the world,), whose detail is known."""
+        white, solved = self._solved
+        unit = np.ones(self.task.expected_noise.size)
+        return MethodResult(
+            solved.image,
+            solved.multipliers / np.sqrt(self.task.expected_noise),  # their squares times the noise are chi-squared
+            solved.solver,
+            robust_error(solved.form, white, noise, CAUSE),
+            None if truth is None else self._interval(truth, total_variance(noise)),
+            lambda weights: variance_of_sum(solved.form, weights, unit),
+        )
+
+    def _interval(self, truth: FloatArray, noise_variance: FloatArray) -> Interval:
+        """Return the expected error of one image; where its world is known, its detail is no noise."""
+        model, (white, solved) = self._model, self._solved
+        form = solved.form
+        if truth.size == form.problem.unknowns:
+            return expected_given(form, truth, np.ones(noise_variance.size))
+        deviation = truth - model.prior_mean
+        light = (model.fine.forward(deviation))[self.task.used]
+        difference = averaging(self.task.shape, model.camera.detail) @ deviation
+        bias: FloatArray = difference - form.gain(white.vector(light))
+        trace = squares = along = 0.0
+        for _, pixels, _, negative in solved_columns(form, np.arange(form.problem.unknowns)):
+            gain = white.multipliers(negative)  # -A^T of the measurements as they are recorded
+            weighted = noise_variance[:, None] * gain
+            trace += float(np.sum(weighted * gain))
+            spread = form.gain(white.vector(weighted))
+            squares += float(np.square(spread).sum())
+            along -= float(bias @ (spread @ bias[pixels]))
+        return interval(float(bias @ bias) + trace, 4 * along + 2 * squares, bias.size)
+
+
+def _of_used(model: DetailedModel, used: BoolArray) -> FloatArray:
+    covariance = model.detail_covariance
+    if covariance is None:
+        return np.diag(model.detail_variance[used])
+    return np.array(covariance) if used.all() else covariance[np.ix_(used, used)]

@@ -29,6 +29,7 @@ from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file
 from ommatid.scenes import scene as scene_file
 from ommatid.scenes import stack as stack_file
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, Scene
 from ommatid.scenes.setup import Setup
@@ -85,7 +86,7 @@ class Result:
             variance=np.square(self.deviation).astype(np.float32),
             truth=None if self.truth is None else self.truth.astype(np.float32),
         )
-        ideal = partial(matrix_as_designed, self.model.camera)
+        ideal = partial(matrix_as_designed, self.stack.camera)
         write_text(Path(path), page(run, ideal, None, self.summary.fingerprint))
         return Path(path)
 
@@ -101,7 +102,7 @@ class Result:
             raise ImportError(
                 "to_xarray needs xarray, which is not installed; run: pip install 'ommatid[notebook]'"
             ) from error
-        camera = self.model.camera
+        camera = self.stack.camera
         heights = [camera.position(row + 0.5, 0)[1] for row in range(camera.rows)]
         widths = [-camera.position(0, column + 0.5)[0] for column in range(camera.columns)]
         images = {"image": self.image, "deviation": self.deviation}
@@ -220,17 +221,18 @@ def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
 def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> Result:
     """Reconstruct a stack as its scene says (Eq. 4), with the posterior standard deviation per pixel (Eq. 5).
 
-    truth : (rows, columns) or (N,), with which the estimate is compared, such as `target_image(scene)`
+    truth : (rows, columns) or (N,), with which the estimate is compared, such as `target_image(scene)`; with
+        target.detail also the picture itself, on the world's grid
     Raises InputError if stack and model are of different cameras, or if memory does not suffice.
     """
     _check_type("stack", stack, Stack, "read_stack")
     _check_type("model", model, Model, "read_model")
-    flat = None if truth is None else _flat_truth(truth, model)
+    flat = None if truth is None else _flat_truth(truth, stack.camera)
     names = Path("the stack"), Path("the model")
     outcome, report = result_files.reconstruct(stack, model, flat, names)
     report = report.with_changes(fingerprint=result_files.fingerprint_of(stack, model))
     image, deviation = outcome.estimate.reshape(outcome.shape), np.sqrt(outcome.expected.variance)
-    shaped = None if flat is None else flat.reshape(outcome.shape)
+    shaped = None if outcome.truth is None else outcome.truth.reshape(outcome.shape)
     return Result(stack, model, image, deviation.reshape(outcome.shape), shaped, report, outcome)
 
 
@@ -251,14 +253,14 @@ def _check_type(name: str, value: object, expected: type, reader: str) -> None:
         )
 
 
-def _flat_truth(truth: FloatArray, model: Model) -> FloatArray:
-    """Return the truth as (N,). Raises InputError for another shape, and for values that are not finite numbers."""
-    camera = model.camera
+def _flat_truth(truth: FloatArray, camera: Camera) -> FloatArray:
+    """Return the truth flattened. Raises InputError for another shape, and for values that are not finite numbers."""
+    world = camera.world
     try:
         image = np.asarray(truth, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"truth: expected an array of numbers, got {shortened_repr(truth)}") from error
-    if image.shape not in (camera.shape, (camera.unknowns,)):
+    if image.shape not in (camera.shape, (camera.unknowns,), world.shape, (world.unknowns,)):
         raise InputError(f"truth: expected {camera.rows} x {camera.columns} pixels, got an array of {image.shape}")
     if not np.isfinite(image).all():
         raise InputError("truth: expected finite values, got NaN or infinity; leave out a truth that is not known")

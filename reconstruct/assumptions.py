@@ -17,7 +17,8 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import CAUSE as DETAIL
-from .detail.detailed_model import DetailedModel, model_of_f
+from .detail.detailed_model import DetailedModel, independent_detail, model_of_f
+from .detail.world_fit import fit_world
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
@@ -25,7 +26,6 @@ from .methods.method import EstimationTask, Execution, Method, total_variance
 from .noise import (
     Noise,
     UsablePixels,
-    at_used,
     check_noise_fit,
     depends_on_light,
     initial_noise,
@@ -67,7 +67,7 @@ def method_for(stack: Stack, model: Model) -> Method:
 def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Result]) -> Result:
     """Return work(choice) for the chosen method, or for tiles where a frame chosen by "auto" does not converge."""
     check_noise_fit(stack)
-    choice = choose_method(stack.scene, stack.camera, model_of_f(model, stack.camera, stack.scene.prior).is_exact)
+    choice = choose_method(stack.scene, stack.camera, model.is_exact and not stack.camera.has_detail)
     try:
         return work(choice)
     except NotReachedError as error:
@@ -99,11 +99,8 @@ class _Observation:
 
     def with_detail(self, noise: Noise) -> Noise:
         """Add the variance of detail finer than f, unless the method knows its covariance."""
-        noise = {name: values for name, values in noise.items() if name != DETAIL}
-        model = self.model
-        if isinstance(model, DetailedModel) and model.detail_covariance is None and model.detail_variance.any():
-            noise[DETAIL] = at_used(model.detail_variance, self.usable.used)
-        return noise
+        known = {name: values for name, values in noise.items() if name != DETAIL}
+        return known | independent_detail(self.model, self.usable.used)
 
     def expected_noise(self, noise: Noise) -> FloatArray:
         """Return the variance that the estimator assumes, (pixels used,)."""
@@ -160,8 +157,8 @@ def _fit(observation: _Observation, noise: Noise) -> PriorFit | None:
         return None
     known = observation.expected_noise(noise) if noise_known else total_variance(_certain(noise))
     task = observation.task(known)
-    if isinstance(task.model, DetailedModel):  # detail tells of the prior as well: it is fitted to the world
-        task = replace(task, model=task.model.fine, recorded=observation.stack.values)
+    if isinstance(task.model, DetailedModel) and noise_known and not prior_known:
+        return fit_world(task)
     return fit_prior(*evidence_of(task, prior_known=prior_known, noise_known=noise_known))
 
 
@@ -172,7 +169,7 @@ def _with_fit(observation: _Observation, model: Model, noise: Noise, fit: PriorF
     """
     if fit.variance is not None and fit.length is not None:
         update = {"kind": "exponential", "variance": fit.variance}
-        update["correlation_length"] = fit.length * model.camera.target_pitch
+        update["correlation_length"] = fit.length * observation.stack.camera.target_pitch
         observation = observation.with_prior(observation.prior.model_copy(update=update), model)
     if fit.noise_variance is not None:
         noise = {**_certain(noise), "noise": uniform(fit.noise_variance, noise["rendering"].size)}

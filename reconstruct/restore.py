@@ -19,6 +19,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .assumptions import assumptions_for, with_fallback
+from .detail.detailed_model import DetailedModel
 from .estimator.estimate import Solver
 from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
@@ -183,6 +184,8 @@ def _spurious_information(
         return 0.0
     noise = np.full(model.measurements, np.inf)
     noise[usable.used] = expected_noise
+    if isinstance(model, DetailedModel) and model.detail_covariance is not None:
+        noise += model.detail_variance
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
         return float(np.nan_to_num(model.spurious_information(noise) * expected.variance).mean())
 

@@ -63,7 +63,12 @@ class Camera:
     @property
     def with_grid_of_matrix(self) -> Camera:
         """The camera on the grid of H's columns: the world's, or f's where its detail does not matter."""
-        return replace(self, detail=1) if self.covers_whole_pixels else self.world
+        return self.world if self.has_detail else replace(self, detail=1)
+
+    @property
+    def has_detail(self) -> bool:
+        """True if the world is finer than f, and measurements depend on its detail."""
+        return self.detail > 1 and not self.covers_whole_pixels
 
     @property
     def covers_whole_pixels(self) -> bool:

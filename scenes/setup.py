@@ -78,9 +78,7 @@ class Setup:
     def has_structured_matrix(self) -> bool:
         """True if the estimator's H is ideal with box footprints, so that no matrix needs to be stored."""
         camera = self.camera
-        if camera.detail > 1 and not camera.covers_whole_pixels:
-            return False
-        return self.scene.calibration.method == "ideal" and camera.has_box_footprints
+        return self.scene.calibration.method == "ideal" and camera.has_box_footprints and not camera.has_detail
 
     @property
     def has_closed_form(self) -> bool:

@@ -12,6 +12,16 @@ def skipped_effects(scene: Scene, camera: Camera) -> tuple[SkippedEffect, ...]:
     return (*_in_rendering(scene, camera), *_in_recording(scene, camera), *_in_estimation(scene))
 
 
+def assumptions(scene: Scene, camera: Camera) -> tuple[str, ...]:
+    """Return what the error bars take for granted and no measurement is asked about, a sentence each."""
+    if camera.covers_whole_pixels or (camera.has_detail and scene.prior.kind != "independent"):
+        return ()
+    remedy = "set target.detail, with a correlated or fitted prior, to include finer detail"
+    if camera.has_detail:
+        remedy = "a prior of independent pixels says nothing of finer detail; take a correlated or fitted one"
+    return (f"the world is made of f's pixels: {remedy}",)
+
+
 def _in_rendering(scene: Scene, camera: Camera) -> list[SkippedEffect]:
     skipped: list[SkippedEffect] = []
     if all(lens_type.optics.aperture is None and lens_type.optics.surfaces is None for lens_type in camera.types):
@@ -21,7 +31,9 @@ def _in_rendering(scene: Scene, camera: Camera) -> list[SkippedEffect]:
     if scene.world is None:
         why = "there is nothing but the luminous target: paths have one segment"
         skipped.append(SkippedEffect("interreflection", why))
-    return skipped + list(without_negligible_effects(scene, camera)[1])
+    if camera.detail > 1 and camera.covers_whole_pixels:
+        skipped.append(SkippedEffect("detail", "every sensor pixel covers whole pixels of f"))
+    return skipped + list(without_negligible_effects(scene, camera.world)[1])
 
 
 def _in_recording(scene: Scene, camera: Camera) -> list[SkippedEffect]:

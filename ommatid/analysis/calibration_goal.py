@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ommatid.reconstruct.detail.detailed_model import independent_detail, model_of_f
 from ommatid.reconstruct.expected_error import ExpectedError
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance
@@ -61,8 +62,9 @@ def for_prior(setup: Setup) -> StoppingRule:
 
     def added_error(model: Model) -> float:
         used = np.isfinite(noise) & (np.diff(model.matrix.indptr) > 0)
+        model = model_of_f(model, camera, prior)
         from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance))
-        causes = {"noise": noise[used], "calibration": from_model[used]}
+        causes = {"noise": noise[used], "calibration": from_model[used], **independent_detail(model, used)}
         setting = scene.estimator.noise_variance
         recorded = model.forward(np.full(model.unknowns, prior.mean))
         method = METHODS[choose_method(scene, camera, exact=False).method]
@@ -72,7 +74,8 @@ def for_prior(setup: Setup) -> StoppingRule:
             task = EstimationTask(model, recorded, used, assumed, prior, scene.estimator, scene.tiles)
             return method(task, Execution()).result(noise, None).expected
 
-        return _added(causes, expected(causes), lambda: expected({"noise": causes["noise"]}).mse)
+        certain = {name: values for name, values in causes.items() if name != "calibration"}
+        return _added(causes, expected(causes), lambda: expected(certain).mse)
 
     return StoppingRule(added_error, fingerprint(["prior", _tables(scene)]), "Eq. 5 for images drawn from the prior")
 

@@ -20,7 +20,7 @@ def study_models(
 ) -> dict[str, Callable[[], Model]]:
     """Return by name the functions that make the models of a scene's study; calibrated ones are cached in `folder`."""
 
-    scene, camera = setup.scene, setup.camera
+    scene, camera = setup.scene, setup.calibrated.camera
 
     def make(name: str) -> Model:
         if name == "true":

@@ -38,6 +38,7 @@ def rows(report: RunReport) -> list[Row]:
         *_solver_rows(report.solver),
         *_diagnostic_rows(report.diagnostics, report.unknowns),
         *_model_rows(report.model),
+        *(("assumed", assumption) for assumption in report.assumes),
         *((f"left out: {skipped.what}", skipped_words(skipped.why, skipped.bound)) for skipped in report.skipped),
         *_time_rows(report.spent),
     ]

@@ -91,6 +91,11 @@ def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tup
 
 
 def _check_flat(scene: Scene) -> None:
+    if scene.target.detail > 1:
+        raise InputError(
+            f"{scene.source}: bench measures worlds made of f's pixels, got target.detail {scene.target.detail};"
+            " set it to 1"
+        )
     if scene.world is not None:
         raise InputError(
             f"{scene.source}: bench measures flat targets, got a [world]; remove it, or choose another scene"

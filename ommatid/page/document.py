@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.bench.table import BenchTable
+from ommatid.reconstruct.detail.detailed_model import model_of_f
+from ommatid.scenes.tables.estimation import PriorTable
 
 from . import error_groups, plots, point_response, sensor, tables, time_curves, words
 from . import maps as result_maps
@@ -35,7 +37,8 @@ def page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: s
 
 def _page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: str, sensor_values: int) -> str:
     shown, mosaic, groups = maps(run), sensor.mosaic(run.stack, sensor_values), error_groups.groups(run)
-    panels, responses = result_maps.panels(shown), point_response.responses(run.model, ideal)
+    panels = result_maps.panels(shown)
+    responses = point_response.responses(model_of_f(run.model, run.stack.camera, PriorTable()), ideal)
     curves = time_curves.time_curves(run, bench)
     figures = [*result_maps.figures(shown, panels), *sensor.figures(mosaic)]
     figures += [figure for response in responses for figure in point_response.figures(response)]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -75,9 +75,16 @@ class DetailedModel(Model):
 
 def is_exact_for(scene: Scene, camera: Camera) -> bool:
     """Return True if the estimator counts with the exact covariance of detail finer than f, where there is any."""
-    if camera.detail == 1 or camera.covers_whole_pixels or scene.prior.kind == "independent":
+    if not camera.has_detail or scene.prior.kind == "independent":
         return False
     return camera.unknowns * camera.detail**2 <= MAX_WORLD and camera.measurements <= MAX_MEASUREMENTS
+
+
+def independent_detail(model: Model, used: BoolArray) -> dict[str, FloatArray]:
+    """Return the variance of detail by its cause, (measurements used,), where its covariance is not known."""
+    if not isinstance(model, DetailedModel) or model.detail_covariance is not None or not model.detail_variance.any():
+        return {}
+    return {CAUSE: model.detail_variance[used]}
 
 
 def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
@@ -85,10 +92,8 @@ def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
 
     camera : of the stack, on f's grid;  prior : "fit" counts as independent pixels
     """
-    if camera.detail == 1 or model.camera.detail > 1:
-        return model
-    if camera.covers_whole_pixels:
-        return replace(model, camera=camera)
+    if not camera.has_detail:
+        return model if camera.detail == model.camera.detail else replace(model, camera=camera)
     if prior.kind in ("independent", "fit"):
         return _without_detail(model, camera, prior.mean)
     world = WorldPrior.of(prior, camera.shape, camera.target_pitch, camera.detail)

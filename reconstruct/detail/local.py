@@ -19,7 +19,7 @@ from ommatid.runtime.processors import processors
 
 from .world_prior import WorldPrior, averaging
 
-WINDOW = 7  # pixels of f, odd: beyond three pixels B is below 1e-3
+WINDOW = 5  # pixels of f, odd
 VALUES = 2**24  # of the patches that are transformed at once
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ommatid.runtime.versions import versions
 from ommatid.scenes.model import Model
 from ommatid.scenes.optics.negligible import SkippedEffect
-from ommatid.scenes.skipped import skipped_effects
+from ommatid.scenes.skipped import assumptions, skipped_effects
 from ommatid.scenes.stack import STRAIGHT, Stack
 
 from ..estimator.estimate import Solver
@@ -45,7 +45,7 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
     return RunReport(
         title=stack.scene.title,
         measurements=model.measurements,
-        unknowns=model.unknowns,
+        unknowns=stack.camera.unknowns,
         stages=stages,
         error=error,
         solver=_solver(restoration.choice.method, restoration.solver),
@@ -53,8 +53,9 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
         model=_model(model, restoration.spurious_information),
         skipped=tuple(
             SkippedReport(**skipped.describe())
-            for skipped in (*skipped_effects(as_run, model.camera), *_skipped_in_world(stack))
+            for skipped in (*skipped_effects(as_run, stack.camera), *_skipped_in_world(stack))
         ),
+        assumes=assumptions(as_run, stack.camera),
         versions={
             **model.record.get("versions", {}),
             **stack.record.get("versions", {}),

@@ -220,6 +220,7 @@ class RunReport(Record):
     diagnostics: DiagnosticsReport
     model: ModelReport
     skipped: tuple[SkippedReport, ...]
+    assumes: tuple[str, ...] = ()
     versions: dict[str, str]
     seeds: SeedReport
     spent: TimeReport

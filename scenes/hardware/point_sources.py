@@ -86,6 +86,10 @@ def from_recorded_points(
     Raises InputError for frames that do not fit the camera, positions outside f, and pixels of f without a source.
     """
     scene, camera, start = setup.scene, setup.camera, perf_counter()
+    if camera.has_detail:
+        raise InputError(
+            f"{scene.source}: recorded point sources fill pixels of f, got target.detail {camera.detail}; set it to 1"
+        )
     frames = read_frames(camera, images, settings, mosaics=True)
     if scene.sensor is not None and (frames.dark is None or frames.flat is None):
         raise InputError(

@@ -102,6 +102,11 @@ class _Observation:
         known = {name: values for name, values in noise.items() if name != DETAIL}
         return known | independent_detail(self.model, self.usable.used)
 
+    @property
+    def detail_variance(self) -> FloatArray | float:
+        """Variance of detail on the pixels used, (pixels used,)."""
+        return self.model.detail_variance[self.usable.used] if isinstance(self.model, DetailedModel) else 0.0
+
     def expected_noise(self, noise: Noise) -> FloatArray:
         """Return the variance that the estimator assumes, (pixels used,)."""
         setting = self.stack.scene.estimator.noise_variance
@@ -128,19 +133,27 @@ def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution:
     def method_with(observation: _Observation, noise: Noise) -> Method:
         return METHODS[choice.method](observation.task(observation.expected_noise(noise)), execution)
 
+    def preliminary(observation: _Observation, noise: Noise) -> Method:
+        """Return a method for a first image, by the variances of detail alone where its covariance is known."""
+        if choice.method != "detail":
+            return method_with(observation, noise)
+        expected = observation.expected_noise(noise) + observation.detail_variance
+        return METHODS["dense"](observation.task(expected), execution)
+
     observation, noise, method = first, first.initial_noise(), None
     if depends_on_light(stack, model):
-        method = method_with(first, noise)
+        method = preliminary(first, noise)
         noise = first.noise_for(method.image, noise)
     fit = _fit(first, noise)
     if fit is not None and model.variance.any():
         # The uncertainty of H was taken at an image that the first prior had left noisy.
         better, fitted = _with_fit(first, model, noise, fit)
-        noise = first.with_detail(better.noise_for(method_with(better, fitted).image, noise))
+        noise = first.with_detail(better.noise_for(preliminary(better, fitted).image, noise))
         fit = _fit(first, noise)
     if fit is not None:
         observation, noise = _with_fit(first, model, noise, fit)
-    if method is None or fit is not None or stack.scene.estimator.noise_variance is None:
+    fixed = isinstance(stack.scene.estimator.noise_variance, float)
+    if method is None or fit is not None or not fixed or choice.method == "detail":
         method = method_with(observation, noise)
     return Assumptions(method, observation.usable, observation.prior, noise, fit)
 

@@ -1,0 +1,242 @@
+"""Worlds finer than f: moments, estimates and error bars against a second method, the estimate of the world itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import sparse
+
+from ommatid.reconstruct.detail import detailed_model
+from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
+from ommatid.reconstruct.detail.local import unexplained_variance
+from ommatid.reconstruct.detail.world_prior import WorldPrior, averaging, repetition
+from ommatid.reconstruct.prior import prior_of
+from ommatid.reconstruct.restore import Reconstruction, restore
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.ideal import exact_model, ideal_matrix, ideal_model, true_matrix
+from ommatid.simulate.render import exposed
+from tests.examples import THREE, scene, with_optics
+
+Array = NDArray[np.float64]
+
+NOISE = 0.5
+EXPONENTIAL = {"kind": "exponential", "correlation_length": "6 mm", "variance": 900.0}
+CAMERAS = {
+    "distorted": ({"distortion": [0.3, 0]}, {"lens_pitch": "3 mm"}),
+    "misaligned": ({}, {"tolerance": {"position": "0.5 um"}}),
+    "out of focus": ({"aperture": "0.8 mm", "focus": "800 mm"}, {}),
+}
+SMALL = (("1/3", [3, 3], [3, 3]), ("1/2", [2, 2], [5, 5]))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A small camera in front of a world twice as fine as f, its true H, and the dense matrices of the problem."""
+
+    setup: Setup
+    model: Model
+    covariance: Array
+    averages: Array
+
+    @property
+    def scene(self) -> Scene:
+        return self.setup.scene
+
+    def recorded(self, world: Array, seed: int) -> Stack:
+        """The noisy measurements of a world."""
+        render = self.scene.render.model_copy(update={"seed": seed})
+        setup = replace(self.setup, scene=self.scene.model_copy(update={"render": render}))
+        return exposed(setup, self.model.forward(world), np.zeros(self.model.measurements), {})
+
+    def restored(self, world: Array, seed: int) -> Reconstruction:
+        """The estimate from these measurements."""
+        return restore(self.recorded(world, seed), self.model, world)
+
+
+@cache
+def case(kind: str, prior_kind: str = "exponential") -> Case:
+    lens, camera_table = CAMERAS[kind]
+    prior = EXPONENTIAL if prior_kind == "exponential" else {"kind": prior_kind}
+    tables = {"prior": prior, "noise": {"variance": NOISE}, "calibration": {"method": "ideal"}}
+    described, _ = with_optics(lens, camera_table, SMALL, (11, 11), **tables)
+    target = described.target.model_copy(update={"detail": 2})
+    described = described.model_copy(update={"target": target})
+    setup = Setup.from_scene(described)
+    camera = setup.calibrated.camera
+    model = exact_model(setup.resolved, camera, true_matrix(camera), "true")
+    covariance = np.zeros((0, 0))
+    if prior_kind == "exponential":
+        root = prior_of(described.prior, camera.shape, camera.target_pitch).root
+        covariance = root @ root.T
+    return Case(setup, model, covariance, averaging((11, 11), 2).toarray())
+
+
+def drawn(case: Case, seed: int) -> Array:
+    """A world drawn from the prior."""
+    root = np.linalg.cholesky(case.covariance)
+    return 127.5 + root @ np.random.default_rng(seed).normal(size=len(root))
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_the_estimate_is_the_average_of_the_estimated_world(kind: str) -> None:
+    """The world is estimated on its own grid (Wood et al., Eq. 4), and averaged: the same image, the same variance."""
+    shown = case(kind)
+    world = drawn(shown, 1)
+    result = shown.restored(world, 3)
+    matrix, average, prior = shown.model.matrix.toarray(), shown.averages, shown.covariance
+    setup = replace(
+        shown.setup, scene=shown.scene.model_copy(update={"render": shown.scene.render.model_copy(update={"seed": 3})})
+    )
+    recorded = exposed(setup, matrix @ world, np.zeros(len(matrix)), {}).values
+    gain = np.linalg.solve(matrix @ prior @ matrix.T + NOISE * np.eye(len(matrix)), matrix @ prior).T
+    estimated = 127.5 + gain @ (recorded - matrix @ np.full(len(prior), 127.5))
+    posterior = prior - gain @ matrix @ prior
+    np.testing.assert_allclose(result.estimate, average @ estimated, rtol=1e-7)
+    np.testing.assert_allclose(result.expected.variance, np.diagonal(average @ posterior @ average.T), rtol=1e-6)
+    assert sum(result.budget().values()) == pytest.approx(result.expected.mse)
+    assert result.budget()["detail"] > 0
+
+
+def test_the_interval_is_that_of_this_world() -> None:
+    shown = case("distorted")
+    world = drawn(shown, 2)
+    results = [shown.restored(world, seed) for seed in range(20)]
+    errors = np.array([result.error.mse for result in results if result.error is not None])
+    intervals = [result.interval for result in results if result.interval is not None]
+    assert errors.mean() == pytest.approx(intervals[0].mse, abs=4 * errors.std() / len(errors) ** 0.5)
+    assert sum(each.low <= error <= each.high for each, error in zip(intervals, errors, strict=True)) == 20
+
+
+def test_the_image_alone_gives_an_interval_that_allows_for_any_detail() -> None:
+    shown = case("distorted")
+    inside = 0
+    for seed in range(20):
+        world = drawn(shown, seed)
+        result = restore(shown.recorded(world, seed), shown.model, shown.averages @ world)
+        assert result.interval is not None
+        assert result.error is not None
+        inside += result.interval.low <= result.error.mse <= result.interval.high
+    assert inside >= 18
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_a_diagonal_form_promises_no_less_than_it_keeps(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in frames: G from neighbourhoods, and only the variances of detail. Its linear gain shows its true error."""
+    monkeypatch.setattr(detailed_model, "MAX_WORLD", 0)
+    shown = case(kind)
+    promised = shown.restored(drawn(shown, 1), 1)
+    assert promised.choice.method == "dense"
+    local = model_of_f(shown.model, shown.setup.camera, shown.scene.prior)
+    assert isinstance(local, DetailedModel)
+    prior = prior_of(shown.scene.prior, (11, 11), 1.0, 2)
+    covariance = prior.root @ prior.root.T
+    dense = local.matrix.toarray()
+    noise = np.diag(local.detail_variance + NOISE)
+    gain = np.linalg.solve(dense @ covariance @ dense.T + noise, dense @ covariance).T
+    error = gain @ shown.model.matrix.toarray() - shown.averages
+    actual = (np.sum((error @ shown.covariance) * error) + NOISE * np.sum(gain**2)) / 121
+    assert promised.expected.mse >= 0.97 * actual
+    # Promises are not idle: not more than twice the error, though correlations are left out.
+    assert promised.expected.mse < 2 * actual
+
+
+def test_neighbourhoods_replace_the_exact_moments() -> None:
+    shown = case("misaligned")
+    camera, prior = shown.setup.camera, WorldPrior.of(shown.scene.prior, (11, 11), 1.0, 2)
+    exact = model_of_f(shown.model, camera, shown.scene.prior)
+    assert isinstance(exact, DetailedModel)
+    left = shown.model.matrix.toarray() - exact.matrix.toarray() @ shown.averages
+    brute = np.einsum("ij,jk,ik->i", left, shown.covariance, left)
+    np.testing.assert_allclose(unexplained_variance(prior, shown.model.matrix, exact.matrix), brute, rtol=1e-9)
+    np.testing.assert_allclose(exact.detail_variance, brute, rtol=1e-6)
+
+
+def test_a_camera_of_whole_pixels_has_no_detail() -> None:
+    """For the paper's camera G is H and the covariance of detail zero, so nothing is computed on the world's grid."""
+    described = scene(lenses=THREE, prior=EXPONENTIAL, calibration={"method": "ideal"})
+    described = described.model_copy(update={"target": described.target.model_copy(update={"detail": 3})})
+    setup = Setup.from_scene(described)
+    assert not setup.camera.has_detail
+    assert setup.calibrated.camera.unknowns == 361
+    assert [each.why for each in setup.skipped if each.what == "detail"] == [
+        "every sensor pixel covers whole pixels of f"
+    ]
+    world, fine = WorldPrior.of(described.prior, (19, 19), 1.0, 3), ideal_matrix(setup.world.camera)
+    coarse = sparse.csr_array(fine @ world.interpolation)
+    np.testing.assert_allclose(coarse.toarray(), ideal_matrix(setup.camera).toarray(), atol=1e-9)
+    assert unexplained_variance(world, fine, coarse).max() < 1e-9 * 900
+
+
+def test_independent_pixels_say_nothing_of_detail() -> None:
+    shown = case("distorted", "independent")
+    coarse = model_of_f(shown.model, shown.setup.camera, shown.scene.prior)
+    assert isinstance(coarse, DetailedModel)
+    np.testing.assert_allclose(
+        coarse.matrix.toarray(), ideal_matrix(replace(shown.setup.camera, detail=1)).toarray(), atol=1e-12
+    )
+    assert not coarse.detail_variance.any()
+    image = np.random.default_rng(0).uniform(0, 255, 121)
+    result = shown.restored(repetition((11, 11), 2) @ image, 4)
+    assert result.error is not None
+    assert result.interval is not None
+    assert result.interval.low <= result.error.mse <= result.interval.high
+
+
+def test_the_prior_of_f_is_that_of_averages() -> None:
+    table = case("distorted").scene.prior
+    root = prior_of(table, (11, 11), 1.0, 2).root
+    expected = case("distorted").averages @ case("distorted").covariance @ case("distorted").averages.T
+    np.testing.assert_allclose(root @ root.T, expected, atol=1e-8)
+
+
+def test_a_prior_is_fitted_to_the_world() -> None:
+    shown, fitted = case("distorted"), case("distorted", "fit")
+    deviations: list[Array] = []
+    for seed in range(8):
+        result = fitted.restored(drawn(shown, seed), seed)
+        assert result.fit is not None
+        logs = np.log([(result.fit.variance or 0) / 900.0, (result.fit.length or 0) / 6.0])
+        deviations.append(logs / np.array(result.fit.spread))
+    # Standard normal to first order; variance and length trade, and few pixels see one realisation.
+    assert np.sqrt(np.mean(np.square(deviations))) < 2
+    assert result.prior.kind == "exponential"
+
+
+def test_uncertain_entries_of_the_world_become_uncertain_measurements() -> None:
+    """The variance that H's errors add, against their scatter over many draws of these errors."""
+    shown = case("misaligned")
+    rng = np.random.default_rng(0)
+    spread = 1e-3 * shown.model.matrix.data.max()
+    noisy = replace(
+        shown.model, variance=np.full(shown.model.matrix.nnz, spread**2), record={"method": "recorded points"}
+    )
+    coarse = model_of_f(noisy, shown.setup.camera, shown.scene.prior)
+    world = drawn(shown, 5)
+    stated = coarse.variance_from_model(shown.averages @ world)
+    scatter = np.zeros(stated.size)
+    for _ in range(300):
+        errors = sparse.csr_array(
+            (rng.normal(size=noisy.matrix.nnz) * spread, noisy.matrix.indices, noisy.matrix.indptr),
+            shape=noisy.matrix.shape,
+        )
+        scatter += np.square(errors @ world) / 300
+    assert float((stated / scatter).mean()) == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("misalignment", ["robust", "fit"])
+def test_estimators_of_misalignment_take_a_world_of_pixels(misalignment: str) -> None:
+    shown = case("misaligned")
+    estimator = shown.scene.estimator.model_copy(update={"misalignment": misalignment})
+    setup = replace(shown.setup, scene=shown.scene.model_copy(update={"estimator": estimator}))
+    model = ideal_model(setup.resolved, setup.calibrated.camera)
+    stack = exposed(setup, model.forward(drawn(shown, 1)), np.zeros(model.measurements), {})
+    with pytest.raises(InputError, match=r"takes a world made of f's pixels, got target.detail 2"):
+        restore(stack, model)

@@ -18,6 +18,7 @@ from .estimator.estimate import factorise
 from .expected_error import expected_error, kernel_widths
 from .forms.form import Form
 from .forms.svd import Svd, svd
+from .gram import gram
 from .measured_error import TRIM, trimmed_mean
 from .method_choice import METHODS, MethodChoice
 from .methods.method import EstimationTask, Execution
@@ -83,8 +84,8 @@ class Prediction:
 def observability(matrix: sparse.csr_array) -> Observability:
     """Return rank and condition of H, from the eigenvalues of the smaller of H H^T and H^T H."""
     wide = matrix.shape[0] < matrix.shape[1]
-    gram = (matrix @ matrix.T if wide else matrix.T @ matrix).toarray()
-    values: FloatArray = np.asarray(linalg.eigvalsh(gram, overwrite_a=True, check_finite=False), dtype=np.float64)
+    square = gram(sparse.csr_array(matrix.T) if wide else matrix)
+    values: FloatArray = np.asarray(linalg.eigvalsh(square, overwrite_a=True, check_finite=False), dtype=np.float64)
     largest = float(values.max(initial=0.0))
     seen = values[values > RANK_TOLERANCE**2 * largest]
     condition = float(np.sqrt(largest / seen.min())) if seen.size else float("inf")

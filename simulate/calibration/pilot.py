@@ -120,7 +120,8 @@ def with_matrix(model: Model, matrix: sparse.csr_array) -> Model:
     """Return a model of another H with the same uncertainty; entries are those that either of them has."""
     columns = model.unknowns
     old, new = _cells(model.matrix, columns), _cells(matrix, columns)
-    cells = np.union1d(old, new)
+    cells = np.sort(np.concatenate([old, new]))
+    cells = cells[np.concatenate([[True], np.diff(cells) > 0])]
     at_old, at_new = np.searchsorted(cells, old), np.searchsorted(cells, new)
     data, variance = np.zeros(cells.size), np.zeros(cells.size)
     data[at_new], variance[at_old] = matrix.data, model.variance

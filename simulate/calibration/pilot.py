@@ -36,13 +36,46 @@ SCALAR = "only Mitsuba's scalar backend works here, which traces no single rays"
 
 @dataclass(frozen=True)
 class Pilot:
-    """H by a pilot, with the variances that all samples of its plans would leave.
+    """H by a pilot.
 
+    factor : (M,) variances with all samples of its plans, relative to those of the pilot
     extrapolated : True if these follow from fewer samples per pass
     """
 
     model: Model
+    factor: FloatArray
     extrapolated: bool
+
+    def variance_from_model(self, image: FloatArray) -> FloatArray:
+        """Return the variance that all samples leave in the readings of an image, (N,): (M,)."""
+        return self.factor * self.model.variance_from_model(image)
+
+    def around(self, matrix: sparse.csr_array, factor: float = 1.0) -> Model:
+        """Return an H that deviates from the true one as H by all samples does, with the variances of its entries.
+
+        matrix : (M, N) the true H;  factor : on the variances, of yet other numbers of samples
+        An estimator that takes it for exact errs as one does that takes a calibrated H; noise added to the readings of
+        the true H would be another error.
+        """
+        model, columns = self.model, self.model.unknowns
+        old, new = _cells(model.matrix, columns), _cells(matrix, columns)
+        cells = np.sort(np.concatenate([old, new]))
+        cells = cells[np.concatenate([[True], np.diff(cells) > 0])]
+        at_old, at_new = np.searchsorted(cells, old), np.searchsorted(cells, new)
+        row, column = np.divmod(cells, columns)
+        scale = factor * self.factor[row]
+        data, variance = np.zeros(cells.size), np.zeros(cells.size)
+        data[at_old] = model.matrix.data
+        data[at_new] -= matrix.data
+        data *= np.sqrt(scale)
+        data[at_new] += matrix.data
+        variance[at_old] = model.variance
+        batches: Float32Array = np.zeros((len(model.batches), cells.size), dtype=np.float32)
+        batches[:, at_old] = model.batches
+        batches *= np.sqrt(scale).astype(np.float32)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=matrix.shape[0]))])
+        joined = sparse.csr_array((data, column, starts), shape=matrix.shape)
+        return replace(model, stored=joined, variance=variance * scale, batches=batches)
 
 
 def reason_against(setup: Setup) -> str:
@@ -106,31 +139,7 @@ def pilot(setup: Setup, plans: Plans, fit: bool = False) -> Pilot:
         few, all_ = traced[lens_type.name], plans[lens_type.name]
         rows[pixels] = few.passes / all_.passes * (few.samples / all_.samples) ** exponent
     extrapolated = any(traced[name].samples < work.samples for name, work in plans.items())
-    return Pilot(scaled(model, rows), extrapolated)
-
-
-def scaled(model: Model, factor: float | FloatArray) -> Model:
-    """Return a model whose variances are multiplied by a factor, one or (M,) for each row."""
-    by_entry = np.repeat(np.broadcast_to(factor, model.measurements), np.diff(model.matrix.indptr))
-    batches = (model.batches * np.sqrt(by_entry)).astype(np.float32)
-    return replace(model, variance=model.variance * by_entry, batches=batches)
-
-
-def with_matrix(model: Model, matrix: sparse.csr_array) -> Model:
-    """Return a model of another H with the same uncertainty; entries are those that either of them has."""
-    columns = model.unknowns
-    old, new = _cells(model.matrix, columns), _cells(matrix, columns)
-    cells = np.sort(np.concatenate([old, new]))
-    cells = cells[np.concatenate([[True], np.diff(cells) > 0])]
-    at_old, at_new = np.searchsorted(cells, old), np.searchsorted(cells, new)
-    data, variance = np.zeros(cells.size), np.zeros(cells.size)
-    data[at_new], variance[at_old] = matrix.data, model.variance
-    batches: Float32Array = np.zeros((len(model.batches), cells.size), dtype=np.float32)
-    batches[:, at_old] = model.batches
-    row, column = np.divmod(cells, columns)
-    starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=matrix.shape[0]))])
-    joined = sparse.csr_array((data, column, starts), shape=matrix.shape)
-    return replace(model, stored=joined, variance=variance, batches=batches)
+    return Pilot(model, rows, extrapolated)
 
 
 def _cells(matrix: sparse.csr_array, columns: int) -> IntArray:

@@ -55,7 +55,7 @@ class _Camera:
     """H of the camera that records, and the uncertainty of a calibration of it, None without one."""
 
     model: Model
-    pilot: Model | None
+    pilot: pilot.Pilot | None
     assumes: Assumptions
 
 
@@ -135,7 +135,7 @@ def _camera(setup: Setup) -> _Camera:
         matrix = _traced_matrix(setup, uncertain, plans)
         assumes = (*assumes, "H of lenses without a closed form is that of a pilot's rays")
     model = exact_model(scene, setup.camera, matrix, "ideal" if simulated.is_ideal_pinhole else "true")
-    return _Camera(model, None if uncertain is None else uncertain.model, assumes)
+    return _Camera(model, uncertain, assumes)
 
 
 def _traced_matrix(setup: Setup, uncertain: pilot.Pilot | None, plans: pilot.Plans) -> sparse.csr_array:
@@ -150,7 +150,8 @@ def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Ass
     """Return the true H with the uncertainty that the scene's calibration leaves."""
     if camera.pilot is None:
         raise ValueError("expected a scene whose H is calibrated, got one with the ideal H")
-    model = pilot.with_matrix(camera.pilot, camera.model.matrix)
+    true = camera.model.matrix
+    model = camera.pilot.around(true)
     model = replace(model, record={**model.record, "method": setup.scene.calibration.method})
     if setup.scene.calibration.samples != "auto":
         return model, ()
@@ -158,17 +159,19 @@ def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Ass
     said = (
         f"the uncertainty of H adds {100 * min(adds, AIM):.2g} %, which calibration.samples 'auto' aims at or finds",
     )
-    return (model if adds <= DONE else pilot.scaled(model, AIM / adds)), said
+    if adds <= DONE:
+        return model, said
+    return replace(camera.pilot.around(true, AIM / adds), record=model.record), said
 
 
 def _rendering_variance(setup: Setup, camera: _Camera, image: FloatArray) -> tuple[FloatArray, Assumptions]:
     """Return the variance of the rendered light, (M,)."""
     scene, plans = setup.scene, pilot.rendering_plans(setup)
     same = camera.pilot is not None and plans == pilot.calibration_plans(setup) and scene.calibration.fit is None
-    traced = pilot.Pilot(camera.pilot, False) if same and camera.pilot is not None else pilot.pilot(setup, plans)
+    traced = camera.pilot if same and camera.pilot is not None else pilot.pilot(setup, plans)
     light = camera.model.forward(image)
     floor = rounding_variance(light, max(work.samples for work in plans.values()))
-    variance = np.maximum(traced.model.variance_from_model(image), floor)
+    variance = np.maximum(traced.variance_from_model(image), floor)
     said = _extrapolation("the rendering", traced.extrapolated)
     if scene.render.samples != "auto":
         return variance, said

@@ -38,13 +38,15 @@ Assumptions = tuple[str, ...]
 class PredictedRecording:
     """A recording of a known image, and the model with which it is to be reconstructed.
 
-    true : (M, N) H of the camera that records, None where the model's is the same
+    true : (M, N) H of the camera that records, None where the model's is the same or a calibration of it
+    certain : H without the errors of a calibration, whose rank is the camera's
     truth : (N,) the scene's picture, None where it has none that can be read and the image is a draw of the prior
     """
 
     stack: Stack
     model: Model
     true: sparse.csr_array | None
+    certain: Model
     image: FloatArray
     truth: FloatArray | None
     assumes: Assumptions
@@ -79,9 +81,9 @@ def predicted_recording(setup: Setup) -> PredictedRecording:
         same = camera.model.is_exact
         designed = camera.model if same else ideal_model(setup.scene, setup.camera)
         true = None if same or not _differs(camera.model, designed) else camera.model.matrix
-        return PredictedRecording(stack, designed, true, image, truth, assumes)
+        return PredictedRecording(stack, designed, true, designed, image, truth, assumes)
     model, said_of_model = _calibrated(setup, camera, stack)
-    return PredictedRecording(stack, model, None, image, truth, (*assumes, *said_of_model))
+    return PredictedRecording(stack, model, None, camera.model, image, truth, (*assumes, *said_of_model))
 
 
 def known_image(setup: Setup) -> tuple[FloatArray | None, Assumptions]:

@@ -102,7 +102,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
         budget[mismatch.cause] = float(mismatch.variance.mean())
     seen = None
     if camera.unknowns <= MAX_DENSE_PIXELS and outcome.choice.method != "robust":
-        seen = observability(recording.model.matrix[outcome.assumed.usable.used])
+        seen = observability(recording.certain.matrix[outcome.assumed.usable.used])
     return Prediction(
         measurements=int(outcome.assumed.usable.used.sum()),
         unknowns=camera.unknowns,

@@ -22,6 +22,8 @@ from ommatid.scenes.camera import Camera
 from .conjugate_gradients import ACCURACY, FrameSystem, NotReachedError, Solution
 from .preconditioner import is_sliding
 
+Indices = NDArray[np.intp]
+
 MOST_WORK = 1.2e11  # pixels times the square of the band: a minute or two with the error bars
 MAX_REFINEMENTS = 4
 
@@ -40,19 +42,12 @@ class BandedSystem(FrameSystem):
         return sparse.csr_array(information + float(np.asarray(self.prior)) * diagonal)
 
     @cached_property
-    def _order(self) -> NDArray[np.intp]:
-        """Pixels along the shorter side first, which makes the band narrow."""
-        numbers = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
-        return (numbers if self.shape[1] <= self.shape[0] else numbers.T).ravel()
+    def _order(self) -> Indices:
+        return shorter_side_first(self.shape)
 
     @cached_property
     def _factor(self) -> FloatArray:
-        ordered = sparse.coo_array(self.precision[self._order][:, self._order])
-        below = ordered.row >= ordered.col
-        row, column, values = ordered.row[below], ordered.col[below], ordered.data[below]
-        band = np.zeros((int((row - column).max(initial=0)) + 1, ordered.shape[0]))
-        band[row - column, column] = values
-        return np.asarray(linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
+        return banded_cholesky(self.precision, self._order)
 
     def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.
@@ -74,6 +69,22 @@ class BandedSystem(FrameSystem):
         progress(1.0)
         largest = float(abs(self.precision).sum(axis=1).max())
         return Solution(image, steps, bound, largest / float(np.asarray(self.prior)))
+
+
+def shorter_side_first(shape: tuple[int, int]) -> Indices:
+    """Return the pixels of a frame in the order that makes the band of K narrow: (N,)."""
+    numbers: Indices = np.arange(shape[0] * shape[1]).reshape(shape)
+    return (numbers if shape[1] <= shape[0] else numbers.T).ravel()
+
+
+def banded_cholesky(precision: sparse.csr_array, order: Indices) -> FloatArray:
+    """Return the lower Cholesky factor of K with its pixels in this order, as SciPy stores bands: (width, N)."""
+    ordered = sparse.coo_array(precision[order][:, order])
+    below = ordered.row >= ordered.col
+    row, column, values = ordered.row[below], ordered.col[below], ordered.data[below]
+    band = np.zeros((int((row - column).max(initial=0)) + 1, ordered.shape[0]))
+    band[row - column, column] = values
+    return np.asarray(linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
 
 
 def serves(camera: Camera, independent: bool) -> bool:

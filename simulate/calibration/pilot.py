@@ -18,6 +18,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.shrinkage import shrink_variances
 
 from ..adaptive_render import EXPONENTS, STRATIFIED
 from ..renderer.variant import choose, unusable_reason
@@ -46,9 +47,20 @@ class Pilot:
     factor: FloatArray
     extrapolated: bool
 
-    def variance_from_model(self, image: FloatArray) -> FloatArray:
-        """Return the variance that all samples leave in the readings of an image, (N,): (M,)."""
-        return self.factor * self.model.variance_from_model(image)
+    def rendering_variance(self, image: FloatArray) -> FloatArray:
+        """Return the variance of an image's rendering, (N,), with all samples: (M,), shrunk as a rendering's is.
+
+        It counts the rays that miss the target too, whose number is part of a reading's error.
+        """
+        model, count = self.model, len(self.model.batches)
+        rows = np.repeat(np.arange(model.measurements), np.diff(model.matrix.indptr))
+        seen = image[model.matrix.indices]
+        scatter = np.zeros(model.measurements)
+        for batch in model.batches:
+            scatter += np.square(np.bincount(rows, weights=batch * seen, minlength=model.measurements))
+        scatter /= count * (count - 1)
+        shrunk = [shrink_variances(scatter[pixels], count) for pixels in model.camera.slices()]
+        return self.factor * np.concatenate(shrunk)
 
     def around(self, matrix: sparse.csr_array, factor: float = 1.0) -> Model:
         """Return an H that deviates from the true one as H by all samples does, with the variances of its entries.

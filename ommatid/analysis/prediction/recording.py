@@ -173,7 +173,7 @@ def _rendering_variance(setup: Setup, camera: _Camera, image: FloatArray) -> tup
     traced = camera.pilot if same and camera.pilot is not None else pilot.pilot(setup, plans)
     light = camera.model.forward(image)
     floor = rounding_variance(light, max(work.samples for work in plans.values()))
-    variance = np.maximum(traced.variance_from_model(image), floor)
+    variance = np.maximum(traced.rendering_variance(image), floor)
     said = _extrapolation("the rendering", traced.extrapolated)
     if scene.render.samples != "auto":
         return variance, said

@@ -167,16 +167,17 @@ def target_image(scene: Scene | str | Path) -> FloatArray:
         return cached_truth(Path(folder) / TRUTH, setup)
 
 
-def predict(scene: Scene | str | Path) -> Prediction:
-    """Predict the error of a scene (Eq. 5), the rank of H and its null space, from the ideal model alone.
+def predict(scene: Scene | str | Path, rays: bool = True) -> Prediction:
+    """Predict the error of a scene's run (Eq. 5), the rank of H and its null space, without rendering a picture.
 
+    rays : False for a perfect H and a perfect rendering, in closed form
     Raises InputError if memory does not suffice.
     """
     from ommatid.analysis.predict import predict_scene
 
     opened = _scene(scene)
     with naming_source(opened.source):
-        return predict_scene(opened)
+        return predict_scene(opened, rays)
 
 
 def render(scene: Scene | str | Path) -> Stack:

@@ -14,6 +14,7 @@ from ommatid.scenes.scene import Scene
 from .detail.detail_method import DetailMethod
 from .detail.detailed_model import is_exact_for
 from .estimator.memory import needed_memory
+from .frame.banded_system import band_width, band_work, leaves_null_space, serves
 from .frame.frame_method import FrameMethod
 from .frame.preconditioner import is_sliding
 from .methods.dense_method import DenseMethod
@@ -83,8 +84,14 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
         return ["tiles"], "measurements without noise need a dense form"
     if estimator.accuracy >= TILE_ACCURACY:
         return ["tiles"], f"tiles reach an accuracy of {estimator.accuracy:g} posterior standard deviations"
-    if all(is_sliding(lens_type) for lens_type in camera.types):
+    sliding = all(is_sliding(lens_type) for lens_type in camera.types)
+    independent = scene.prior.kind == "independent"
+    if sliding and independent and leaves_null_space(camera) and not serves(camera, independent):
+        return ["tiles"], "the lens types leave a null space, and the pixels are too many for a frame's error bars"
+    if sliding:
         return ["frame", "tiles"], f"{camera.unknowns} pixels, and every lens type sees the same everywhere"
+    if camera.has_sharp_footprints and serves(camera, independent):
+        return ["frame", "tiles"], f"{camera.unknowns} pixels, whose lens types do not see the same everywhere"
     return ["tiles"], "the lens types do not see the same everywhere: not all are m x m one pixel apart"
 
 
@@ -143,6 +150,9 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
         return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory("information", 3 * side, side)
     longest = max(camera.shape)
     strips = 8 * 4 * longest * (5 * widest) * (5 * widest * (widest - 1) + widest)
+    if serves(camera, scene.prior.kind == "independent"):
+        band = 8 * camera.unknowns * band_width(camera)
+        return PROGRAM_MEMORY + images + entries + 5 * band  # the factor, a copy, and two matrices per block of lines
     if exact:
         return PROGRAM_MEMORY + images + strips + 8 * 2 * longest * 81 * widest**2 * (widest - 1)
     normal_matrix = 12 * 3 * (2 * widest + 1) ** 2 * camera.unknowns  # K, stored
@@ -158,4 +168,6 @@ def _seconds(method: str, scene: Scene, camera: Camera, exact: bool) -> float:
     per_pixel = 0.15 * (scene.tiles.size / 35) ** 6 / (scene.tiles.size - 2 * scene.tiles.overlap) ** 2
     if method == "tiles":
         return 1.0 + count * (per_pixel if not exact else 2e-6)
+    if serves(camera, scene.prior.kind == "independent"):
+        return 1.5 + 1.5e-9 * band_work(camera)
     return 1.5 + count * (1.2e-5 if exact else 1.5e-4 + per_pixel / 2)

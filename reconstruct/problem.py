@@ -11,6 +11,7 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
+from .gram import is_dense
 from .prior import Prior
 
 
@@ -62,14 +63,19 @@ class Problem:
 
     def forward(self, coefficients: FloatArray) -> FloatArray:
         """Apply H L: (K, q) to (M, q)."""
-        return np.asarray(self.matrix @ self.prior.apply_root(coefficients))
+        return np.asarray(self._factor @ self.prior.apply_root(coefficients))
 
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """Apply L^T H^T: (M, q) to (K, q)."""
-        return np.asarray(self.prior.apply_root_transposed(self.matrix.T @ measurements))
+        return np.asarray(self.prior.apply_root_transposed(self._factor.T @ measurements))
 
     def dense_matrix(self) -> FloatArray:
         """H L as a dense matrix: (M, K)."""
         if self.prior.independent:
             return np.asarray(self.matrix.multiply(self.prior.root[None, :]).toarray())
-        return np.asarray(self.matrix @ self.prior.root)
+        return np.asarray(self._factor @ self.prior.root)
+
+    @cached_property
+    def _factor(self) -> sparse.csr_array | FloatArray:
+        """H as products take it: with its zeros where they are few."""
+        return self.matrix.toarray() if is_dense(self.matrix) else self.matrix

@@ -22,7 +22,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibration.stopping_rule import StoppingRule
 
-from .predict import expected_noise
+from .prediction.sensor_noise import expected_noise
 
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
 TINY = float(np.finfo(np.float64).tiny)

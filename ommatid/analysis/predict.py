@@ -1,7 +1,8 @@
-"""Predict the error (Eq. 5), the sharpness and the light of a scene from theory; nothing is rendered."""
+"""Predict the error (Eq. 5), the sharpness and the light of a scene from theory; no picture is rendered."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,17 +10,46 @@ from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
 from ommatid.reconstruct.prediction import Prediction, predict, predict_frame
 from ommatid.reconstruct.prior import prior_of
-from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
+from ommatid.simulate.validation import check_lenses, check_scene_memory
+
+from .prediction.run_prediction import predict_run
+from .prediction.sensor_noise import expected_noise
+
+LEFT_OUT = "a perfect H and a perfect rendering: their uncertainty is left out"
+PERFECT_LENSES = "lenses of surfaces are perfect and in focus"
+PRIOR_LIGHT = "light of the prior's mean, and no pixel saturated"
+
+
+def predict_scene(scene: Scene, rays: bool = True) -> Prediction:
+    """Predict the error of a scene's run, or with `rays` False of its ideal H alone, in closed form.
+
+    Rays of a pilot tell what calibration and rendering leave uncertain. Without a backend that traces them the
+    prediction is the closed form. Raises InputError as a run does, and of the closed form where the estimator takes a
+    recorded stack.
+    """
+    if not rays:
+        return predict_ideal(scene)
+    from ommatid.simulate.calibration.pilot import reason_against
+
+    setup = Setup.from_scene(scene)
+    reason = reason_against(setup)
+    if reason:
+        closed = predict_ideal(scene)
+        return replace(closed, assumes=(f"{closed.assumes[0]}, since {reason}", *closed.assumes[1:]))
+    check_scene_memory(setup)
+    check_lenses(setup.camera)
+    with one_thread():
+        return predict_run(setup)
 
 
 @one_thread()
-def predict_scene(scene: Scene) -> Prediction:
+def predict_ideal(scene: Scene) -> Prediction:
     """Predict the error of a scene with the ideal H. Raises InputError where the estimator takes a recorded stack."""
     setup = Setup.from_scene(scene)
     camera = setup.camera
@@ -28,23 +58,18 @@ def predict_scene(scene: Scene) -> Prediction:
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.method != "dense":
-        return predict_frame(choice, ideal_model(scene, camera), actual)
+        return replace(predict_frame(choice, ideal_model(scene, camera), actual), assumes=_ideal_assumptions(setup))
     prior = prior_of(scene.prior, camera.shape, camera.target_pitch)
     added = None
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":
         added = partial(misalignment_variance, camera=camera, prior=prior)
-    return predict(ideal_matrix(camera), prior, actual, scene.estimator, camera.shape, added)
+    prediction = predict(ideal_matrix(camera), prior, actual, scene.estimator, camera.shape, added)
+    return replace(prediction, assumes=_ideal_assumptions(setup))
 
 
-def expected_noise(setup: Setup) -> float | FloatArray:
-    """Return the variance of all measurements, or of each, (M,): with a [sensor] that of light of the prior's mean."""
-    scene = setup.scene
-    if scene.sensor is not None:
-        from ommatid.scenes.optics.radiometry import predicted_noise
-        from ommatid.simulate.sensor.response import response
-
-        return predicted_noise(scene, setup.camera, response(setup))
-    return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0
+def _ideal_assumptions(setup: Setup) -> tuple[str, ...]:
+    surfaces = any(lens_type.optics.surfaces is not None for lens_type in setup.camera.types)
+    return (LEFT_OUT, *([PERFECT_LENSES] if surfaces else []), PRIOR_LIGHT)
 
 
 def optics(camera: Camera) -> list[dict[str, Any]]:

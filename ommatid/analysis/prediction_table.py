@@ -8,21 +8,32 @@ from typing import Any
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.reconstruct.prediction import Prediction
 
+OPTIONAL = ("misalignment", "prior_variance", "mse_for_picture", "interval", "budget", "as_designed", "calibrated")
+
 
 def json_of(prediction: Prediction) -> dict[str, Any]:
-    """Return a prediction in JSON's types; the part of misalignment only where it is known."""
+    """Return a prediction in JSON's types; what is only sometimes known only where it is."""
     values = asdict(prediction)
-    if prediction.misalignment is None:
-        del values["misalignment"]
-    return values
+    for name in OPTIONAL:
+        if values[name] is None:
+            del values[name]
+    for name in ("as_designed", "calibrated"):
+        if name in values:
+            values[name] = {"mse": values[name]}
+    if prediction.interval is not None:
+        values["interval"] = dict(zip(("low", "high"), prediction.interval, strict=True))
+    return values | {"assumes": list(prediction.assumes), "recovers_nothing": prediction.recovers_nothing}
 
 
 def rows(prediction: Prediction) -> list[tuple[str, str]]:
-    """Return names and values, in the order in which they are printed."""
+    """Return names and values, in the order in which they are printed: first what the prediction takes for granted."""
     deviation = prediction.mse**0.5
     inner = "the target is too small" if prediction.trimmed_mse is None else f"{prediction.trimmed_mse:.6g}"
     width = "nothing is resolved" if prediction.resolution is None else f"{prediction.resolution:.3g} pixels of f"
-    lines = [("measurements", str(prediction.measurements)), ("unknowns", str(prediction.unknowns))]
+    lines = [("assumes", "; ".join(prediction.assumes))] if prediction.assumes else []
+    if prediction.recovers_nothing:
+        lines.append(("nothing is recovered", "the error is that of the prior, whatever the camera records"))
+    lines += [("measurements", str(prediction.measurements)), ("unknowns", str(prediction.unknowns))]
     if prediction.rank is None or prediction.condition is None:
         lines.append(("rank of H", "not computed for a frame, nor where misalignment counts as noise"))
     else:
@@ -34,7 +45,8 @@ def rows(prediction: Prediction) -> list[tuple[str, str]]:
         ]
     expected = f"{prediction.mse:.6g} per pixel, a deviation of {deviation:.3g} of 255"
     lines.append(("expected squared error (Eq. 5)", expected))
-    if prediction.misalignment is not None:
+    lines += _parts(prediction)
+    if prediction.budget is None and prediction.misalignment is not None:
         share = f"{prediction.misalignment:.6g}, within camera.tolerance, for an estimator that takes H as designed"
         lines.append(("  of it by misalignment", share))
     return [
@@ -44,3 +56,23 @@ def rows(prediction: Prediction) -> list[tuple[str, str]]:
         ("resolution, median", width),
         ("form of the estimator", prediction.method),
     ]
+
+
+def _parts(prediction: Prediction) -> list[tuple[str, str]]:
+    """Return the parts of the expected error, and the errors to compare with it."""
+    lines = [
+        (f"  from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / prediction.mse:.1f} %)")
+        for name, part in (prediction.budget or {}).items()
+        if part != 0
+    ]
+    if prediction.mse_for_picture is not None:
+        words = f"{prediction.mse_for_picture:.6g}, to compare with the run's interval"
+        if prediction.interval is not None:
+            low, high = prediction.interval
+            words = f"{prediction.mse_for_picture:.6g} (99 %: {low:.4g} to {high:.4g})"
+        lines.append(("  expected for this picture", words))
+    if prediction.as_designed is not None:
+        lines.append(("  with H as designed", f"{prediction.as_designed:.6g}, within camera.tolerance"))
+    if prediction.calibrated is not None:
+        lines.append(("  with a calibrated H", f"{prediction.calibrated:.6g}, with calibration.samples"))
+    return lines

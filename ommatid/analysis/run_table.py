@@ -115,6 +115,8 @@ def _solver_rows(solver: SolverReport) -> list[Row]:
     else:
         bounds = f"error below {solver.bound:.0e}, of variances {solver.variance_bound:.0e} (relative)"
         lines = [("right digits", f"{solver.digits:.1f}: {bounds}")]
+    if solver.way == "tiles":
+        lines.append(("  in tiles", solver.why))
     return lines + [(f"  not by the {form.method} form", form.why_not) for form in solver.tried]
 
 

@@ -1,7 +1,8 @@
-"""Commands that render nothing and expect errors from Eq. 5 alone: predict and design."""
+"""Commands that render no picture and expect errors from Eq. 5 alone: predict and design."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,9 @@ from .run import finish_batch
 SweepFolder = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the table and the plot of --sweep.")
 ]
+NoRays = Annotated[
+    bool, typer.Option("--no-rays", help="Ideal H and perfect rendering only: Eq. 5 in closed form, without any rays.")
+]
 Candidates = Annotated[
     str, typer.Option("--candidates", metavar="1/M,...", help="Magnifications; dots continue the step before.")
 ]
@@ -27,15 +31,16 @@ def predict(
     lens: Lenses = "",
     sweep: Sweeps = None,
     folder: SweepFolder = None,
+    no_rays: NoRays = False,
     as_json: Json = False,
 ) -> None:
     """Predict the error, the rank and the null space of H.
 
-    From Eq. 5 and the ideal model: nothing is rendered.
+    From Eq. 5 and a few rays: no picture is rendered.
     """
     asked = options.changes(sets), options.lens_names(lens)
     if sweep:
-        _predict_sweep(scene, sweep, folder, *asked, as_json)
+        _predict_sweep(scene, sweep, folder, *asked, not no_rays, as_json)
         return
     if folder is not None:
         raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
@@ -44,7 +49,7 @@ def predict(
     from ommatid.scenes.scene import read
 
     described = read(scene, *asked)
-    prediction, light = predict_with_light(described)
+    prediction, light = predict_with_light(described, rays=not no_rays)
     sections = prediction_sections(described, prediction, light)
     output.print_result(describe_prediction(prediction, light), sections, as_json)
 
@@ -73,12 +78,19 @@ def design(
 
 
 def _predict_sweep(
-    scene: Path, sweep: list[str], folder: Path | None, changes: tuple[str, ...], lenses: tuple[str, ...], as_json: bool
+    scene: Path,
+    sweep: list[str],
+    folder: Path | None,
+    changes: tuple[str, ...],
+    lenses: tuple[str, ...],
+    rays: bool,
+    as_json: bool,
 ) -> None:
     from ommatid.pipeline import stages
     from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
 
     members = batch_members([scene], Path(), sweep, changes, lenses)
-    batch = scene_batch(changes, lenses, stages.predict_scene, output.observer, lambda _, description: description)
+    predicted = partial(stages.predict_scene, rays=rays)
+    batch = scene_batch(changes, lenses, predicted, output.observer, lambda _, description: description)
     outcome = run_batch(batch, members, failures.report, sweep_folder=folder, with_folders=False)
     finish_batch(outcome, as_json)

@@ -10,7 +10,7 @@ from typing import Any
 
 from ommatid.analysis import design, summary
 from ommatid.analysis.design import DesignCandidate
-from ommatid.analysis.predict import electrons, optics, predict_scene
+from ommatid.analysis.predict import electrons, optics, predict_ideal, predict_scene
 from ommatid.analysis.prediction_table import json_of
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.prediction import Prediction
@@ -47,13 +47,14 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
     return summary.describe(setup, variant.choose(scene.render.variant), choice, lens_optics, light)
 
 
-def predict_with_light(scene: Scene) -> tuple[Prediction, dict[str, Any] | None]:
+def predict_with_light(scene: Scene, rays: bool = True) -> tuple[Prediction, dict[str, Any] | None]:
     """Predict the error of a scene and the electrons that its pixels collect, None without a sensor.
 
+    rays : False for the ideal H in closed form alone
     Raises InputError that names the scene file.
     """
     with naming_source(scene.source):
-        return predict_scene(scene), electrons(Setup.from_scene(scene))
+        return predict_scene(scene, rays), electrons(Setup.from_scene(scene))
 
 
 def describe_prediction(prediction: Prediction, light: dict[str, Any] | None) -> dict[str, Any]:
@@ -64,12 +65,12 @@ def describe_prediction(prediction: Prediction, light: dict[str, Any] | None) ->
 def compare_lens_types(
     scene: Scene, magnifications: Sequence[Fraction], progress: Progress = no_progress
 ) -> DesignComparison:
-    """Predict the error of the scene with one more lens type of each magnification."""
-    before = predict_scene(scene)
+    """Predict the error of the scene with one more lens type of each magnification, with the ideal H."""
+    before = predict_ideal(scene)
     candidates: list[DesignCandidate] = []
     for index, magnification in enumerate(magnifications):
         try:
-            expected = predict_scene(design.with_lens(scene, magnification))
+            expected = predict_ideal(design.with_lens(scene, magnification))
             candidates.append(DesignCandidate(str(magnification), expected))
         except InputError as error:
             reason = str(error).removeprefix(f"{scene.source}: ")

@@ -38,7 +38,13 @@ def scene_sections(description: dict[str, Any]) -> list[Section]:
 def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:
     """Tabulate a prediction, and the electrons that the pixels collect where the scene has a sensor."""
     lines, tolerance = prediction_table.rows(prediction), scene.camera.tolerance
-    if tolerance is not None and prediction.misalignment is None and scene.estimator.misalignment == "trust":
+    ideal_alone = prediction.budget is None
+    if (
+        ideal_alone
+        and tolerance is not None
+        and prediction.misalignment is None
+        and scene.estimator.misalignment == "trust"
+    ):
         lines.append(("misalignment", "not included; it is predicted for small targets and sharp lenses only"))
     return [(scene.title or scene.source.stem, lines), *_light_sections({"light": light} if light else {})]
 

@@ -115,14 +115,14 @@ def render(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     return {"sub_images": len(setup.camera.sub_imagers), **stack.record}
 
 
-def predict_scene(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+def predict_scene(setup: Setup, folder: Path, observer: RunObserver, rays: bool = True) -> dict[str, Any]:
     """Predict the error of a scene of a sweep, without rendering or writing anything."""
     from ommatid.analysis.predict import predict_scene
     from ommatid.analysis.prediction_table import json_of
 
     del folder, observer
     with naming_source(setup.scene.source):
-        return json_of(predict_scene(setup.scene))
+        return json_of(predict_scene(setup.scene, rays))
 
 
 def calibrated_model(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:

@@ -20,6 +20,7 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 
+from ..gram import gram
 from ..prior import Prior, lag_distances, stationary_matrix
 
 OUTSIDE = 1e-6  # share of a measurement's footprint that may lie outside its tile
@@ -131,7 +132,7 @@ class Evidence:
 
     def _normal_matrix(self, weights: FloatArray) -> FloatArray:
         """Return H^T diag(weights) H: (N, N)."""
-        return np.asarray((self.matrix.T @ sparse.csr_array(self.matrix.multiply(weights[:, None]))).toarray())
+        return gram(self.matrix, weights)
 
 
 def _dense(root: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 
+from ..gram import gram
 from ..problem import Problem
 from .cholesky import Factor, factorise_positive
 from .form import Form
@@ -52,7 +53,7 @@ def covariance(problem: Problem) -> Covariance:
     """Factorise in covariance form. Raises NotSolvableError if the matrix is not positive definite in float64."""
     if problem.prior.independent:
         scaled = sparse.csr_array(problem.matrix.multiply(problem.prior.root[None, :]))
-        matrix = np.asarray((scaled @ scaled.T).toarray())
+        matrix = gram(sparse.csr_array(scaled.T))
     else:
         dense = problem.dense_matrix()
         matrix = dense @ dense.T

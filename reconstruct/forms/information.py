@@ -16,6 +16,7 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 
+from ..gram import gram
 from ..problem import Problem
 from .cholesky import Factor, factorise_positive
 from .form import Form, NotSolvableError, check_noise, multipliers, whitened_matrix
@@ -60,7 +61,7 @@ def information(problem: Problem) -> Information:
     if problem.prior.independent:
         scaled = sparse.csr_array(problem.matrix.multiply(1 / problem.deviation[:, None]))
         scaled = sparse.csr_array(scaled.multiply(problem.prior.root[None, :]))
-        normal = np.asarray((scaled.T @ scaled).toarray())
+        normal = gram(scaled)
     else:
         whitened = whitened_matrix(problem)
         normal = whitened.T @ whitened

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from math import ceil
 from typing import Any, cast
 
 import numpy as np
@@ -28,9 +29,10 @@ from ..methods.method import (
     residual_multipliers,
     total_variance,
 )
+from .banded_system import BandedSystem, serves
 from .conjugate_gradients import FrameSystem, Solution
 from .preconditioner import Preconditioner, is_sliding
-from .selected_inverse import frame_variances
+from .selected_inverse import frame_variances, whole_variances
 from .variance_map import (
     VarianceMap,
     posterior_variance,
@@ -40,6 +42,7 @@ from .variance_map import (
     variance_map,
 )
 
+NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 SEED = 20260401  # of random images of the error analysis, different from those of data and calibration
 MANY = 250_000  # pixels above which exact variances and more than a few probes take too long
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
@@ -52,13 +55,15 @@ class FrameMethod(Method):
     """Estimation of all pixels at once by conjugate gradients."""
 
     def __init__(self, task: EstimationTask, execution: Execution) -> None:
-        """Raises InputError if the camera is not shift-invariant or a measurement has no noise."""
+        """Raises InputError if the camera is not shift-invariant and too large, or a measurement has no noise."""
         super().__init__(task, execution)
+        self._banded = serves(task.model.camera, task.prior.kind == "independent")
         for lens_type in task.model.camera.types:
-            if not is_sliding(lens_type):
+            if not (self._banded or is_sliding(lens_type)):
                 raise InputError(
                     f"estimator.method 'frame': lens type '{lens_type.name}' is no array of m x m sub-imagers with"
-                    " step 1 and magnification 1/m; set estimator.method = 'tiles'"
+                    " step 1 and magnification 1/m, and the frame is too large for another solver, or its prior"
+                    " correlated; set estimator.method = 'tiles'"
                 )
         if not (task.expected_noise > 0).all():
             raise InputError(
@@ -73,7 +78,10 @@ class FrameMethod(Method):
             weights = np.broadcast_to(1 / task.expected_noise[:1], task.expected_noise.shape)
         else:
             weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
-        return FrameSystem(task.model.camera, _without_matrix(task.model), weights, task.precision_on(task.shape))
+        camera, prior, observation = task.model.camera, task.precision_on(task.shape), _without_matrix(task.model)
+        if self._banded:
+            return BandedSystem(camera, observation, weights, prior, task.model.matrix)
+        return FrameSystem(camera, observation, weights, prior)
 
     @cached_property
     def solution(self) -> Solution:
@@ -104,7 +112,7 @@ class FrameMethod(Method):
         given = None if truth is None else self._interval(truth - task.prior.mean, actual, expected, map_error)
         solver = Solver(
             method="frame",
-            why="every lens type is shift-invariant except at the edges",
+            why=NULL_SPACE if self._banded else "every lens type is shift-invariant except at the edges",
             condition=solution.condition,
             variance_bound=map_error,
             bound=solution.bound,
@@ -136,6 +144,8 @@ class FrameMethod(Method):
         return readings if self.task.complete else readings[self.task.used]
 
     def _variances(self, noise: dict[str, FloatArray]) -> VarianceMap:
+        if self._banded:
+            return self._exact_variances(total_variance(noise))
         uniform = self._is_uniform(noise)
         if not uniform and self.task.model.unknowns <= MANY and isinstance(self.system.prior, float):
             return self._exact_variances(total_variance(noise))
@@ -149,7 +159,7 @@ class FrameMethod(Method):
     def _exact_variances(self, actual: FloatArray) -> VarianceMap:
         """Variances for any H and noise, pixel by pixel, from strips of the frame."""
         task, weights, prior = self.task, self.system.weights, float(np.asarray(self.system.prior))
-        widest = max(int(lens_type.ratio) for lens_type in task.model.camera.types)
+        widest = max(ceil(lens_type.ratio) for lens_type in task.model.camera.types)
         information = _gram(task.model.matrix, weights)
         as_expected = np.allclose(actual, task.expected_noise, rtol=1e-12)
         largest = float(np.max(actual / task.expected_noise)) or 1.0
@@ -162,7 +172,10 @@ class FrameMethod(Method):
             precision += (1 + by_prior) * prior * sparse.eye_array(information.shape[0])
             if by_noise:
                 precision += by_noise * cast(Any, noise_gram)
-            return frame_variances(sparse.csr_array(precision), task.shape, task.model.reach - 1, HALO * widest)
+            reach = task.model.reach - 1
+            if self._banded:
+                return whole_variances(sparse.csr_array(precision), task.shape, reach)
+            return frame_variances(sparse.csr_array(precision), task.shape, reach, HALO * widest)
 
         variances = variance_map(perturbed, noise_as_expected=as_expected)
         return variances if as_expected else replace(variances, noisy=largest * variances.noisy)

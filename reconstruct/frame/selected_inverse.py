@@ -61,6 +61,16 @@ def frame_variances(precision: sparse.csr_array, shape: tuple[int, int], reach: 
     return variance
 
 
+def whole_variances(precision: sparse.csr_array, shape: tuple[int, int], reach: int) -> FloatArray:
+    """Return the same from one strip, for errors that are correlated over any distance."""
+    numbers: NDArray[np.intp] = np.arange(shape[0] * shape[1]).reshape(shape)
+    upright = shape[1] <= shape[0]
+    ordered = numbers if upright else numbers.T
+    with one_thread():
+        variances = _strip_variances(precision, ordered, slice(0, ordered.shape[1]), reach, 0)
+    return variances if upright else variances.T
+
+
 def _strip_variances(
     precision: sparse.csr_array, numbers: NDArray[np.intp], core: slice, reach: int, halo: int
 ) -> FloatArray:

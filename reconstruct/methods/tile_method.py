@@ -18,6 +18,7 @@ from ommatid.runtime.processors import one_thread, processors
 from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, interval
 from .method import Method, MethodResult, is_uniform, residual_multipliers, total_variance
+from .tile_cost import tile_cost, words
 from .tile_solver import (
     SolvedTiles,
     Tile,
@@ -60,10 +61,11 @@ class TileMethod(Method):
                 parts = {name: part + share * solved.parts[name] for name, part in parts.items()}
                 sums += 0.0 if solved.given is None else solved.given[:, index]
         self.image = image.ravel()
+        cost = tile_cost(task, variance) if np.allclose(total_variance(noise), task.expected_noise, rtol=1e-9) else None
         return MethodResult(
             self.image,
             residual_multipliers(task, self.image),
-            _worst([solved.solver for solved in results], len(groups)),
+            _worst([solved.solver for solved in results], len(groups), words(cost)),
             ExpectedError(variance.ravel(), missing, parts, resolved.ravel()),
             None if truth is None else interval(float(sums[0]), float(sums[1]), image.size),
             lambda weights: self._variance_of_sum(weights, total_variance(noise)),
@@ -142,8 +144,8 @@ class TileMethod(Method):
         return task.prior_variance_of_sum(unexplained) + float(actual @ np.square(gain))
 
 
-def _worst(solvers: list[Solver], factorisations: int) -> Solver:
+def _worst(solvers: list[Solver], factorisations: int, cost: str) -> Solver:
     worst = max(solvers, key=lambda solver: max(solver.bound or 0.0, solver.variance_bound))
     condition = max(solver.condition for solver in solvers)
-    why = f"each tile separately, {factorisations} factorisations"
+    why = f"each tile separately, {factorisations} factorisations{cost}"
     return replace(worst, method=f"tiles, {worst.method}", why=why, condition=condition)

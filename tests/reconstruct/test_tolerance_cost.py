@@ -62,7 +62,7 @@ def test_the_cost_falls_with_the_tolerance() -> None:
 
 def test_predict_includes_the_cost(tmp_path: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    tile = (GALLERY / "tile19.toml", "--set", "noise.variance=1e-2")
+    tile = (GALLERY / "tile19.toml", "--no-rays", "--set", "noise.variance=1e-2")
     strict = document(ommatid("predict", *tile, "--json"))
     loose = document(ommatid("predict", *tile, "--set", 'camera.tolerance.position="10 nm"', "--json"))
     assert "misalignment" not in strict
@@ -82,12 +82,12 @@ def test_predict_with_saturated_pixels_and_with_blurred_lenses(ommatid: Command)
     loose = ("--set", 'camera.tolerance.position="10 nm"')
     aperture = [part for name in ["I", "II", "III"] for part in ("--set", f'camera.lens.{name}.aperture="0.4 mm"')]
     sensor = ("--set", "noise=", "--set", 'sensor.illuminance="500 lux"', "--set", 'sensor.exposure="10 ms"')
-    bright = document(ommatid("predict", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
+    bright = document(ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
     assert bright["measurements"] < 706
     assert bright["misalignment"] > 0
-    lens = ommatid("predict", GALLERY / "doublet.toml", *loose)
+    lens = ommatid("predict", "--no-rays", GALLERY / "doublet.toml", *loose)
     assert lens.code == 0
     assert "not included" in lens.out
-    assert "not included" not in ommatid("predict", GALLERY / "tile19.toml", *loose).out
+    assert "not included" not in ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *loose).out
     ranked = document(ommatid("design", GALLERY / "tile19.toml", *aperture, *sensor, "--candidates", "1/2", "--json"))
     assert ranked["candidates"][0]["expected"] is not None, "the added type has the aperture of the others"

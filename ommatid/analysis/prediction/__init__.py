@@ -1,0 +1,1 @@
+"""Prediction of a run before anything is rendered: its recording, its H, and the error that they leave."""

@@ -1,0 +1,197 @@
+"""The recording that a scene would give, from H and a pilot's rays instead of a rendering.
+
+Its values are H f with noise of every cause: the rendering's, whose variance a pilot shows, and the sensor's. It is
+reconstructed like any other stack, so that a prediction knows of everything that a run does. Its seeds are its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
+from ommatid.reconstruct.prior import prior_of, spectrum_of
+from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import with_tables
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.adaptive_render import AIM as RENDERING_AIM
+from ommatid.simulate.adaptive_render import DONE as RENDERING_DONE
+from ommatid.simulate.calibration import pilot
+from ommatid.simulate.calibration.adaptive_rounds import AIM, DONE
+from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
+from ommatid.simulate.noise_target import SHARE, allowed_variance, check_noise_target
+from ommatid.simulate.render import exposed
+from ommatid.simulate.sampling.passes import rounding_variance
+from ommatid.simulate.sampling.seeds import repeat_seed
+
+from ..calibration_goal import for_stack
+
+Assumptions = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PredictedRecording:
+    """A recording of a known image, and the model with which it is to be reconstructed.
+
+    true : (M, N) H of the camera that records, None where the model's is the same or a calibration of it
+    certain : H without the errors of a calibration, whose rank is the camera's
+    truth : (N,) the scene's picture, None where it has none that can be read and the image is a draw of the prior
+    """
+
+    stack: Stack
+    model: Model
+    true: sparse.csr_array | None
+    certain: Model
+    image: FloatArray
+    truth: FloatArray | None
+    assumes: Assumptions
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """H of the camera that records, and the uncertainty of a calibration of it, None without one."""
+
+    model: Model
+    pilot: pilot.Pilot | None
+    assumes: Assumptions
+
+
+def predicted_recording(setup: Setup) -> PredictedRecording:
+    """Return the recording that a run of this scene would give, and its model of H.
+
+    Raises InputError where only Mitsuba's scalar backend works.
+    """
+    setup = _with_own_seed(setup)
+    truth, said = known_image(setup)
+    image = _prior_draw(setup) if truth is None else truth
+    camera = _camera(setup)
+    variance, said_of_light = _rendering_variance(setup, camera, image)
+    rng = np.random.default_rng(setup.scene.render.seed)
+    light = camera.model.forward(image)
+    light = light + rng.normal(size=light.size) * np.sqrt(variance)
+    light = np.maximum(light, 0.0) if setup.scene.sensor is not None else light
+    stack = exposed(setup, light, variance, {})
+    assumes = (*said, *camera.assumes, *said_of_light)
+    if setup.scene.calibration.method == "ideal":
+        same = camera.model.is_exact
+        designed = camera.model if same else ideal_model(setup.scene, setup.camera)
+        true = None if same or not _differs(camera.model, designed) else camera.model.matrix
+        return PredictedRecording(stack, designed, true, designed, image, truth, assumes)
+    model, said_of_model = _calibrated(setup, camera, stack)
+    return PredictedRecording(stack, model, None, camera.model, image, truth, (*assumes, *said_of_model))
+
+
+def known_image(setup: Setup) -> tuple[FloatArray | None, Assumptions]:
+    """Return the scene's picture, (N,), None where there is none to read, and the assumption made in its place."""
+    world = ("the world is flat, and the target's plane is all of it",) if setup.scene.world is not None else ()
+    drawn = "light and contrast of an image drawn from the prior"
+    if setup.scene.target.image is None:
+        return None, (*world, f"{drawn}, since the target has no picture")
+    try:
+        return setup.image.astype(np.float32).astype(np.float64).ravel(), world
+    except InputError:
+        return None, (*world, f"{drawn}, since the target's picture cannot be read")
+
+
+def _with_own_seed(setup: Setup) -> Setup:
+    render = setup.scene.render
+    render = render.model_copy(update={"seed": repeat_seed(render.seed, "prediction", 0)})
+    return replace(setup, scene=with_tables(setup.scene, render=render))
+
+
+def _prior_draw(setup: Setup) -> FloatArray:
+    """Return an image drawn from the prior, (N,); of a prior that is to be fitted, with independent pixels."""
+    scene, camera = setup.scene, setup.camera
+    random = np.random.default_rng(scene.render.seed + 1).normal(size=camera.unknowns)
+    table = scene.prior
+    if table.kind in ("independent", "fit"):
+        image = table.variance**0.5 * random
+    elif camera.unknowns <= MAX_DENSE_PIXELS:
+        image = prior_of(table, camera.shape, camera.target_pitch).apply_root(random)
+    else:
+        from scipy import fft
+
+        waves = np.sqrt(spectrum_of(table, camera.shape, camera.target_pitch)) * random.reshape(camera.shape)
+        image = np.asarray(fft.idctn(waves, 2, norm="ortho")).ravel()
+    image = image + table.mean
+    return np.maximum(image, 0.0) if scene.sensor is not None else image
+
+
+def _camera(setup: Setup) -> _Camera:
+    """Return H of the camera that records: in closed form, or where it has none from a pilot."""
+    scene, simulated = setup.scene, setup.simulated
+    calibrated = scene.calibration.method != "ideal"
+    if setup.has_structured_matrix and setup.has_closed_form and simulated.tolerance is None:
+        return _Camera(ideal_model(scene, setup.camera), None, ())
+    plans = pilot.calibration_plans(setup)
+    uncertain = pilot.pilot(setup, plans, fit=True) if calibrated else None
+    assumes = _extrapolation("H", uncertain is not None and uncertain.extrapolated)
+    if setup.has_closed_form:
+        matrix = true_matrix(simulated)
+    else:
+        matrix = _traced_matrix(setup, uncertain, plans)
+        assumes = (*assumes, "H of lenses without a closed form is that of a pilot's rays")
+    model = exact_model(scene, setup.camera, matrix, "ideal" if simulated.is_ideal_pinhole else "true")
+    return _Camera(model, uncertain, assumes)
+
+
+def _traced_matrix(setup: Setup, uncertain: pilot.Pilot | None, plans: pilot.Plans) -> sparse.csr_array:
+    """Return H by a pilot of as many rays as are affordable; `uncertain`, of `plans`, serves where it has as many."""
+    best = pilot.best_plans(setup, plans if uncertain is not None else pilot.rendering_plans(setup))
+    if uncertain is not None and best == plans and setup.scene.calibration.fit is None:
+        return uncertain.model.matrix
+    return pilot.pilot(setup, best).model.matrix
+
+
+def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Assumptions]:
+    """Return the true H with the uncertainty that the scene's calibration leaves."""
+    if camera.pilot is None:
+        raise ValueError("expected a scene whose H is calibrated, got one with the ideal H")
+    true = camera.model.matrix
+    model = camera.pilot.around(true)
+    model = replace(model, record={**model.record, "method": setup.scene.calibration.method})
+    if setup.scene.calibration.samples != "auto":
+        return model, ()
+    adds = for_stack(stack).added_error(model)
+    said = (
+        f"the uncertainty of H adds {100 * min(adds, AIM):.2g} %, which calibration.samples 'auto' aims at or finds",
+    )
+    if adds <= DONE:
+        return model, said
+    return replace(camera.pilot.around(true, AIM / adds), record=model.record), said
+
+
+def _rendering_variance(setup: Setup, camera: _Camera, image: FloatArray) -> tuple[FloatArray, Assumptions]:
+    """Return the variance of the rendered light, (M,)."""
+    scene, plans = setup.scene, pilot.rendering_plans(setup)
+    same = camera.pilot is not None and plans == pilot.calibration_plans(setup) and scene.calibration.fit is None
+    traced = camera.pilot if same and camera.pilot is not None else pilot.pilot(setup, plans)
+    light = camera.model.forward(image)
+    floor = rounding_variance(light, max(work.samples for work in plans.values()))
+    variance = np.maximum(traced.rendering_variance(image), floor)
+    said = _extrapolation("the rendering", traced.extrapolated)
+    if scene.render.samples != "auto":
+        return variance, said
+    check_noise_target(scene)
+    allowed = np.nan_to_num(allowed_variance(setup)(light))
+    variance = np.where(variance > RENDERING_DONE * allowed, np.maximum(RENDERING_AIM * allowed, floor), variance)
+    aim = (
+        f"the rendering's variance is {RENDERING_AIM * SHARE:g} of the sensor's or less, as render.samples 'auto' plans"
+    )
+    return variance, (*said, aim)
+
+
+def _extrapolation(what: str, extrapolated: bool) -> Assumptions:
+    return (f"the variance of {what} is extrapolated from fewer samples",) if extrapolated else ()
+
+
+def _differs(model: Model, other: Model) -> bool:
+    if model.stored is None or other.stored is None:
+        return False
+    difference = sparse.csr_array(model.stored - other.stored)
+    return bool(np.abs(difference.data).max(initial=0.0) > 1e-12)

@@ -1,0 +1,185 @@
+"""The error that a run of a scene will have, from the recording that it would give.
+
+The recording is reconstructed as a run's is, with the same choice of methods, prior and noise. Where the estimator's H
+is not that of the camera which records, Eq. 5 gains what the difference brings: on average over assemblies within
+camera.tolerance, or of the lenses as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ommatid.reconstruct.assumptions import Assumptions, assumptions_for, with_fallback
+from ommatid.reconstruct.measured_error import TRIM, trimmed_mean
+from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS, METHODS, MethodChoice
+from ommatid.reconstruct.methods.dense_method import DenseMethod
+from ommatid.reconstruct.methods.method import Execution, MethodResult
+from ommatid.reconstruct.misalignment.robust_noise import CAUSE, MisalignmentNoise, robust_noise
+from ommatid.reconstruct.misalignment.tolerance_cost import mismatch_of_image, mismatch_variance
+from ommatid.reconstruct.prediction import Prediction, median_width, observability
+from ommatid.reconstruct.prior import Prior
+from ommatid.reconstruct.restore import BUDGET
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.scene import with_tables
+from ommatid.scenes.setup import Setup
+
+from .recording import PredictedRecording, predicted_recording
+
+MODEL = "model"  # in the budget: H as designed is not that of the lenses
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """A reconstruction of the predicted recording."""
+
+    choice: MethodChoice
+    assumed: Assumptions
+    result: MethodResult
+
+
+@dataclass(frozen=True)
+class _Mismatch:
+    """What the difference between the camera's H and the estimator's adds.
+
+    variance : (N,) to Eq. 5;  of_picture : mean over the pixels of the picture's, None without one
+    """
+
+    cause: str
+    variance: FloatArray
+    of_picture: float | None
+    assumes: tuple[str, ...]
+
+
+def predict_run(setup: Setup) -> Prediction:
+    """Predict what a run of a scene states and measures. Raises InputError as a run does."""
+    recording = predicted_recording(setup)
+    outcome = _reconstructed(recording)
+    prediction = _prediction(setup, recording, outcome)
+    if setup.camera.tolerance is None or not setup.camera.has_sharp_footprints or not _dense(outcome):
+        return prediction
+    return replace(
+        prediction,
+        as_designed=_mse_with(setup, "ideal", prediction),
+        calibrated=_mse_with(setup, "transport", prediction),
+    )
+
+
+def _mse_with(setup: Setup, method: str, prediction: Prediction) -> float:
+    """Return the error with H as designed or calibrated, of an estimator that takes it for exact."""
+    scene = setup.scene
+    asked = scene.calibration.method == "ideal"
+    if asked == (method == "ideal") and scene.estimator.misalignment == "trust":
+        return prediction.mse
+    calibration = scene.calibration.model_copy(
+        update={"method": method, **({"fit": None} if method == "ideal" else {})}
+    )
+    estimator = scene.estimator.model_copy(update={"misalignment": "trust"})
+    changed = replace(setup, scene=with_tables(scene, calibration=calibration, estimator=estimator))
+    recording = predicted_recording(changed)
+    return _prediction(changed, recording, _reconstructed(recording)).mse
+
+
+def _reconstructed(recording: PredictedRecording) -> _Outcome:
+    stack, model = recording.stack, recording.model
+
+    def work(choice: MethodChoice) -> _Outcome:
+        assumed = assumptions_for(stack, model, choice, Execution())
+        return _Outcome(choice, assumed, assumed.method.result(assumed.noise, recording.truth))
+
+    return with_fallback(stack, model, work)
+
+
+def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) -> Prediction:
+    expected, given, camera = outcome.result.expected, outcome.result.interval, setup.camera
+    mismatch = _mismatch(setup, recording, outcome)
+    variance = expected.variance if mismatch is None else expected.variance + mismatch.variance
+    parts = {"null_space": expected.missing, **expected.parts}
+    budget = {name: parts.get(name, 0.0) for name in BUDGET} | parts
+    if mismatch is not None:
+        budget[mismatch.cause] = float(mismatch.variance.mean())
+    seen = None
+    if camera.unknowns <= MAX_DENSE_PIXELS and outcome.choice.method != "robust":
+        seen = observability(recording.certain.matrix[outcome.assumed.usable.used])
+    return Prediction(
+        measurements=int(outcome.assumed.usable.used.sum()),
+        unknowns=camera.unknowns,
+        rank=None if seen is None else seen.rank,
+        null_space=None if seen is None else seen.null_space,
+        condition=None if seen is None else seen.condition,
+        mse=float(variance.mean()),
+        trimmed_mse=trimmed_mean(variance, camera.shape),
+        trim=TRIM,
+        degrees_of_freedom=expected.degrees_of_freedom,
+        resolution=median_width(expected.resolved),
+        method=outcome.result.solver.method,
+        misalignment=budget.get(CAUSE),
+        prior_variance=outcome.assumed.prior.variance,
+        mse_for_picture=None if given is None else given.mse + (mismatch.of_picture or 0.0 if mismatch else 0.0),
+        interval=None if given is None or mismatch is not None else (given.low, given.high),
+        budget=budget,
+        assumes=(*recording.assumes, *(() if mismatch is None else mismatch.assumes), *_world(setup)),
+    )
+
+
+def _world(setup: Setup) -> tuple[str, ...]:
+    """Return the assumption on detail finer than f, where sensor pixels do not cover whole pixels of f."""
+    camera = setup.simulated
+    whole = camera.is_ideal_pinhole and all(
+        lens_type.ratio.denominator == 1 and all(first.denominator == 1 for first in lens_type.origin)
+        for lens_type in camera.types
+    )
+    return () if whole else ("the world is made of f's pixels",)
+
+
+def _dense(outcome: _Outcome) -> bool:
+    return isinstance(outcome.assumed.method, DenseMethod)
+
+
+def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) -> _Mismatch | None:
+    """Return what the camera's deviation from the estimator's H brings; None where there is none."""
+    if recording.true is None or setup.scene.estimator.misalignment != "trust":
+        return None
+    method = outcome.assumed.method
+    if not isinstance(method, DenseMethod):
+        return _mismatch_of_images(recording, outcome, _cause(setup.camera))
+    camera, prior, used = setup.camera, method.task.prior_on(setup.camera.shape), outcome.assumed.usable.used
+    form, slices = method.estimate.form, setup.camera.slices()
+    averaged = camera.tolerance is not None and camera.has_sharp_footprints
+    of_picture = None
+    if recording.truth is not None:
+        image = Prior(recording.truth, np.zeros(camera.unknowns))
+        moments = robust_noise(camera, image) if averaged else MisalignmentNoise(recording.true, ())
+        of_picture = float(mismatch_of_image(form, used, moments, slices, recording.truth).mean())
+    moments = robust_noise(camera, prior) if averaged else MisalignmentNoise(recording.true, ())
+    variance = mismatch_variance(form, used, moments, slices, prior)
+    said = "H as designed; the error is the mean over assemblies within camera.tolerance"
+    if not averaged:
+        said = "H as designed; the error is that of these lenses, for an estimator that does not know them"
+    return _Mismatch(_cause(camera), variance, of_picture, (said,))
+
+
+def _cause(camera: Camera) -> str:
+    return MODEL if camera.tolerance is None else CAUSE
+
+
+def _mismatch_of_images(recording: PredictedRecording, outcome: _Outcome, cause: str) -> _Mismatch:
+    """Return the same of a frame, from the error of noiseless readings of the image by the true H.
+
+    Their estimate is off by the expected error of the image less that by noise.
+    """
+    if recording.true is None:
+        raise ValueError("expected a camera whose H differs from the estimator's, got one that it knows")
+    task = outcome.assumed.method.task
+    image = recording.image
+    readings = {"true": recording.true @ image, "designed": recording.model.forward(image)}
+    errors = {
+        name: np.square(METHODS[outcome.choice.method](replace(task, recorded=values), Execution()).image - image)
+        for name, values in readings.items()
+    }
+    added = errors["true"] - errors["designed"]
+    said = "H as designed; the error is that of one image and of the assembly that camera.tolerance draws"
+    of_picture = None if recording.truth is None else float(added.mean())
+    return _Mismatch(cause, np.broadcast_to(added.mean(), image.shape), of_picture, (said,))

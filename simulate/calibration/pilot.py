@@ -1,0 +1,186 @@
+"""A pilot: how uncertain a calibration leaves H, and a rendering its light, with given samples, from few rays.
+
+Rays are traced as for a calibration by transport, with seeds that neither data nor calibration uses, on the same grids
+of samples but in fewer passes: what n passes leave is 1/n of the variance of one. Where that is still too much work the
+grids are smaller, and variances are extrapolated. A rendering with as many samples has the same law as a calibration:
+the reading of a pass is the row of H of that pass, applied to the picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import with_tables
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.shrinkage import shrink_variances
+
+from ..adaptive_render import EXPONENTS, STRATIFIED
+from ..renderer.variant import choose, unusable_reason
+from ..sampling.passes import BATCHES, MOST_SAMPLES, Plan, cells_of, on_grid, plan
+from ..sampling.samplers import fitting
+from ..sampling.seeds import repeat_seed
+from .adaptive_rounds import LEAST, plans_of
+from .entries import rendered_model
+from .point_sources import Plans
+
+MOST_RAYS = 2**26  # of a pilot: some seconds
+FEWEST_SAMPLES = 16  # per pixel in a pass
+MOST_PER_PIXEL = 2**16  # samples of a pilot for H itself
+SCALAR = "only Mitsuba's scalar backend works here, which traces no single rays"
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """H by a pilot.
+
+    factor : (M,) variances with all samples of its plans, relative to those of the pilot
+    extrapolated : True if these follow from fewer samples per pass
+    """
+
+    model: Model
+    factor: FloatArray
+    extrapolated: bool
+
+    def rendering_variance(self, image: FloatArray) -> FloatArray:
+        """Return the variance of an image's rendering, (N,), with all samples: (M,), shrunk as a rendering's is.
+
+        It counts the rays that miss the target too, whose number is part of a reading's error.
+        """
+        model, count = self.model, len(self.model.batches)
+        rows = np.repeat(np.arange(model.measurements), np.diff(model.matrix.indptr))
+        seen = image[model.matrix.indices]
+        scatter = np.zeros(model.measurements)
+        for batch in model.batches:
+            scatter += np.square(np.bincount(rows, weights=batch * seen, minlength=model.measurements))
+        scatter /= count * (count - 1)
+        shrunk = [shrink_variances(scatter[pixels], count) for pixels in model.camera.slices()]
+        return self.factor * np.concatenate(shrunk)
+
+    def around(self, matrix: sparse.csr_array, factor: float = 1.0) -> Model:
+        """Return an H that deviates from the true one as H by all samples does, with the variances of its entries.
+
+        matrix : (M, N) the true H;  factor : on the variances, of yet other numbers of samples
+        An estimator that takes it for exact errs as one does that takes a calibrated H; noise added to the readings of
+        the true H would be another error.
+        """
+        model, columns = self.model, self.model.unknowns
+        old, new = _cells(model.matrix, columns), _cells(matrix, columns)
+        cells = np.sort(np.concatenate([old, new]))
+        cells = cells[np.concatenate([[True], np.diff(cells) > 0])]
+        at_old, at_new = np.searchsorted(cells, old), np.searchsorted(cells, new)
+        row, column = np.divmod(cells, columns)
+        scale = factor * self.factor[row]
+        data, variance = np.zeros(cells.size), np.zeros(cells.size)
+        data[at_old] = model.matrix.data
+        data[at_new] -= matrix.data
+        data *= np.sqrt(scale)
+        data[at_new] += matrix.data
+        variance[at_old] = model.variance
+        batches: Float32Array = np.zeros((len(model.batches), cells.size), dtype=np.float32)
+        batches[:, at_old] = model.batches
+        batches *= np.sqrt(scale).astype(np.float32)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=matrix.shape[0]))])
+        joined = sparse.csr_array((data, column, starts), shape=matrix.shape)
+        return replace(model, stored=joined, variance=variance * scale, batches=batches)
+
+
+def reason_against(setup: Setup) -> str:
+    """Return why no pilot can be traced here, or ""."""
+    if choose("auto").startswith("scalar"):
+        return SCALAR
+    if setup.camera.measurements * BATCHES * FEWEST_SAMPLES > 2 * MOST_RAYS:
+        return f"{setup.camera.measurements} sensor pixels are too many for a pilot"
+    return ""
+
+
+def calibration_plans(setup: Setup) -> Plans:
+    """Return the samples that the scene's calibration takes, by lens type; of "auto" those of its first round."""
+    scene = setup.scene
+    if scene.calibration.samples == "auto":
+        return plans_of(setup, LEAST, float64=True)
+    work = plan(scene.calibration.samples, scene.render.sampler)
+    return {lens_type.name: work for lens_type in setup.camera.types}
+
+
+def rendering_plans(setup: Setup) -> Plans:
+    """Return the samples that the scene's rendering takes, by lens type; of "auto" those of its first round."""
+    render = setup.scene.render
+    if render.samples == "auto":
+        return {
+            lens_type.name: on_grid(LEAST, render.sampler, cells_of(lens_type.ratio), MOST_SAMPLES)
+            for lens_type in setup.camera.types
+        }
+    work = plan(render.samples, render.sampler)
+    return {lens_type.name: work for lens_type in setup.camera.types}
+
+
+def best_plans(setup: Setup, plans: Plans) -> Plans:
+    """Return plans for an H that is known as well as a pilot allows, at least as well as by `plans`."""
+    affordable = min(MOST_RAYS // setup.camera.measurements, MOST_PER_PIXEL)
+    work = plan(max(affordable, LEAST), setup.scene.render.sampler)
+    return {name: work if work.total > wanted.total else wanted for name, wanted in plans.items()}
+
+
+def pilot(setup: Setup, plans: Plans, fit: bool = False) -> Pilot:
+    """Trace a pilot for the samples of `plans`.
+
+    fit : True if the geometry is fitted as the scene's calibration asks
+    Raises InputError if only Mitsuba's scalar backend works.
+    """
+    scene = setup.scene
+    traced = _affordable(setup, plans)
+    calibration = scene.calibration.model_copy(
+        update={"method": "transport", "samples": max(work.total for work in traced.values())}
+        | ({} if fit else {"fit": None})
+    )
+    render = scene.render.model_copy(
+        update={"seed": repeat_seed(scene.render.seed, "pilot", 0), "variant": _fast_variant(scene.render.variant)}
+    )
+    changed = replace(setup, scene=with_tables(scene, calibration=calibration, render=render))
+    model = rendered_model(changed, plans=traced, float64=scene.calibration.samples == "auto")
+    pinholes = all(lens.optics.aperture is None and lens.optics.surfaces is None for lens in setup.simulated.types)
+    exponent = EXPONENTS.get(scene.render.sampler, STRATIFIED) if pinholes else 1.0
+    rows = np.empty(setup.camera.measurements)
+    for lens_type, pixels in zip(setup.camera.types, setup.camera.type_slices(), strict=True):
+        few, all_ = traced[lens_type.name], plans[lens_type.name]
+        rows[pixels] = few.passes / all_.passes * (few.samples / all_.samples) ** exponent
+    extrapolated = any(traced[name].samples < work.samples for name, work in plans.items())
+    return Pilot(model, rows, extrapolated)
+
+
+def _cells(matrix: sparse.csr_array, columns: int) -> IntArray:
+    """Return the positions of the entries in the flattened H, rising."""
+    matrix.sort_indices()
+    rows = np.repeat(np.arange(matrix.shape[0], dtype=np.int64), np.diff(matrix.indptr))
+    return rows * columns + matrix.indices
+
+
+def _fast_variant(requested: str) -> str:
+    """Return the scene's variant, or the fastest that works here if that traces no single rays."""
+    usable = requested != "auto" and not requested.startswith("scalar") and not unusable_reason(requested)
+    return requested if usable else choose("auto")
+
+
+def _affordable(setup: Setup, plans: Plans) -> Plans:
+    """Return the plans with the fewest passes that a model needs, and smaller grids where rays are still too many."""
+    camera, sampler = setup.camera, setup.scene.render.sampler
+    if _rays(camera, plans) <= MOST_RAYS:
+        return plans
+    fewer = {name: Plan(BATCHES, work.samples) for name, work in plans.items()}
+    share = MOST_RAYS / _rays(camera, fewer)
+    if share >= 0.5:
+        return fewer
+    return {
+        name: Plan(BATCHES, min(work.samples, fitting(sampler, max(int(share * work.samples), FEWEST_SAMPLES))))
+        for name, work in fewer.items()
+    }
+
+
+def _rays(camera: Camera, plans: Plans) -> int:
+    return sum(lens_type.measurements * plans[lens_type.name].total for lens_type in camera.types)

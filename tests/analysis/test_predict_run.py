@@ -1,0 +1,185 @@
+"""Predictions of runs: against runs, against cameras drawn at random, and what they say of themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ommatid.analysis.predict import predict_scene
+from ommatid.analysis.prediction_table import json_of, rows
+from ommatid.reconstruct.expected_error import expected_error
+from ommatid.reconstruct.forms.information import information
+from ommatid.reconstruct.misalignment.robust_noise import MisalignmentNoise, robust_noise
+from ommatid.reconstruct.misalignment.tolerance_cost import mismatch_of_image, mismatch_variance
+from ommatid.reconstruct.prior import Prior, independent
+from ommatid.reconstruct.problem import Problem
+from ommatid.reconstruct.restore import restore
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import read
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.camera import ToleranceTable
+from ommatid.simulate.calibrate import calibrate
+from ommatid.simulate.calibration import pilot
+from ommatid.simulate.ideal import ideal_matrix, true_matrix
+from ommatid.simulate.render import light, render
+
+from ..conftest import Command
+from ..examples import GALLERY, needs, tile_problem
+from ..examples import scene as described
+from ..runs import document
+
+TILE = GALLERY / "tile19.toml"
+FEW = ("noise.variance=1e-2", "render.samples=1024", "calibration.samples=1024", "calibration.method=transport")
+BLUR = tuple(f'camera.lens.{name}.aperture="0.8 mm"' for name in ("I", "II", "III"))
+DIFFRACTION = (*BLUR, 'camera.wavelength="550 nm"')
+DISTORTION = tuple(f"camera.lens.{name}.distortion=[0.05,0.02]" for name in ("I", "II", "III"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "lenses"),
+    [
+        ((), ()),
+        ((), ("I", "II")),
+        (("camera.lens.II.array=[3,4]", "camera.lens.II.pixels=fit"), ()),
+        (DIFFRACTION, ()),
+        (DISTORTION, ()),
+        (('camera.tolerance.position="1 um"',), ()),
+        (("render.samples=auto", "calibration.samples=auto"), ()),
+        (("calibration.method=ideal",), ()),
+    ],
+    ids=["three types", "two types", "odd array", "diffraction", "distortion", "misaligned", "auto", "ideal"],
+)
+def test_a_prediction_lies_in_the_interval_of_the_run(changes: tuple[str, ...], lenses: tuple[str, ...]) -> None:
+    needs("llvm_ad_mono")
+    asked = ("calibration.samples=1024", "calibration.method=ideal") if "calibration.samples=auto" in changes else ()
+    scene = read(TILE, (*FEW, *changes, *asked), lenses)
+    setup = Setup.from_scene(scene)
+    predicted = predict_scene(read(TILE, (*FEW, *changes), lenses))
+    truth = setup.image.astype(np.float32).astype(np.float64).ravel()
+    run = restore(render(setup), calibrate(setup), truth)
+    assert run.interval is not None
+    assert predicted.mse_for_picture is not None
+    assert run.interval.low < predicted.mse_for_picture < run.interval.high
+    assert predicted.budget is not None
+    assert sum(predicted.budget.values()) == pytest.approx(predicted.mse, rel=1e-9)
+
+
+def test_diffraction_with_distortion_has_no_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs("llvm_ad_mono")
+    monkeypatch.setattr(pilot, "MOST_RAYS", 2**21)
+    predicted = predict_scene(read(TILE, (*FEW, *DIFFRACTION, *DISTORTION)))
+    alone = predict_scene(read(TILE, (*FEW, *DIFFRACTION)))
+    assert any("pilot's rays" in sentence for sentence in predicted.assumes)
+    assert predicted.mse == pytest.approx(alone.mse, rel=0.5), "a little distortion changes little"
+    assert predict_scene(read(TILE, (*FEW, *DIFFRACTION)), rays=False).mse < 0.5 * alone.mse
+
+
+@pytest.mark.parametrize("changes", [(), DIFFRACTION], ids=["pinholes", "light beside the target"])
+def test_a_pilot_knows_the_variance_of_a_rendering(changes: tuple[str, ...]) -> None:
+    """Against the scatter of eight renderings: 7 x 706 degrees of freedom, but neighbours go together."""
+    needs("llvm_ad_mono")
+    values = [
+        light(Setup.from_scene(read(TILE, (*FEW, *changes, "render.samples=256", f"render.seed={seed}")))).mean
+        for seed in range(1, 9)
+    ]
+    setup = Setup.from_scene(read(TILE, (*FEW, *changes, "render.samples=256")))
+    stated = pilot.pilot(setup, pilot.rendering_plans(setup)).rendering_variance(setup.image.ravel())
+    assert stated.mean() == pytest.approx(np.var(values, axis=0, ddof=1).mean(), rel=0.1)
+
+
+def test_an_h_around_the_true_one_deviates_as_a_calibration_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With half the passes, and with fewer samples in each of them."""
+    needs("llvm_ad_mono")
+    setup = Setup.from_scene(read(TILE, FEW))
+    true, plans = ideal_matrix(setup.camera), pilot.calibration_plans(setup)
+    norms: list[float] = []
+    for most in (2**26, 600_000, 200_000):
+        monkeypatch.setattr(pilot, "MOST_RAYS", most)
+        around = pilot.pilot(setup, plans).around(true)
+        norms.append(float(np.sqrt(np.square((around.matrix - true).data).sum())))
+        assert around.variance.sum() == pytest.approx(norms[-1] ** 2, rel=0.15)
+    assert norms[1] == pytest.approx(norms[0], rel=0.1)
+    assert norms[2] == pytest.approx(norms[0], rel=0.5), "extrapolated: edges of texels do not follow a power"
+
+
+def test_an_estimator_with_the_wrong_h() -> None:
+    """By Eq. 5 with matrices: A of one H, light of another, with and without its scatter."""
+    rng = np.random.default_rng(0)
+    problem = tile_problem(2, 1.0)
+    form = information(problem)
+    true = problem.matrix + 0.02 * problem.matrix.multiply(rng.normal(size=problem.matrix.shape))
+    gain, prior = form.gain(np.eye(problem.measurements)), problem.prior
+    used = np.ones(problem.measurements, dtype=np.bool_)
+    noise = expected_error(form, {"noise": np.zeros(problem.measurements)}).variance
+    moments = MisalignmentNoise(true.tocsr(), ())
+    lost = np.eye(problem.unknowns) - gain @ true.toarray()
+    exact = prior.variance[0] * np.square(lost).sum(axis=1)
+    exact += np.square(gain @ ((true - problem.matrix) @ prior.mean))
+    added = mismatch_variance(form, used, moments, [], prior)
+    np.testing.assert_allclose(noise + added, exact, rtol=1e-8)
+    image = prior.mean + 50 * rng.normal(size=problem.unknowns)
+    error = prior.mean + gain @ (true @ image - problem.matrix @ prior.mean) - image
+    known = prior.mean + gain @ (problem.matrix @ (image - prior.mean)) - image
+    of_image = mismatch_of_image(form, used, moments, [], image)
+    np.testing.assert_allclose(np.square(known) + of_image, np.square(error), rtol=1e-8, atol=1e-8)
+
+
+def test_uncalibrated_tolerances_cost_a_picture_the_mean_over_assemblies() -> None:
+    """Against 300 assemblies; the form is that of the design, and nothing but H scatters."""
+    lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
+    tolerances = [ToleranceTable.model_validate({"position": "60 nm", "seed": seed}) for seed in range(300)]
+    camera = replace(derive(described((12, 12), lenses)), tolerance=tolerances[0])
+    image = 127.5 + 60 * np.sin(0.7 * np.arange(144.0))
+    prior, matrix = independent(127.5, 5461.25, 144), ideal_matrix(camera)
+    form = information(Problem(matrix, prior, np.full(camera.measurements, 0.1)))
+    start = form.gain(matrix @ (image - prior.mean)) + prior.mean - image
+    errors = [
+        np.square(start + form.gain((true_matrix(replace(camera, tolerance=each)) - matrix) @ image)).mean()
+        for each in tolerances
+    ]
+    moments = robust_noise(camera, Prior(image, np.zeros(144)))
+    used = np.ones(camera.measurements, dtype=np.bool_)
+    added = mismatch_of_image(form, used, moments, camera.slices(), image)
+    predicted = float(np.square(start).mean() + added.mean())
+    assert abs(np.mean(errors) - predicted) < 3 * np.std(errors, ddof=1) / len(errors) ** 0.5
+    assert predicted > 2 * float(np.square(start).mean()), "misalignment raises the error"
+
+
+def test_a_tolerance_as_designed_and_calibrated_side_by_side(ommatid: Command) -> None:
+    needs("llvm_ad_mono")
+    loose = ("--set", 'camera.tolerance.position="41 nm"', "--set", "calibration.samples=1024")
+    ideal = document(ommatid("predict", TILE, *loose, "--set", "calibration.method=ideal", "--json"))
+    assert ideal["mse"] == ideal["as_designed"]["mse"] > 5 * ideal["calibrated"]["mse"]
+    assert sum(ideal["budget"].values()) == pytest.approx(ideal["mse"], rel=1e-9)
+    assert "mean over assemblies" in " ".join(ideal["assumes"])
+    assert "with a calibrated H" in ommatid("predict", TILE, *loose).out
+
+
+def test_without_a_fast_backend_it_is_the_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ommatid.simulate.calibration.pilot.choose", lambda _: "scalar_rgb")
+    predicted, closed = predict_scene(read(TILE)), predict_scene(read(TILE), rays=False)
+    assert predicted.mse == closed.mse
+    assert "scalar backend" in predicted.assumes[0]
+    assert rows(predicted)[0][0] == "assumes"
+
+
+def test_it_says_where_nothing_is_recovered(ommatid: Command) -> None:
+    dark = ("--set", "noise.variance=1e8", "--no-rays")
+    assert document(ommatid("predict", TILE, *dark, "--json"))["recovers_nothing"]
+    assert "nothing is recovered" in ommatid("predict", TILE, *dark).out
+    assert "nothing is recovered" not in ommatid("predict", TILE, "--no-rays").out
+
+
+def test_a_scene_without_a_picture(tmp_path: Path) -> None:
+    needs("llvm_ad_mono")
+    scene = tmp_path / "scene.toml"
+    scene.write_text(TILE.read_text().replace("photo:camera", "missing.png"))
+    predicted = predict_scene(read(scene, FEW))
+    known = predict_scene(read(TILE, FEW))
+    assert predicted.mse_for_picture is None
+    assert "cannot be read" in predicted.assumes[0]
+    assert predicted.mse > known.mse, "white noise has more contrast than the photograph"
+    assert "mse_for_picture" not in json_of(predicted)

@@ -1,0 +1,107 @@
+"""Frames whose lens types leave a null space, or are other arrays: against the dense problem, and what tiles cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from ommatid.reconstruct.frame.banded_system import leaves_null_space
+from ommatid.reconstruct.gram import gram
+from ommatid.reconstruct.method_choice import choose_method
+from ommatid.reconstruct.restore import Reconstruction, restore
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.stack import Stack
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
+
+from ..examples import Lenses, camera
+from ..examples import scene as described
+
+ONE: Lenses = (("1/3", [3, 3], "fit"),)
+TWO: Lenses = (*ONE, ("1/5", [5, 5], "fit"))
+ODD: Lenses = (*ONE, ("1/4", [3, 5], "fit"))
+FRACTION: Lenses = (*ONE, ("2/7", [4, 4], "fit"))
+THREE: Lenses = (*TWO, ("1/4", [4, 4], "fit"))
+NOISE = 1e-2
+
+
+def recorded(scene: Scene, rng: np.random.Generator, used: bool = True) -> tuple[Stack, FloatArray]:
+    camera = derive(scene)
+    image = 127.5 + 5461.25**0.5 * rng.normal(size=camera.unknowns)
+    values = ideal_model(scene, camera).forward(image) + rng.normal(0, NOISE**0.5, camera.measurements)
+    if not used:
+        values[::23] = np.nan
+    return Stack(scene, camera, values, np.zeros(values.size), {}), image
+
+
+def restored(stack: Stack, image: FloatArray, method: str) -> Reconstruction:
+    estimator = stack.scene.estimator.model_copy(update={"method": method})
+    scene = stack.scene.model_copy(update={"estimator": estimator})
+    return restore(replace(stack, scene=scene), ideal_model(scene, stack.camera), image)
+
+
+@pytest.mark.parametrize(("shape", "lenses"), [((24, 31), ONE), ((31, 24), TWO), ((25, 25), ODD), ((27, 25), FRACTION)])
+@pytest.mark.parametrize("used", [True, False])
+def test_a_frame_is_the_dense_problem(shape: tuple[int, int], lenses: Lenses, used: bool) -> None:
+    scene = described(shape, lenses, noise={"variance": NOISE})
+    stack, image = recorded(scene, np.random.default_rng(0), used)
+    dense, frame = restored(stack, image, "information"), restored(stack, image, "frame")
+    np.testing.assert_allclose(frame.estimate, dense.estimate, atol=1e-6 * 5461.25**0.5)
+    # Its parts are differences of inverses, at a step of 1e-4.
+    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=2e-4)
+    np.testing.assert_allclose(frame.expected.resolved, dense.expected.resolved, atol=1e-6)
+    assert frame.solver.variance_bound < 1e-6
+    assert frame.interval is not None
+    assert dense.interval is not None
+    assert frame.interval.mse == pytest.approx(dense.interval.mse, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("lenses", "side", "method"), [(TWO, 99, "frame"), (ODD, 99, "frame"), (TWO, 499, "tiles"), (THREE, 499, "frame")]
+)
+def test_large_frames_with_a_null_space_are_factorised_and_larger_ones_tiled(
+    lenses: Lenses, side: int, method: str
+) -> None:
+    data = described((side, side), (("1/3", [1, 1], [3, 3]),), noise={"variance": NOISE}).plain()
+    lens = [
+        {"name": f"L{number}", "magnification": ratio, "array": array, "pixels": pixels}
+        for number, (ratio, array, pixels) in enumerate(lenses)
+    ]
+    scene = parse({**data, "camera": {**data["camera"], "lens_pitch": "2 mm", "lens": lens}}, Path("test.toml"))
+    assert choose_method(scene, derive(scene), exact=True).method == method
+
+
+@pytest.mark.parametrize(("lenses", "leaves"), [(ONE, True), (TWO, True), (ODD, True), (THREE, False)])
+def test_a_null_space_of_every_frame(lenses: Lenses, leaves: bool) -> None:
+    """Of a 59 x 59 camera, whose edges all types see: by the rank of H."""
+    seen = camera((59, 59), lenses)
+    small = np.linalg.matrix_rank(ideal_matrix(camera((29, 29), lenses)).toarray()) if leaves else 0
+    assert leaves_null_space(seen) is leaves
+    assert small < 29**2
+
+
+def test_what_tiles_cost() -> None:
+    scene = described((47, 47), TWO, noise={"variance": NOISE}, tiles={"size": 21, "overlap": 5})
+    stack, image = recorded(scene, np.random.default_rng(1))
+    tiles, frame = restored(stack, image, "tiles"), restored(stack, image, "frame")
+    stated = float(tiles.solver.why.partition("factor of ")[2].split()[0])
+    middle = slice(13, 34)
+    cost = [r.expected.variance.reshape(47, 47)[middle, middle].mean() for r in (tiles, frame)]
+    assert stated == pytest.approx(cost[0] / cost[1], rel=0.25), "twelve pixels of 441"
+    three = described((47, 47), THREE, noise={"variance": NOISE}, tiles={"size": 35, "overlap": 8})
+    assert "cost" not in restored(*recorded(three, np.random.default_rng(1)), "tiles").solver.why
+
+
+@pytest.mark.parametrize("density", [0.01, 0.6])
+def test_products_of_dense_and_of_sparse_matrices(density: float) -> None:
+    rng = np.random.default_rng(0)
+    matrix = sparse.csr_array(rng.normal(size=(200, 150)) * (rng.random((200, 150)) < density))
+    weights = rng.random(200)
+    expected = np.einsum("mi,m,mj->ij", matrix.toarray(), weights, matrix.toarray())
+    np.testing.assert_allclose(gram(matrix, weights), expected, atol=1e-10)
+    np.testing.assert_allclose(gram(matrix), matrix.toarray().T @ matrix.toarray(), atol=1e-10)

@@ -14,6 +14,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import EstimatorTable
 
+from .detail.detailed_model import CAUSE as DETAIL
+from .detail.detailed_model import independent_detail
 from .estimator.estimate import factorise
 from .expected_error import expected_error, kernel_widths
 from .forms.form import Form
@@ -146,7 +148,9 @@ def predict(
 
 
 def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray) -> Prediction:
-    """Predict the error where the frame is too large for one dense problem, without rank, null space and condition.
+    """Predict the error by the method chosen; rank, null space and condition of H where one dense problem serves.
+
+    Use it for frames, and where the world is finer than f.
 
     actual : one variance for all measurements, or (M,); NaN leaves a measurement out
     Raises InputError where the noise is to be fitted to a stack, or where the estimator has no noise to expect.
@@ -163,22 +167,26 @@ def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray
             " above 0"
         )
     recorded = model.forward(np.full(model.unknowns, scene.prior.mean))
+    detail = independent_detail(model, used)
+    if detail and not isinstance(setting, float):
+        expected_noise = expected_noise + detail[DETAIL]
     task = EstimationTask(model, recorded, used, expected_noise, scene.prior, scene.estimator, scene.tiles)
-    result = METHODS[choice.method](task, Execution()).result({"noise": noise}, None)
-    variance = result.expected.variance
+    result = METHODS[choice.method](task, Execution()).result({"noise": noise, **detail}, None)
+    seen = observability(model.matrix[used]) if choice.method in ("dense", "detail") else None
     return Prediction(
         measurements=noise.size,
         unknowns=model.unknowns,
-        rank=None,
-        null_space=None,
-        condition=None,
-        mse=float(variance.mean()),
-        trimmed_mse=trimmed_mean(variance, camera.shape),
+        rank=None if seen is None else seen.rank,
+        null_space=None if seen is None else seen.null_space,
+        condition=None if seen is None else seen.condition,
+        mse=result.expected.mse,
+        trimmed_mse=trimmed_mean(result.expected.variance, camera.shape),
         trim=TRIM,
         degrees_of_freedom=result.expected.degrees_of_freedom,
         resolution=median_width(result.expected.resolved),
         method=result.solver.method,
         prior_variance=scene.prior.variance,
+        budget={"null_space": result.expected.missing, **result.expected.parts} if camera.has_detail else None,
     )
 
 

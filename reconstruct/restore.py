@@ -13,6 +13,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.workers import Workers
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
@@ -154,11 +155,8 @@ def _restored(
 ) -> Reconstruction:
     start, shape = perf_counter(), stack.camera.shape
     assumed = assumptions_for(stack, model, choice, execution)
-    given = truth
-    if truth is not None and truth.size > stack.camera.unknowns:
-        truth = averaged(truth.reshape(stack.camera.world.shape), stack.camera.detail).ravel()
-        given = given if choice.method == "detail" else truth
-    result, task = assumed.method.result(assumed.noise, given), assumed.method.task
+    result, task = assumed.method.result(assumed.noise, truth_for(choice, truth, stack.camera)), assumed.method.task
+    truth = None if truth is None else _image(truth, stack.camera)
     expected_noise = task.expected_noise
     return Reconstruction(
         result=result,
@@ -174,6 +172,18 @@ def _restored(
         seconds=perf_counter() - start,
         truth=truth,
         error=None if truth is None else measure_error(result.image, truth, shape),
+    )
+
+
+def truth_for(choice: MethodChoice, truth: FloatArray | None, camera: Camera) -> FloatArray | None:
+    """Return what a method compares its estimate with: the world where it takes detail into account, else f."""
+    return truth if truth is None or choice.method == "detail" else _image(truth, camera)
+
+
+def _image(truth: FloatArray, camera: Camera) -> FloatArray:
+    """Return f, (N,), from itself or from the world, (pixels of the world,)."""
+    return (
+        truth if truth.size == camera.unknowns else averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
     )
 
 

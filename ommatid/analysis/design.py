@@ -14,7 +14,9 @@ import numpy as np
 
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.skipped import assumptions
 
 from .prediction_table import json_of
 
@@ -90,6 +92,15 @@ def with_lens(scene: Scene, magnification: Fraction) -> Scene:
     added = {**optics, "name": name, "magnification": str(magnification), "array": [count, count], "pixels": "fit"}
     camera = {**data["camera"], "lens": [*data["camera"]["lens"], added]}
     return parse({**data, "camera": camera}, scene.source)
+
+
+def check_detail(scene: Scene) -> None:
+    """Raise InputError where the error depends on detail finer than f, of which the scene says nothing."""
+    if assumptions(scene, derive(scene)):
+        raise InputError(
+            "not ranked: its sensor pixels divide pixels of f, so its error depends on detail finer than f; set"
+            " target.detail and a correlated prior"
+        )
 
 
 def _between(before: Fraction, last: Fraction, end: Fraction) -> list[Fraction]:

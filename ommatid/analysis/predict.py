@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
 from ommatid.reconstruct.prediction import Prediction, predict, predict_frame
@@ -15,6 +16,7 @@ from ommatid.runtime.processors import one_thread
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.skipped import assumptions
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.validation import check_lenses, check_scene_memory
 
@@ -53,13 +55,14 @@ def predict_ideal(scene: Scene) -> Prediction:
     """Predict the error of a scene with the ideal H. Raises InputError where the estimator takes a recorded stack."""
     setup = Setup.from_scene(scene)
     camera = setup.camera
-    choice = choose_method(scene, camera, exact=camera.has_box_footprints)
+    choice = choose_method(scene, camera, exact=camera.has_box_footprints and not camera.has_detail)
     actual = expected_noise(setup)
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
-    if choice.method != "dense":
-        return replace(predict_frame(choice, ideal_model(scene, camera), actual), assumes=_ideal_assumptions(setup))
-    prior = prior_of(scene.prior, camera.shape, camera.target_pitch)
+    if choice.method != "dense" or camera.has_detail:
+        model = model_of_f(ideal_model(scene, camera.with_grid_of_matrix), camera, scene.prior)
+        return replace(predict_frame(choice, model, actual), assumes=_ideal_assumptions(setup))
+    prior = prior_of(scene.prior, camera.shape, camera.target_pitch, camera.detail)
     added = None
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":
         added = partial(misalignment_variance, camera=camera, prior=prior)
@@ -69,7 +72,7 @@ def predict_ideal(scene: Scene) -> Prediction:
 
 def _ideal_assumptions(setup: Setup) -> tuple[str, ...]:
     surfaces = any(lens_type.optics.surfaces is not None for lens_type in setup.camera.types)
-    return (LEFT_OUT, *([PERFECT_LENSES] if surfaces else []), PRIOR_LIGHT)
+    return (LEFT_OUT, *([PERFECT_LENSES] if surfaces else []), PRIOR_LIGHT, *assumptions(setup.scene, setup.camera))
 
 
 def optics(camera: Camera) -> list[dict[str, Any]]:

@@ -66,11 +66,14 @@ def compare_lens_types(
     scene: Scene, magnifications: Sequence[Fraction], progress: Progress = no_progress
 ) -> DesignComparison:
     """Predict the error of the scene with one more lens type of each magnification, with the ideal H."""
-    before = predict_ideal(scene)
+    before, of_pixels = predict_ideal(scene), Setup.from_scene(scene).camera.covers_whole_pixels
     candidates: list[DesignCandidate] = []
     for index, magnification in enumerate(magnifications):
         try:
-            expected = predict_ideal(design.with_lens(scene, magnification))
+            wider = design.with_lens(scene, magnification)
+            if of_pixels:
+                design.check_detail(wider)
+            expected = predict_ideal(wider)
             candidates.append(DesignCandidate(str(magnification), expected))
         except InputError as error:
             reason = str(error).removeprefix(f"{scene.source}: ")

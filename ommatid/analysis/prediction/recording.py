@@ -38,6 +38,8 @@ Assumptions = tuple[str, ...]
 class PredictedRecording:
     """A recording of a known image, and the model with which it is to be reconstructed.
 
+    H and images are on the grid of H's columns, the world's where its detail matters; the stack is on that of f.
+
     true : (M, N) H of the camera that records, None where the model's is the same or a calibration of it
     certain : H without the errors of a calibration, whose rank is the camera's
     truth : (N,) the scene's picture, None where it has none that can be read and the image is a draw of the prior
@@ -66,7 +68,8 @@ def predicted_recording(setup: Setup) -> PredictedRecording:
 
     Raises InputError where only Mitsuba's scalar backend works.
     """
-    setup = _with_own_seed(setup)
+    coarse = _with_own_seed(setup)
+    setup = coarse.calibrated
     truth, said = known_image(setup)
     image = _prior_draw(setup) if truth is None else truth
     camera = _camera(setup)
@@ -75,7 +78,7 @@ def predicted_recording(setup: Setup) -> PredictedRecording:
     light = camera.model.forward(image)
     light = light + rng.normal(size=light.size) * np.sqrt(variance)
     light = np.maximum(light, 0.0) if setup.scene.sensor is not None else light
-    stack = exposed(setup, light, variance, {})
+    stack = exposed(coarse, light, variance, {})
     assumes = (*said, *camera.assumes, *said_of_light)
     if setup.scene.calibration.method == "ideal":
         same = camera.model.is_exact

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_for, with_fallback
+from ommatid.reconstruct.detail.detail_method import DetailMethod
+from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
 from ommatid.reconstruct.measured_error import TRIM, trimmed_mean
 from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS, METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
@@ -20,11 +22,14 @@ from ommatid.reconstruct.misalignment.robust_noise import CAUSE, MisalignmentNoi
 from ommatid.reconstruct.misalignment.tolerance_cost import mismatch_of_image, mismatch_variance
 from ommatid.reconstruct.prediction import Prediction, median_width, observability
 from ommatid.reconstruct.prior import Prior
-from ommatid.reconstruct.restore import BUDGET
+from ommatid.reconstruct.restore import BUDGET, truth_for
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.skipped import assumptions
+from ommatid.scenes.tables.estimation import PriorTable
 
 from .recording import PredictedRecording, predicted_recording
 
@@ -87,7 +92,8 @@ def _reconstructed(recording: PredictedRecording) -> _Outcome:
 
     def work(choice: MethodChoice) -> _Outcome:
         assumed = assumptions_for(stack, model, choice, Execution())
-        return _Outcome(choice, assumed, assumed.method.result(assumed.noise, recording.truth))
+        truth = truth_for(choice, recording.truth, stack.camera)
+        return _Outcome(choice, assumed, assumed.method.result(assumed.noise, truth))
 
     return with_fallback(stack, model, work)
 
@@ -102,7 +108,8 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
         budget[mismatch.cause] = float(mismatch.variance.mean())
     seen = None
     if camera.unknowns <= MAX_DENSE_PIXELS and outcome.choice.method != "robust":
-        seen = observability(recording.certain.matrix[outcome.assumed.usable.used])
+        of_pixels = model_of_f(recording.certain, camera, PriorTable())
+        seen = observability(of_pixels.matrix[outcome.assumed.usable.used])
     return Prediction(
         measurements=int(outcome.assumed.usable.used.sum()),
         unknowns=camera.unknowns,
@@ -120,22 +127,16 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
         mse_for_picture=None if given is None else given.mse + (mismatch.of_picture or 0.0 if mismatch else 0.0),
         interval=None if given is None or mismatch is not None else (given.low, given.high),
         budget=budget,
-        assumes=(*recording.assumes, *(() if mismatch is None else mismatch.assumes), *_world(setup)),
+        assumes=(
+            *recording.assumes,
+            *(() if mismatch is None else mismatch.assumes),
+            *assumptions(setup.scene, setup.camera),
+        ),
     )
-
-
-def _world(setup: Setup) -> tuple[str, ...]:
-    """Return the assumption on detail finer than f, where sensor pixels do not cover whole pixels of f."""
-    camera = setup.simulated
-    whole = camera.is_ideal_pinhole and all(
-        lens_type.ratio.denominator == 1 and all(first.denominator == 1 for first in lens_type.origin)
-        for lens_type in camera.types
-    )
-    return () if whole else ("the world is made of f's pixels",)
 
 
 def _dense(outcome: _Outcome) -> bool:
-    return isinstance(outcome.assumed.method, DenseMethod)
+    return isinstance(outcome.assumed.method, DenseMethod | DetailMethod)
 
 
 def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) -> _Mismatch | None:
@@ -173,10 +174,15 @@ def _mismatch_of_images(recording: PredictedRecording, outcome: _Outcome, cause:
     if recording.true is None:
         raise ValueError("expected a camera whose H differs from the estimator's, got one that it knows")
     task = outcome.assumed.method.task
-    image = recording.image
-    readings = {"true": recording.true @ image, "designed": recording.model.forward(image)}
+    world, offset = recording.image, task.model.offset if isinstance(task.model, DetailedModel) else 0.0
+    image = averaged(world.reshape(recording.model.camera.shape), task.model.camera.detail).ravel()
+    if recording.model.camera.shape == task.model.camera.shape:
+        image = world
+    readings = {"true": recording.true @ world, "designed": recording.model.forward(world)}
     errors = {
-        name: np.square(METHODS[outcome.choice.method](replace(task, recorded=values), Execution()).image - image)
+        name: np.square(
+            METHODS[outcome.choice.method](replace(task, recorded=values - offset), Execution()).image - image
+        )
         for name, values in readings.items()
     }
     added = errors["true"] - errors["designed"]

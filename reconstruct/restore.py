@@ -182,9 +182,9 @@ def truth_for(choice: MethodChoice, truth: FloatArray | None, camera: Camera) ->
 
 def _image(truth: FloatArray, camera: Camera) -> FloatArray:
     """Return f, (N,), from itself or from the world, (pixels of the world,)."""
-    return (
-        truth if truth.size == camera.unknowns else averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
-    )
+    if truth.size == camera.unknowns:
+        return truth
+    return averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
 
 
 def _spurious_information(

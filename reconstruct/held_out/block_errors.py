@@ -32,8 +32,9 @@ from ..forms.information import information
 from ..problem import Problem
 
 EPS = float(np.finfo(np.float64).eps)
-PRECISION = 1e-7  # relative, of the errors by a pessimistic estimate; else the next factorisation is taken
-LEAST_PRECISION = 1e-3  # of the errors where memory allows the cheap factorisation alone
+PRECISION = 1e-6  # of the whitened errors by a cautious estimate; else the next factorisation is taken
+LEAST_PRECISION = 1e-3  # where memory allows the cheap factorisation alone
+SAFETY = 30.0  # factor on the relative error of T T^T
 MOST_ROOT = 6000  # measurements up to which S is factorised itself
 PANEL = 32  # columns factorised together by LAPACK
 
@@ -84,14 +85,22 @@ def _by_unknowns(
 ) -> list[BlockErrors]:
     """Use W = I - T T^T. Raises _ImpreciseError where the difference keeps less than `precision`."""
     form = information(problem)
-    if form.condition * EPS > precision:
-        raise _ImpreciseError
     inverse, _ = linalg.lapack.dtrtri(form.factor.root, lower=1)
     root = np.tril(inverse) / form.factor.scale
     del inverse
     by_pixels = problem.prior.apply_root(np.ascontiguousarray(root.T))  # L (I + B^T B)^-1/2: (N, K)
     scaled = sparse.csr_array(problem.matrix.multiply(1 / problem.deviation[:, None]))
-    projected = by_pixels.T @ (scaled.T @ white)
+
+    def without_explained(values: FloatArray) -> FloatArray:
+        return values - scaled @ (by_pixels @ (by_pixels.T @ (scaled.T @ values)))
+
+    residual = without_explained(white)
+    # One step of refinement shows the error of the solution, and so of T T^T.
+    explained = scaled @ problem.prior.apply_root(problem.prior.apply_root_transposed(scaled.T @ residual))
+    correction = float(np.abs(without_explained(white - residual - explained)).max(initial=0.0))
+    relative = max(correction / float(np.abs(white - residual).max(initial=1.0)), EPS)
+    if not correction <= precision:
+        raise _ImpreciseError
     result: list[BlockErrors] = []
     for block in blocks:
         rows: FloatArray = scaled[block] @ by_pixels
@@ -101,10 +110,9 @@ def _by_unknowns(
             lower = np.asarray(linalg.cholesky(inner, lower=True, check_finite=False))
         except linalg.LinAlgError as error:
             raise _ImpreciseError from error
-        if lower.size and EPS * form.condition**0.5 > precision * float(np.diagonal(lower).min()) ** 2:
+        if SAFETY * relative > precision * float(np.diagonal(lower).min(initial=1.0)) ** 2:
             raise _ImpreciseError
-        z = _solve_lower(lower, white[block] - rows @ projected)
-        result.append(_block(lower, z, problem.deviation[block]))
+        result.append(_block(lower, _solve_lower(lower, residual[block]), problem.deviation[block]))
     return result
 
 

@@ -34,6 +34,7 @@ from .windows import HeldOutSums, held_out_sums, windows
 SIGNIFICANCE = 1e-4  # of all sub-imagers together
 LEAST_EXCESS = 0.1  # of the sum of squares over its expectation
 LEAST_PROGRESS = 0.1  # by which leaving out a sub-imager must reduce the excess of all
+MOST_QUICK = 4000  # measurements of a check that takes a second or less
 MOST_NAMED = 10  # sub-imagers left out one after the other
 LEAST_DEVIATE = -37.0  # z of a probability of 1 in float64
 TERMS = 200  # of a continued fraction
@@ -146,6 +147,17 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
     return HeldOutCheck(subs, _familywise(first), explained, task.prior, prior is not None, (len(shown), total))
 
 
+def quick_check(task: EstimationTask, method: str) -> HeldOutCheck | None:
+    """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
+    possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())
+    if not possible or task.expected_noise.size > MOST_QUICK or len(windows(task, method == "robust")[0]) > 1:
+        return None
+    try:
+        return check_task(task, method, fitted=False)
+    except InputError:  # the noise is too small
+        return None
+
+
 def _culprits(rounds: _Rounds, first: HeldOutSums) -> tuple[list[int], HeldOutSums]:
     """Return the sub-imagers after whose removal all others agree, none if there are no such, and the others' sums."""
     named: list[int] = []
@@ -171,7 +183,7 @@ class _Rounds:
         self._last: HeldOutSums | None = None
 
     def sums(self, left_out: tuple[int, ...]) -> HeldOutSums:
-        """Predict without the measurements of these sub-imagers."""
+        """Predict without the measurements of these sub-imagers; sums are 0 where there is nothing to predict from."""
         if left_out and self._last is not None:
             self._when_named[left_out[-1]] = self._last
         self._last = held_out_sums(_without(self._task, left_out), self._robust, self._execution)

@@ -75,6 +75,7 @@ def windows(task: EstimationTask, robust: bool) -> tuple[list[Window], int]:
 def held_out_sums(task: EstimationTask, robust: bool, execution: Execution) -> HeldOutSums:
     """Predict the used pixels of every sub-imager from all others, and sum their squares.
 
+    Sums are 0 where there are no others to predict from.
     robust : True if the noise holds the misalignment that the camera's tolerance allows
     """
     chosen, _ = windows(task, robust)
@@ -142,7 +143,9 @@ def _sums(window: WindowProblem) -> HeldOutSums:
     blocks = [np.flatnonzero(window.sub_imager == index) for index in present]
     pixels = np.zeros(window.count, dtype=np.int64)
     chi_squared, precision = np.zeros(window.count), np.zeros(window.count)
-    errors = block_errors(window.problem, window.recorded, blocks) if present.size else []
+    if present.size < 2:  # nothing to predict from
+        return HeldOutSums(pixels, chi_squared, precision)
+    errors = block_errors(window.problem, window.recorded, blocks)
     for index, block in zip(present, errors, strict=True):
         pixels[index] = block.whitened.size
         chi_squared[index] = float(block.whitened @ block.whitened)

@@ -128,30 +128,28 @@ def _verdict(report: HeldOutReport) -> HeldOutVerdict:
     if not disagreeing:
         return HeldOutVerdict(trusted=True, reasons=())
     if named:
+        one = len(named) == 1
+        subject = f"sub-imager {listed(named)} contradicts" if one else f"sub-imagers {listed(named)} contradict"
         reason = (
-            f"{listed(named)} {'contradicts' if len(named) == 1 else 'contradict'} all others"
-            f" ({_size(named[0])}): H of {'it' if len(named) == 1 else 'them'} is not this camera's, or pixels of"
-            f" {'it' if len(named) == 1 else 'them'} are damaged; the others agree with one another"
+            f"{subject} the others: {_size(named[0])}; {'its' if one else 'their'} H is not this camera's, or"
+            f" {'its' if one else 'their'} pixels are damaged; the others agree"
         )
     else:
         reason = (
-            f"{len(disagreeing)} of {report.judged} sub-imagers contradict one another, most {listed(disagreeing)}"
-            f" ({_size(disagreeing[0])}): H is not this camera's, the world has depth or detail finer than f, or the"
+            f"{len(disagreeing)} of {report.judged} sub-imagers contradict one another, most {listed(disagreeing)}:"
+            f" {_size(disagreeing[0])}; H is not this camera's, the world has depth or detail finer than f, or the"
             " noise is larger than stated"
         )
     return HeldOutVerdict(trusted=False, reasons=(reason,))
 
 
 def _size(entry: HeldOutEntry) -> str:
-    return f"{entry.name} errs by {entry.rms_error:.3g} grey levels, expected {entry.expected_rms:.3g}"
+    return f"{entry.name} errs by {entry.rms_error:.3g} grey levels where {entry.expected_rms:.3g} are expected"
 
 
 def listed(entries: list[HeldOutEntry]) -> str:
-    """Return "sub-imager A", or "sub-imagers A, B and C", the first few of them."""
+    """Return "A", "A and B", or the first few names and the number of the others."""
     names = [entry.name for entry in entries[:MOST_LISTED]]
     more = len(entries) - len(names)
-    if len(entries) == 1:
-        return f"sub-imager {names[0]}"
-    if more:
-        return f"sub-imagers {', '.join(names)} and {more} more"
-    return f"sub-imagers {', '.join(names[:-1])} and {names[-1]}"
+    names += [f"{more} more"] if more else []
+    return f"{', '.join(names[:-1])} and {names[-1]}" if names[1:] else names[0]

@@ -6,6 +6,7 @@ from ommatid.reconstruct.output.held_out_report import HeldOutEntry, HeldOutPrio
 
 Row = tuple[str, str]
 
+LEAST = 1e-300  # probability that is printed
 MOST_ROWS = 5  # sub-imagers in the table, unless more are named
 
 
@@ -20,7 +21,7 @@ def rows(report: HeldOutReport) -> list[Row]:
         where = f", in {report.windows.checked} of {report.windows.total} windows of the target"
     lines += [
         ("sub-imagers predicted", f"{report.judged} of {len(report.sub_imagers)}, {pixels} pixels{where}"),
-        ("largest deviation", f"p = {report.p_value:.2g} among all sub-imagers"),
+        ("largest deviation", f"{_probability(report.p_value)}, among all sub-imagers"),
     ]
     worst = report.worst()
     shown = worst[: max(MOST_ROWS, sum(entry.named for entry in worst))]
@@ -40,7 +41,7 @@ def verdict(report: HeldOutReport) -> str:
 def entry_words(entry: HeldOutEntry) -> str:
     """Return z, probability and size of a sub-imager's error."""
     words = (
-        f"z {entry.z:.1f}, p {entry.p_value:.2g}, errs by {entry.rms_error:.3g} grey levels,"
+        f"z = {entry.z:.1f}, {_probability(entry.p_value)}, errs by {entry.rms_error:.3g} grey levels,"
         f" expected {entry.expected_rms:.3g}"
     )
     return f"{words}; contradicts the others" if entry.named else words
@@ -53,3 +54,10 @@ def prior_words(prior: HeldOutPrior) -> str:
     if prior.fitted:
         return f"{words}, fitted to the stack"
     return f"{words}, as the scene says; a photograph is no draw of it"
+
+
+def _probability(p_value: float | None) -> str:
+    """Return a probability, also one that float64 takes for 0."""
+    if p_value is None:
+        return "p unknown"
+    return f"p = {p_value:.2g}" if p_value >= LEAST else f"p < {LEAST:g}"

@@ -32,10 +32,12 @@ from ..forms.information import information
 from ..problem import Problem
 
 EPS = float(np.finfo(np.float64).eps)
-PRECISION = 1e-6  # of the whitened errors by a cautious estimate; else the next factorisation is taken
-LEAST_PRECISION = 1e-3  # where memory allows the cheap factorisation alone
+MOST_EXACT = 1000  # measurements up to which S itself is factorised, which keeps ten digits or more
+MOST_ROOT = 6000  # measurements up to which that is possible
+EXACT = 1e-11  # relative error up to which S is factorised by Cholesky instead of QR
+PRECISION = 1e-6  # of whitened errors by W = I - T T^T, by a cautious estimate; else S itself is factorised
+LEAST_PRECISION = 1e-3  # where that is not possible
 SAFETY = 30.0  # factor on the relative error of T T^T
-MOST_ROOT = 6000  # measurements up to which S is factorised itself
 PANEL = 32  # columns factorised together by LAPACK
 
 
@@ -68,7 +70,7 @@ def block_errors(problem: Problem, recorded: FloatArray, blocks: Sequence[IntArr
         )
     white = (recorded - problem.matrix @ problem.prior.mean) / problem.deviation
     large = problem.measurements > MOST_ROOT
-    if large or problem.measurements > problem.prior.dimension:
+    if large or problem.measurements > max(problem.prior.dimension, MOST_EXACT):
         try:
             return _by_unknowns(problem, white, blocks, LEAST_PRECISION if large else PRECISION)
         except (_ImpreciseError, NotSolvableError) as error:
@@ -136,7 +138,7 @@ def _upper_root(problem: Problem) -> FloatArray:
     covariance[np.diag_indices_from(covariance)] += 1.0
     try:
         factor, condition = factorise_positive(covariance)
-        if condition * EPS <= PRECISION:
+        if condition * EPS <= EXACT:
             return np.ascontiguousarray((np.tril(factor.root) * factor.scale[:, None]).T)
     except NotSolvableError:
         pass

@@ -191,12 +191,9 @@ class _Rounds:
 
     def shown(self, named: list[int], last: HeldOutSums) -> HeldOutSums:
         """Return the sums of `last`, and of the named sub-imagers those before they were left out."""
-        arrays = [values.copy() for values in (last.pixels, last.chi_squared, last.precision)]
         for index in named:
-            before = self._when_named[index]
-            for array, values in zip(arrays, (before.pixels, before.chi_squared, before.precision), strict=True):
-                array[index] = values[index]
-        return HeldOutSums(*arrays)
+            last = last.replaced(index, self._when_named[index])
+        return last
 
 
 def _without(task: EstimationTask, left_out: tuple[int, ...]) -> EstimationTask:
@@ -218,7 +215,7 @@ def _log_p(sums: HeldOutSums) -> FloatArray:
     """Logarithm of the probability of a larger sum of squares: (sub-imagers,), NaN without pixels."""
     result = np.full(sums.pixels.size, np.nan)
     judged = sums.pixels > 0
-    result[judged] = log_survival(sums.chi_squared[judged], sums.pixels[judged])
+    result[judged] = log_survival(sums.chi_squared[judged], sums.pixels[judged].astype(np.float64))
     return result
 
 

@@ -44,6 +44,15 @@ class HeldOutSums:
     chi_squared: FloatArray
     precision: FloatArray
 
+    def replaced(self, index: int, other: HeldOutSums) -> HeldOutSums:
+        """Return the sums with those of one sub-imager taken from others."""
+        here = np.arange(self.pixels.size) == index
+        return HeldOutSums(
+            np.where(here, other.pixels, self.pixels),
+            np.where(here, other.chi_squared, self.chi_squared),
+            np.where(here, other.precision, self.precision),
+        )
+
     def __add__(self, other: HeldOutSums) -> HeldOutSums:
         """Add the sums of another window."""
         return HeldOutSums(
@@ -68,8 +77,8 @@ def windows(task: EstimationTask, robust: bool) -> tuple[list[Window], int]:
         return [(slice(0, shape[0]), slice(0, shape[1]))], 1
     side = min(max(WINDOW, REACHES * task.model.reach), WIDEST_WINDOW)
     rows, columns = (_intervals(size, side) for size in shape)
-    shown = [[axis[index] for index in _evenly(len(axis))] for axis in (rows, columns)]
-    return list(product(*shown)), len(rows) * len(columns)
+    shown = product(_evenly(rows), _evenly(columns))
+    return [(down, across) for down, across in shown], len(rows) * len(columns)
 
 
 def held_out_sums(task: EstimationTask, robust: bool, execution: Execution) -> HeldOutSums:
@@ -94,8 +103,9 @@ def _intervals(size: int, side: int) -> list[slice]:
     return [slice(int(first), int(last)) for first, last in pairwise(edges)]
 
 
-def _evenly(count: int) -> list[int]:
-    return sorted({int(index) for index in np.linspace(0, count - 1, min(count, MOST_WINDOWS)).round()})
+def _evenly(intervals: list[slice]) -> list[slice]:
+    chosen = np.linspace(0, len(intervals) - 1, min(len(intervals), MOST_WINDOWS)).round()
+    return [intervals[int(index)] for index in chosen]
 
 
 def _sub_imager_of(camera: Camera, measurements: IntArray) -> IntArray:

@@ -30,7 +30,7 @@ from ..examples import GALLERY, THREE, TWO, familywise, scene
 from ..frames import P0, recorded, wide
 
 SMALL = (("1/3", [3, 3], [3, 3]), ("1/4", [4, 4], [2, 2]))
-NOISE = {"noise": {"variance": 1e-2}}
+NOISE: dict[str, Any] = {"noise": {"variance": 1e-2}}
 
 
 def blocks_of(camera: Camera) -> list[IntArray]:
@@ -211,7 +211,7 @@ def test_what_is_right_is_trusted_on_a_photograph(name: str) -> None:
 
 
 def test_rendered_draws_of_the_prior_are_predicted_as_well_as_stated() -> None:
-    """Five draws, with the variance of the rendering from its own passes: sums of squares of all sub-imagers."""
+    """Five draws, with the variance of the rendering from its own passes; one wrong H is named."""
     described = scene(lenses=THREE, **NOISE, render={"variant": "scalar_rgb", "samples": 1024})
     camera = derive(described)
     model = ideal_model(described, camera)
@@ -219,9 +219,13 @@ def test_rendered_draws_of_the_prior_are_predicted_as_well_as_stated() -> None:
     for seed in range(5):
         image = draw(camera, seed).reshape(camera.shape)
         seeded = described.model_copy(update={"render": described.render.model_copy(update={"seed": seed})})
-        check = check_held_out(render(Setup(seeded, camera, image)), model, fitted=False)
+        stack = render(Setup(seeded, camera, image))
+        check = check_held_out(stack, model, fitted=False)
         assert check.trusted
         sums += [entry.chi_squared for entry in check.sub_imagers]
+        if seed == 0:
+            wrong = replace(model, stored=moved(camera, [30], 0.3), record={"method": "transport"})
+            assert names(check_held_out(stack, wrong, fitted=False)) == [camera.sub_imagers[30].name]
     freedoms = 5 * np.array([pixels.stop - pixels.start for pixels in camera.slices()])
     assert stats.chi2.sf(sums, freedoms).min() > familywise(sums.size)
 
@@ -295,7 +299,7 @@ def test_without_noise_there_is_nothing_to_compare_with() -> None:
 
 
 def tolerant(method: str) -> tuple[Scene, Stack]:
-    tables = {"estimator": {"misalignment": method}, "calibration": {"method": "ideal"}}
+    tables: dict[str, Any] = {"estimator": {"misalignment": method}, "calibration": {"method": "ideal"}}
     data = scene(lenses=THREE, **NOISE, **tables).plain()
     data["camera"]["tolerance"] = {"position": "41 nm"}
     from pathlib import Path

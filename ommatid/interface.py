@@ -20,6 +20,7 @@ import numpy as np
 from ommatid.batch.remote import RunObserver
 from ommatid.pipeline import stages
 from ommatid.reconstruct.output import result_files
+from ommatid.reconstruct.output.held_out_report import HeldOutReport
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.reconstruct.restore import Reconstruction
@@ -235,6 +236,22 @@ def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> 
     image, deviation = outcome.estimate.reshape(outcome.shape), np.sqrt(outcome.expected.variance)
     shaped = None if outcome.truth is None else outcome.truth.reshape(outcome.shape)
     return Result(stack, model, image, deviation.reshape(outcome.shape), shaped, report, outcome)
+
+
+def check(stack: Stack, model: Model, *, fitted: bool = True) -> HeldOutReport:
+    """Predict every sub-imager of a stack from all others, and name those that disagree; needs no truth.
+
+    fitted : True replaces an independent prior by one fitted to the stack, since a photograph is no draw of it
+    Raises InputError if stack and model are of different cameras, or if a measurement has no noise.
+    """
+    from ommatid.reconstruct.held_out.check import check_held_out
+    from ommatid.reconstruct.output.held_out_report import held_out_report
+    from ommatid.reconstruct.restore import check_match
+
+    _check_type("stack", stack, Stack, "read_stack")
+    _check_type("model", model, Model, "read_model")
+    check_match(stack, model, ("the stack", "the model"))
+    return held_out_report(check_held_out(stack, model, fitted=fitted))
 
 
 def run(scene: Scene | str | Path, folder: str | Path) -> Result:

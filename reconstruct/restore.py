@@ -26,7 +26,7 @@ from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
-from .methods.method import Execution, MethodResult
+from .methods.method import EstimationTask, Execution, MethodResult
 from .noise import Noise, UsablePixels
 
 MAX_SPURIOUS_INFORMATION = 0.05  # share above which the expected error is not to be trusted
@@ -51,6 +51,7 @@ class Reconstruction:
 
     prior : as assumed, fitted or described;  noise : variances by cause, (pixels used,) each
     spurious_information : mean share of a pixel's apparent information that the noise of H may have produced
+    task : what the estimator was given, H and the expected noise included
     """
 
     result: MethodResult
@@ -66,6 +67,7 @@ class Reconstruction:
     seconds: float
     truth: FloatArray | None
     error: MeasuredError | None
+    task: EstimationTask
 
     @property
     def estimate(self) -> FloatArray:
@@ -172,6 +174,7 @@ def _restored(
         seconds=perf_counter() - start,
         truth=truth,
         error=None if truth is None else measure_error(result.image, truth, shape),
+        task=assumed.method.task,
     )
 
 

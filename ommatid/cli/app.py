@@ -21,7 +21,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Simulate, calibrate and reconstruct the images of flat compound-eye cameras, with error bars.",
 )
-for command in (run.run, run.render, calibrate.calibrate, reconstruct.reconstruct):
+for command in (run.run, run.render, calibrate.calibrate, reconstruct.reconstruct, reconstruct.check):
     app.command()(command)
 app.command("import")(calibrate.import_frames)
 for command in (predict.predict, predict.design, studies.paper, studies.stability, studies.bench):

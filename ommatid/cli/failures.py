@@ -13,6 +13,7 @@ from ommatid.runtime.errors import InputError, MachineError
 
 from .output import say
 
+NOT_TRUSTED = 3  # exit code of --strict
 INTERRUPTED = 130  # exit code of a command stopped by Ctrl-C
 
 

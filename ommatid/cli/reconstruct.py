@@ -1,4 +1,4 @@
-"""The command that needs no scene file: reconstruct."""
+"""The commands that need no scene file: reconstruct and check."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from . import options, output
+from . import failures, options, output
 from .options import Json, Lenses, Output, Sets
 
 StackFile = Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")]
@@ -27,6 +27,13 @@ TileWorkers = Annotated[
     int | None,
     typer.Option("--workers", metavar="N", min=1, help="Distribute the tiles of a frame over N processes."),
 ]
+ScenePrior = Annotated[
+    bool,
+    typer.Option(
+        "--scene-prior", help="Assume the scene's prior (default: an independent one is replaced by a fitted one)."
+    ),
+]
+StrictCheck = Annotated[bool, typer.Option("--strict", help="Exit with code 3 if the result is not to be trusted.")]
 
 
 def reconstruct(
@@ -48,3 +55,27 @@ def reconstruct(
     with output.progress_bar("reconstruct") as progress:
         report = reconstruct_files(stack, model, file, *asked, progress, scheduler, workers)
     output.print_result({"file": str(file), **report.plain()}, [(str(file), run_table.rows(report))], as_json)
+
+
+def check(
+    stack: StackFile,
+    model: ModelFile,
+    sets: Sets = None,
+    lens: Lenses = "",
+    scene_prior: ScenePrior = False,
+    strict: StrictCheck = False,
+    as_json: Json = False,
+) -> None:
+    """Predict every sub-imager from all others.
+
+    Names those that disagree: their H is wrong, or their pixels. Needs no truth.
+    """
+    from ommatid.analysis.held_out import table
+    from ommatid.pipeline.held_out import check_files
+
+    asked = options.changes(sets), options.lens_names(lens)
+    with output.progress_bar("check") as progress:
+        report = check_files(stack, model, *asked, fitted=not scene_prior, progress=progress)
+    output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", table.rows(report))], as_json)
+    if strict and report.verdict.trusted is False:
+        raise failures.BatchError(failures.NOT_TRUSTED)

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ommatid.analysis.held_out import maps as held_out_maps
+from ommatid.analysis.held_out import table
 from ommatid.bench.table import BenchTable
 from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.scenes.tables.estimation import PriorTable
@@ -56,6 +58,7 @@ def _page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: 
         "budget": words.budget(run.report.error),
         "groups": groups,
         "group_words": error_groups.words(groups) if groups else "",
+        **_held_out(run),
         "mosaic": mosaic,
         "mosaic_words": sensor.words(mosaic),
         "responses": [(response, point_response.words(response), _titled(response)) for response in responses],
@@ -72,6 +75,20 @@ def _page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: 
         "origins": tables.origins(run),
     }
     return fill("page.html", {**content, "document": plots.document(figures), "stamp": stamp})
+
+
+def _held_out(run: Run) -> dict[str, Any]:
+    report = run.report.held_out
+    if report is None:
+        return {"held_out": None}
+    rows = table.rows(report)
+    return {
+        "held_out": report,
+        "held_out_words": f"{rows[0][1][:1].upper()}{rows[0][1][1:]}",
+        "held_out_prior": table.prior_words(report.prior),
+        "held_out_maps": held_out_maps.lens_type_maps(report),
+        "held_out_table": tables.held_out(rows),
+    }
 
 
 def _titled(response: point_response.PointResponse) -> list[tuple[str, str, str]]:

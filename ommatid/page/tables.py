@@ -147,6 +147,11 @@ def further(run: Run) -> list[tuple[str, PageTable]]:
     return tables
 
 
+def held_out(rows: Sequence[tuple[str, str]]) -> PageTable:
+    """Return the numbers of the held-out check below its verdict and its prior, which the page shows elsewhere."""
+    return PageTable("Largest deviations", ("quantity", "value"), [(name.strip(), value) for name, value in rows[2:]])
+
+
 def origins(run: Run) -> list[PageTable]:
     """Return seeds and versions, which are needed to repeat the run."""
     seeds = [(name, "none" if seed is None else str(seed)) for name, seed in run.report.seeds]

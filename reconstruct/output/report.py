@@ -15,7 +15,9 @@ from ommatid.scenes.skipped import assumptions, skipped_effects
 from ommatid.scenes.stack import STRAIGHT, Stack
 
 from ..estimator.estimate import Solver
+from ..held_out.check import quick_check
 from ..restore import Reconstruction
+from .held_out_report import held_out_report
 from .run_json import (
     DiagnosticsReport,
     ErrorReport,
@@ -67,7 +69,13 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
             calibration=model.record.get("first_seed"),
         ),
         spent=time_spent(stages, error, calibrated=model.record["method"] != "ideal"),
+        **_held_out(restoration),
     )
+
+
+def _held_out(restoration: Reconstruction) -> dict[str, Any]:
+    check = quick_check(restoration.task, restoration.choice.method)
+    return {} if check is None else {"held_out": held_out_report(check)}
 
 
 def _stage(record: dict[str, Any]) -> StageReport:

@@ -10,22 +10,15 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, Field, ValidationError
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 
+from .held_out_report import HeldOutReport
+from .record import Record
+
 RUN = "run.json"
-
-
-class Record(BaseModel):
-    """A part of run.json; frozen, and built from keywords, from JSON or from an object with these attributes."""
-
-    model_config = ConfigDict(frozen=True, from_attributes=True, allow_inf_nan=False)
-
-    def plain(self) -> dict[str, Any]:
-        """Return the fields that were set, in JSON's types."""
-        return self.model_dump(mode="json", exclude_unset=True)
 
 
 class StageReport(Record):
@@ -40,8 +33,8 @@ class StageReport(Record):
     variant: str | None = None
     rays: int | None = None
     reached: bool | None = None
-    not_reached: dict[str, str] = {}
-    auto: dict[str, Any] = {}
+    not_reached: dict[str, str] = Field(default_factory=dict[str, str])
+    auto: dict[str, Any] = Field(default_factory=dict[str, Any])
 
 
 class IntervalReport(Record):
@@ -111,7 +104,7 @@ class DiagnosticsReport(Record):
     degrees_of_freedom: float
     resolution: float | None
     chi_squared: ResidualReport | None
-    fit: dict[str, FittedNumber] = {}
+    fit: dict[str, FittedNumber] = Field(default_factory=dict[str, FittedNumber])
     fit_measurements: int | None = None
     fit_doubtful: bool = False
 
@@ -159,7 +152,7 @@ class TimeReport(Record):
     more: tuple[MoreTime, ...] = ()
     within: float | None = None
     asked: RequestedTime | None = None
-    chosen: dict[str, int | Literal["auto"]] = {}
+    chosen: dict[str, int | Literal["auto"]] = Field(default_factory=dict[str, int | Literal["auto"]])
 
 
 class SeedReport(Record):
@@ -224,6 +217,7 @@ class RunReport(Record):
     versions: dict[str, str]
     seeds: SeedReport
     spent: TimeReport
+    held_out: HeldOutReport | None = None
     region: RegionReport | None = None
     depth: tuple[DepthBin, ...] = ()
     study: tuple[StudyCase, ...] = ()

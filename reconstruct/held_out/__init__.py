@@ -1,0 +1,1 @@
+"""The held-out check: every sub-imager predicted from all others, which needs no truth."""

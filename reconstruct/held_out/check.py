@@ -1,0 +1,260 @@
+"""The held-out check: which sub-imagers the others contradict, and by how much.
+
+Every sub-imager is predicted from all others (`block_errors`). Over draws of prior and noise the sum of the squares of
+its b whitened errors is a chi-squared variate of b degrees of freedom. Sums of different sub-imagers are correlated, so
+each is judged by itself, at a significance for all together (Sidak), which correlation makes a little too strict.
+
+A wrong sub-imager spoils the predictions of its neighbours. Therefore the one whose removal takes away the most excess
+is named and left out, and the rest is judged again, until the others agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import log
+
+import numpy as np
+from scipy import special
+
+from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.processors import one_thread
+from ommatid.runtime.progress import Progress, no_progress
+from ommatid.scenes.lens_type import SubImager
+from ommatid.scenes.model import Model
+from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.estimation import PriorTable
+
+from ..assumptions import assumptions_for, with_fallback
+from ..method_choice import MethodChoice
+from ..methods.method import EstimationTask, Execution
+from .stationary_prior import fitted_prior
+from .windows import HeldOutSums, held_out_sums, windows
+
+SIGNIFICANCE = 1e-4  # of all sub-imagers together
+LEAST_EXCESS = 0.1  # of the sum of squares over its expectation
+LEAST_PROGRESS = 0.1  # by which leaving out a sub-imager must reduce the excess of all
+MOST_QUICK = 4000  # measurements of a check that takes a second or less
+MOST_NAMED = 10  # sub-imagers left out one after the other
+LEAST_DEVIATE = -37.0  # z of a probability of 1 in float64
+TERMS = 200  # of a continued fraction
+
+
+@dataclass(frozen=True)
+class HeldOutSubImager:
+    """How well a sub-imager is predicted from all others.
+
+    pixels : used for it; 0 if none is usable, and then the rest is None
+    z : normal deviate of the same probability as `chi_squared`
+    rms_error, expected_rms : of its error in grey levels, weighted by the precision of the prediction
+    disagrees : before any sub-imager was left out;  named : among those that explain the disagreement
+    """
+
+    sub: SubImager
+    pixels: int
+    chi_squared: float
+    z: float | None
+    p_value: float | None
+    rms_error: float | None
+    expected_rms: float | None
+    disagrees: bool
+    named: bool
+
+
+@dataclass(frozen=True)
+class HeldOutCheck:
+    """The check of a stack with a model.
+
+    p_value : of the largest deviation among all sub-imagers (Sidak), None if none can be predicted
+    explained : True if the named sub-imagers explain the disagreement of the others
+    prior : as assumed;  fitted : True if it was fitted to the stack
+    windows : windows of the target that were checked, and their number in all
+    """
+
+    sub_imagers: tuple[HeldOutSubImager, ...]
+    p_value: float | None
+    explained: bool
+    prior: PriorTable
+    fitted: bool
+    windows: tuple[int, int]
+
+    @property
+    def trusted(self) -> bool:
+        """True if no sub-imager disagrees."""
+        return not any(sub.disagrees for sub in self.sub_imagers)
+
+
+def log_survival(chi_squared: FloatArray, freedoms: FloatArray) -> FloatArray:
+    """Return the logarithm of the probability that a chi-squared variate is larger, where that underflows, too.
+
+    freedoms : above 0, of the same shape
+    """
+    shape, value = np.asarray(freedoms) / 2, np.asarray(chi_squared) / 2
+    probability = special.gammaincc(shape, value)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # The upper incomplete gamma function as a continued fraction (Abramowitz and Stegun, 6.5.31).
+        fraction = np.zeros_like(value)
+        for term in range(TERMS, 0, -1):
+            fraction = term * (shape - term) / (value + 2 * term + 1 - shape + fraction)
+        tail = -value + shape * np.log(value) - special.gammaln(shape) - np.log(value + 1 - shape + fraction)
+        return np.where(probability > 1e-290, np.log(probability), tail)
+
+
+@one_thread()
+def check_held_out(
+    stack: Stack, model: Model, *, fitted: bool = True, progress: Progress = no_progress
+) -> HeldOutCheck:
+    """Predict every sub-imager of a stack from all others, and name those that disagree.
+
+    fitted : True replaces an independent prior by one fitted to the stack, since a photograph is no draw of it
+    Raises InputError without noise, for H fitted to the stack itself, and where `restore` does.
+    """
+    execution = Execution(progress=progress)
+
+    def checked(choice: MethodChoice) -> HeldOutCheck:
+        task = assumptions_for(stack, model, choice, execution).method.task
+        return check_task(task, choice.method, fitted=fitted, execution=execution)
+
+    return with_fallback(stack, model, checked)
+
+
+def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Execution | None = None) -> HeldOutCheck:
+    """Check a task whose noise is known; `method` is that of the estimate. Arguments and errors: `check_held_out`."""
+    if method == "fit":
+        raise InputError(
+            "estimator.misalignment 'fit' fits H to all sub-imagers at once, so that none is held out; set it to"
+            " 'trust' or 'robust'"
+        )
+    if not (task.expected_noise > 0).all():
+        raise InputError(
+            "a prediction of measurements without noise has nothing to be compared with; set noise.variance or"
+            " estimator.noise_variance to a number above 0"
+        )
+    prior = fitted_prior(task) if fitted and task.prior.kind == "independent" else None
+    if prior is not None:
+        task = replace(task, prior=prior)
+    shown, total = windows(task, method == "robust")
+    rounds = _Rounds(task, method == "robust", execution or Execution())
+    first = rounds.sums(())
+    disagreeing = _disagreeing(first)
+    named, last = _culprits(rounds, first)
+    sums = rounds.shown(named, last)
+    subs = tuple(
+        _sub_imager(sub, index, sums, bool(disagreeing[index]), index in named)
+        for index, sub in enumerate(task.model.camera.sub_imagers)
+    )
+    explained = bool(named) or not disagreeing.any()
+    return HeldOutCheck(subs, _familywise(first), explained, task.prior, prior is not None, (len(shown), total))
+
+
+def quick_check(task: EstimationTask, method: str) -> HeldOutCheck | None:
+    """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
+    possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())
+    if not possible or task.expected_noise.size > MOST_QUICK or len(windows(task, method == "robust")[0]) > 1:
+        return None
+    try:
+        return check_task(task, method, fitted=False)
+    except InputError:  # the noise is too small
+        return None
+
+
+def _culprits(rounds: _Rounds, first: HeldOutSums) -> tuple[list[int], HeldOutSums]:
+    """Return the sub-imagers after whose removal all others agree, none if there are no such, and the others' sums."""
+    named: list[int] = []
+    last = first
+    while (disagreeing := _disagreeing(last)).any():
+        if len(named) == MOST_NAMED:
+            return [], first
+        excess = _excess(last)
+        named.append(int(np.argmax(np.where(disagreeing, excess, -np.inf))))
+        last = rounds.sums(tuple(named))
+        remaining = _excess(last)[_disagreeing(last)].sum()
+        if remaining > (1 - LEAST_PROGRESS) * excess[disagreeing].sum():
+            return [], first
+    return named, last
+
+
+class _Rounds:
+    """The sums after leaving out more and more sub-imagers."""
+
+    def __init__(self, task: EstimationTask, robust: bool, execution: Execution) -> None:
+        self._task, self._robust, self._execution = task, robust, execution
+        self._when_named: dict[int, HeldOutSums] = {}
+        self._last: HeldOutSums | None = None
+
+    def sums(self, left_out: tuple[int, ...]) -> HeldOutSums:
+        """Predict without the measurements of these sub-imagers; sums are 0 where there is nothing to predict from."""
+        if left_out and self._last is not None:
+            self._when_named[left_out[-1]] = self._last
+        self._last = held_out_sums(_without(self._task, left_out), self._robust, self._execution)
+        return self._last
+
+    def shown(self, named: list[int], last: HeldOutSums) -> HeldOutSums:
+        """Return the sums of `last`, and of the named sub-imagers those before they were left out."""
+        for index in named:
+            last = last.replaced(index, self._when_named[index])
+        return last
+
+
+def _without(task: EstimationTask, left_out: tuple[int, ...]) -> EstimationTask:
+    if not left_out:
+        return task
+    kept: BoolArray = task.used.copy()
+    slices = task.model.camera.slices()
+    for index in left_out:
+        kept[slices[index]] = False
+    return replace(task, used=kept, expected_noise=task.expected_noise[kept[task.used]])
+
+
+def _excess(sums: HeldOutSums) -> FloatArray:
+    """Sums of squares above their expectation: (sub-imagers,)."""
+    return sums.chi_squared - sums.pixels
+
+
+def _log_p(sums: HeldOutSums) -> FloatArray:
+    """Logarithm of the probability of a larger sum of squares: (sub-imagers,), NaN without pixels."""
+    result = np.full(sums.pixels.size, np.nan)
+    judged = sums.pixels > 0
+    result[judged] = log_survival(sums.chi_squared[judged], sums.pixels[judged].astype(np.float64))
+    return result
+
+
+def _disagreeing(sums: HeldOutSums) -> BoolArray:
+    count = int(np.sum(sums.pixels > 0))
+    limit = np.log(-np.expm1(np.log1p(-SIGNIFICANCE) / max(count, 1)))
+    with np.errstate(invalid="ignore"):  # NaN without pixels
+        return (_log_p(sums) < limit) & (_excess(sums) > LEAST_EXCESS * sums.pixels)
+
+
+def _familywise(sums: HeldOutSums) -> float | None:
+    """Probability that the largest deviation of all is larger by chance (Sidak)."""
+    count = int(np.sum(sums.pixels > 0))
+    if not count:
+        return None
+    least = float(np.exp(np.nanmin(_log_p(sums))))
+    return 1.0 if least >= 1 else float(-np.expm1(count * np.log1p(-least)))
+
+
+def _deviate(log_p: float, chi_squared: float, freedoms: int) -> float:
+    """Return the normal deviate that is exceeded as rarely as `chi_squared`."""
+    if log_p < log(0.5):
+        return -float(special.ndtri_exp(log_p))
+    return max(float(special.ndtri(special.gammainc(freedoms / 2, chi_squared / 2))), LEAST_DEVIATE)
+
+
+def _sub_imager(sub: SubImager, index: int, sums: HeldOutSums, disagrees: bool, named: bool) -> HeldOutSubImager:
+    pixels, chi_squared = int(sums.pixels[index]), float(sums.chi_squared[index])
+    if not pixels:
+        return HeldOutSubImager(sub, 0, 0.0, None, None, None, None, disagrees, named)
+    log_p, precision = float(_log_p(sums)[index]), float(sums.precision[index])
+    return HeldOutSubImager(
+        sub=sub,
+        pixels=pixels,
+        chi_squared=chi_squared,
+        z=_deviate(log_p, chi_squared, pixels),
+        p_value=float(np.exp(log_p)),
+        rms_error=(chi_squared / precision) ** 0.5,
+        expected_rms=(pixels / precision) ** 0.5,
+        disagrees=disagrees,
+        named=named,
+    )

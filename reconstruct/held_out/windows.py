@@ -1,0 +1,163 @@
+"""The problems in which sub-imagers are predicted: the whole of a small target, or windows of a frame.
+
+The windows of a frame do not overlap, and a window holds the measurements that see nothing outside it. So sums of
+squares of different windows are independent where the pixels of the prior are, and a sub-imager's sums add up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise, product
+
+import numpy as np
+
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.pool import worker_pool
+from ommatid.runtime.processors import one_thread, processors
+from ommatid.scenes.camera import Camera
+
+from ..methods.method import EstimationTask, Execution
+from ..misalignment.robust_noise import robust_noise, whitening
+from ..prior import Prior
+from ..problem import Problem
+from .block_errors import block_errors
+
+MOST_WHOLE = 1700  # pixels of a target that is one window
+WINDOW, WIDEST_WINDOW = 32, 60  # pixels, largest side of a window of a frame: of narrow and of wide footprints
+REACHES = 3  # footprints that fit side by side into a window
+MOST_WINDOWS = 8  # along each axis; of larger frames so many at equal distances
+
+Window = tuple[slice, slice]
+Unwhitening = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class HeldOutSums:
+    """Sums over the predicted pixels of each sub-imager: (sub-imagers,) each.
+
+    pixels : how many;  chi_squared : of the whitened errors;  precision : of the diagonals of W
+    """
+
+    pixels: IntArray
+    chi_squared: FloatArray
+    precision: FloatArray
+
+    def replaced(self, index: int, other: HeldOutSums) -> HeldOutSums:
+        """Return the sums with those of one sub-imager taken from others."""
+        here = np.arange(self.pixels.size) == index
+        return HeldOutSums(
+            np.where(here, other.pixels, self.pixels),
+            np.where(here, other.chi_squared, self.chi_squared),
+            np.where(here, other.precision, self.precision),
+        )
+
+    def __add__(self, other: HeldOutSums) -> HeldOutSums:
+        """Add the sums of another window."""
+        return HeldOutSums(
+            self.pixels + other.pixels, self.chi_squared + other.chi_squared, self.precision + other.precision
+        )
+
+
+@dataclass(frozen=True)
+class WindowProblem:
+    """A problem with its measurements, and the sub-imager of each: (m,)."""
+
+    problem: Problem
+    recorded: FloatArray
+    sub_imager: IntArray
+    count: int
+
+
+def windows(task: EstimationTask, robust: bool) -> tuple[list[Window], int]:
+    """Return the windows of a task's target that are checked, and the number that would cover it."""
+    shape = task.shape
+    if robust or shape[0] * shape[1] <= MOST_WHOLE:
+        return [(slice(0, shape[0]), slice(0, shape[1]))], 1
+    side = min(max(WINDOW, REACHES * task.model.reach), WIDEST_WINDOW)
+    rows, columns = (_intervals(size, side) for size in shape)
+    shown = product(_evenly(rows), _evenly(columns))
+    return [(down, across) for down, across in shown], len(rows) * len(columns)
+
+
+def held_out_sums(task: EstimationTask, robust: bool, execution: Execution) -> HeldOutSums:
+    """Predict the used pixels of every sub-imager from all others, and sum their squares.
+
+    Sums are 0 where there are no others to predict from.
+    robust : True if the noise holds the misalignment that the camera's tolerance allows
+    """
+    chosen, _ = windows(task, robust)
+    if len(chosen) == 1:
+        return _sums(_whole_robust(task) if robust else _whole(task))
+    with one_thread(), worker_pool(threads=processors()) as pool:
+        parts = pool.map(_sums, _problems(task, chosen), execution.progress, len(chosen))
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return total
+
+
+def _intervals(size: int, side: int) -> list[slice]:
+    edges = np.linspace(0, size, -(-size // side) + 1).astype(int)
+    return [slice(int(first), int(last)) for first, last in pairwise(edges)]
+
+
+def _evenly(intervals: list[slice]) -> list[slice]:
+    chosen = np.linspace(0, len(intervals) - 1, min(len(intervals), MOST_WINDOWS)).round()
+    return [intervals[int(index)] for index in chosen]
+
+
+def _sub_imager_of(camera: Camera, measurements: IntArray) -> IntArray:
+    starts = np.array([pixels.start for pixels in camera.slices()])
+    return np.searchsorted(starts, measurements, side="right") - 1
+
+
+def _whole(task: EstimationTask) -> WindowProblem:
+    camera, used = task.model.camera, np.flatnonzero(task.used)
+    problem = Problem(task.model.matrix[used], task.prior_on(task.shape), task.expected_noise)
+    return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
+
+
+def _whole_robust(task: EstimationTask) -> WindowProblem:
+    """Whiten each sub-imager by its own covariance; its errors then count in units of that covariance."""
+    camera, used, prior = task.model.camera, np.flatnonzero(task.used), task.prior_on(task.shape)
+    misaligned = robust_noise(camera, prior)
+    white = whitening(camera, misaligned, task.expected_noise, task.used)
+    problem = white.problem(misaligned.matrix[used], prior)
+    return WindowProblem(
+        problem, white.vector(task.recorded[used]), _sub_imager_of(camera, used), len(camera.sub_imagers)
+    )
+
+
+def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:
+    """Yield the problem of every window, one at a time to bound memory."""
+    camera, index_among_used = task.model.camera, np.cumsum(task.used) - 1
+
+    @cache
+    def prior_on(shape: tuple[int, int]) -> Prior:
+        return task.prior_on(shape)
+
+    for rows, columns in chosen:
+        inside = task.model.measurements_inside(rows, columns)
+        kept: BoolArray = task.used[inside]
+        matrix = task.model.submatrix(rows, columns)[kept]
+        inside = inside[kept]
+        noise = task.expected_noise[index_among_used[inside]]
+        problem = Problem(matrix, prior_on((rows.stop - rows.start, columns.stop - columns.start)), noise)
+        yield WindowProblem(problem, task.recorded[inside], _sub_imager_of(camera, inside), len(camera.sub_imagers))
+
+
+def _sums(window: WindowProblem) -> HeldOutSums:
+    present = np.unique(window.sub_imager)
+    blocks = [np.flatnonzero(window.sub_imager == index) for index in present]
+    pixels = np.zeros(window.count, dtype=np.int64)
+    chi_squared, precision = np.zeros(window.count), np.zeros(window.count)
+    if present.size < 2:  # nothing to predict from
+        return HeldOutSums(pixels, chi_squared, precision)
+    errors = block_errors(window.problem, window.recorded, blocks)
+    for index, block in zip(present, errors, strict=True):
+        pixels[index] = block.whitened.size
+        chi_squared[index] = float(block.whitened @ block.whitened)
+        precision[index] = float(block.precision.sum())
+    return HeldOutSums(pixels, chi_squared, precision)

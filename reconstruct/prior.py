@@ -53,7 +53,7 @@ class Prior:
     def restrict(self, pixels: NDArray[np.intp]) -> Prior:
         """Return the marginal prior of these pixels."""
         rows = self.root[pixels]
-        return Prior(self.mean[pixels], rows if self.independent else _covariance_root(rows @ rows.T))
+        return Prior(self.mean[pixels], rows if self.independent else covariance_root(rows @ rows.T))
 
 
 def independent(mean: float, variance: float, unknowns: int) -> Prior:
@@ -142,7 +142,7 @@ def stationary_matrix(lags: FloatArray, shape: tuple[int, int]) -> FloatArray:
     return np.ascontiguousarray(table.reshape(rows * columns, rows * columns))
 
 
-def _covariance_root(covariance: FloatArray) -> FloatArray:
+def covariance_root(covariance: FloatArray) -> FloatArray:
     """Return L with L L^T = P0, (N, N): Cholesky, or the symmetric root if P0 is singular in float64."""
     try:
         return np.asarray(linalg.cholesky(covariance, lower=True, check_finite=False))
@@ -152,7 +152,7 @@ def _covariance_root(covariance: FloatArray) -> FloatArray:
 
 
 def _stationary(mean: float, shape: tuple[int, int], lags: FloatArray) -> Prior:
-    return Prior(np.full(shape[0] * shape[1], mean), _covariance_root(stationary_matrix(lags, shape)))
+    return Prior(np.full(shape[0] * shape[1], mean), covariance_root(stationary_matrix(lags, shape)))
 
 
 def _power_correlation(shape: tuple[int, int], exponent: float | None) -> FloatArray:

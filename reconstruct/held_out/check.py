@@ -26,6 +26,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from ..assumptions import assumptions_for, with_fallback
+from ..detail.detailed_model import DetailedModel
 from ..method_choice import MethodChoice
 from ..methods.method import EstimationTask, Execution
 from .stationary_prior import fitted_prior
@@ -35,6 +36,7 @@ SIGNIFICANCE = 1e-4  # of all sub-imagers together
 LEAST_EXCESS = 0.1  # of the sum of squares over its expectation
 LEAST_PROGRESS = 0.1  # by which leaving out a sub-imager must reduce the excess of all
 MOST_QUICK = 4000  # measurements of a check that takes a second or less
+MOST_QUICK_DETAILED = 1500  # where the world is finer than f, so that S is that of all measurements
 MOST_NAMED = 10  # sub-imagers left out one after the other
 LEAST_DEVIATE = -37.0  # z of a probability of 1 in float64
 TERMS = 200  # of a continued fraction
@@ -150,7 +152,8 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
 def quick_check(task: EstimationTask, method: str) -> HeldOutCheck | None:
     """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
     possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())
-    if not possible or task.expected_noise.size > MOST_QUICK or len(windows(task, method == "robust")[0]) > 1:
+    most = MOST_QUICK_DETAILED if isinstance(task.model, DetailedModel) else MOST_QUICK
+    if not possible or task.expected_noise.size > most or len(windows(task, method == "robust")[0]) > 1:
         return None
     try:
         return check_task(task, method, fitted=False)

@@ -12,15 +12,17 @@ from functools import cache
 from itertools import pairwise, product
 
 import numpy as np
+from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.pool import worker_pool
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.scenes.camera import Camera
 
+from ..detail.detailed_model import DetailedModel
 from ..methods.method import EstimationTask, Execution
 from ..misalignment.robust_noise import robust_noise, whitening
-from ..prior import Prior
+from ..prior import Prior, covariance_root
 from ..problem import Problem
 from .block_errors import block_errors
 
@@ -73,7 +75,7 @@ class WindowProblem:
 def windows(task: EstimationTask, robust: bool) -> tuple[list[Window], int]:
     """Return the windows of a task's target that are checked, and the number that would cover it."""
     shape = task.shape
-    if robust or shape[0] * shape[1] <= MOST_WHOLE:
+    if robust or _knows_detail(task) or shape[0] * shape[1] <= MOST_WHOLE:
         return [(slice(0, shape[0]), slice(0, shape[1]))], 1
     side = min(max(WINDOW, REACHES * task.model.reach), WIDEST_WINDOW)
     rows, columns = (_intervals(size, side) for size in shape)
@@ -89,7 +91,7 @@ def held_out_sums(task: EstimationTask, robust: bool, execution: Execution) -> H
     """
     chosen, _ = windows(task, robust)
     if len(chosen) == 1:
-        return _sums(_whole_robust(task) if robust else _whole(task))
+        return _sums(_whole_robust(task) if robust else _whole_detailed(task) if _knows_detail(task) else _whole(task))
     with one_thread(), worker_pool(threads=processors()) as pool:
         parts = pool.map(_sums, _problems(task, chosen), execution.progress, len(chosen))
     total = parts[0]
@@ -116,6 +118,24 @@ def _sub_imager_of(camera: Camera, measurements: IntArray) -> IntArray:
 def _whole(task: EstimationTask) -> WindowProblem:
     camera, used = task.model.camera, np.flatnonzero(task.used)
     problem = Problem(task.model.matrix[used], task.prior_on(task.shape), task.expected_noise)
+    return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
+
+
+def _knows_detail(task: EstimationTask) -> bool:
+    """True if the task's model holds the covariance of detail finer than f."""
+    return isinstance(task.model, DetailedModel) and task.model.detail_covariance is not None
+
+
+def _whole_detailed(task: EstimationTask) -> WindowProblem:
+    """Take the light on the pixels itself as what is measured: its covariance is that by f and by finer detail."""
+    model, camera, used = task.model, task.model.camera, np.flatnonzero(task.used)
+    if not isinstance(model, DetailedModel) or model.detail_covariance is None:
+        raise TypeError("expected a model with the covariance of its detail")
+    prior, matrix = task.prior_on(task.shape), model.matrix[used]
+    root: FloatArray = matrix @ (np.diag(prior.root) if prior.independent else prior.root)
+    covariance = root @ root.T + model.detail_covariance[np.ix_(used, used)]
+    light = Prior(matrix @ prior.mean, covariance_root(covariance))
+    problem = Problem(sparse.csr_array(sparse.eye_array(used.size)), light, task.expected_noise)
     return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
 
 

@@ -14,6 +14,7 @@ from ommatid.reconstruct.detail import detailed_model
 from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
 from ommatid.reconstruct.detail.local import unexplained_variance
 from ommatid.reconstruct.detail.world_prior import WorldPrior, averaging, repetition
+from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.prior import prior_of
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.errors import InputError
@@ -240,3 +241,20 @@ def test_estimators_of_misalignment_take_a_world_of_pixels(misalignment: str) ->
     stack = exposed(setup, model.forward(drawn(shown, 1)), np.zeros(model.measurements), {})
     with pytest.raises(InputError, match=r"takes a world made of f's pixels, got target.detail 2"):
         restore(stack, model)
+
+
+def test_held_out_errors_are_those_of_the_world() -> None:
+    """Predictions of a sub-imager from the others, with the covariance of the world itself, by the normal equations."""
+    shown = case("distorted")
+    world = drawn(shown, 7)
+    checked = check_held_out(shown.recorded(world, 7), shown.model)
+    matrix = shown.model.matrix.toarray()
+    covariance = matrix @ shown.covariance @ matrix.T + NOISE * np.eye(len(matrix))
+    residual = shown.recorded(world, 7).values - matrix @ np.full(len(world), 127.5)
+    for sub, rows in zip(checked.sub_imagers, shown.setup.camera.slices(), strict=True):
+        block, others = np.arange(len(matrix))[rows], np.delete(np.arange(len(matrix)), rows)
+        gain = np.linalg.solve(covariance[np.ix_(others, others)], covariance[np.ix_(others, block)]).T
+        error = residual[block] - gain @ residual[others]
+        spread = covariance[np.ix_(block, block)] - gain @ covariance[np.ix_(others, block)]
+        assert sub.chi_squared == pytest.approx(error @ np.linalg.solve(spread, error), rel=1e-6)
+    assert checked.trusted

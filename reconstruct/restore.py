@@ -25,6 +25,8 @@ from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import Execution, MethodResult
 from .noise import Noise, UsablePixels
+from .run_verdict import verdict_of
+from .verdict.verdict import Verdict
 
 MAX_SPURIOUS_INFORMATION = 0.05  # share above which the expected error is not to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
@@ -34,7 +36,7 @@ BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
 class Residual:
     """Chi-squared of the residual g - H f^ with the expected noise, and its expectation.
 
-    expected : M - trace(A H) for images drawn from the prior;  deviation : upper bound of the standard deviation
+    expected : for images drawn from the prior, M - trace(A H);  deviation : upper bound of the standard deviation
     """
 
     chi_squared: float
@@ -63,6 +65,7 @@ class Reconstruction:
     seconds: float
     truth: FloatArray | None
     error: MeasuredError | None
+    verdict: Verdict
 
     @property
     def estimate(self) -> FloatArray:
@@ -147,37 +150,35 @@ def _restored(
     assumed = assumptions_for(stack, model, choice, execution)
     result, expected_noise = assumed.method.result(assumed.noise, truth), assumed.method.task.expected_noise
     shape = model.camera.shape
+    error = None if truth is None else measure_error(result.image, truth, shape)
+    spurious = _spurious_information(model, assumed.usable, expected_noise, result.expected)
+    verdict = verdict_of(stack, model, assumed, result, error, spurious)
+    whole = verdict.parts[0] if verdict.parts else None
     return Reconstruction(
         result=result,
         choice=choice,
         prior=assumed.prior,
         trimmed_mse=trimmed_mean(result.expected.variance, shape),
-        residual=_residual(result, expected_noise),
+        residual=None if whole is None else Residual(whole.chi_squared, whole.prior, (2 * whole.prior) ** 0.5),
         shape=shape,
         usable=assumed.usable,
         noise=assumed.noise,
         fit=assumed.fit,
-        spurious_information=_spurious_information(model, assumed.usable, expected_noise, result.expected),
+        spurious_information=float(spurious.mean()),
         seconds=perf_counter() - start,
         truth=truth,
-        error=None if truth is None else measure_error(result.image, truth, shape),
+        error=error,
+        verdict=verdict,
     )
 
 
 def _spurious_information(
     model: Model, usable: UsablePixels, expected_noise: FloatArray, expected: ExpectedError
-) -> float:
+) -> FloatArray:
+    """Return the share of each pixel's apparent information that the noise of H may have produced: (N,)."""
     if not model.variance.any():
-        return 0.0
+        return np.zeros(model.unknowns)
     noise = np.full(model.measurements, np.inf)
     noise[usable.used] = expected_noise
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
-        return float(np.nan_to_num(model.spurious_information(noise) * expected.variance).mean())
-
-
-def _residual(result: MethodResult, expected_noise: FloatArray) -> Residual | None:
-    """Return None where a measurement has no expected noise, which is the unit of its residual."""
-    if not expected_noise.size or not (expected_noise > 0).all():
-        return None
-    freedoms = max(expected_noise.size - result.expected.degrees_of_freedom, 0.0)
-    return Residual(float(expected_noise @ np.square(result.multipliers)), freedoms, (2 * freedoms) ** 0.5)
+        return np.nan_to_num(model.spurious_information(noise) * expected.variance)

@@ -28,7 +28,6 @@ from .noise import Noise, UsablePixels
 from .run_verdict import verdict_of
 from .verdict.verdict import Verdict
 
-MAX_SPURIOUS_INFORMATION = 0.05  # share above which the expected error is not to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
 
 

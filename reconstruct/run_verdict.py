@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
@@ -38,6 +38,7 @@ def verdict_of(
         interval=result.interval,
         variance_bound=result.solver.variance_bound,
         spurious=float(spurious @ expected.variance) / total if total else 0.0,
+        spurious_share=float(spurious.mean()),
         fit_doubtful=assumed.fit is not None and assumed.fit.doubtful,
         noise_fitted=assumed.fit is not None and assumed.fit.noise_variance is not None,
         pixels_used=int(used.sum()),

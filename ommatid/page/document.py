@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.bench.table import BenchTable
+from ommatid.reconstruct.output import verdict_words
 
 from . import error_groups, plots, point_response, sensor, tables, time_curves, words
 from . import maps as result_maps
@@ -44,7 +45,10 @@ def _page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: 
     lenses, facts = tables.geometry(run)
     content: dict[str, Any] = {
         "title": run.title,
-        "verdict": words.verdict(run.report),
+        "heading": verdict_words.heading(run.report),
+        "grounds": words.grounds(run.report),
+        "notes": words.notes(run.report),
+        "summary": words.summary(run.report),
         "agreement": words.agreement(run.report.error),
         "cautions": words.cautions(run.report),
         "key_numbers": words.key_numbers(run.report),

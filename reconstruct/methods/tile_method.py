@@ -87,9 +87,7 @@ class TileMethod(Method):
         draws = DRAWS if task.model.unknowns <= MANY else FEW_DRAWS
         return ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws)
 
-    def _residual_power(
-        self, inputs: ResidualInputs, deviations: FloatArray, responses: FloatArray
-    ) -> ResidualPower:
+    def _residual_power(self, inputs: ResidualInputs, deviations: FloatArray, responses: FloatArray) -> ResidualPower:
         """Return the expected squares of the residual from A applied to the deviations: (rows, columns, inputs)."""
         residuals = (
             deviations[:, number] - self.task.observe(np.ascontiguousarray(responses[..., number]).ravel())

@@ -29,6 +29,7 @@ from .run_json import (
     SkippedReport,
     SolverReport,
     StageReport,
+    VerdictReport,
 )
 from .time_spent import time_spent
 
@@ -44,6 +45,7 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
     as_run = stack.scene.model_copy(update={"calibration": model.scene.calibration})
     return RunReport(
         title=stack.scene.title,
+        verdict=VerdictReport.model_validate(restoration.verdict),
         measurements=model.measurements,
         unknowns=model.unknowns,
         stages=stages,

@@ -87,8 +87,8 @@ def _mean(values: FloatArray) -> float:
     return float(values.mean()) if values.size else float("nan")
 
 
-def likely_causes(beyond: Sequence[ResidualPart], parts: Sequence[ResidualPart], evidence: Evidence) -> str:
-    """Return the likely causes of the excess in `beyond`, of all `parts`, as one clause."""
+def likely_causes(parts: Sequence[ResidualPart], evidence: Evidence) -> str:
+    """Return the likely causes of a residual that is larger than expected in some of all `parts`, as one clause."""
     if evidence.dark:
         verb = "is" if len(evidence.dark) == 1 else "are"
         return f"{listed(evidence.dark)} {verb} dark, covered or dead"

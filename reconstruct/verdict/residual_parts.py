@@ -2,15 +2,14 @@
 
 The whitened residual r of a part has the covariance W, whose eigenvalues are at most 1 where the actual noise is the
 expected one. |r|^2 then has the mean tr W and a variance of 2 tr W^2 <= 2 tr W; the certain part b of a known image
-adds |b|^2 to the mean and 4 b^T W b <= 4 |b|^2 to the variance. The p-value takes |r|^2 for a gamma variate of that mean
-and variance. Noise variances that are themselves estimates make the tails heavier; `spread` holds their relative
+adds |b|^2 to the mean and 4 b^T W b <= 4 |b|^2 to the variance. The p-value takes |r|^2 for a gamma variate of that
+mean and variance. Noise variances that are themselves estimates make the tails heavier; `spread` holds their relative
 variances.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -36,7 +35,7 @@ PLACES = (
 class ResidualPart:
     """Chi-squared of the measurements of a part, its expectation and standard deviation.
 
-    prior : expectation for images drawn from the prior;  expected : the larger of that and of the true image's, if known
+    prior : expectation for images of the prior;  expected : the larger of that and of the true image's, if known
     p_value : probability of a larger value by chance
     """
 

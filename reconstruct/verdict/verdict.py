@@ -8,15 +8,19 @@ stated; what can change a number by less is a note.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
-from scipy import stats
+import numpy as np
+from scipy import optimize, stats
 
-from ..expected_error import Interval
+from ..expected_error import COVERAGE, Interval
 from .causes import Evidence, likely_causes, listed, named
 from .residual_parts import ResidualPart, sidak
 
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
+SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
+SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 MOST_NAMED = 5  # sub-imagers in one sentence
 
 
@@ -42,7 +46,8 @@ class ErrorCheck:
     """Numbers of the other checks.
 
     mse, interval : measured and expected error of the image, None if not known
-    variance_bound : on the relative error of variances;  spurious : relative error of Eq. 5 by the noise of H
+    variance_bound : on the relative error of variances
+    spurious : relative error of Eq. 5 by the noise of H;  spurious_share : of a pixel's information, on average
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
     """
 
@@ -50,6 +55,7 @@ class ErrorCheck:
     interval: Interval | None
     variance_bound: float
     spurious: float
+    spurious_share: float
     fit_doubtful: bool
     noise_fitted: bool
     pixels_used: int
@@ -81,14 +87,10 @@ def judge(parts: list[ResidualPart], evidence: Evidence, check: ErrorCheck) -> V
 
 def excesses(parts: list[ResidualPart]) -> list[ResidualPart]:
     """Return the parts whose residual is significantly and by more than a tenth larger than expected."""
-    return [
-        part for part in parts if sidak([part.p_value] * len(parts)) < SIGNIFICANCE and part.ratio > 1 + SIZE
-    ]
+    return [part for part in parts if sidak([part.p_value] * len(parts)) < SIGNIFICANCE and part.ratio > 1 + SIZE]
 
 
-def _judge_residual(
-    parts: list[ResidualPart], evidence: Evidence, check: ErrorCheck, findings: _Findings
-) -> None:
+def _judge_residual(parts: list[ResidualPart], evidence: Evidence, check: ErrorCheck, findings: _Findings) -> None:
     if not parts:
         findings.notes.append("chi-squared was not checked: some measurements are expected to have no noise")
         return
@@ -96,7 +98,7 @@ def _judge_residual(
     if check.noise_fitted:
         findings.notes.append("the noise was fitted to this stack, so chi-squared was checked by part only")
     if beyond:
-        findings.reasons.append(f"{_excess_words(whole, beyond)}: {likely_causes(beyond, parts, evidence)}")
+        findings.reasons.append(f"{_excess_words(whole, beyond)}: {likely_causes(parts, evidence)}")
         return
     findings.passed.append(f"the residual is {whole.ratio:.3g} times its expectation")
     lower = stats.norm.cdf((whole.chi_squared - whole.prior) / (2 * whole.prior) ** 0.5) if whole.prior else 1.0
@@ -123,7 +125,9 @@ def _excess_words(whole: ResidualPart, beyond: list[ResidualPart]) -> str:
         most = f", most in {where[0]}" if subs or types else ""
         most += f"{' and' if most else ', most'} {where[-1]}" if places else ""
         return f"the residual is {whole.ratio:.3g} times what was expected{most}"
-    return f"the residual of {', '.join(where)} is up to {max(part.ratio for part in beyond):.3g} times what was expected"
+    return (
+        f"the residual of {', '.join(where)} is up to {max(part.ratio for part in beyond):.3g} times what was expected"
+    )
 
 
 def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
@@ -134,17 +138,34 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
         findings.notes.append("the error was not checked: this method states no interval for one image")
     else:
         words = f"the error, {mse:.4g}, lies {{}} its 99 % interval, {interval.low:.4g} to {interval.high:.4g}"
-        if mse > (1 + SIZE) * interval.high or mse < (1 - SIZE) * interval.low:
+        outside = mse > (1 + SIZE) * interval.high or mse < (1 - SIZE) * interval.low
+        if outside and error_p_value(mse, interval) < SIGNIFICANCE:
             findings.reasons.append(words.format("above" if mse > interval.high else "below"))
         elif interval.low <= mse <= interval.high:
             findings.passed.append(words.format("inside"))
         else:
-            findings.passed.append(words.format("within a tenth of"))
+            findings.passed.append(words.format("outside") + ", but not by more than chance and a tenth")
     if check.variance_bound > SIZE:
         findings.reasons.append(
             f"the variances of some pixels are wrong by {100 * check.variance_bound:.2g} % or more: the solver's map of"
             " them is an approximation; set estimator.method to 'tiles', or crop the target"
         )
+
+
+def error_p_value(mse: float, interval: Interval) -> float:
+    """Return the probability of an error this far on its side of the expected one, for the gamma variate of `interval`."""
+    if not interval.low < interval.mse < interval.high:
+        return float(mse == interval.mse)
+    above = mse > interval.mse
+    level, end = (COVERAGE[1], interval.high) if above else (COVERAGE[0], interval.low)
+
+    def difference(logarithm: float) -> float:
+        shape = float(np.exp(logarithm))
+        return float(stats.gamma.ppf(level, shape)) / shape - end / interval.mse
+
+    shape = float(np.exp(cast(Any, optimize).brentq(difference, *SHAPES)))
+    value = shape * mse / interval.mse
+    return float(stats.gamma.sf(value, shape) if above else stats.gamma.cdf(value, shape))
 
 
 def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
@@ -153,6 +174,11 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
             "the lens types leave pixels undetermined, and the noise of H adds spurious information:"
             f" the predicted error is too small by about {100 * min(check.spurious, 1.0):.2g} %; raise"
             " calibration.samples, or take calibration.method = 'ideal' if the camera is"
+        )
+    elif check.spurious_share > SPURIOUS_SHARE:
+        findings.notes.append(
+            f"the noise of H may have produced {100 * check.spurious_share:.2g} % of the information on a pixel, on"
+            " average; raise calibration.samples"
         )
     if check.fit_doubtful:
         findings.reasons.append(

@@ -153,7 +153,7 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
 
 
 def error_p_value(mse: float, interval: Interval) -> float:
-    """Return the probability of an error this far on its side of the expected one, for the gamma variate of `interval`."""
+    """Return the probability of an error this far on its side of the expected one, as a gamma variate."""
     if not interval.low < interval.mse < interval.high:
         return float(mse == interval.mse)
     above = mse > interval.mse

@@ -17,15 +17,16 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .assumptions import assumptions_for, with_fallback
+from .assumptions import Assumptions, assumptions_for, with_fallback
 from .estimator.estimate import Solver
 from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
-from .methods.method import Execution, MethodResult
+from .methods.method import Execution, MethodResult, total_variance
 from .noise import Noise, UsablePixels
 from .run_verdict import verdict_of
+from .verdict.residual_parts import ResidualPart
 from .verdict.verdict import Verdict
 
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
@@ -33,7 +34,7 @@ BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration")
 
 @dataclass(frozen=True)
 class Residual:
-    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation.
+    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation if the noise is that.
 
     expected : for images drawn from the prior, M - trace(A H);  deviation : upper bound of the standard deviation
     """
@@ -152,13 +153,13 @@ def _restored(
     error = None if truth is None else measure_error(result.image, truth, shape)
     spurious = _spurious_information(model, assumed.usable, expected_noise, result.expected)
     verdict = verdict_of(stack, model, assumed, result, error, spurious)
-    whole = verdict.parts[0] if verdict.parts else None
+    whole = verdict.parts[0] if verdict.parts else None  # chi-squared of all measurements
     return Reconstruction(
         result=result,
         choice=choice,
         prior=assumed.prior,
         trimmed_mse=trimmed_mean(result.expected.variance, shape),
-        residual=None if whole is None else Residual(whole.chi_squared, whole.prior, (2 * whole.prior) ** 0.5),
+        residual=None if whole is None else _residual(whole, assumed, result.expected.degrees_of_freedom),
         shape=shape,
         usable=assumed.usable,
         noise=assumed.noise,
@@ -169,6 +170,14 @@ def _restored(
         error=error,
         verdict=verdict,
     )
+
+
+def _residual(whole: ResidualPart, assumed: Assumptions, degrees_of_freedom: float) -> Residual:
+    """Return chi-squared beside what it would be if the noise were as expected."""
+    expected = whole.prior
+    if not np.allclose(total_variance(assumed.noise), assumed.method.task.expected_noise, rtol=1e-9):
+        expected = max(whole.measurements - degrees_of_freedom, 0.0)
+    return Residual(whole.chi_squared, expected, (2 * expected) ** 0.5)
 
 
 def _spurious_information(

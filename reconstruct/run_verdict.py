@@ -60,6 +60,7 @@ def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResul
         used=assumed.usable.used,
         spread=_spread(stack, assumed, total),
         shared=_shared(model, assumed, total, result),
+        largest=max(1.0, float((total / expected_noise).max())),
     )
     return residual_parts(residual, stack.camera)
 

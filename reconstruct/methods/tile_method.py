@@ -30,8 +30,8 @@ from .tile_solver import (
 )
 
 MAX_TILES = 256  # in one task
-MANY = 250_000  # pixels above which each draw takes long and one is enough
-DRAWS, FEW_DRAWS = 8, 1  # of images and noise for the expected residual
+MANY = 250_000  # pixels above which each draw takes long and few are enough
+DRAWS, FEW_DRAWS = 8, 2  # of images and noise for the expected residual
 
 
 class TileMethod(Method):
@@ -85,7 +85,7 @@ class TileMethod(Method):
             return None
         deviation = None if truth is None else truth - task.prior.mean
         draws = DRAWS if task.model.unknowns <= MANY else FEW_DRAWS
-        return ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws)
+        return ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws, optimal=False)
 
     def _residual_power(self, inputs: ResidualInputs, deviations: FloatArray, responses: FloatArray) -> ResidualPower:
         """Return the expected squares of the residual from A applied to the deviations: (rows, columns, inputs)."""

@@ -12,7 +12,7 @@ CHANGES = {
     "quantisation": ("one more bit", 0.25),
     "misalignment": ("a camera without misalignment", 0.0),
 }
-STAGES = {"rendering": "render.samples", "calibration": "calibration.samples"}
+SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}
 
 
 def is_trusted(report: RunReport) -> bool:
@@ -73,8 +73,9 @@ def _change(name: str, part: float, error: ErrorReport, spent: TimeReport) -> st
         words, factor = CHANGES[name]
         return f"; {words}: {_fall(now, now - (1 - factor) * part)}"
     more = next((more for more in spent.more if more.times == TIMES), None)
-    if name in STAGES and more is not None and more.predicted_mse < (1 - LEAST_GAIN) * now:
-        return f"; four times the samples (`{STAGES[name]}`): {_fall(now, more.predicted_mse)}"
+    if name in SAMPLES and more is not None and more.predicted_mse < (1 - LEAST_GAIN) * now:
+        keys = " and ".join(key for part_name, key in SAMPLES.items() if error.budget.get(part_name))
+        return f"; four times the samples ({keys}): {_fall(now, more.predicted_mse)}"
     return ""
 
 

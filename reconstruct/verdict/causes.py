@@ -98,7 +98,8 @@ def likely_causes(parts: Sequence[ResidualPart], evidence: Evidence) -> str:
     if evidence.designed:
         return "H as designed is not this camera's; calibrate it, or fit its misalignment"
     if few and not evidence.unflattened:
-        return f"{named(few)} {'is' if len(few) == 1 else 'are'} not where H places {'it' if len(few) == 1 else 'them'}"
+        beside = "" if len(few) == 1 else ", or one beside it,"
+        return f"{named(few[:1])}{beside} is not where H places it"
     causes = ["the pixels differ in gain, for which no flat frame was given (--flat)"] if evidence.unflattened else []
     causes.append("H is not this camera's" + ("" if evidence.calibrated else ", which was not calibrated"))
     if evidence.recorded or (evidence.independent and not evidence.whole_pixels):

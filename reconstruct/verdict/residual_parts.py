@@ -3,19 +3,20 @@
 The whitened residual r of a part has the covariance W, whose eigenvalues are at most 1 where the actual noise is the
 expected one. |r|^2 then has the mean tr W and a variance of 2 tr W^2 <= 2 tr W; the certain part b of a known image
 adds |b|^2 to the mean and 4 b^T W b <= 4 |b|^2 to the variance. The p-value takes |r|^2 for a gamma variate of that
-mean and variance. Noise variances that are themselves estimates make the tails heavier; `spread` holds their relative
-variances.
+mean and variance. Where the estimate is not optimal, tr W^2 is the mean of (r^T s)^2 over pairs of draws r and s.
+Noise variances that are themselves estimates make the tails heavier; `spread` holds their relative variances.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
-from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
 
 from .residual_power import ResidualPower
@@ -61,6 +62,7 @@ class WhitenedResidual:
     used : (M,) True for measurements that are used
     spread : (measurements used,) relative variance of the expected noise, where that is an estimate
     shared : (measurements used,) share of the expected noise whose errors few parameters per sub-imager determine
+    largest : largest ratio of the actual to the expected noise variance, at least 1; bounds the eigenvalues of W
     """
 
     squares: FloatArray
@@ -68,8 +70,10 @@ class WhitenedResidual:
     used: BoolArray
     spread: FloatArray
     shared: FloatArray
+    largest: float = 1.0
 
 
+SAMPLES_MARGIN = 2.0  # on a variance from few draws
 SHARED_FREEDOMS = 2  # of such errors in a sub-imager
 
 
@@ -116,17 +120,20 @@ class _Sums:
     def parts(self, kind: Kind, names: list[str], labels: IntArray) -> list[ResidualPart]:
         """Return the parts with these names from the (M,) index of each measurement's name."""
         labels = labels[self.residual.used]
-        power, count = self.residual.power, len(names)
+        residual, count = self.residual, len(names)
+        power = residual.power
         sizes = np.bincount(labels, minlength=count)
-        squares, prior = (np.bincount(labels, weights, count) for weights in (self.residual.squares, power.prior))
+        squares, prior = (np.bincount(labels, weights, count) for weights in (residual.squares, power.prior))
         expected, variance = prior, self._variance(power.prior, labels, count)
+        if power.samples is not None:
+            variance = np.maximum(variance, self._variance_of_samples(power.samples, labels, count))
         if power.bias is not None and power.noise is not None:
             bias = np.bincount(labels, power.bias, count)
             given = bias + np.bincount(labels, power.noise, count)
-            larger = given > prior
-            expected = np.where(larger, given, prior)
-            variance = np.where(larger, self._variance(power.noise, labels, count) + 4 * bias, variance)
+            variance_given = self._variance(power.noise, labels, count) + 4 * residual.largest * bias
+            expected, variance = np.where(given > prior, [given, variance_given], [prior, variance])
         variance *= 1 + (1 / power.draws if power.draws else 0.0)
+        p_values = _p_values(squares, expected, variance)
         return [
             ResidualPart(
                 kind,
@@ -136,7 +143,7 @@ class _Sums:
                 float(prior[number]),
                 float(expected[number]),
                 float(variance[number]) ** 0.5,
-                _p_value(float(squares[number]), float(expected[number]), float(variance[number])),
+                float(p_values[number]),
             )
             for number, name in enumerate(names)
             if sizes[number]
@@ -145,18 +152,26 @@ class _Sums:
     def _variance(self, power: FloatArray, labels: IntArray, count: int) -> FloatArray:
         """Return the variance of the sums of squares with these means."""
         residual = self.residual
-        variance = 2 * np.bincount(labels, power, count) + 3 * np.bincount(labels, residual.spread * power**2, count)
+        variance = 2 * residual.largest * np.bincount(labels, power, count)
+        variance += 3 * np.bincount(labels, residual.spread * power**2, count)
         if residual.shared.any():
             subs = int(self.subs.max()) + 1
             shared = np.bincount(self.subs + subs * labels, residual.shared * power, subs * count).reshape(count, subs)
-            variance = variance + 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
+            variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance
 
+    def _variance_of_samples(self, samples: Float32Array, labels: IntArray, count: int) -> FloatArray:
+        """Return 2 tr W^2 of each part from pairs of draws, with a margin since they are few."""
+        pairs = list(combinations(samples, 2))
+        squares = sum((np.square(np.bincount(labels, one * other, count)) for one, other in pairs), np.zeros(count))
+        return SAMPLES_MARGIN * 2 * squares / len(pairs)
 
-def _p_value(value: float, mean: float, variance: float) -> float:
-    if mean <= 0 or variance <= 0:
-        return 1.0
-    return float(stats.gamma.sf(value, mean**2 / variance, scale=variance / mean))
+
+def _p_values(values: FloatArray, means: FloatArray, variances: FloatArray) -> FloatArray:
+    """Return the probabilities of larger gamma variates of these means and variances; 1 where one of them is 0."""
+    known = (means > 0) & (variances > 0)
+    means, variances = np.where(known, means, 1.0), np.where(known, variances, 1.0)
+    return np.where(known, special.gammaincc(means**2 / variances, values * means / variances), 1.0)
 
 
 def sidak(p_values: list[float]) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 
 SEED = 20260402  # of random images and noise, different from those of data, calibration and error analysis
 
@@ -25,12 +25,15 @@ class ResidualPower:
     prior : for images drawn from the prior
     bias, noise : for the true image, the square that is certain and the mean square that noise adds; None without it
     draws : number of random draws of which these are means, 0 where nothing was drawn
+    samples : (draws, measurements used) whitened residuals of images drawn from the prior, by an estimate that is not
+        optimal, such as that of tiles; None of one whose residual varies by no more than its measurements' noise
     """
 
     prior: FloatArray
     bias: FloatArray | None
     noise: FloatArray | None
     draws: int
+    samples: Float32Array | None = None
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class ResidualInputs:
     draw_image : a random image of the prior less its mean, (N,);  actual : (M,) actual noise variances
     deviation : (N,) f - f0 of the true image, None without it
     leverage : (M,) exact (H A)_ii where the noise is as expected, None where it is not known
+    optimal : True if the estimate is that of minimum variance
     """
 
     observe: Callable[[FloatArray], FloatArray]
@@ -49,6 +53,7 @@ class ResidualInputs:
     deviation: FloatArray | None
     draws: int
     leverage: FloatArray | None = None
+    optimal: bool = True
 
     @property
     def count(self) -> int:
@@ -78,20 +83,23 @@ class ResidualInputs:
 
     def power(self, residuals: Iterator[FloatArray], expected_noise: FloatArray) -> ResidualPower:
         """Return the expected squares from the residuals, (M,) each, of the columns in their order."""
-        bias: FloatArray | None = None
-        if self.deviation is not None:
-            bias = np.square(next(residuals)) / expected_noise
-        noise: FloatArray | None = None
-        if self.deviation is not None or self.leverage is None:
-            noise = self._mean_square(residuals) / expected_noise
+        white = 1 / np.sqrt(expected_noise)
+        bias = None if self.deviation is None else np.square(white * next(residuals))
         if self.leverage is not None:
-            prior = np.clip(1 - self.leverage, 0.0, 1.0)
-        else:
-            prior = self._mean_square(residuals) / expected_noise + (0.0 if noise is None else noise)
-        return ResidualPower(prior, bias, None if bias is None else noise, self.draws if self.count else 0)
+            noise = None if bias is None else self._mean_square(white, residuals)
+            return ResidualPower(np.clip(1 - self.leverage, 0.0, 1.0), bias, noise, 0 if bias is None else self.draws)
+        samples = None if self.optimal else np.zeros((self.draws, white.size), np.float32)
+        noise, image = (self._mean_square(white, residuals, samples) for _ in range(2))
+        return ResidualPower(noise + image, bias, None if bias is None else noise, self.draws, samples)
 
-    def _mean_square(self, residuals: Iterator[FloatArray]) -> FloatArray:
-        total = np.zeros(self.actual.size)
-        for _ in range(self.draws):
-            total += np.square(next(residuals))
+    def _mean_square(
+        self, white: FloatArray, residuals: Iterator[FloatArray], samples: Float32Array | None = None
+    ) -> FloatArray:
+        """Return the mean square of the next residuals, whitened, and add these to `samples`, (draws, M)."""
+        total = np.zeros(white.size)
+        for number in range(self.draws):
+            residual = white * next(residuals)
+            total += np.square(residual)
+            if samples is not None:
+                samples[number] += residual
         return total / self.draws

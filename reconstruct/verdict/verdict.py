@@ -19,6 +19,7 @@ from .residual_parts import ResidualPart, sidak
 
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
+STRIKING = 1.5  # ratio to the whole from which a region is worth naming
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 MOST_NAMED = 5  # sub-imagers in one sentence
@@ -114,6 +115,7 @@ def _excess_words(whole: ResidualPart, beyond: list[ResidualPart]) -> str:
     subs = sorted((part for part in beyond if part.kind == "sub-imager"), key=lambda part: -part.ratio)
     types = sorted((part for part in beyond if part.kind == "lens type"), key=lambda part: -part.ratio)
     places = sorted((part for part in beyond if part.kind == "region"), key=lambda part: -part.ratio)
+    places = [place for place in places if place.ratio > STRIKING * whole.ratio]
     where: list[str] = []
     if subs:
         where.append(named([part.name for part in subs[:MOST_NAMED]]))
@@ -171,9 +173,9 @@ def error_p_value(mse: float, interval: Interval) -> float:
 def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
     if check.spurious > SIZE:
         findings.reasons.append(
-            "the lens types leave pixels undetermined, and the noise of H adds spurious information:"
-            f" the predicted error is too small by about {100 * min(check.spurious, 1.0):.2g} %; raise"
-            " calibration.samples, or take calibration.method = 'ideal' if the camera is"
+            "the lens types leave pixels undetermined, and the noise of H adds spurious information about them, so the"
+            " predicted error is too small; raise calibration.samples, or take calibration.method = 'ideal' if the"
+            " camera is"
         )
     elif check.spurious_share > SPURIOUS_SHARE:
         findings.notes.append(

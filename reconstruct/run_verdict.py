@@ -39,6 +39,7 @@ def verdict_of(
         variance_bound=result.solver.variance_bound,
         spurious=float(spurious @ expected.variance) / total if total else 0.0,
         spurious_share=float(spurious.mean()),
+        calibration_share=expected.parts.get("calibration", 0.0) / expected.mse if expected.mse else 0.0,
         fit_doubtful=assumed.fit is not None and assumed.fit.doubtful,
         noise_fitted=assumed.fit is not None and assumed.fit.noise_variance is not None,
         pixels_used=int(used.sum()),

@@ -20,6 +20,7 @@ from .residual_parts import ResidualPart, sidak
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
+UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 MOST_NAMED = 5  # sub-imagers in one sentence
@@ -49,6 +50,7 @@ class ErrorCheck:
     mse, interval : measured and expected error of the image, None if not known
     variance_bound : on the relative error of variances
     spurious : relative error of Eq. 5 by the noise of H;  spurious_share : of a pixel's information, on average
+    calibration_share : of the predicted error that the uncertainty of H causes
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
     """
 
@@ -57,6 +59,7 @@ class ErrorCheck:
     variance_bound: float
     spurious: float
     spurious_share: float
+    calibration_share: float
     fit_doubtful: bool
     noise_fitted: bool
     pixels_used: int
@@ -102,11 +105,13 @@ def _judge_residual(parts: list[ResidualPart], evidence: Evidence, check: ErrorC
         findings.reasons.append(f"{_excess_words(whole, beyond)}: {likely_causes(parts, evidence)}")
         return
     findings.passed.append(f"the residual is {whole.ratio:.3g} times its expectation")
+    uncertain = check.calibration_share > SIZE
     lower = stats.norm.cdf((whole.chi_squared - whole.prior) / (2 * whole.prior) ** 0.5) if whole.prior else 1.0
     if whole.chi_squared < (1 - SIZE) * whole.prior and lower < SIGNIFICANCE:
         findings.notes.append(
             f"the residual is {whole.chi_squared / whole.prior:.3g} times that of images drawn from the prior: the"
-            " picture is smoother than the prior, or the noise is smaller than stated"
+            f" picture is smoother than the prior, or the noise{' or the uncertainty of H' if uncertain else ''} is"
+            " smaller than stated"
         )
 
 
@@ -142,7 +147,8 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
         words = f"the error, {mse:.4g}, lies {{}} its 99 % interval, {interval.low:.4g} to {interval.high:.4g}"
         outside = mse > (1 + SIZE) * interval.high or mse < (1 - SIZE) * interval.low
         if outside and error_p_value(mse, interval) < SIGNIFICANCE:
-            findings.reasons.append(words.format("above" if mse > interval.high else "below"))
+            reason = words.format("above" if mse > interval.high else "below")
+            findings.reasons.append(reason + (UNCERTAIN if check.calibration_share > SIZE else ""))
         elif interval.low <= mse <= interval.high:
             findings.passed.append(words.format("inside"))
         else:

@@ -71,6 +71,14 @@ class Result:
         """Measured mean squared error per pixel, None without the truth."""
         return self.summary.error.mse
 
+    @property
+    def trusted(self) -> bool | None:
+        """True if the verdict on the run is that its error bars can be trusted, None for a run of an earlier version.
+
+        `summary.verdict` holds the reasons.
+        """
+        return None if self.summary.verdict is None else self.summary.verdict.trusted
+
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML page, and return its path. Raises InputError or MachineError."""
         from ommatid.page.data import Run

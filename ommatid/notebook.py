@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.output.verdict_words import grounds, heading
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -75,7 +76,8 @@ def result_html(
     """Show the image, its posterior standard deviation and, where the truth is known, its error: (rows, columns)."""
     values = 0.0, 255.0
     pictures: list[Picture] = [("image", image, values), ("posterior standard deviation", deviation, None)]
-    rows = [("expected mean squared error", f"{summary.error.predicted_mse:.4g}")]
+    rows = [("verdict", f"{heading(summary)}: {grounds(summary)}")]
+    rows += [("expected mean squared error", f"{summary.error.predicted_mse:.4g}")]
     if truth is not None:
         pictures = [("truth", truth, values), *pictures, ("error", image - truth, None)]
         rows.append(("measured mean squared error", f"{summary.error.mse:.4g}"))

@@ -31,12 +31,14 @@ class ExpectedError:
 
     missing : the prior's part, in run.json "null_space": unseen by the measurements, or hidden by their noise
     resolved : (N,), the diagonal of A H: the share of a pixel's value that comes from the measurements, 0 to 1
+    leverage : (M,), the diagonal of H A, where all pixels were solved for; None where it is not known
     """
 
     variance: FloatArray
     missing: float
     parts: dict[str, float]
     resolved: FloatArray
+    leverage: FloatArray | None = None
 
     @property
     def mse(self) -> float:
@@ -76,17 +78,21 @@ def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | No
     count, measurements = pixels.size, problem.measurements
     by_column = sparse.csc_array(problem.matrix)
     total = np.sum(list(noise.values()), axis=0) if noise else np.zeros(measurements)
-    missing, noisy, resolved, weights = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(measurements)
+    missing, noisy, resolved = np.zeros(count), np.zeros(count), np.zeros(count)
+    weights, leverage = np.zeros(measurements), np.zeros(measurements)
     for chunk, chosen, u, negative in solved_columns(form, pixels):
         missing[chunk] = np.square(u).sum(axis=0)
-        resolved[chunk] = -np.asarray(by_column[:, chosen].multiply(negative).sum(axis=0)).ravel()
+        products = by_column[:, chosen].multiply(negative)
+        resolved[chunk] = -np.asarray(products.sum(axis=0)).ravel()
+        leverage -= np.asarray(products.sum(axis=1)).ravel()
         squared = np.square(negative)
         noisy[chunk] = total @ squared
         weights += squared.sum(axis=1) / count
     as_expected = np.array_equal(total, problem.noise_variance)
     variance = form.variance()[pixels] if as_expected else missing + noisy
     parts = {name: float(weights @ values) for name, values in noise.items()}
-    return ExpectedError(variance, float(missing.mean()), parts, resolved)
+    all_pixels = count == problem.unknowns
+    return ExpectedError(variance, float(missing.mean()), parts, resolved, leverage if all_pixels else None)
 
 
 def expected_given(form: Form, truth: FloatArray, noise_variance: FloatArray) -> Interval:

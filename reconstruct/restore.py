@@ -19,25 +19,27 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .assumptions import assumptions_for, with_fallback
+from .assumptions import Assumptions, assumptions_for, with_fallback
 from .detail.detailed_model import DetailedModel
 from .estimator.estimate import Solver
 from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
-from .methods.method import EstimationTask, Execution, MethodResult
+from .methods.method import EstimationTask, Execution, MethodResult, total_variance
 from .noise import Noise, UsablePixels
+from .run_verdict import verdict_of
+from .verdict.residual_parts import ResidualPart
+from .verdict.verdict import Verdict
 
-MAX_SPURIOUS_INFORMATION = 0.05  # share above which the expected error is not to be trusted
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration", "detail")
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation.
+    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation if the noise is that.
 
-    expected : M - trace(A H) for images drawn from the prior;  deviation : upper bound of the standard deviation
+    expected : for images drawn from the prior, M - trace(A H);  deviation : upper bound of the standard deviation
     """
 
     chi_squared: float
@@ -68,6 +70,7 @@ class Reconstruction:
     truth: FloatArray | None
     error: MeasuredError | None
     task: EstimationTask
+    verdict: Verdict
 
     @property
     def estimate(self) -> FloatArray:
@@ -159,22 +162,26 @@ def _restored(
     assumed = assumptions_for(stack, model, choice, execution)
     result, task = assumed.method.result(assumed.noise, truth_for(choice, truth, stack.camera)), assumed.method.task
     truth = None if truth is None else _image(truth, stack.camera)
-    expected_noise = task.expected_noise
+    error = None if truth is None else measure_error(result.image, truth, shape)
+    spurious = _spurious_information(task.model, assumed.usable, task.expected_noise, result.expected)
+    verdict = verdict_of(stack, model, assumed, result, error, spurious)
+    whole = verdict.parts[0] if verdict.parts else None  # chi-squared of all measurements
     return Reconstruction(
         result=result,
         choice=choice,
         prior=assumed.prior,
         trimmed_mse=trimmed_mean(result.expected.variance, shape),
-        residual=_residual(result, expected_noise),
+        residual=None if whole is None else _residual(whole, assumed, result.expected.degrees_of_freedom),
         shape=shape,
         usable=assumed.usable,
         noise=assumed.noise,
         fit=assumed.fit,
-        spurious_information=_spurious_information(task.model, assumed.usable, expected_noise, result.expected),
+        spurious_information=float(spurious.mean()),
         seconds=perf_counter() - start,
         truth=truth,
-        error=None if truth is None else measure_error(result.image, truth, shape),
-        task=assumed.method.task,
+        error=error,
+        task=task,
+        verdict=verdict,
     )
 
 
@@ -190,22 +197,23 @@ def _image(truth: FloatArray, camera: Camera) -> FloatArray:
     return averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
 
 
+def _residual(whole: ResidualPart, assumed: Assumptions, degrees_of_freedom: float) -> Residual:
+    """Return chi-squared beside what it would be if the noise were as expected."""
+    expected = whole.prior
+    if not np.allclose(total_variance(assumed.noise), assumed.method.task.expected_noise, rtol=1e-9):
+        expected = max(whole.measurements - degrees_of_freedom, 0.0)
+    return Residual(whole.chi_squared, expected, (2 * expected) ** 0.5)
+
+
 def _spurious_information(
     model: Model, usable: UsablePixels, expected_noise: FloatArray, expected: ExpectedError
-) -> float:
+) -> FloatArray:
+    """Return the share of each pixel's apparent information that the noise of H may have produced: (N,)."""
     if not model.variance.any():
-        return 0.0
+        return np.zeros(model.unknowns)
     noise = np.full(model.measurements, np.inf)
     noise[usable.used] = expected_noise
     if isinstance(model, DetailedModel) and model.detail_covariance is not None:
         noise += model.detail_variance
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
-        return float(np.nan_to_num(model.spurious_information(noise) * expected.variance).mean())
-
-
-def _residual(result: MethodResult, expected_noise: FloatArray) -> Residual | None:
-    """Return None where a measurement has no expected noise, which is the unit of its residual."""
-    if not expected_noise.size or not (expected_noise > 0).all():
-        return None
-    freedoms = max(expected_noise.size - result.expected.degrees_of_freedom, 0.0)
-    return Residual(float(expected_noise @ np.square(result.multipliers)), freedoms, (2 * freedoms) ** 0.5)
+        return np.nan_to_num(model.spurious_information(noise) * expected.variance)

@@ -121,6 +121,12 @@ class Scene(Table):
     """A camera, its target and the settings of the computation."""
 
     title: str = ""
+    expect: str | None = Field(
+        default=None,
+        pattern="^(trusted|not trusted: .+)$",
+        exclude=True,  # changes no result, so it is in no fingerprint and no file of a run
+        description='the verdict that a run must have: "trusted", or "not trusted: REASON"',
+    )
     target: TargetTable
     camera: CameraTable
     world: WorldTable | None = None

@@ -15,22 +15,20 @@ from ommatid.reconstruct.output.run_json import (
     StageReport,
     TimeReport,
 )
-from ommatid.reconstruct.restore import MAX_SPURIOUS_INFORMATION
+from ommatid.reconstruct.output.verdict_words import grounds, heading, is_trusted
 
 from .summary import skipped_words
 
 Row = tuple[str, str]
 
 MAX_NAMES = 5  # sub-imagers named in one row
-SPURIOUS = (
-    "the lens types leave pixels undetermined, and the noise of H adds spurious information:"
-    " raise calibration.samples, or take calibration.method = 'ideal' if the camera is"
-)
+VERDICT = "verdict"
 
 
 def rows(report: RunReport) -> list[Row]:
-    """Return names and values, in the order in which they are printed."""
+    """Return names and values, in the order in which they are printed; the verdict is first."""
     return [
+        *_verdict_rows(report),
         *_stage_rows(report),
         *_error_rows(report.error),
         *([] if report.region is None else [_region_row(report.region)]),
@@ -40,8 +38,13 @@ def rows(report: RunReport) -> list[Row]:
         *_model_rows(report.model),
         *(("assumed", assumption) for assumption in report.assumes),
         *((f"left out: {skipped.what}", skipped_words(skipped.why, skipped.bound)) for skipped in report.skipped),
-        *_time_rows(report.spent),
+        *_time_rows(report.spent, limits=is_trusted(report)),
     ]
+
+
+def _verdict_rows(report: RunReport) -> list[Row]:
+    notes = () if report.verdict is None else report.verdict.notes
+    return [(VERDICT, f"{heading(report)}: {grounds(report)}"), *(("  note", note) for note in notes)]
 
 
 def samples_of(stage: StageReport) -> str:
@@ -125,8 +128,6 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
     if diagnostics.pixels_dead or diagnostics.pixels_saturated:
         counts = f"{diagnostics.pixels_dead} dead, {diagnostics.pixels_saturated} saturated"
         lines.append(("sensor pixels left out", counts))
-    if not diagnostics.pixels_used:
-        lines.append(("this is the prior, not an image", "no sensor pixel is left"))
     width = "nothing is resolved" if diagnostics.resolution is None else f"{diagnostics.resolution:.3g} pixels of f"
     lines += [
         ("degrees of freedom", f"{diagnostics.degrees_of_freedom:.1f} of {unknowns}"),
@@ -142,9 +143,6 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
         if number.log_deviation is not None:
             precision = f"within a factor of {exp(number.log_deviation):.3g}"
         lines.append((f"fitted {name.replace('_', ' ')}", f"{number.value:.4g}{unit}, {precision}"))
-    if diagnostics.fit_doubtful:
-        why = "a fitted value lies on the bound of its range, so the stack does not determine it"
-        lines.append(("do not trust the fit", why))
     return lines
 
 
@@ -157,18 +155,17 @@ def _model_rows(model: ModelReport) -> list[Row]:
         refused = model.fit["refused"]
         rest = f"; as measured, since the fit is not good there: {_named(refused)}" if refused else ""
         lines.append(("H by a fit of its geometry", f"{model.fit['accepted']} sub-imagers{rest}"))
-    if model.spurious_information > MAX_SPURIOUS_INFORMATION:
-        lines.append(("do not trust the predicted error", SPURIOUS))
     return lines
 
 
-def _time_rows(spent: TimeReport) -> list[Row]:
+def _time_rows(spent: TimeReport, limits: bool) -> list[Row]:
+    """limits : True to state what more time would bring"""
     lines: list[Row] = []
     if spent.within is not None:
         stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.stages.items())
         chosen = ", ".join(f"{key} {value}" for key, value in spent.chosen.items())
         lines.append(("time", f"{spent.seconds:.1f} s of {spent.within:g} s: {stages}; chosen: {chosen}"))
-    if spent.more:
+    if spent.more and limits:
         more = ", ".join(f"{more.seconds:.3g} s: {more.predicted_mse:.4g}" for more in spent.more[:2])
         lines.append(("error at most, in more time", f"{more}; by noise alone: {spent.noise_alone:.4g}"))
     return lines

@@ -25,7 +25,7 @@ class SweepRow(BaseModel):
 
     values : of the swept keys; in memory as they were written, in sweep.json as the scene file has them
     expected_mse, expected_low, expected_high : expectation given the true image, and its 99 % interval
-    predicted_mse : Eq. 5
+    predicted_mse : Eq. 5;  trusted : the verdict
     The order of the fields is that of the columns of sweep.csv.
     """
 
@@ -34,6 +34,7 @@ class SweepRow(BaseModel):
     scene: str
     folder: str | None = None
     values: dict[str, Any]
+    trusted: bool | None = None
     mse: float | None = None
     expected_mse: float | None = None
     expected_low: float | None = None
@@ -95,6 +96,7 @@ def summary(document: Mapping[str, Any]) -> SweepRow:
     return SweepRow(
         **where,
         **numbers,
+        trusted=document.get("verdict", {}).get("trusted"),
         budget=error.get("budget", {}),
         seconds={name: value for name, value in seconds.items() if value is not None},
     )

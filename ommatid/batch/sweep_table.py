@@ -34,6 +34,7 @@ def lines(rows: Sequence[SweepRow]) -> list[tuple[str, str]]:
         label += [f"{key} = {value}" for key, value in row.values.items()]
         errors = {"mse": row.mse, "predicted mse": row.predicted_mse}
         result = [f"{name} {error:.4g}" for name, error in errors.items() if error is not None]
+        result += ["not to be trusted"] if row.trusted is False else []
         result += [] if row.null_space is None else [f"null space {row.null_space}"]
         printed.append((", ".join(label), row.failed or ", ".join(result) or "done"))
     return printed

@@ -1,6 +1,7 @@
 """Convert every failure of a command into one sentence on stderr and an exit code.
 
-Exit codes are 0, 2 for a scene, option or file to correct, and 1 for a failure of the machine.
+Exit codes are 0, 2 for a scene, option or file to correct, 1 for a failure of the machine, and 3 with --strict for
+results that are not to be trusted.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ INTERRUPTED = 130  # exit code of a command stopped by Ctrl-C
 
 
 class BatchError(Exception):
-    """Scenes of a batch failed, as has been reported for each; `exit_code` is the worst of theirs."""
+    """Scenes failed or are not to be trusted, as has been reported for each; `exit_code` is the worst of theirs."""
 
     def __init__(self, exit_code: int) -> None:
-        """Stop a command with an exit code after its failures have been reported."""
+        """Stop a command with an exit code after its results and failures have been reported."""
         super().__init__(exit_code)
         self.exit_code = exit_code
 

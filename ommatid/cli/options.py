@@ -45,6 +45,9 @@ Workers = Annotated[
     int | None,
     typer.Option("--workers", metavar="N", min=1, help="Number of processes (default: chosen automatically)."),
 ]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Exit with code 3 if the results are not to be trusted; they are written.")
+]
 Within = Annotated[
     str, typer.Option("--within", metavar="TIME", help='Find the best result within a time, such as "30 s".')
 ]

@@ -56,7 +56,7 @@ def print_tables(sections: Iterable[Section]) -> None:
     for title, lines in sections:
         table = Table("", "", title=title, title_justify="left", show_header=False)
         for name, value in lines:
-            table.add_row(name, value)
+            table.add_row(name, value, style="bold red" if (name, value[:3]) == ("verdict", "not") else None)
         Console(markup=False, emoji=False).print(table)
 
 

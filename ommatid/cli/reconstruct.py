@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from . import failures, options, output
-from .options import Json, Lenses, Output, Sets
+from .options import Json, Lenses, Output, Sets, Strict
 
 StackFile = Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")]
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Their observation model, model.npz.")]
@@ -45,16 +45,20 @@ def reconstruct(
     region: Region = "",
     scheduler: TileScheduler = "",
     workers: TileWorkers = None,
+    strict: Strict = False,
     as_json: Json = False,
 ) -> None:
     """Reconstruct from files alone."""
     from ommatid.analysis import run_table
     from ommatid.pipeline.reconstruction import reconstruct_files
+    from ommatid.reconstruct.output.verdict_words import is_trusted
 
     asked = options.changes(sets), options.lens_names(lens), options.region(region)
     with output.progress_bar("reconstruct") as progress:
         report = reconstruct_files(stack, model, file, *asked, progress, scheduler, workers)
     output.print_result({"file": str(file), **report.plain()}, [(str(file), run_table.rows(report))], as_json)
+    if strict and not is_trusted(report):
+        raise failures.BatchError(failures.NOT_TRUSTED)
 
 
 def check(

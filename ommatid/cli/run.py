@@ -15,6 +15,7 @@ from .options import (
     SceneFiles,
     Scheduler,
     Sets,
+    Strict,
     Sweeps,
     Within,
     Workers,
@@ -39,6 +40,7 @@ def run(
     workers: Workers = None,
     complete: Complete = False,
     within: Within = "",
+    strict: Strict = False,
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
@@ -55,7 +57,8 @@ def run(
     stages, workers = stages_within(within, members, STARTED, output.say, scheduler, workers)
     batch = scene_batch(*asked, stages, output.observer, report)
     pool = scheduler, workers
-    finish_batch(run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder), as_json)
+    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder)
+    finish_batch(outcome, as_json, strict)
 
 
 def render(
@@ -82,8 +85,13 @@ def render(
     finish_batch(run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder), as_json)
 
 
-def finish_batch(outcome: BatchOutcome, as_json: bool) -> None:
-    """Print the documents of a batch, or the table of a sweep. Raises BatchError if a scene failed."""
+def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False) -> None:
+    """Print the documents of a batch, or the table of a sweep.
+
+    Raises BatchError if a scene failed or, if `strict`, if the results of one are not to be trusted.
+    """
     output.print_result(outcome.documents, outcome.sections, as_json)
-    if outcome.exit_code:
-        raise failures.BatchError(outcome.exit_code)
+    verdicts = [document["verdict"]["trusted"] for document in outcome.documents if "verdict" in document]
+    code = max(outcome.exit_code, failures.NOT_TRUSTED if strict and not all(verdicts) else 0)
+    if code:
+        raise failures.BatchError(code)

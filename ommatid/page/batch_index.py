@@ -17,6 +17,7 @@ from ommatid.batch.sweep_row import NUMBERS, read_rows
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
+from ommatid.reconstruct.output.verdict_words import heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
@@ -44,6 +45,11 @@ class BatchEntry:
     def agreement(self) -> str:
         """Agreement of the measured error with the expected interval, as `agreement` of `words` returns it."""
         return agreement(self.report.error) if self.report else "unknown"
+
+    @property
+    def heading(self) -> str:
+        """The verdict in two or three words."""
+        return heading(self.report) if self.report else ""
 
     @property
     def seconds(self) -> float:
@@ -139,6 +145,9 @@ def words(entries: list[BatchEntry]) -> str:
     """Return the results of the batch in one sentence."""
     finished = [entry for entry in entries if not entry.failure]
     sentence = f"{len(finished)} of {len(entries)} scenes are finished"
+    distrusted = [entry.title for entry in finished if entry.heading == "not to be trusted"]
+    if distrusted:
+        sentence += f"; not to be trusted: {', '.join(distrusted)}"
     agreements = [entry.agreement for entry in finished if entry.agreement != "unknown"]
     if agreements:
         inside = agreements.count("agrees")

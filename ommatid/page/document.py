@@ -10,6 +10,7 @@ from ommatid.analysis.held_out import maps as held_out_maps
 from ommatid.analysis.held_out import table
 from ommatid.bench.table import BenchTable
 from ommatid.reconstruct.detail.detailed_model import model_of_f
+from ommatid.reconstruct.output import verdict_words
 from ommatid.scenes.tables.estimation import PriorTable
 
 from . import error_groups, plots, point_response, sensor, tables, time_curves, words
@@ -49,7 +50,10 @@ def _page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: 
     lenses, facts = tables.geometry(run)
     content: dict[str, Any] = {
         "title": run.title,
-        "verdict": words.verdict(run.report),
+        "heading": verdict_words.heading(run.report),
+        "grounds": words.grounds(run.report),
+        "notes": words.notes(run.report),
+        "summary": words.summary(run.report),
         "agreement": words.agreement(run.report.error),
         "cautions": words.cautions(run.report),
         "key_numbers": words.key_numbers(run.report),

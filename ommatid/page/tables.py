@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from ommatid.analysis import depth_error, run_table, study
 from ommatid.analysis.summary import describe, skipped_words
 from ommatid.reconstruct.output.run_json import StageReport
+from ommatid.reconstruct.output.verdict_words import is_trusted
 from ommatid.scenes.setup import Setup
 
 from .data import Run
@@ -49,12 +50,12 @@ def _seconds(value: float) -> str:
 
 
 def more_samples(run: Run) -> PageTable | None:
-    """Return run time and predicted error with more samples, None if nothing was rendered.
+    """Return run time and predicted error with more samples, None if nothing was rendered or the run is not trusted.
 
     The error is that of this run's estimator. The optimal one for less noise relies less on the prior and is better.
     """
     spent = run.report.spent
-    if not spent.more:
+    if not spent.more or not is_trusted(run.report):
         return None
     present = ("as in this run", sum(spent.stages.values()), run.report.error.predicted_mse)
     known = [present, *((f"{more.times} times as many", more.seconds, more.predicted_mse) for more in spent.more)]

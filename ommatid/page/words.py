@@ -4,26 +4,39 @@ from __future__ import annotations
 
 from math import sqrt
 
+from ommatid.reconstruct.output import verdict_words
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
-from ommatid.reconstruct.restore import MAX_SPURIOUS_INFORMATION
+from ommatid.reconstruct.output.verdict_words import cause, is_trusted, remedy
 
 SCALE = "on a scale of 0 to 255"
-# Cause of a part of the predicted error, and the remedy:
-CAUSES = {
-    "null_space": ("null space of H", "another lens type would reduce it (`ommatid design` ranks candidates)"),
-    "noise": ("sensor noise", "only more light or a better sensor would reduce it"),
-    "quantisation": ("quantisation", "more bits would reduce it"),
-    "rendering": ("noise of the rendering", "a larger `render.samples` would reduce it"),
-    "calibration": ("uncertainty of H", "a larger `calibration.samples` would reduce it"),
-    "misalignment": ("misalignment of the lenses", "a calibration would remove it"),
-}
 
 
-def verdict(report: RunReport) -> str:
-    """Return the main results in three sentences: measured against expected error, resolution, largest cause."""
+def summary(report: RunReport) -> str:
+    """Return the main results in three sentences: measured against expected error, resolution, largest cause.
+
+    Where the verdict is against trust, only the first, and nothing of limits or remedies.
+    """
     if not report.diagnostics.pixels_used:
         return "No sensor pixel could be used: the estimate is the prior, not an image."
-    return f"{_error(report.error)} {_resolution(report)} {_largest_cause(report.error)}"
+    if not is_trusted(report):
+        return f"{_error(report.error)} The figures below rest on assumptions that do not hold; resolve this first."
+    return f"{_error(report.error)} {_resolution(report)} {remedy(report)}"
+
+
+def grounds(report: RunReport) -> list[str]:
+    """Return what the verdict rests on, one sentence for each reason or passed check."""
+    verdict = report.verdict
+    listed = [verdict_words.grounds(report)] if verdict is None else list(verdict.reasons or verdict.passed)
+    return [_sentence(words) for words in listed or [verdict_words.grounds(report)]]
+
+
+def notes(report: RunReport) -> list[str]:
+    """Return the notes of the verdict as sentences."""
+    return [] if report.verdict is None else [_sentence(words) for words in report.verdict.notes]
+
+
+def _sentence(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:]}."
 
 
 def _error(error: ErrorReport) -> str:
@@ -63,26 +76,10 @@ def _resolution(report: RunReport) -> str:
     return f"The median resolution is {pixels} of the target."
 
 
-def _largest_cause(error: ErrorReport) -> str:
-    total = error.predicted_mse
-    if total <= 0:
-        return "The predicted error is zero."
-    name, part = max(error.budget.items(), key=lambda item: item[1])
-    cause, remedy = CAUSES.get(name, (name.replace("_", " "), "see the error budget"))
-    return f"Largest part of the predicted squared error: {cause}, {100 * part / total:.0f} %; {remedy}."
-
-
 def cautions(report: RunReport) -> list[str]:
     """Return warnings that a reader needs before the numbers, one sentence each."""
     warnings: list[str] = []
     diagnostics = report.diagnostics
-    if report.model.spurious_information > MAX_SPURIOUS_INFORMATION:
-        warnings.append(
-            "Do not trust the predicted error: the lens types leave pixels undetermined, and the noise of H adds"
-            " spurious information about them."
-        )
-    if diagnostics.fit_doubtful:
-        warnings.append("Do not trust the fitted prior or noise: the stack does not determine them.")
     if diagnostics.pixels_dead or diagnostics.pixels_saturated:
         warnings.append(
             f"{diagnostics.pixels_dead} dead and {diagnostics.pixels_saturated} saturated sensor pixels are excluded"
@@ -111,8 +108,4 @@ def key_numbers(report: RunReport) -> list[tuple[str, str, str]]:
 def budget(error: ErrorReport) -> list[tuple[str, float, float]]:
     """Return the parts of the predicted squared error, the largest first: cause, part, share in per cent."""
     parts = sorted(error.budget.items(), key=lambda item: -item[1])
-    return [
-        (CAUSES.get(name, (name.replace("_", " "), ""))[0], part, 100 * part / error.predicted_mse)
-        for name, part in parts
-        if part > 0
-    ]
+    return [(cause(name), part, 100 * part / error.predicted_mse) for name, part in parts if part > 0]

@@ -12,8 +12,10 @@ from ommatid.runtime.errors import InputError
 
 from ..estimator.estimate import Estimate, estimate
 from ..expected_error import Interval, expected_given, interval, solved_columns, variance_of_sum
+from ..methods.dense_method import DRAWS, residual_power, residuals
 from ..methods.method import Method, MethodResult, total_variance
 from ..misalignment.robust_noise import Whitening, robust_error
+from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .detailed_model import CAUSE, DetailedModel
 from .world_prior import averaging
 
@@ -52,14 +54,35 @@ class DetailMethod(Method):
         """Return the estimate and its error; truth : (N,), or better (pixels of the world,), whose detail is known."""
         white, solved = self._solved
         unit = np.ones(self.task.expected_noise.size)
+        expected = robust_error(solved.form, white, noise, CAUSE)
         return MethodResult(
             solved.image,
             solved.multipliers / np.sqrt(self.task.expected_noise),  # their squares times the noise are chi-squared
             solved.solver,
-            robust_error(solved.form, white, noise, CAUSE),
+            expected,
             None if truth is None else self._interval(truth, total_variance(noise)),
             lambda weights: variance_of_sum(solved.form, weights, unit),
+            self._residual_power(truth, total_variance(noise), expected.leverage),
         )
+
+    def _residual_power(
+        self, truth: FloatArray | None, actual: FloatArray, leverage: FloatArray | None
+    ) -> ResidualPower | None:
+        """Return the expected squares of the whitened residual; where its world is known, its detail is no noise."""
+        model, (white, solved) = self._model, self._solved
+        unit = np.ones(actual.size)
+        if truth is None or truth.size == solved.form.problem.unknowns:
+            return residual_power(solved.form, unit, leverage, truth)
+        inputs = ResidualInputs(
+            observe=lambda world: white.vector(model.fine.forward(world)[self.task.used]),
+            draw_image=lambda _: np.zeros(truth.size),
+            actual=actual,
+            deviation=truth - model.prior_mean,
+            draws=DRAWS,
+            leverage=leverage,
+            whiten=white.vector,
+        )
+        return inputs.power(residuals(solved.form, inputs.block()), unit)
 
     def _interval(self, truth: FloatArray, noise_variance: FloatArray) -> Interval:
         """Return the expected error of one image; where its world is known, its detail is no noise."""

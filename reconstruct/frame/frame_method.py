@@ -29,6 +29,7 @@ from ..methods.method import (
     residual_multipliers,
     total_variance,
 )
+from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .banded_system import BandedSystem, serves
 from .conjugate_gradients import FrameSystem, Solution
 from .preconditioner import Preconditioner, is_sliding
@@ -48,6 +49,7 @@ MANY = 250_000  # pixels above which exact variances and more than a few probes 
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
 PROBES = 6  # pixels whose exact variance checks the map
 FEW_PROBES = 2
+DRAWS = 2  # of images and noise for the expected residual
 HALO = 5  # boxes of the widest type, beyond which pixels do not affect a variance
 
 
@@ -121,8 +123,26 @@ class FrameMethod(Method):
         )
         multipliers = residual_multipliers(task, self.image)
         return MethodResult(
-            self.image, multipliers, solver, expected, given, lambda weights: self._variance_of_sum(weights, actual)
+            self.image,
+            multipliers,
+            solver,
+            expected,
+            given,
+            lambda weights: self._variance_of_sum(weights, actual),
+            self._residual_power(actual, truth),
         )
+
+    def _residual_power(self, actual: FloatArray, truth: FloatArray | None) -> ResidualPower:
+        """Return the expected squares of the residual, by solutions for random images and noise."""
+        task, system = self.task, self.system
+        deviation = None if truth is None else truth - task.prior.mean
+        draws = DRAWS if task.model.unknowns <= MANY else 1
+        inputs = ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws)
+        residuals = (
+            column - task.observe(self._solve(system.right_hand_side(task.on_all_measurements(column, 0.0))))
+            for column in inputs.columns()
+        )
+        return inputs.power(residuals, task.expected_noise)
 
     def _solve(self, right: FloatArray) -> FloatArray:
         return self.system.solve(right, self.task.settings.accuracy).image

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
+
+import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 
 from ..estimator.estimate import Estimate, estimate
 from ..expected_error import expected_error, expected_given, variance_of_sum
+from ..forms.form import Form
 from ..problem import Problem
+from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .method import Method, MethodResult, total_variance
+
+DRAWS = 32  # of images and noise for the expected residual
 
 
 class DenseMethod(Method):
@@ -29,11 +36,43 @@ class DenseMethod(Method):
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
         solution, actual = self.estimate, total_variance(noise)
+        expected = expected_error(solution.form, noise)
         return MethodResult(
             solution.image,
             solution.multipliers,
             solution.solver,
-            expected_error(solution.form, noise),
+            expected,
             None if truth is None else expected_given(solution.form, truth, actual),
             lambda weights: variance_of_sum(solution.form, weights, actual),
+            residual_power(solution.form, actual, expected.leverage, truth),
         )
+
+
+def residual_power(
+    form: Form, actual: FloatArray, leverage: FloatArray | None, truth: FloatArray | None
+) -> ResidualPower | None:
+    """Return the expected squares of the residual; None where a measurement has no expected noise.
+
+    leverage : (M,) the diagonal of H A, which holds for the expected noise;  truth : (N,) the image, if it is known
+    """
+    problem = form.problem
+    if not problem.noisy:
+        return None
+    prior = problem.prior
+    inputs = ResidualInputs(
+        observe=lambda image: problem.matrix @ image,
+        draw_image=lambda rng: prior.apply_root(rng.normal(size=prior.dimension)),
+        actual=actual,
+        deviation=None if truth is None else truth - prior.mean,
+        draws=DRAWS,
+        leverage=leverage if np.allclose(actual, problem.noise_variance, rtol=1e-9) else None,
+    )
+    return inputs.power(residuals(form, inputs.block()), problem.noise_variance)
+
+
+def residuals(form: Form, block: FloatArray) -> Iterator[FloatArray]:
+    """Yield (I - H A) x of every column x: Rv times the multipliers."""
+    if not block.size:
+        return
+    _, multipliers = form.solve(np.zeros((form.problem.prior.dimension, block.shape[1])), block)
+    yield from (form.problem.noise_variance[:, None] * multipliers).T

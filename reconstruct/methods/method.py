@@ -19,6 +19,7 @@ from ommatid.scenes.tables import estimation
 from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval
 from ..prior import Prior, prior_of, spectrum_of
+from ..verdict.residual_power import ResidualPower
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,19 @@ class EstimationTask:
         waves = fft.dctn(weights.reshape(self.shape), 2, norm="ortho")
         return float(np.sum(spectrum * np.square(waves)))
 
+    def draw_deviation(self, rng: np.random.Generator) -> FloatArray:
+        """Draw an image from the prior, less its mean: (N,). Correlated pixels are reflected at the edges."""
+        spectrum = spectrum_of(self.prior, self.shape, *self._scale)
+        noise = rng.normal(size=self.shape)
+        if isinstance(spectrum, float):
+            return spectrum**0.5 * noise.ravel()
+        return np.asarray(fft.idctn(np.sqrt(spectrum) * noise, 2, norm="ortho")).ravel()
+
+    def observe(self, image: FloatArray) -> FloatArray:
+        """Return H f of the used measurements: (N,) to (measurements used,)."""
+        readings = self.model.forward(image)
+        return readings if self.complete else readings[self.used]
+
     def on_all_measurements(self, values: FloatArray, fill: float) -> FloatArray:
         """Return values of the used measurements on all of them: (measurements used,) to (M,), else `fill`."""
         if self.complete:
@@ -92,6 +106,7 @@ class MethodResult:
     image : (N,) f^;  multipliers : (measurements used,) Rv^-1 (g - H f^)
     expected : Eq. 5 with the actual noise;  interval : for the true image, if it is known
     variance_of_sum : expected squared error of a weighted sum of pixels, as a function of (N,) weights
+    residual_power : expected squares of the residual, None where a measurement has no expected noise
     """
 
     image: FloatArray
@@ -100,6 +115,7 @@ class MethodResult:
     expected: ExpectedError
     interval: Interval | None
     variance_of_sum: Callable[[FloatArray], float]
+    residual_power: ResidualPower | None
 
 
 class Method(ABC):
@@ -142,7 +158,6 @@ def is_uniform(values: FloatArray) -> bool:
 
 def residual_multipliers(task: EstimationTask, image: FloatArray) -> FloatArray:
     """Return Rv^-1 (g - H f^): (measurements used,); 0 for a measurement without noise."""
-    residual = task.recorded - task.model.forward(image)
-    if not task.complete:
-        residual = residual[task.used]
+    recorded = task.recorded if task.complete else task.recorded[task.used]
+    residual = recorded - task.observe(image)
     return np.divide(residual, task.expected_noise, out=np.zeros_like(residual), where=task.expected_noise > 0)

@@ -17,6 +17,7 @@ from ommatid.runtime.processors import one_thread, processors
 
 from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, interval
+from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .method import Method, MethodResult, is_uniform, residual_multipliers, total_variance
 from .tile_cost import tile_cost, words
 from .tile_solver import (
@@ -30,6 +31,8 @@ from .tile_solver import (
 )
 
 MAX_TILES = 256  # in one task
+MANY = 250_000  # pixels above which each draw takes long and few are enough
+DRAWS, FEW_DRAWS = 8, 2  # of images and noise for the expected residual
 
 
 class TileMethod(Method):
@@ -47,7 +50,10 @@ class TileMethod(Method):
         """Return the estimate and its error for the actual noise."""
         task = self.task
         groups = self.groups(noise)
-        results = self._solve(groups, noise, truth)
+        inputs = self._residual_inputs(total_variance(noise), truth)
+        deviations = None if inputs is None else inputs.block()
+        results = self._solve(groups, noise, truth, deviations)
+        responses = np.empty((*task.shape, 0 if inputs is None else inputs.count))
         image, variance, resolved = (np.empty(task.shape) for _ in range(3))
         missing, parts, sums = 0.0, dict.fromkeys(noise, 0.0), np.zeros(2)
         for tiles, solved in zip(groups, results, strict=True):
@@ -57,6 +63,8 @@ class TileMethod(Method):
                 image[tile.core] = solved.image[:, index].reshape(shape)
                 variance[tile.core] = solved.variance.reshape(shape)
                 resolved[tile.core] = solved.resolved.reshape(shape)
+                if solved.responses is not None:
+                    responses[tile.core] = solved.responses[:, index].reshape(*shape, -1)
                 missing += share * solved.missing
                 parts = {name: part + share * solved.parts[name] for name, part in parts.items()}
                 sums += 0.0 if solved.given is None else solved.given[:, index]
@@ -69,7 +77,25 @@ class TileMethod(Method):
             ExpectedError(variance.ravel(), missing, parts, resolved.ravel()),
             None if truth is None else interval(float(sums[0]), float(sums[1]), image.size),
             lambda weights: self._variance_of_sum(weights, total_variance(noise)),
+            None if inputs is None or deviations is None else self._residual_power(inputs, deviations, responses),
         )
+
+    def _residual_inputs(self, actual: FloatArray, truth: FloatArray | None) -> ResidualInputs | None:
+        """Return the inputs of the expected residual, None where a measurement has no expected noise."""
+        task = self.task
+        if not task.expected_noise.size or not (task.expected_noise > 0).all():
+            return None
+        deviation = None if truth is None else truth - task.prior.mean
+        draws = DRAWS if task.model.unknowns <= MANY else FEW_DRAWS
+        return ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws, optimal=False)
+
+    def _residual_power(self, inputs: ResidualInputs, deviations: FloatArray, responses: FloatArray) -> ResidualPower:
+        """Return the expected squares of the residual from A applied to the deviations: (rows, columns, inputs)."""
+        residuals = (
+            deviations[:, number] - self.task.observe(np.ascontiguousarray(responses[..., number]).ravel())
+            for number in range(inputs.count)
+        )
+        return inputs.power(residuals, self.task.expected_noise)
 
     def groups(self, noise: dict[str, FloatArray]) -> list[list[Tile]]:
         """Return the tiles in groups of at most MAX_TILES that share a factorisation."""
@@ -84,10 +110,14 @@ class TileMethod(Method):
         return overlapping_tiles(self.task.shape, self.task.tiles.size, self.task.tiles.overlap)
 
     def _solve(
-        self, groups: list[list[Tile]], noise: dict[str, FloatArray], truth: FloatArray | None
+        self,
+        groups: list[list[Tile]],
+        noise: dict[str, FloatArray],
+        truth: FloatArray | None,
+        deviations: FloatArray | None = None,
     ) -> list[SolvedTiles]:
         """Solve every group with one thread each, so that results do not depend on the workers."""
-        tasks = (self._tile_task(tiles, noise, truth) for tiles in groups)  # lazily, to bound memory
+        tasks = (self._tile_task(tiles, noise, truth, deviations) for tiles in groups)  # lazily, to bound memory
         workers, progress = self.execution.workers, self.execution.progress
         if workers is not None:
             return workers.map(solve_tiles_single_threaded, tasks, progress, len(groups))
@@ -104,7 +134,13 @@ class TileMethod(Method):
             digests = [digest(task.used[inside]), *(digest(values[self._used_index(inside)]) for values in varied)]
         return task.model.signature(*tile.window), tile.shape, tile.kept.tobytes(), *digests
 
-    def _tile_task(self, tiles: list[Tile], noise: dict[str, FloatArray], truth: FloatArray | None) -> TileTask:
+    def _tile_task(
+        self,
+        tiles: list[Tile],
+        noise: dict[str, FloatArray],
+        truth: FloatArray | None,
+        deviations: FloatArray | None = None,
+    ) -> TileTask:
         task, first = self.task, tiles[0]
         inside = [task.model.measurements_inside(*tile.window) for tile in tiles]
         index = self._used_index(inside[0])
@@ -118,6 +154,9 @@ class TileMethod(Method):
             kept=first.kept,
             settings=task.settings,
             truth=None if true_image is None else np.stack([true_image[tile.window].ravel() for tile in tiles], axis=1),
+            deviations=None
+            if deviations is None
+            else np.stack([deviations[self._used_index(numbers)] for numbers in inside], axis=1),
         )
 
     def _used_index(self, numbers: IntArray) -> IntArray:

@@ -75,6 +75,7 @@ class TileTask:
 
     recorded : (m, tiles) g;  noise : (m,) actual noise variances by cause, empty to estimate images only
     kept : indices of the core's pixels;  truth : (n, tiles) true images, if known
+    deviations : (m, tiles, columns) deviations of g from H f0 that are to pass through the estimator, too
     """
 
     matrix: sparse.csr_array
@@ -85,6 +86,7 @@ class TileTask:
     kept: NDArray[np.intp]
     settings: EstimatorTable
     truth: FloatArray | None = None
+    deviations: FloatArray | None = None
 
     @property
     def problem(self) -> Problem:
@@ -98,6 +100,7 @@ class SolvedTiles:
 
     variance, resolved : (kept,) Eq. 5 and the diagonal of A H;  missing, parts : means of the parts of Eq. 5
     given : (2, tiles) sums over the pixels of the expected error for the true image, and their variances
+    responses : (kept, tiles, columns) A applied to the deviations of the task
     """
 
     image: FloatArray
@@ -107,6 +110,7 @@ class SolvedTiles:
     missing: float
     parts: dict[str, float]
     given: FloatArray | None
+    responses: FloatArray | None = None
 
 
 def solve_tiles(task: TileTask) -> SolvedTiles:
@@ -122,9 +126,15 @@ def solve_tiles(task: TileTask) -> SolvedTiles:
         return SolvedTiles(image, first.solver, np.zeros(0), np.zeros(0), 0.0, {}, None)
     expected = expected_error(first.form, task.noise, pixels=task.kept)
     given = None if task.truth is None else _error_given(task, first.form, task.truth)
+    responses = None if task.deviations is None else _responses(first.form, task.deviations, task.kept)
     return SolvedTiles(
-        image, first.solver, expected.variance, expected.resolved, expected.missing, expected.parts, given
+        image, first.solver, expected.variance, expected.resolved, expected.missing, expected.parts, given, responses
     )
+
+
+def _responses(form: Form, deviations: FloatArray, kept: NDArray[np.intp]) -> FloatArray:
+    _, tiles, columns = deviations.shape
+    return form.gain(deviations.reshape(-1, tiles * columns))[kept].reshape(-1, tiles, columns)
 
 
 def solve_tiles_single_threaded(task: TileTask) -> SolvedTiles:

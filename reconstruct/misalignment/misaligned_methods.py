@@ -15,7 +15,7 @@ from ommatid.scenes.model import Model
 
 from ..estimator.estimate import Estimate, estimate
 from ..expected_error import ExpectedError, Interval, variance_of_sum
-from ..methods.dense_method import DenseMethod
+from ..methods.dense_method import DenseMethod, residual_power
 from ..methods.method import Method, MethodResult
 from .alignment import Alignment, align
 from .robust_noise import CAUSE, Whitening, robust_error, robust_noise, whitening
@@ -46,13 +46,15 @@ class RobustMethod(Method):
         del truth
         white, solved = self._solved
         unit = np.ones(self.task.expected_noise.size)
+        expected = robust_error(solved.form, white, noise)
         return MethodResult(
             solved.image,
             solved.multipliers / np.sqrt(self.task.expected_noise),  # their squares times the noise are chi-squared
             solved.solver,
-            robust_error(solved.form, white, noise),
+            expected,
             None,
             lambda weights: variance_of_sum(solved.form, weights, unit),
+            residual_power(solved.form, unit, expected.leverage, None),
         )
 
 

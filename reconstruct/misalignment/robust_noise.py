@@ -180,7 +180,7 @@ def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray], cau
     by_column = sparse.csc_array(form.problem.matrix)
     variance, resolved = np.zeros(count), np.zeros(count)
     missing = from_measurements = 0.0
-    weights = np.zeros(form.problem.measurements)
+    weights, leverage = np.zeros(form.problem.measurements), np.zeros(form.problem.measurements)
     for start in range(0, count, CHUNK):
         pixels = np.arange(start, min(start + CHUNK, count))
         u, negative = form.pixel_solutions(pixels)
@@ -188,11 +188,13 @@ def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray], cau
         variance[pixels] = prior + noisy
         missing += float(prior.sum()) / count
         from_measurements += float(noisy.sum()) / count
-        resolved[pixels] = -np.asarray(by_column[:, pixels].multiply(negative).sum(axis=0)).ravel()
+        products = by_column[:, pixels].multiply(negative)
+        resolved[pixels] = -np.asarray(products.sum(axis=0)).ravel()
+        leverage -= np.asarray(products.sum(axis=1)).ravel()
         weights += np.square(white.multipliers(negative)).sum(axis=1) / count
     parts = {name: float(weights @ values) for name, values in noise.items()}
     rest = max(from_measurements - sum(parts.values()), 0.0)
-    return ExpectedError(variance, missing, {**parts, cause: rest}, resolved)
+    return ExpectedError(variance, missing, {**parts, cause: rest}, resolved, leverage)
 
 
 def _quadrature(free: NDArray[np.bool_]) -> list[list[tuple[float, FloatArray]]]:

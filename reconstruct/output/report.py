@@ -31,6 +31,7 @@ from .run_json import (
     SkippedReport,
     SolverReport,
     StageReport,
+    VerdictReport,
 )
 from .time_spent import time_spent
 
@@ -46,6 +47,7 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
     as_run = stack.scene.model_copy(update={"calibration": model.scene.calibration})
     return RunReport(
         title=stack.scene.title,
+        verdict=VerdictReport.model_validate(restoration.verdict),
         measurements=model.measurements,
         unknowns=stack.camera.unknowns,
         stages=stages,

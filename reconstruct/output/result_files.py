@@ -116,7 +116,7 @@ def _read_results(folder: Path) -> tuple[RunReport, str | None]:
     report = run_json.read(folder)
     made_from = exr.read(folder / ESTIMATE)[0].record["fingerprint"]
     whole = report.fingerprint == made_from and all((folder / name).is_file() for name in (PICTURE, OVERVIEW))
-    return report, made_from if whole else None
+    return report, made_from if whole and report.verdict is not None else None
 
 
 def cached_results(

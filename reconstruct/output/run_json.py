@@ -88,6 +88,36 @@ class ResidualReport(Record):
     deviation: float
 
 
+class ResidualPartReport(Record):
+    """Chi-squared of a part of the residual: all, a lens type, a sub-imager or a region of the target.
+
+    prior : expectation for images of the prior;  expected : the larger of that and of the true image's, if known
+    """
+
+    kind: str
+    name: str
+    measurements: int
+    chi_squared: float
+    prior: float
+    expected: float
+    deviation: float
+    p_value: float
+
+
+class VerdictReport(Record):
+    """Whether the error bars can be trusted: reasons against it, passed checks, and notes.
+
+    p_value : of the residual in all and by part together, None if it was not checked
+    """
+
+    trusted: bool
+    reasons: tuple[str, ...]
+    passed: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    p_value: float | None = None
+    parts: tuple[ResidualPartReport, ...] = ()
+
+
 class FittedNumber(Record):
     """A fitted value and the standard deviation of its logarithm, None where the likelihood does not bend."""
 
@@ -205,6 +235,7 @@ class RunReport(Record):
 
     fingerprint: str = ""
     title: str
+    verdict: VerdictReport | None = None  # absent in files of earlier versions
     measurements: int
     unknowns: int
     stages: dict[str, StageReport]

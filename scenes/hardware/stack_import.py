@@ -33,6 +33,7 @@ def import_stack(setup: Setup, images: Sequence[Path], settings: AcquisitionSett
     record = {
         "fingerprint": fingerprint(made_from),
         "method": "imported",
+        "flat": frames.flat is not None,
         "source": frames.sources,
         "seconds": perf_counter() - start,
         "versions": versions("scikit-image", "OpenEXR"),

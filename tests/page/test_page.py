@@ -32,11 +32,12 @@ from ommatid.reconstruct.output.run_json import (
     DepthBin,
     DiagnosticsReport,
     ErrorReport,
+    MoreTime,
     RunReport,
     StudyCase,
     TimeReport,
+    VerdictReport,
 )
-from ommatid.reconstruct.restore import MAX_SPURIOUS_INFORMATION
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats import exr
@@ -360,10 +361,10 @@ def test_a_page_shows_the_run_time_and_the_effect_of_more_samples(run: data.Run)
     assert "chose render.samples = 700, calibration.samples = auto." in text
 
 
-def test_commands_in_the_verdict_are_marked_and_the_rest_is_escaped(
+def test_commands_in_the_summary_are_marked_and_the_rest_is_escaped(
     run: data.Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ommatid.page.words.verdict", lambda _: "a < b; `ommatid design` & more")
+    monkeypatch.setattr("ommatid.page.words.summary", lambda _: "a < b; `ommatid design` & more")
     assert "a &lt; b; <code>ommatid design</code> &amp; more</p>" in html_of(run)
 
 
@@ -482,12 +483,16 @@ def test_a_bench_serves_the_same_camera_in_the_folder_or_its_parent(run: data.Ru
 
 
 def described(**error: Any) -> RunReport:
-    """A report with this error and the fields that the verdict depends on."""
+    """A report with this error and the fields that the summary depends on; four times the samples divide it by 8."""
     budget = {"null_space": 0.0, "noise": 1.0, "quantisation": 0.0, "rendering": 3.0, "calibration": 0.0}
     diagnostics: dict[str, Any] = {"pixels_used": 9, "pixels_dead": 0, "pixels_saturated": 0, "resolution": 1.0}
     return RunReport.model_construct(
         error=ErrorReport.model_validate({"predicted_mse": 4.0, "budget": budget, **error}),
         diagnostics=DiagnosticsReport.model_construct(**diagnostics),
+        spent=TimeReport(
+            seconds=1.0, stages={}, noise_alone=1.0, more=(MoreTime(times=4, seconds=2.0, predicted_mse=1.375),)
+        ),
+        verdict=None,
     )
 
 
@@ -504,28 +509,53 @@ INTERVAL = {"mse": 4.0, "low": 2.25, "high": 6.25}
         ({}, "unknown", "The truth is not known; the predicted RMS error of a pixel is 2 on a scale of 0 to 255."),
     ],
 )
-def test_the_verdict_compares_measured_and_expected_error(error: dict[str, Any], agreement: str, sentence: str) -> None:
-    verdict = words.verdict(described(**error))
+def test_the_summary_compares_measured_and_expected_error(error: dict[str, Any], agreement: str, sentence: str) -> None:
+    summary = words.summary(described(**error))
     assert words.agreement(described(**error).error) == agreement
-    assert sentence in verdict
-    assert "that of the target's pixel grid (1 pixel)." in verdict
-    cause = "noise of the rendering, 75 %; a larger `render.samples` would reduce it."
-    assert verdict.endswith(cause)
+    assert sentence in summary
+    assert "that of the target's pixel grid (1 pixel)." in summary
+    assert summary.endswith("noise of the rendering, 75 %; four times the samples (`render.samples`): 4 to 1.38.")
 
 
-def test_the_verdict_names_missing_measurements_and_low_resolution() -> None:
+@pytest.mark.parametrize(
+    ("cause", "remedy"),
+    [
+        ("noise", "half the noise variance: 4 to 2.5."),
+        ("quantisation", "one more bit: 4 to 1.75."),
+        ("misalignment", "a camera without misalignment: 4 to 1."),
+        ("null_space", "neither samples nor less noise reduce it"),
+        ("anything else", "anything else, 75 %."),
+    ],
+)
+def test_the_remedy_is_a_number_of_the_budget(cause: str, remedy: str) -> None:
+    budget = {"calibration": 1.0, cause: 3.0}
+    assert remedy in words.summary(described(budget=budget))
+
+
+def test_without_trust_a_page_and_a_table_say_nothing_of_limits() -> None:
+    report = described(mse=9.0, expected_given_truth=INTERVAL)
+    wrong = report.with_changes(verdict=VerdictReport(trusted=False, reasons=("H is another camera's",)))
+    assert words.grounds(wrong) == ["H is another camera's."]
+    for word in ("resolution", "samples", "Largest"):
+        assert word in words.summary(report)
+        assert word not in words.summary(wrong)
+    assert "resolve this first" in words.summary(wrong)
+
+
+def test_the_summary_names_missing_measurements_and_low_resolution() -> None:
     report = described()
     unused = report.diagnostics.model_copy(update={"pixels_used": 0, "resolution": None})
-    assert "not an image" in words.verdict(report.with_changes(diagnostics=unused))
+    assert "not an image" in words.summary(report.with_changes(diagnostics=unused))
     blurred = report.diagnostics.model_copy(update={"resolution": 2.5})
-    assert "The median resolution is 2.5 pixels" in words.verdict(report.with_changes(diagnostics=blurred))
+    assert "The median resolution is 2.5 pixels" in words.summary(report.with_changes(diagnostics=blurred))
 
 
 def test_spurious_information_is_reported_before_the_numbers(finished: Path, html: str) -> None:
-    report = data.read_run(finished).report
-    assert report.model.spurious_information > MAX_SPURIOUS_INFORMATION, "one lens type leaves pixels undetermined"
-    warning = "Do not trust the predicted error"
-    assert 0 < html.index(warning) < html.index("<main")
+    verdict = data.read_run(finished).report.verdict
+    assert verdict is not None
+    assert not verdict.trusted, "one lens type leaves pixels undetermined"
+    assert 0 < html.index("adds spurious information") < html.index("<main")
+    assert html.index('class="banner not-to-be-trusted"') < html.index('class="summary')
 
 
 # --- pages that are up to date

@@ -1,0 +1,83 @@
+"""The verdict on a run in words, and what would reduce its error, as far as its numbers tell."""
+
+from __future__ import annotations
+
+from .run_json import ErrorReport, RunReport, TimeReport
+
+TIMES = 4  # as many samples, in the sentence on more samples
+LEAST_GAIN = 0.05  # relative fall of the error from which a change is worth a sentence
+# Causes with a simple law: the change, the factor on their part of the error, and its name
+CHANGES = {
+    "noise": ("half the noise variance", 0.5),
+    "quantisation": ("one more bit", 0.25),
+    "misalignment": ("a camera without misalignment", 0.0),
+}
+SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}
+
+
+def is_trusted(report: RunReport) -> bool:
+    """Return True unless the verdict says that the error bars are not to be trusted."""
+    return report.verdict is None or report.verdict.trusted
+
+
+def heading(report: RunReport) -> str:
+    """Return the verdict in two or three words."""
+    if report.verdict is None:
+        return "no verdict"
+    if not report.verdict.trusted:
+        return "not to be trusted"
+    return "trusted" if report.verdict.passed else "not checked"
+
+
+def grounds(report: RunReport) -> str:
+    """Return what the verdict rests on: the reasons against trust, or the checks that found nothing wrong."""
+    verdict = report.verdict
+    if verdict is None:
+        return "the results are of an earlier version; run the scene again"
+    return "; ".join(verdict.reasons or verdict.passed or ("neither the residual nor the error could be checked",))
+
+
+def remedy(report: RunReport) -> str:
+    """Return the largest part of the predicted error and a change that would reduce it, as a sentence.
+
+    Empty where the verdict is against trust, since the parts then belong to assumptions that do not hold.
+    """
+    error = report.error
+    if not is_trusted(report):
+        return ""
+    if error.predicted_mse <= 0:
+        return "The predicted error is zero."
+    name, part = max(error.budget.items(), key=lambda item: item[1])
+    share = 100 * part / error.predicted_mse
+    change = _change(name, part, error, report.spent)
+    return f"Largest part of the predicted squared error: {cause(name)}, {share:.0f} %{change}."
+
+
+def cause(name: str) -> str:
+    """Return the name of a part of the error in words."""
+    words = {
+        "null_space": "null space of H",
+        "noise": "sensor noise",
+        "rendering": "noise of the rendering",
+        "calibration": "uncertainty of H",
+        "misalignment": "misalignment of the lenses",
+    }
+    return words.get(name, name.replace("_", " "))
+
+
+def _change(name: str, part: float, error: ErrorReport, spent: TimeReport) -> str:
+    now = error.predicted_mse
+    if name == "null_space":
+        return "; neither samples nor less noise reduce it (`ommatid design` computes what another lens type brings)"
+    if name in CHANGES:
+        words, factor = CHANGES[name]
+        return f"; {words}: {_fall(now, now - (1 - factor) * part)}"
+    more = next((more for more in spent.more if more.times == TIMES), None)
+    if name in SAMPLES and more is not None and more.predicted_mse < (1 - LEAST_GAIN) * now:
+        keys = " and ".join(key for part_name, key in SAMPLES.items() if error.budget.get(part_name))
+        return f"; four times the samples ({keys}): {_fall(now, more.predicted_mse)}"
+    return ""
+
+
+def _fall(now: float, then: float) -> str:
+    return f"{now:.3g} to {then:.3g}"

@@ -1,0 +1,108 @@
+"""Expected squares of the whitened residual R^-1/2 (g - H f^), one for each measurement.
+
+With g = H f + v and f^ = f0 + A (g - H f0), the residual is (I - H A) (H (f - f0) + v). Over draws of the prior and of
+the expected noise its square has the mean 1 - (H A)_ii, in units of R_ii. Without A as a matrix, or with another noise
+than the expected one, the mean comes from random images and noise that pass through the same estimator. For a known
+image the first term is certain, and only the noise is random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ommatid.runtime.arrays import Float32Array, FloatArray
+
+SEED = 20260402  # of random images and noise, different from those of data, calibration and error analysis
+
+
+@dataclass(frozen=True)
+class ResidualPower:
+    """Expected squares of the whitened residual, (measurements used,).
+
+    prior : for images drawn from the prior
+    bias, noise : for the true image, the square that is certain and the mean square that noise adds; None without it
+    draws : number of random draws of which these are means, 0 where nothing was drawn
+    samples : (draws, measurements used) whitened residuals of images drawn from the prior, by an estimate that is not
+        optimal, such as that of tiles; None of one whose residual varies by no more than its measurements' noise
+    """
+
+    prior: FloatArray
+    bias: FloatArray | None
+    noise: FloatArray | None
+    draws: int
+    samples: Float32Array | None = None
+
+
+@dataclass(frozen=True)
+class ResidualInputs:
+    """What the measurements deviate by from H f0, as the estimator's random or given inputs.
+
+    observe : image, (N,), to measurements used, (M,)
+    draw_image : a random image of the prior less its mean, (N,);  actual : (M,) actual noise variances
+    deviation : (N,) f - f0 of the true image, None without it
+    leverage : (M,) exact (H A)_ii where the noise is as expected, None where it is not known
+    optimal : True if the estimate is that of minimum variance
+    whiten : applied to the noise where the estimator whitens correlated measurements, None where it does not
+    """
+
+    observe: Callable[[FloatArray], FloatArray]
+    draw_image: Callable[[np.random.Generator], FloatArray]
+    actual: FloatArray
+    deviation: FloatArray | None
+    draws: int
+    leverage: FloatArray | None = None
+    optimal: bool = True
+    whiten: Callable[[FloatArray], FloatArray] | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of columns."""
+        noise = 0 if self.deviation is None and self.leverage is not None else self.draws
+        return noise + (self.deviation is not None) + (self.draws if self.leverage is None else 0)
+
+    def columns(self) -> Iterator[FloatArray]:
+        """Yield the inputs, (M,) each: the known image, noises, then images; those that are needed."""
+        rng = np.random.default_rng(SEED)
+        if self.deviation is not None:
+            yield self.observe(self.deviation)
+        if self.deviation is not None or self.leverage is None:
+            root = np.sqrt(self.actual)
+            for _ in range(self.draws):
+                noise = root * rng.normal(size=root.size)
+                yield noise if self.whiten is None else self.whiten(noise)
+        if self.leverage is None:
+            for _ in range(self.draws):
+                yield self.observe(self.draw_image(rng))
+
+    def block(self) -> FloatArray:
+        """All columns together: (M, count)."""
+        block = np.empty((self.actual.size, self.count))
+        for number, column in enumerate(self.columns()):
+            block[:, number] = column
+        return block
+
+    def power(self, residuals: Iterator[FloatArray], expected_noise: FloatArray) -> ResidualPower:
+        """Return the expected squares from the residuals, (M,) each, of the columns in their order."""
+        white = 1 / np.sqrt(expected_noise)
+        bias = None if self.deviation is None else np.square(white * next(residuals))
+        if self.leverage is not None:
+            noise = None if bias is None else self._mean_square(white, residuals)
+            return ResidualPower(np.clip(1 - self.leverage, 0.0, 1.0), bias, noise, 0 if bias is None else self.draws)
+        samples = None if self.optimal else np.zeros((self.draws, white.size), np.float32)
+        noise, image = (self._mean_square(white, residuals, samples) for _ in range(2))
+        return ResidualPower(noise + image, bias, None if bias is None else noise, self.draws, samples)
+
+    def _mean_square(
+        self, white: FloatArray, residuals: Iterator[FloatArray], samples: Float32Array | None = None
+    ) -> FloatArray:
+        """Return the mean square of the next residuals, whitened, and add these to `samples`, (draws, M)."""
+        total = np.zeros(white.size)
+        for number in range(self.draws):
+            residual = white * next(residuals)
+            total += np.square(residual)
+            if samples is not None:
+                samples[number] += residual
+        return total / self.draws

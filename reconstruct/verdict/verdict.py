@@ -1,0 +1,200 @@
+"""The verdict on a run: whether its error bars can be trusted, why not, and what could not be checked.
+
+There are three checks: chi-squared of the residual in all and by part, the interval of the error where the truth is
+known, and the bound on the variances. A deviation counts if it is significant and exceeds a tenth of the number that is
+stated; what can change a number by less is a note.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from scipy import optimize, stats
+
+from ..expected_error import COVERAGE, Interval
+from .causes import Evidence, likely_causes, listed, named
+from .residual_parts import ResidualPart, sidak
+
+SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
+SIZE = 0.1  # relative deviation from which a number is wrong
+STRIKING = 1.5  # ratio to the whole from which a region is worth naming
+UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
+SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
+SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
+MOST_NAMED = 5  # sub-imagers in one sentence
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the error bars of a run can be trusted.
+
+    reasons : why not, empty if trusted;  passed : checks that found nothing wrong;  notes : everything else, such as
+        checks that were not possible
+    p_value : of the residual in all and by part together, None if it was not checked
+    """
+
+    trusted: bool
+    reasons: tuple[str, ...]
+    passed: tuple[str, ...]
+    notes: tuple[str, ...]
+    p_value: float | None
+    parts: tuple[ResidualPart, ...]
+
+
+@dataclass(frozen=True)
+class ErrorCheck:
+    """Numbers of the other checks.
+
+    mse, interval : measured and expected error of the image, None if not known
+    variance_bound : on the relative error of variances
+    spurious : relative error of Eq. 5 by the noise of H;  spurious_share : of a pixel's information, on average
+    calibration_share : of the predicted error that the uncertainty of H causes
+    pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
+    """
+
+    mse: float | None
+    interval: Interval | None
+    variance_bound: float
+    spurious: float
+    spurious_share: float
+    calibration_share: float
+    fit_doubtful: bool
+    noise_fitted: bool
+    pixels_used: int
+    left_out: tuple[str, ...]
+
+
+@dataclass
+class _Findings:
+    reasons: list[str]
+    passed: list[str]
+    notes: list[str]
+
+
+def judge(parts: list[ResidualPart], evidence: Evidence, check: ErrorCheck) -> Verdict:
+    """Return the verdict from the residual by part, none where it was not checked, and the other checks."""
+    findings = _Findings([], [], [])
+    if check.pixels_used:
+        _judge_residual(parts, evidence, check, findings)
+        _judge_error(check, findings)
+        _judge_assumptions(check, findings)
+    else:
+        findings.reasons.append("no sensor pixel could be used, so this is the prior and not an image")
+    p_value = sidak([part.p_value for part in parts]) if parts else None
+    trusted = not findings.reasons
+    return Verdict(
+        trusted, tuple(findings.reasons), tuple(findings.passed), tuple(findings.notes), p_value, tuple(parts)
+    )
+
+
+def excesses(parts: list[ResidualPart]) -> list[ResidualPart]:
+    """Return the parts whose residual is significantly and by more than a tenth larger than expected."""
+    return [part for part in parts if sidak([part.p_value] * len(parts)) < SIGNIFICANCE and part.ratio > 1 + SIZE]
+
+
+def _judge_residual(parts: list[ResidualPart], evidence: Evidence, check: ErrorCheck, findings: _Findings) -> None:
+    if not parts:
+        findings.notes.append("chi-squared was not checked: some measurements are expected to have no noise")
+        return
+    whole, beyond = parts[0], excesses(parts)
+    if check.noise_fitted:
+        findings.notes.append("the noise was fitted to this stack, so chi-squared was checked by part only")
+    if beyond:
+        findings.reasons.append(f"{_excess_words(whole, beyond)}: {likely_causes(parts, evidence)}")
+        return
+    findings.passed.append(f"the residual is {whole.ratio:.3g} times its expectation")
+    uncertain = check.calibration_share > SIZE
+    lower = stats.norm.cdf((whole.chi_squared - whole.prior) / (2 * whole.prior) ** 0.5) if whole.prior else 1.0
+    if whole.chi_squared < (1 - SIZE) * whole.prior and lower < SIGNIFICANCE:
+        findings.notes.append(
+            f"the residual is {whole.chi_squared / whole.prior:.3g} times that of images drawn from the prior: the"
+            f" picture is smoother than the prior, or the noise{' or the uncertainty of H' if uncertain else ''} is"
+            " smaller than stated"
+        )
+
+
+def _excess_words(whole: ResidualPart, beyond: list[ResidualPart]) -> str:
+    """Say by how much the residual exceeds its expectation, and where most."""
+    subs = sorted((part for part in beyond if part.kind == "sub-imager"), key=lambda part: -part.ratio)
+    types = sorted((part for part in beyond if part.kind == "lens type"), key=lambda part: -part.ratio)
+    places = sorted((part for part in beyond if part.kind == "region"), key=lambda part: -part.ratio)
+    places = [place for place in places if place.ratio > STRIKING * whole.ratio]
+    where: list[str] = []
+    if subs:
+        where.append(named([part.name for part in subs[:MOST_NAMED]]))
+    elif types:
+        where.append(f"lens type {types[0].name}")
+    if places:
+        where.append(f"at the {places[0].name} of the target" if places[0].name != "middle" else "in the middle")
+    if beyond[0] is whole:
+        most = f", most in {where[0]}" if subs or types else ""
+        most += f"{' and' if most else ', most'} {where[-1]}" if places else ""
+        return f"the residual is {whole.ratio:.3g} times what was expected{most}"
+    return (
+        f"the residual of {', '.join(where)} is up to {max(part.ratio for part in beyond):.3g} times what was expected"
+    )
+
+
+def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
+    interval, mse = check.interval, check.mse
+    if mse is None:
+        findings.notes.append("the error was not checked: the truth is not known")
+    elif interval is None:
+        findings.notes.append("the error was not checked: this method states no interval for one image")
+    else:
+        words = f"the error, {mse:.4g}, lies {{}} its 99 % interval, {interval.low:.4g} to {interval.high:.4g}"
+        outside = mse > (1 + SIZE) * interval.high or mse < (1 - SIZE) * interval.low
+        if outside and error_p_value(mse, interval) < SIGNIFICANCE:
+            reason = words.format("above" if mse > interval.high else "below")
+            findings.reasons.append(reason + (UNCERTAIN if check.calibration_share > SIZE else ""))
+        elif interval.low <= mse <= interval.high:
+            findings.passed.append(words.format("inside"))
+        else:
+            findings.passed.append(words.format("outside") + ", but not by more than chance and a tenth")
+    if check.variance_bound > SIZE:
+        findings.reasons.append(
+            f"the variances of some pixels are wrong by {100 * check.variance_bound:.2g} % or more: the solver's map of"
+            " them is an approximation; set estimator.method to 'tiles', or crop the target"
+        )
+
+
+def error_p_value(mse: float, interval: Interval) -> float:
+    """Return the probability of an error this far on its side of the expected one, as a gamma variate."""
+    if not interval.low < interval.mse < interval.high:
+        return float(mse == interval.mse)
+    above = mse > interval.mse
+    level, end = (COVERAGE[1], interval.high) if above else (COVERAGE[0], interval.low)
+
+    def difference(logarithm: float) -> float:
+        shape = float(np.exp(logarithm))
+        return float(stats.gamma.ppf(level, shape)) / shape - end / interval.mse
+
+    shape = float(np.exp(cast(Any, optimize).brentq(difference, *SHAPES)))
+    value = shape * mse / interval.mse
+    return float(stats.gamma.sf(value, shape) if above else stats.gamma.cdf(value, shape))
+
+
+def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
+    if check.spurious > SIZE:
+        findings.reasons.append(
+            "the lens types leave pixels undetermined, and the noise of H adds spurious information about them, so the"
+            " predicted error is too small; raise calibration.samples, or take calibration.method = 'ideal' if the"
+            " camera is"
+        )
+    elif check.spurious_share > SPURIOUS_SHARE:
+        findings.notes.append(
+            f"the noise of H may have produced {100 * check.spurious_share:.2g} % of the information on a pixel, on"
+            " average; raise calibration.samples"
+        )
+    if check.fit_doubtful:
+        findings.reasons.append(
+            "a fitted value of the prior or of the noise lies on the bound of its range, so the stack does not"
+            " determine it"
+        )
+    if check.left_out:
+        findings.notes.append(
+            f"{listed(check.left_out)} {'gives' if len(check.left_out) == 1 else 'give'} no usable pixel and"
+            f" {'is' if len(check.left_out) == 1 else 'are'} left out"
+        )

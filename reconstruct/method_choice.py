@@ -90,7 +90,7 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
         return ["tiles"], "the lens types leave a null space, and the pixels are too many for a frame's error bars"
     if sliding:
         return ["frame", "tiles"], f"{camera.unknowns} pixels, and every lens type sees the same everywhere"
-    if camera.has_sharp_footprints and serves(camera, independent):
+    if serves(camera, independent):
         return ["frame", "tiles"], f"{camera.unknowns} pixels, whose lens types do not see the same everywhere"
     return ["tiles"], "the lens types do not see the same everywhere: not all are m x m one pixel apart"
 

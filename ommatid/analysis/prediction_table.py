@@ -66,7 +66,9 @@ def _parts(prediction: Prediction) -> list[tuple[str, str]]:
         if part != 0
     ]
     if prediction.mse_for_picture is not None:
-        words = f"{prediction.mse_for_picture:.6g}, to compare with the run's interval"
+        words = (
+            f"{prediction.mse_for_picture:.6g}, of which the run's interval knows nothing: it takes H for the camera's"
+        )
         if prediction.interval is not None:
             low, high = prediction.interval
             words = f"{prediction.mse_for_picture:.6g} (99 %: {low:.4g} to {high:.4g})"

@@ -90,6 +90,8 @@ def banded_cholesky(precision: sparse.csr_array, order: Indices) -> FloatArray:
 def serves(camera: Camera, independent: bool) -> bool:
     """Return True where K of a frame is factorised: a null space or another array, few pixels, independent in P0."""
     sliding = all(is_sliding(lens_type) for lens_type in camera.types)
+    if not camera.has_sharp_footprints:  # a blurred footprint may be as wide as the frame
+        return False
     return independent and band_work(camera) <= MOST_WORK and not (sliding and not leaves_null_space(camera))
 
 

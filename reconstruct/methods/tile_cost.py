@@ -29,6 +29,8 @@ def tile_cost(task: EstimationTask, variance: FloatArray) -> float | None:
     size = task.tiles.size
     if task.prior.kind != "independent" or max(task.shape) <= size or not (task.expected_noise > 0).all():
         return None
+    if task.model.reach > size:  # footprints as wide as a tile leave K without a band
+        return None
     sides = [min(TILES * size, length) for length in task.shape]
     rows, columns = (
         slice((length - side) // 2, (length + side) // 2) for length, side in zip(task.shape, sides, strict=True)

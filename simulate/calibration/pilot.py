@@ -92,8 +92,11 @@ class Pilot:
 
 def reason_against(setup: Setup) -> str:
     """Return why no pilot can be traced here, or ""."""
-    if choose("auto").startswith("scalar"):
-        return SCALAR
+    try:
+        if choose("auto").startswith("scalar"):
+            return SCALAR
+    except ImportError:
+        return "Mitsuba is not installed"
     if setup.camera.measurements * BATCHES * FEWEST_SAMPLES > 2 * MOST_RAYS:
         return f"{setup.camera.measurements} sensor pixels are too many for a pilot"
     return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,8 +145,9 @@ def test_uncalibrated_tolerances_cost_a_picture_the_mean_over_assemblies() -> No
     used = np.ones(camera.measurements, dtype=np.bool_)
     added = mismatch_of_image(form, used, moments, camera.slices(), image)
     predicted = float(np.square(start).mean() + added.mean())
-    assert abs(np.mean(errors) - predicted) < 3 * np.std(errors, ddof=1) / len(errors) ** 0.5
-    assert predicted > 2 * float(np.square(start).mean()), "misalignment raises the error"
+    deviation = np.std(errors, ddof=1) / len(errors) ** 0.5
+    assert abs(np.mean(errors) - predicted) < 3 * deviation
+    assert predicted > float(np.square(start).mean()) + 20 * deviation, "misalignment raises the error"
 
 
 def test_a_tolerance_as_designed_and_calibrated_side_by_side(ommatid: Command) -> None:
@@ -164,6 +166,11 @@ def test_without_a_fast_backend_it_is_the_closed_form(monkeypatch: pytest.Monkey
     assert predicted.mse == closed.mse
     assert "scalar backend" in predicted.assumes[0]
     assert rows(predicted)[0][0] == "assumes"
+
+
+def test_without_mitsuba_it_is_the_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "drjit", None)
+    assert "not installed" in predict_scene(read(TILE)).assumes[0]
 
 
 def test_it_says_where_nothing_is_recovered(ommatid: Command) -> None:

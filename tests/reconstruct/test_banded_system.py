@@ -78,11 +78,11 @@ def test_large_frames_with_a_null_space_are_factorised_and_larger_ones_tiled(
 
 @pytest.mark.parametrize(("lenses", "leaves"), [(ONE, True), (TWO, True), (ODD, True), (THREE, False)])
 def test_a_null_space_of_every_frame(lenses: Lenses, leaves: bool) -> None:
-    """Of a 59 x 59 camera, whose edges all types see: by the rank of H."""
+    """By the rank of H of a small frame."""
     seen = camera((59, 59), lenses)
-    small = np.linalg.matrix_rank(ideal_matrix(camera((29, 29), lenses)).toarray()) if leaves else 0
+    small = np.linalg.matrix_rank(ideal_matrix(camera((19, 19), lenses)).toarray()) if leaves else 0
     assert leaves_null_space(seen) is leaves
-    assert small < 29**2
+    assert small < 19**2
 
 
 def test_what_tiles_cost() -> None:

@@ -203,7 +203,11 @@ def test_peak_memory_is_below_the_stated_one() -> None:
     ("tables", "lenses", "message"),
     [
         ({"noise": {"variance": 0.0}}, FITTED, "needs noise in every measurement"),
-        ({"noise": NOISE}, UNFITTED, "lens type 'A' is no array of m x m sub-imagers with step 1"),
+        (
+            {"noise": NOISE, "prior": {"kind": "exponential", "correlation_length": "4 mm"}},
+            UNFITTED,
+            "lens type 'A' is no array of m x m sub-imagers with step 1",
+        ),
     ],
 )
 def test_cameras_and_noise_that_the_frame_cannot_handle_are_refused(
@@ -222,7 +226,8 @@ def test_cameras_and_noise_that_the_frame_cannot_handle_are_refused(
         ((239, 239), FITTED, {"noise": NOISE}, "frame"),
         ((239, 239), FITTED, {"noise": NOISE, "estimator": {"accuracy": 0.5}}, "tiles"),
         ((239, 239), FITTED, {}, "tiles"),
-        ((239, 239), UNFITTED, {"noise": NOISE}, "tiles"),
+        ((239, 239), UNFITTED, {"noise": NOISE}, "frame"),
+        ((479, 479), UNFITTED, {"noise": NOISE}, "tiles"),
         ((239, 239), FITTED, {"noise": NOISE, "estimator": {"method": "tiles"}}, "tiles"),
         ((59, 59), FITTED, {"noise": NOISE, "estimator": {"method": "frame"}}, "frame"),
         ((59, 59), FITTED, {"noise": NOISE, "estimator": {"memory": "650 MB"}}, "tiles"),

@@ -108,7 +108,8 @@ def check_held_out(
 ) -> HeldOutCheck:
     """Predict every sub-imager of a stack from all others, and name those that disagree.
 
-    fitted : True replaces an independent prior by one fitted to the stack, since a photograph is no draw of it
+    fitted : True replaces an independent prior by one fitted to the stack, since a photograph is no draw of it; then
+        sub-imagers disagree only if they do so with either prior
     Raises InputError without noise, for H fitted to the stack itself, and where `restore` does.
     """
     execution = Execution(progress=progress)
@@ -132,11 +133,22 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
             "a prediction of measurements without noise has nothing to be compared with; set noise.variance or"
             " estimator.noise_variance to a number above 0"
         )
-    prior = fitted_prior(task) if fitted and task.prior.kind == "independent" else None
-    if prior is not None:
-        task = replace(task, prior=prior)
-    shown, total = windows(task, method == "robust")
-    rounds = _Rounds(task, method == "robust", execution or Execution())
+    to_fit = fitted and task.prior.kind == "independent" and len(task.model.camera.sub_imagers) > 1
+    prior = fitted_prior(task) if to_fit else None
+    robust, execution = method == "robust", execution or Execution()
+    if prior is None:
+        return _check(task, robust, execution, fitted=False)
+    narrow = _check(replace(task, prior=prior), robust, execution, fitted=True)
+    if narrow.trusted:
+        return narrow
+    # Parts of a picture differ more from one another than the fitted prior knows; the scene's is wide enough for all.
+    wide = _check(task, robust, execution, fitted=False)
+    return wide if wide.trusted else narrow
+
+
+def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: bool) -> HeldOutCheck:
+    shown, total = windows(task, robust)
+    rounds = _Rounds(task, robust, execution)
     first = rounds.sums(())
     disagreeing = _disagreeing(first)
     named, last = _culprits(rounds, first)
@@ -146,7 +158,7 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
         for index, sub in enumerate(task.model.camera.sub_imagers)
     )
     explained = bool(named) or not disagreeing.any()
-    return HeldOutCheck(subs, _familywise(first), explained, task.prior, prior is not None, (len(shown), total))
+    return HeldOutCheck(subs, _familywise(first), explained, task.prior, fitted, (len(shown), total))
 
 
 def quick_check(task: EstimationTask, method: str) -> HeldOutCheck | None:

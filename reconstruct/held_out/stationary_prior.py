@@ -20,20 +20,15 @@ from ..methods.method import EstimationTask
 
 WINDOW = 16  # pixels, side of a window of narrow footprints
 REACHES = 2  # footprints that fit side by side into a window
-PER_AXIS = 2  # windows along each axis
+PER_AXIS = 3  # most windows along each axis
 
 
 def fitted_prior(task: EstimationTask) -> PriorTable | None:
     """Return the exponential prior of largest evidence with the task's noise; None if measurements are too few."""
     side = max(WINDOW, REACHES * task.model.reach)
-    starts = [np.unique(np.linspace(0, max(size - side, 0), PER_AXIS).astype(int)) for size in task.shape]
+    windows = product(*(_spread(size, side) for size in task.shape))
     order: IntArray = np.cumsum(task.used) - 1
-    blocks = [
-        _window(
-            task, order, slice(row, min(row + side, task.shape[0])), slice(column, min(column + side, task.shape[1]))
-        )
-        for row, column in product(*starts)
-    ]
+    blocks = [_window(task, order, rows, columns) for rows, columns in windows]
     residual = np.concatenate([block.residual for block in blocks])
     if residual.size < MIN_MEASUREMENTS or not residual.any():
         return None
@@ -45,6 +40,15 @@ def fitted_prior(task: EstimationTask) -> PriorTable | None:
     length = fit.length * task.model.camera.target_pitch
     update = {"kind": "exponential", "variance": fit.variance, "correlation_length": length, "exponent": None}
     return task.prior.model_copy(update=update)
+
+
+def _spread(size: int, side: int) -> list[slice]:
+    """Return windows of one axis in the middle of equal parts of it, or all of it where it is short."""
+    count = min(size // side, PER_AXIS)
+    if count <= 1:
+        return [slice(0, size)]
+    starts = (np.arange(count) + 0.5) * size / count - side / 2
+    return [slice(int(start), int(start) + side) for start in starts]
 
 
 def _window(task: EstimationTask, order: IntArray, rows: slice, columns: slice) -> Evidence:

@@ -20,7 +20,7 @@ MOST_NAMED = 5  # sub-imagers in one sentence
 
 
 @dataclass(frozen=True)
-class Evidence:
+class RunEvidence:
     """What is known about a run besides its residual.
 
     dark : sub-imagers that receive far less light than the others of their type, by name
@@ -41,12 +41,12 @@ class Evidence:
     detailed: bool
 
 
-def evidence_of(stack: Stack, model: Model, used: BoolArray, independent: bool) -> Evidence:
+def evidence_of(stack: Stack, model: Model, used: BoolArray, independent: bool) -> RunEvidence:
     """Collect what may explain a residual; used : (M,) True for measurements that are used."""
     camera, scene = stack.camera, stack.scene
     ideal = model.record["method"] == "ideal"
     recorded = stack.record.get("method") == "imported"
-    return Evidence(
+    return RunEvidence(
         dark=_dark(stack, used),
         deep=scene.world is not None,
         designed=ideal and (camera.tolerance is not None or _has_surfaces(camera)),
@@ -84,7 +84,7 @@ def _mean(values: FloatArray) -> float:
     return float(values.mean()) if values.size else float("nan")
 
 
-def likely_causes(parts: Sequence[ResidualPart], evidence: Evidence) -> str:
+def likely_causes(parts: Sequence[ResidualPart], evidence: RunEvidence) -> str:
     """Return the likely causes of a residual that is larger than expected in some of all `parts`, as one clause."""
     if evidence.dark:
         verb = "is" if len(evidence.dark) == 1 else "are"

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from ..expected_error import COVERAGE, Interval
-from .causes import Evidence, likely_causes, listed, named
+from .causes import RunEvidence, likely_causes, listed, named
 from .residual_parts import ResidualPart, sidak
 
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
@@ -73,7 +73,7 @@ class _Findings:
     notes: list[str]
 
 
-def judge(parts: list[ResidualPart], evidence: Evidence, check: ErrorCheck) -> Verdict:
+def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -> Verdict:
     """Return the verdict from the residual by part, none where it was not checked, and the other checks."""
     findings = _Findings([], [], [])
     if check.pixels_used:
@@ -94,7 +94,7 @@ def excesses(parts: list[ResidualPart]) -> list[ResidualPart]:
     return [part for part in parts if sidak([part.p_value] * len(parts)) < SIGNIFICANCE and part.ratio > 1 + SIZE]
 
 
-def _judge_residual(parts: list[ResidualPart], evidence: Evidence, check: ErrorCheck, findings: _Findings) -> None:
+def _judge_residual(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck, findings: _Findings) -> None:
     if not parts:
         findings.notes.append("chi-squared was not checked: some measurements are expected to have no noise")
         return

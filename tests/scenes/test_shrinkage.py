@@ -55,6 +55,16 @@ def test_too_few_or_zero_variances_are_unchanged() -> None:
     np.testing.assert_array_equal(shrink_variances(np.zeros(5), 16), np.zeros(5))
 
 
+@pytest.mark.parametrize("ratio", [1.0, 1e6])
+def test_few_rare_events_leave_what_never_varied_without_variance(ratio: float) -> None:
+    """Two of 1000 quantities were hit by a ray from elsewhere: the sum of variances stays that of these two."""
+    sample = np.zeros(1000)
+    sample[[3, 500]] = 1.0, ratio
+    shrunk = shrink_variances(sample, 16)
+    assert np.flatnonzero(shrunk).tolist() == [3, 500]
+    assert shrunk.sum() < 2 * sample.sum()
+
+
 @pytest.mark.parametrize(("spread", "bound"), [(0.5, 1.05), (1.0, 1.1), (2.0, 1.25)])
 def test_lognormal_variances_are_not_underestimated(spread: float, bound: float) -> None:
     """With another distribution than the assumed one, sums may be too large, up to a bound, but not too small."""

@@ -1,0 +1,68 @@
+"""Every scene of the gallery has the verdict that its key `expect` states, in smaller variants where it is slow.
+
+The variants keep what a verdict depends on: the lenses, the way to H, the depth and the method.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ommatid.reconstruct.restore import restore
+from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import load
+from ommatid.scenes.scene import read, with_changes
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.gallery import gallery_names
+from ommatid.simulate.calibrate import calibrate
+from ommatid.simulate.ground_truth import cached_truth
+from ommatid.simulate.render import render
+
+from ..examples import needs, scene
+
+TRANSPORT = "calibration.method=transport"  # the same H as from points, sooner
+TILE = (
+    "target.shape=[19, 19]",
+    "camera.lens.I.pixels=[5, 5]",
+    "camera.lens.II.pixels=[3, 3]",
+    "camera.lens.III.pixels=[4, 4]",
+)
+SAMPLES = ("render.samples=8192", "calibration.samples=8192")
+DEEP = ("target.shape=[29, 29]", "render.samples=256")
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "corridor": DEEP,
+    "distorted": (TRANSPORT,),
+    "doublet": SAMPLES,
+    "misaligned": (*TILE, "render.samples=2048", "calibration.samples=2048"),
+    "photo": ("target.shape=[41, 41]", "estimator.method=tiles", TRANSPORT),
+    "planoconvex": (*SAMPLES, "noise.variance=1e-2"),
+    "sensor": (*TILE, "calibration.samples=4096"),
+    "single": ("target.shape=[29, 29]", TRANSPORT),
+    "still_life": DEEP,
+    "tile19": (TRANSPORT,),
+    "tile35": (TRANSPORT,),
+    "tile41": (TRANSPORT,),
+}
+
+
+@pytest.mark.parametrize("name", gallery_names())
+def test_a_scene_of_the_gallery_has_the_verdict_that_it_states(name: str, tmp_path: Path) -> None:
+    needs("llvm_ad_mono")
+    described = read(Path(name), VARIANTS[name])
+    camera = derive(described)
+    setup = Setup(described, camera)
+    truth = load(described) if described.world is None else cached_truth(tmp_path / "truth.exr", setup)
+    verdict = restore(render(setup), calibrate(setup), truth.ravel()).verdict
+    assert described.expect is not None
+    assert verdict.trusted == (described.expect == "trusted"), verdict.reasons
+    if described.world is not None:
+        assert "before or behind the target's plane" in verdict.reasons[0]
+
+
+def test_the_stated_verdict_is_no_part_of_a_result() -> None:
+    """With another one, nothing of a run has to be made again."""
+    plain = scene().plain()
+    stated = with_changes(plain, Path("a.toml"), ['expect="not trusted: a reason"'], ())
+    assert stated.expect == "not trusted: a reason"
+    assert stated.plain() == plain

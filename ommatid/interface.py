@@ -73,10 +73,7 @@ class Result:
 
     @property
     def trusted(self) -> bool | None:
-        """True if the verdict on the run is that its error bars can be trusted, None for a run of an earlier version.
-
-        `summary.verdict` holds the reasons.
-        """
+        """The verdict on the error bars, with reasons in `summary.verdict`; None for runs of earlier versions."""
         return None if self.summary.verdict is None else self.summary.verdict.trusted
 
     def report(self, path: str | Path) -> Path:
@@ -231,8 +228,7 @@ def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
 def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> Result:
     """Reconstruct a stack as its scene says (Eq. 4), with the posterior standard deviation per pixel (Eq. 5).
 
-    truth : (rows, columns) or (N,), with which the estimate is compared, such as `target_image(scene)`; with
-        target.detail also the picture itself, on the world's grid
+    truth : with which the estimate is compared, (rows, columns) or (N,), of f or of a world finer than f
     Raises InputError if stack and model are of different cameras, or if memory does not suffice.
     """
     _check_type("stack", stack, Stack, "read_stack")

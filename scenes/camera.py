@@ -36,7 +36,7 @@ class Camera:
     """All lens types, and the target's grid on which the image is reconstructed.
 
     lens_columns : columns of sub-imagers on the sensor, those of types left out by `restrict` included
-    detail : the world's grid is so many times finer than f along both axes
+    detail : the world's grid is so many times finer than f
     """
 
     rows: int
@@ -56,8 +56,9 @@ class Camera:
         """The same camera described on the grid of the world, `detail` times finer than f along both axes."""
         if self.detail == 1:
             return self
-        types = tuple(lens_type.finer(self.detail) for lens_type in self.types)
-        rows, columns, pitch = self.rows * self.detail, self.columns * self.detail, self.target_pitch / self.detail
+        finer = self.detail
+        rows, columns, pitch = self.rows * finer, self.columns * finer, self.target_pitch / finer
+        types = tuple(lens_type.finer(finer) for lens_type in self.types)
         return replace(self, rows=rows, columns=columns, target_pitch=pitch, types=types, detail=1)
 
     @property
@@ -73,12 +74,9 @@ class Camera:
     @property
     def covers_whole_pixels(self) -> bool:
         """True if every sensor pixel averages whole pixels of f, so that detail finer than f changes no measurement."""
-        if self.tolerance is not None or not self.has_box_footprints:
-            return False
-        return all(
-            lens_type.optics.surfaces is None and lens_type.ratio.denominator == lens_type.step.denominator == 1
-            for lens_type in self.types
-        )
+        whole = all(lens.ratio.denominator == lens.step.denominator == 1 for lens in self.types)
+        surfaces = any(lens.optics.surfaces is not None for lens in self.types)
+        return whole and not surfaces and self.tolerance is None and self.has_box_footprints
 
     @property
     def unknowns(self) -> int:
@@ -259,7 +257,7 @@ def derive(scene: Scene) -> Camera:
                 f"{scene.source}: camera.lens.{lens_type.name}.array has {lens_type.count} sub-imagers, expected at"
                 f" most {MOST_SUB_IMAGERS} per lens type; use fewer"
             )
-    needed = PLANES * 8 * (camera.unknowns * camera.detail**2 + camera.measurements)
+    needed = PLANES * 8 * (camera.world.unknowns + camera.measurements)
     check_memory(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
     if camera.measurements > MOST_MEASUREMENTS:
         raise InputError(
@@ -304,10 +302,4 @@ def _check_overlap(camera: Camera, scene: Scene) -> None:
         if index:
             pairs.append((camera.sub_imager(index - 1, 0, camera.types[index - 1].array[1] - 1), first, 1))
     for first, second, axis in pairs:
-        distance = first.patch[1 - axis] - second.patch[1 - axis]
-        needed = (first.type.pixels[axis] + second.type.pixels[axis]) / 2 * camera.pixel_pitch
-        if distance < needed * (1 - 1e-9):
-            raise InputError(
-                f"{scene.source}: camera.lens_pitch: the sub-images {first.name} and {second.name} overlap on the"
-                f" sensor (their centres are {distance:.4g} mm apart, they need {needed:.4g} mm); widen the pitch"
-            )
+        first.check_apart(second, axis, camera.pixel_pitch, scene.source)

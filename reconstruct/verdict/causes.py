@@ -25,7 +25,7 @@ class RunEvidence:
 
     dark : sub-imagers that receive far less light than the others of their type, by name
     deep : True if there is a world, which may lie before or behind the target's plane
-    designed : True if H is that of the design and the camera is more than aligned pinholes
+    designed : True if H is that of the design, and the camera differs from it by a tolerance or by its lenses' surfaces
     calibrated : True if H was measured;  unflattened : True for recorded frames without a flat frame
     independent : True if neighbouring pixels are independent in the prior;  whole_pixels : True if every sensor pixel
         covers whole pixels of f, so that finer detail of the world has no effect
@@ -49,13 +49,17 @@ def evidence_of(stack: Stack, model: Model, used: BoolArray, independent: bool) 
     return RunEvidence(
         dark=_dark(stack, used),
         deep=scene.world is not None,
-        designed=ideal and not camera.is_ideal_pinhole,
+        designed=ideal and (camera.tolerance is not None or _has_surfaces(camera)),
         calibrated=not ideal,
         recorded=recorded,
         unflattened=recorded and stack.record.get("flat") is False,
         independent=independent,
         whole_pixels=covers_whole_pixels(camera),
     )
+
+
+def _has_surfaces(camera: Camera) -> bool:
+    return any(lens_type.optics.surfaces is not None for lens_type in camera.types)
 
 
 def covers_whole_pixels(camera: Camera) -> bool:
@@ -94,16 +98,15 @@ def likely_causes(parts: Sequence[ResidualPart], evidence: RunEvidence) -> str:
         return f"{listed(evidence.dark)} {verb} dark, covered or dead"
     if evidence.deep:
         return "parts of the world lie before or behind the target's plane, for which alone H holds"
-    few = _few(parts)
+    few, fine = _few(parts), evidence.recorded or (evidence.independent and not evidence.whole_pixels)
     if evidence.designed:
         return "H as designed is not this camera's; calibrate it, or fit its misalignment"
-    if few and not evidence.unflattened:
+    if few and not fine:
         beside = "" if len(few) == 1 else ", or one beside it,"
         return f"{named(few[:1])}{beside} is not where H places it"
     causes = ["the pixels differ in gain, for which no flat frame was given (--flat)"] if evidence.unflattened else []
-    causes.append("H is not this camera's" + ("" if evidence.calibrated else ", which was not calibrated"))
-    if evidence.recorded or (evidence.independent and not evidence.whole_pixels):
-        causes.append("the world has detail finer than the pixels of f")
+    causes += ["the world has detail finer than the pixels of f"] if fine else []
+    causes.append(f"H{'' if evidence.calibrated else ', which was not calibrated,'} is not this camera's")
     causes.append("the noise is larger than stated")
     return f"{', '.join(causes[:-1])} or {causes[-1]}"
 

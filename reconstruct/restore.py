@@ -163,7 +163,7 @@ def _restored(
     result, task = assumed.method.result(assumed.noise, truth_for(choice, truth, stack.camera)), assumed.method.task
     truth = None if truth is None else _image(truth, stack.camera)
     error = None if truth is None else measure_error(result.image, truth, shape)
-    spurious = _spurious_information(task.model, assumed.usable, task.expected_noise, result.expected)
+    spurious = _spurious_information(task, result.expected)
     verdict = verdict_of(stack, model, assumed, result, error, spurious)
     whole = verdict.parts[0] if verdict.parts else None  # chi-squared of all measurements
     return Reconstruction(
@@ -205,14 +205,13 @@ def _residual(whole: ResidualPart, assumed: Assumptions, degrees_of_freedom: flo
     return Residual(whole.chi_squared, expected, (2 * expected) ** 0.5)
 
 
-def _spurious_information(
-    model: Model, usable: UsablePixels, expected_noise: FloatArray, expected: ExpectedError
-) -> FloatArray:
+def _spurious_information(task: EstimationTask, expected: ExpectedError) -> FloatArray:
     """Return the share of each pixel's apparent information that the noise of H may have produced: (N,)."""
+    model = task.model
     if not model.variance.any():
         return np.zeros(model.unknowns)
     noise = np.full(model.measurements, np.inf)
-    noise[usable.used] = expected_noise
+    noise[task.used] = task.expected_noise
     if isinstance(model, DetailedModel) and model.detail_covariance is not None:
         noise += model.detail_variance
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H

@@ -56,9 +56,8 @@ class Camera:
         """The same camera described on the grid of the world, `detail` times finer than f along both axes."""
         if self.detail == 1:
             return self
-        finer = self.detail
+        finer, types = self.detail, tuple(lens_type.finer(self.detail) for lens_type in self.types)
         rows, columns, pitch = self.rows * finer, self.columns * finer, self.target_pitch / finer
-        types = tuple(lens_type.finer(finer) for lens_type in self.types)
         return replace(self, rows=rows, columns=columns, target_pitch=pitch, types=types, detail=1)
 
     @property
@@ -75,8 +74,8 @@ class Camera:
     def covers_whole_pixels(self) -> bool:
         """True if every sensor pixel averages whole pixels of f, so that detail finer than f changes no measurement."""
         whole = all(lens.ratio.denominator == lens.step.denominator == 1 for lens in self.types)
-        surfaces = any(lens.optics.surfaces is not None for lens in self.types)
-        return whole and not surfaces and self.tolerance is None and self.has_box_footprints
+        sharp = all(lens.optics.surfaces is None for lens in self.types) and self.has_box_footprints
+        return whole and sharp and self.tolerance is None
 
     @property
     def unknowns(self) -> int:
@@ -231,10 +230,7 @@ def _slices(sizes: Iterable[int]) -> list[slice]:
 
 
 def derive(scene: Scene) -> Camera:
-    """Derive the camera that a scene describes.
-
-    Raises InputError if an array does not fit the target or if sub-images overlap on the sensor.
-    """
+    """Derive the camera of a scene. Raises InputError if arrays do not fit the target, or sub-images the sensor."""
     rows, columns = target_shape(scene)
     types = tuple(_lens_type(lens, rows, columns, scene) for lens in scene.camera.lens)
     lefts = list(accumulate((lens_type.array[1] for lens_type in types), initial=0))
@@ -292,14 +288,12 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
 
 def _check_overlap(camera: Camera, scene: Scene) -> None:
     # The patches of a type form a regular grid and the types lie side by side, so these neighbours suffice.
-    pairs: list[tuple[SubImager, SubImager, int]] = []
+    pitch, source = camera.pixel_pitch, scene.source
     for index, lens_type in enumerate(camera.types):
         first = camera.sub_imager(index, 0, 0)
         if lens_type.array[0] > 1:
-            pairs.append((first, camera.sub_imager(index, 1, 0), 0))
+            first.check_apart(camera.sub_imager(index, 1, 0), 0, pitch, source)
         if lens_type.array[1] > 1:
-            pairs.append((first, camera.sub_imager(index, 0, 1), 1))
+            first.check_apart(camera.sub_imager(index, 0, 1), 1, pitch, source)
         if index:
-            pairs.append((camera.sub_imager(index - 1, 0, camera.types[index - 1].array[1] - 1), first, 1))
-    for first, second, axis in pairs:
-        first.check_apart(second, axis, camera.pixel_pitch, scene.source)
+            camera.sub_imager(index - 1, 0, camera.types[index - 1].array[1] - 1).check_apart(first, 1, pitch, source)

@@ -91,18 +91,16 @@ def likely_causes(parts: Sequence[ResidualPart], evidence: RunEvidence) -> str:
         return f"{listed(evidence.dark)} {verb} dark, covered or dead"
     if evidence.deep:
         return "parts of the world lie before or behind the target's plane, for which alone H holds"
-    few = _few(parts)
+    few, fine = _few(parts), evidence.recorded or evidence.of_pixels
     if evidence.designed:
         return "H as designed is not this camera's; calibrate it, or fit its misalignment"
-    if few and not evidence.unflattened:
+    if few and not fine:
         beside = "" if len(few) == 1 else ", or one beside it,"
         return f"{named(few[:1])}{beside} is not where H places it"
     causes = ["the pixels differ in gain, for which no flat frame was given (--flat)"] if evidence.unflattened else []
-    causes.append("H is not this camera's" + ("" if evidence.calibrated else ", which was not calibrated"))
-    if evidence.recorded or evidence.of_pixels:
-        causes.append("the world has detail finer than the pixels of f")
-    if evidence.detailed:
-        causes.append("the world is rougher than its prior")
+    causes += ["the world has detail finer than the pixels of f"] if fine else []
+    causes += ["the world is rougher than its prior"] if evidence.detailed else []
+    causes.append(f"H{'' if evidence.calibrated else ', which was not calibrated,'} is not this camera's")
     causes.append("the noise is larger than stated")
     return f"{', '.join(causes[:-1])} or {causes[-1]}"
 

@@ -68,7 +68,7 @@ def test_spurious_information_of_h_is_reported() -> None:
         lines = run_table.rows(report_of(stack, model, restoration))
         name, words = lines[0]
         assert name == "verdict"
-        assert ("spurious information" in words) == words.startswith("not to be trusted") == bool(lenses)
+        assert ("spurious information" in words) == bool(lenses)
     assert shares[1] > 10 * shares[0]
     _, _, exact = chain(read(GALLERY / "tile19.toml", ["calibration.method=ideal"], ("I", "II")))
     assert exact.spurious_information == 0

@@ -27,7 +27,7 @@ from .local import WINDOW, local_interpolation, unexplained_variance
 from .world_prior import WorldPrior, averaging, repetition
 
 MAX_WORLD = 32_000  # pixels of the world, and
-MAX_MEASUREMENTS = 5_000  # measurements, up to which the exact moments take seconds
+MAX_MEASUREMENTS = 1_500  # measurements, up to which the exact moments take seconds
 CAUSE = "detail"  # in the error budget
 
 

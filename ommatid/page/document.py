@@ -54,7 +54,7 @@ def _page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: 
         "grounds": words.grounds(run.report),
         "notes": words.notes(run.report),
         "summary": words.summary(run.report),
-        "agreement": words.agreement(run.report.error),
+        "agreement": words.agreement(run.report.error) if verdict_words.is_trusted(run.report) else "worse",
         "cautions": words.cautions(run.report),
         "key_numbers": words.key_numbers(run.report),
         "maps": shown,

@@ -123,13 +123,13 @@ class _Sums:
         residual, count = self.residual, len(names)
         power = residual.power
         sizes = np.bincount(labels, minlength=count)
-        squares, prior = (np.bincount(labels, weights, count) for weights in (residual.squares, power.prior))
+        squares, prior = _sums(labels, residual.squares, count), _sums(labels, power.prior, count)
         expected, variance = prior, self._variance(power.prior, labels, count)
         if power.samples is not None:
             variance = np.maximum(variance, self._variance_of_samples(power.samples, labels, count))
         if power.bias is not None and power.noise is not None:
-            bias = np.bincount(labels, power.bias, count)
-            given = bias + np.bincount(labels, power.noise, count)
+            bias = _sums(labels, power.bias, count)
+            given = bias + _sums(labels, power.noise, count)
             variance_given = self._variance(power.noise, labels, count) + 4 * residual.largest * bias
             expected, variance = np.where(given > prior, [given, variance_given], [prior, variance])
         variance *= 1 + (1 / power.draws if power.draws else 0.0)
@@ -152,19 +152,24 @@ class _Sums:
     def _variance(self, power: FloatArray, labels: IntArray, count: int) -> FloatArray:
         """Return the variance of the sums of squares with these means."""
         residual = self.residual
-        variance = 2 * residual.largest * np.bincount(labels, power, count)
-        variance += 3 * np.bincount(labels, residual.spread * power**2, count)
+        variance = 2 * residual.largest * _sums(labels, power, count)
+        variance += 3 * _sums(labels, residual.spread * power**2, count)
         if residual.shared.any():
             subs = int(self.subs.max()) + 1
-            shared = np.bincount(self.subs + subs * labels, residual.shared * power, subs * count).reshape(count, subs)
+            shared = _sums(self.subs + subs * labels, residual.shared * power, subs * count).reshape(count, subs)
             variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance
 
     def _variance_of_samples(self, samples: Float32Array, labels: IntArray, count: int) -> FloatArray:
         """Return 2 tr W^2 of each part from pairs of draws, with a margin since they are few."""
         pairs = list(combinations(samples, 2))
-        squares = sum((np.square(np.bincount(labels, one * other, count)) for one, other in pairs), np.zeros(count))
+        squares = sum((np.square(_sums(labels, one * other, count)) for one, other in pairs), np.zeros(count))
         return SAMPLES_MARGIN * 2 * squares / len(pairs)
+
+
+def _sums(labels: IntArray, values: FloatArray | Float32Array, count: int) -> FloatArray:
+    """Return the sum of the values with each label from 0 to `count` - 1."""
+    return np.bincount(labels, values, count).astype(np.float64)
 
 
 def _p_values(values: FloatArray, means: FloatArray, variances: FloatArray) -> FloatArray:

@@ -106,8 +106,8 @@ def _judge_residual(parts: list[ResidualPart], evidence: RunEvidence, check: Err
         return
     findings.passed.append(f"the residual is {whole.ratio:.3g} times its expectation")
     uncertain = check.calibration_share > SIZE
-    lower = stats.norm.cdf((whole.chi_squared - whole.prior) / (2 * whole.prior) ** 0.5) if whole.prior else 1.0
-    if whole.chi_squared < (1 - SIZE) * whole.prior and lower < SIGNIFICANCE:
+    shortfall = (whole.prior - whole.chi_squared) / (2 * whole.prior) ** 0.5 if whole.prior else 0.0
+    if whole.chi_squared < (1 - SIZE) * whole.prior and float(stats.norm.sf(shortfall)) < SIGNIFICANCE:
         findings.notes.append(
             f"the residual is {whole.chi_squared / whole.prior:.3g} times that of images drawn from the prior: the"
             f" picture is smoother than the prior, or the noise{' or the uncertainty of H' if uncertain else ''} is"

@@ -187,7 +187,8 @@ def test_the_p_value_of_an_error_is_that_of_its_gamma_variate() -> None:
 
 def stack_of(factor: float = 1.0, **tables: Any) -> Stack:
     """The stack of a drawn image with `factor` times the noise variance of the scene."""
-    described = scene(lenses=THREE, **{"noise": {"variance": NOISE}, **tables})
+    noise: dict[str, Any] = {"variance": NOISE}
+    described = scene(lenses=THREE, noise=tables.pop("noise", noise), **tables)
     return recorded(described, drawn_image(), factor * NOISE, seed=1)
 
 

@@ -45,7 +45,8 @@ def verdict_of(
         pixels_used=int(used.sum()),
         left_out=without_pixels(stack.camera, used),
     )
-    evidence = evidence_of(stack, model, used, assumed.prior.kind == "independent")
+    light = assumed.method.task.model.light(result.image)
+    evidence = evidence_of(stack, model, used, light, assumed.prior.kind == "independent")
     return judge(_parts(stack, model, assumed, result), evidence, check)
 
 

@@ -14,7 +14,8 @@ from ommatid.scenes.stack import Stack
 
 from .residual_parts import ResidualPart
 
-DARK = 0.5  # share of the light of a type's other sub-imagers below which one counts as dark
+DARK = 0.5  # share of the light of a type's other sub-imagers below which one counts as dark, and
+UNEXPLAINED = 0.8  # share of the light that the estimate predicts, since a part of the target may be dark
 FEW = 0.2  # share of the sub-imagers that are few
 MOST_NAMED = 5  # sub-imagers in one sentence
 
@@ -41,13 +42,16 @@ class RunEvidence:
     detailed: bool
 
 
-def evidence_of(stack: Stack, model: Model, used: BoolArray, independent: bool) -> RunEvidence:
-    """Collect what may explain a residual; used : (M,) True for measurements that are used."""
+def evidence_of(stack: Stack, model: Model, used: BoolArray, light: FloatArray, independent: bool) -> RunEvidence:
+    """Collect what may explain a residual.
+
+    used : (M,) True for measurements that are used;  light : (M,) as the estimate predicts it
+    """
     camera, scene = stack.camera, stack.scene
     ideal = model.record["method"] == "ideal"
     recorded = stack.record.get("method") == "imported"
     return RunEvidence(
-        dark=_dark(stack, used),
+        dark=_dark(stack, used, light),
         deep=scene.world is not None,
         designed=ideal and (camera.tolerance is not None or _has_surfaces(camera)),
         calibrated=not ideal,
@@ -68,15 +72,21 @@ def without_pixels(camera: Camera, used: BoolArray) -> tuple[str, ...]:
     return tuple(sub.name for sub, part in pairs if not used[part].any())
 
 
-def _dark(stack: Stack, used: BoolArray) -> tuple[str, ...]:
+def _dark(stack: Stack, used: BoolArray, light: FloatArray) -> tuple[str, ...]:
     camera = stack.camera
     parts = camera.slices()
-    means = np.array([_mean(stack.values[part][used[part]]) for part in parts])
+    means, predicted = (
+        np.array([_mean(values[part][used[part]]) for part in parts]) for values in (stack.values, light)
+    )
     dark: list[str] = []
     for lens_type in camera.types:
         index = [number for number, sub in enumerate(camera.sub_imagers) if sub.type is lens_type]
         typical = float(np.nanmedian(means[index])) if np.isfinite(means[index]).any() else 0.0
-        dark += [camera.sub_imagers[number].name for number in index if means[number] < DARK * typical]
+        dark += [
+            camera.sub_imagers[number].name
+            for number in index
+            if means[number] < DARK * typical and means[number] < UNEXPLAINED * predicted[number]
+        ]
     return tuple(dark)
 
 

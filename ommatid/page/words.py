@@ -85,7 +85,7 @@ def cautions(report: RunReport) -> list[str]:
             f"{diagnostics.pixels_dead} dead and {diagnostics.pixels_saturated} saturated sensor pixels are excluded"
             " from the estimate."
         )
-    return warnings
+    return warnings + [f"Assumed: {assumption}." for assumption in report.assumes]
 
 
 def key_numbers(report: RunReport) -> list[tuple[str, str, str]]:

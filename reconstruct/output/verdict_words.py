@@ -59,6 +59,7 @@ def cause(name: str) -> str:
         "null_space": "null space of H",
         "noise": "sensor noise",
         "rendering": "noise of the rendering",
+        "detail": "detail finer than f",
         "calibration": "uncertainty of H",
         "misalignment": "misalignment of the lenses",
     }

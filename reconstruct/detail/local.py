@@ -97,7 +97,8 @@ def _batches(matrix: sparse.csr_array, shape: tuple[int, int]) -> Iterator[_Batc
         count = max(1, int(np.searchsorted(area * np.arange(1, order.size + 1), VALUES)))
         chosen, order = order[:count], order[count:]
         sizes = np.diff(matrix.indptr)[filled[chosen]].astype(np.int64)
-        entries = np.concatenate([np.arange(starts[i], starts[i] + n) for i, n in zip(chosen, sizes, strict=True)])
+        before = np.repeat(np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes)
+        entries: IntArray = np.repeat(starts[chosen], sizes) + np.arange(int(sizes.sum())) - before
         number = np.repeat(np.arange(chosen.size), sizes)
         yield _Batch(
             filled[chosen],

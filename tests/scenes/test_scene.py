@@ -21,7 +21,8 @@ def test_gallery_reads_and_survives_writing(path: Path, tmp_path: Path) -> None:
     first = resolved(read(path), (19, 19))
     write(tmp_path / "scene.toml", first)
     again = read(tmp_path / "scene.toml")
-    assert again.target.image == (None if first.world else str(tmp_path / "truth.exr"))
+    picture = "truth.exr" if first.target.detail == 1 else "target.exr"
+    assert again.target.image == (None if first.world else str(tmp_path / picture))
     assert resolved(again, (19, 19)).plain() == first.plain()
 
 

@@ -121,8 +121,8 @@ def check_region(corner: tuple[int, int], size: tuple[int, int], shape: tuple[in
 
 def check_match(stack: Stack, model: Model, names: tuple[Path | str, Path | str]) -> None:
     """Raise InputError, naming the first difference, unless a stack and a model are of one camera and target grid."""
-    if model.camera.shape != stack.camera.with_grid_of_matrix.shape:
-        rows, columns = stack.camera.with_grid_of_matrix.shape
+    rows, columns = stack.camera.with_grid_of_matrix.shape
+    if stack.camera.has_detail and model.camera.shape != (rows, columns):
         raise InputError(
             f"{names[0]} and {names[1]} do not belong together: target.shape {list(stack.camera.shape)} and"
             f" target.detail {stack.camera.detail} of the stack need H on {rows} x {columns} pixels, the model has"

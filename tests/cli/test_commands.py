@@ -166,7 +166,7 @@ def test_run_json_keeps_the_contract(finished: Path) -> None:
     assert all(stage["seconds"] >= 0 for stage in run["stages"].values())
     error = run["error"]
     assert {"mse", "trimmed_mse", "predicted_mse", "psnr", "ssim", "budget"} <= set(error)
-    assert set(error["budget"]) == {"null_space", "noise", "quantisation", "rendering", "calibration"}
+    assert set(error["budget"]) == {"null_space", "noise", "quantisation", "rendering", "calibration", "detail"}
     assert sum(error["budget"].values()) == pytest.approx(error["predicted_mse"], rel=1e-9)
     assert min(error["budget"].values()) >= 0
     assert {"method", "condition", "digits", "bound", "variance_bound", "why", "tried"} <= set(run["solver"])

@@ -51,12 +51,12 @@ class DenseMethod(Method):
 def residual_power(
     form: Form, actual: FloatArray, leverage: FloatArray | None, truth: FloatArray | None
 ) -> ResidualPower | None:
-    """Return the expected squares of the residual; None where a measurement has no expected noise.
+    """Return the expected squares of the residual; None where a measurement has no expected noise, or none is left.
 
     leverage : (M,) the diagonal of H A, which holds for the expected noise;  truth : (N,) the image, if it is known
     """
     problem = form.problem
-    if not problem.noisy:
+    if not problem.noisy or not problem.measurements:
         return None
     prior = problem.prior
     inputs = ResidualInputs(

@@ -34,7 +34,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "corridor": DEEP,
     "distorted": (TRANSPORT,),
     "doublet": SAMPLES,
-    "misaligned": (*TILE, "render.samples=2048", "calibration.samples=2048"),
+    "misaligned": TILE,
     "photo": ("target.shape=[47, 47]", "estimator.method=tiles", TRANSPORT),
     "planoconvex": ("render.samples=8192", "calibration.samples=16384", "noise.variance=1e-2"),
     "sensor": (*TILE, "calibration.samples=4096"),

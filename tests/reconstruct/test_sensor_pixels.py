@@ -111,7 +111,7 @@ def test_a_stack_without_usable_pixels_gives_the_prior_and_a_warning() -> None:
         assert restoration.estimate == pytest.approx(np.full(361, 99.0))
         assert restoration.expected.variance == pytest.approx(np.full(361, 16.0))
         assert restoration.usable.dead == 706
-        assert "no sensor pixel is left" in rows(restoration, nothing, model)["this is the prior, not an image"]
+        assert "this is the prior and not an image" in rows(restoration, nothing, model)["verdict"]
 
 
 def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:

@@ -38,7 +38,7 @@ def scene_sections(description: dict[str, Any]) -> list[Section]:
 def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:
     """Tabulate a prediction, and the electrons that the pixels collect where the scene has a sensor."""
     lines, tolerance = prediction_table.rows(prediction), scene.camera.tolerance
-    ideal_alone = prediction.budget is None
+    ideal_alone = prediction.budget is None or "rendering" not in prediction.budget  # no rays
     if (
         ideal_alone
         and tolerance is not None

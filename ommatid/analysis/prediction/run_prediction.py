@@ -144,7 +144,7 @@ def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) ->
     if recording.true is None or setup.scene.estimator.misalignment != "trust":
         return None
     method = outcome.assumed.method
-    if not isinstance(method, DenseMethod):
+    if not isinstance(method, DenseMethod) or setup.camera.has_detail:
         return _mismatch_of_images(recording, outcome, _cause(setup.camera))
     camera, prior, used = setup.camera, method.task.prior_on(setup.camera.shape), outcome.assumed.usable.used
     form, slices = method.estimate.form, setup.camera.slices()

@@ -12,7 +12,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.scene import Scene
 
 from .detail.detail_method import DetailMethod
-from .detail.detailed_model import is_exact_for
+from .detail.detailed_model import detail_memory, is_exact_for
 from .estimator.memory import needed_memory
 from .frame.banded_system import band_width, band_work, leaves_null_space, serves
 from .frame.frame_method import FrameMethod
@@ -143,7 +143,8 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
         if form == "auto":
             form = "covariance" if camera.measurements < camera.unknowns else "information"
         correlated = scene.prior.kind != "independent"
-        return needed_memory(form, camera.measurements, camera.unknowns, correlated=correlated) + entries
+        needed = needed_memory(form, camera.measurements, camera.unknowns, correlated=correlated) + entries
+        return needed + (detail_memory(camera) if method == "detail" else 0)
     images = 8 * (5 * camera.measurements + 16 * camera.unknowns)
     if method == "tiles":
         side = scene.tiles.size**2

@@ -112,24 +112,19 @@ def predict(
         the estimator expects noise
     Raises InputError where the noise is to be fitted to a stack, or where no form is right.
     """
-    noise = np.broadcast_to(actual, matrix.shape[0])
-    used = np.isfinite(noise)
-    matrix, noise = matrix if used.all() else sparse.csr_array(matrix[used]), noise[used]
-    seen = observability(matrix)
-    if estimator.noise_variance == "fit":
-        raise InputError("estimator.noise_variance 'fit' takes a recorded stack; set a number to predict without one")
-    setting = estimator.noise_variance
-    expected_noise = noise if setting is None else np.full(noise.size, float(setting))
-    added = None
+    noise, expected_noise, used = _noises(actual, matrix.shape[0], estimator)
+    matrix = matrix if used.all() else sparse.csr_array(matrix[used])
+    seen, added = observability(matrix), None
     if (expected_noise > 0).all():
         form, solver = factorise(Problem(matrix, prior, expected_noise), estimator.method, estimator.tolerance)
         expected = expected_error(form, {"noise": noise})
         method, variance, resolved = solver.method, expected.variance, expected.resolved
-        added = None if misalignment_variance is None else misalignment_variance(form, used)
+        if misalignment_variance is not None:
+            added = misalignment_variance(form, used)
+            variance = variance + added
     else:
         limit = svd(Problem(matrix, prior, np.ones(noise.size)))
         method, variance, resolved = limit.name, _noiseless_limit(limit, noise), limit.resolved()
-    variance = variance if added is None else variance + added
     return Prediction(
         noise.size,
         prior.mean.size,
@@ -156,19 +151,15 @@ def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray
     Raises InputError where the noise is to be fitted to a stack, or where the estimator has no noise to expect.
     """
     scene, camera = model.scene, model.camera
-    setting = scene.estimator.noise_variance
-    noise = actual if isinstance(actual, np.ndarray) else uniform(actual, model.measurements)
-    used = np.isfinite(noise)
-    noise = at_used(noise, used)
-    expected_noise = uniform(setting, noise.size) if isinstance(setting, float) else noise
-    if setting == "fit" or not (expected_noise > 0).all():
+    noise, expected_noise, used = _noises(actual, model.measurements, scene.estimator)
+    if not (expected_noise > 0).all():
         raise InputError(
             f"{camera.unknowns} pixels are predicted with noise alone; set noise.variance or estimator.noise_variance"
             " above 0"
         )
     recorded = model.forward(np.full(model.unknowns, scene.prior.mean))
     detail = independent_detail(model, used)
-    if detail and not isinstance(setting, float):
+    if detail and scene.estimator.noise_variance is None:
         expected_noise = expected_noise + detail[DETAIL]
     task = EstimationTask(model, recorded, used, expected_noise, scene.prior, scene.estimator, scene.tiles)
     result = METHODS[choice.method](task, Execution()).result({"noise": noise, **detail}, None)
@@ -188,6 +179,19 @@ def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray
         prior_variance=scene.prior.variance,
         budget={"null_space": result.expected.missing, **result.expected.parts} if camera.has_detail else None,
     )
+
+
+def _noises(
+    actual: float | FloatArray, measurements: int, estimator: EstimatorTable
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return actual and expected noise of the measurements used, and which of all are, (M,). Raises InputError."""
+    setting = estimator.noise_variance
+    if setting == "fit":
+        raise InputError("estimator.noise_variance 'fit' takes a recorded stack; set a number to predict without one")
+    noise = actual if isinstance(actual, np.ndarray) else uniform(actual, measurements)
+    used = np.isfinite(noise)
+    noise = at_used(noise, used)
+    return noise, noise if setting is None else uniform(setting, noise.size), used
 
 
 def median_width(resolved: FloatArray) -> float | None:

@@ -80,6 +80,12 @@ def is_exact_for(scene: Scene, camera: Camera) -> bool:
     return camera.unknowns * camera.detail**2 <= MAX_WORLD and camera.measurements <= MAX_MEASUREMENTS
 
 
+def detail_memory(camera: Camera) -> int:
+    """Return the bytes of the exact moments: B, P A^T and P Hf^T, R_detail, its sum with the noise, and its factor."""
+    world, measurements = camera.world.unknowns, camera.measurements
+    return 8 * (world * (2 * camera.unknowns + measurements) + 4 * measurements**2)
+
+
 def independent_detail(model: Model, used: BoolArray) -> dict[str, FloatArray]:
     """Return the variance of detail by its cause, (measurements used,), where its covariance is not known."""
     if not isinstance(model, DetailedModel) or model.detail_covariance is not None or not model.detail_variance.any():

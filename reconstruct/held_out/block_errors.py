@@ -134,17 +134,23 @@ def _upper_root(problem: Problem) -> FloatArray:
     """Return the upper C of C^T C = I + B B^T: by Cholesky where that keeps enough digits, else by QR of [I; B^T]."""
     dense = problem.dense_matrix()
     dense /= problem.deviation[:, None]
+    root = _cholesky_root(dense)
+    if root is not None:
+        return root
+    panel = min(PANEL, problem.measurements)
+    triangle, *_ = linalg.lapack.dtpqrt(0, panel, np.eye(problem.measurements, order="F"), np.asfortranarray(dense.T))
+    return np.triu(triangle)
+
+
+def _cholesky_root(dense: FloatArray) -> FloatArray | None:
+    """Return the same by Cholesky, None where that fails or loses digits, since it squares B."""
     covariance = dense @ dense.T
     covariance[np.diag_indices_from(covariance)] += 1.0
     try:
         factor, condition = factorise_positive(covariance)
-        if condition * EPS <= EXACT:
-            return np.ascontiguousarray((np.tril(factor.root) * factor.scale[:, None]).T)
     except NotSolvableError:
-        pass
-    panel = min(PANEL, problem.measurements)
-    triangle, *_ = linalg.lapack.dtpqrt(0, panel, np.eye(problem.measurements, order="F"), np.asfortranarray(dense.T))
-    return np.triu(triangle)
+        return None
+    return np.ascontiguousarray((np.tril(factor.root) * factor.scale[:, None]).T) if condition * EPS <= EXACT else None
 
 
 def _inverse_root(upper: FloatArray) -> FloatArray:

@@ -115,8 +115,9 @@ def check_held_out(
     execution = Execution(progress=progress)
 
     def checked(choice: MethodChoice) -> HeldOutCheck:
-        task = assumptions_for(stack, model, choice, execution).method.task
-        return check_task(task, choice.method, fitted=fitted, execution=execution)
+        assumed = assumptions_for(stack, model, choice, execution)
+        found = check_task(assumed.method.task, choice.method, fitted=fitted, execution=execution)
+        return replace(found, fitted=True) if stack.scene.prior.kind == "fit" else found
 
     return with_fallback(stack, model, checked)
 

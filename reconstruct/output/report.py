@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from math import isfinite
 from typing import Any
 
@@ -77,7 +77,10 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
 
 def _held_out(restoration: Reconstruction) -> dict[str, Any]:
     check = quick_check(restoration.task, restoration.choice.method)
-    return {} if check is None else {"held_out": held_out_report(check)}
+    if check is None:
+        return {}
+    fitted = restoration.fit is not None and restoration.fit.variance is not None
+    return {"held_out": held_out_report(replace(check, fitted=fitted))}
 
 
 def _stage(record: dict[str, Any]) -> StageReport:

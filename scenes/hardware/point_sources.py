@@ -86,16 +86,9 @@ def from_recorded_points(
     Raises InputError for frames that do not fit the camera, positions outside f, and pixels of f without a source.
     """
     scene, camera, start = setup.scene, setup.camera, perf_counter()
-    if camera.has_detail:
-        raise InputError(
-            f"{scene.source}: recorded point sources fill pixels of f, got target.detail {camera.detail}; set it to 1"
-        )
+    _check_pixels_of_f(setup)
     frames = read_frames(camera, images, settings, mosaics=True)
-    if scene.sensor is not None and (frames.dark is None or frames.flat is None):
-        raise InputError(
-            f"{scene.source}: a [sensor] needs dark and flat frames to convert readings of points; pass them with"
-            " --dark and --flat, or remove [sensor]"
-        )
+    _check_conversion(scene, frames)
     positions = (
         positions_by_rows(camera, frames.files) if places is None else read_positions(places, camera, frames.files)
     )
@@ -126,6 +119,22 @@ def from_recorded_points(
     once = scene.sensor is None and not (entries.count > 1).any()
     batches = np.zeros((0, entries.mean.size), dtype=np.float32)
     return RecordedCalibration(Model(setup.resolved, camera, matrix, variance, batches, record), frames, stray, once)
+
+
+def _check_pixels_of_f(setup: Setup) -> None:
+    if setup.camera.has_detail:
+        raise InputError(
+            f"{setup.scene.source}: recorded point sources fill pixels of f, got target.detail {setup.camera.detail};"
+            " set it to 1"
+        )
+
+
+def _check_conversion(scene: Scene, frames: RecordedFrames) -> None:
+    if scene.sensor is not None and (frames.dark is None or frames.flat is None):
+        raise InputError(
+            f"{scene.source}: a [sensor] needs dark and flat frames to convert readings of points; pass them with"
+            " --dark and --flat, or remove [sensor]"
+        )
 
 
 def _check_complete(camera: Camera, positions: list[IntArray], places: Path | None) -> None:

@@ -186,7 +186,7 @@ def _noises(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return actual and expected noise of the measurements used, and which of all are, (M,). Raises InputError."""
     setting = estimator.noise_variance
-    if setting == "fit":
+    if isinstance(setting, str):
         raise InputError("estimator.noise_variance 'fit' takes a recorded stack; set a number to predict without one")
     noise = actual if isinstance(actual, np.ndarray) else uniform(actual, measurements)
     used = np.isfinite(noise)

@@ -22,7 +22,9 @@ from .detail.world_fit import fit_world
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
-from .methods.method import EstimationTask, Execution, Method, total_variance
+from .methods.method import EstimationTask, Execution, Method, MethodResult, total_variance
+from .model_error.attenuation import can_be_corrected, with_attenuation
+from .model_error.contrast import Contrast, true_contrast
 from .noise import (
     Noise,
     UsablePixels,
@@ -36,18 +38,36 @@ from .noise import (
 
 Result = TypeVar("Result")
 
+NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
 CERTAIN = ("rendering", "calibration", DETAIL)  # noise that stays known when the rest of it is to be fitted
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """The prior, the noise by cause, (pixels used,) each, the fit of either, and the method that assumes them."""
+    """The prior, the noise by cause, (pixels used,) each, the fit of either, and the method that assumes them.
+
+    contrast : of the true image, where the uncertainty of H depends on it
+    """
 
     method: Method
     usable: UsablePixels
     prior: PriorTable
     noise: Noise
     fit: PriorFit | None
+    contrast: Contrast | None = None
+
+    def result(self, truth: FloatArray | None) -> MethodResult:
+        """Return the estimate and its error, with the attenuation by the errors of H where that matters.
+
+        truth : (N,), or (pixels of the world,) for a method that takes detail into account
+        """
+        method, result = self.method, self.method.result(self.noise, truth)
+        operators = None if self.contrast is None else method.operators()
+        if self.contrast is None or operators is None:
+            return result
+        known = truth if truth is not None and truth.size == method.task.model.unknowns else None
+        actual = total_variance(self.noise)
+        return with_attenuation(result, method, operators, self.contrast.image, known, actual)
 
 
 def method_for(stack: Stack, model: Model) -> Method:
@@ -155,7 +175,23 @@ def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution:
     fixed = isinstance(stack.scene.estimator.noise_variance, float)
     if method is None or fit is not None or not fixed or choice.method == "detail":
         method = method_with(observation, noise)
-    return Assumptions(method, observation.usable, observation.prior, noise, fit)
+    contrast = _true_contrast(method, noise)
+    if contrast is not None:
+        noise = noise | {"calibration": contrast.calibration}
+        if not fixed:
+            method = method_with(observation, noise)
+    return Assumptions(method, observation.usable, observation.prior, noise, fit, contrast)
+
+
+def _true_contrast(method: Method, noise: Noise) -> Contrast | None:
+    """Return the contrast on which the errors of H act, None where they hardly matter or nothing can show it."""
+    if "calibration" not in noise or not can_be_corrected(method):
+        return None
+    actual = total_variance(noise)
+    if float(noise["calibration"].sum()) <= NEGLIGIBLE * float(actual.sum()):
+        return None
+    operators = method.operators()
+    return None if operators is None else true_contrast(method, operators, actual)
 
 
 def _certain(noise: Noise) -> Noise:

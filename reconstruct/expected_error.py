@@ -61,11 +61,15 @@ class ExpectedError:
 
 @dataclass(frozen=True)
 class Interval:
-    """Expectation of the mean squared error given the image, and the interval that holds it in 99 of 100 cases."""
+    """Expectation of the mean squared error given the image, and the interval that holds it in 99 of 100 cases.
+
+    variance : of the sum of the squares of all pixels
+    """
 
     mse: float
     low: float
     high: float
+    variance: float = 0.0
 
 
 def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | None = None) -> ExpectedError:
@@ -119,7 +123,7 @@ def interval(mean: float, variance: float, count: int) -> Interval:
         return Interval(mean / count, mean / count, mean / count)
     shape, scale = mean**2 / variance, variance / mean
     low, high = (float(stats.gamma.ppf(level, shape, scale=scale)) for level in COVERAGE)
-    return Interval(mean / count, low / count, high / count)
+    return Interval(mean / count, low / count, high / count, variance)
 
 
 def kernel_widths(resolved: FloatArray) -> FloatArray:

@@ -65,7 +65,8 @@ def initial_noise(stack: Stack, model: Model, usable: UsablePixels, prior: Prior
     """Return the variances, (pixels used,), before there is an estimate; that of H is for images of the prior."""
     noise = {name: at_used(variances, usable.used) for name, variances in known_noise(stack).items()}
     if model.variance.any():
-        noise["calibration"] = model.prior_variance_from_model(np.full(model.unknowns, prior.variance))[usable.used]
+        from_prior = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
+        noise["calibration"] = from_prior[usable.used]
     return noise
 
 

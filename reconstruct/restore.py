@@ -160,7 +160,7 @@ def _restored(
 ) -> Reconstruction:
     start, shape = perf_counter(), stack.camera.shape
     assumed = assumptions_for(stack, model, choice, execution)
-    result, task = assumed.method.result(assumed.noise, truth_for(choice, truth, stack.camera)), assumed.method.task
+    result, task = assumed.result(truth_for(choice, truth, stack.camera)), assumed.method.task
     truth = None if truth is None else _image(truth, stack.camera)
     error = None if truth is None else measure_error(result.image, truth, shape)
     spurious = _spurious_information(task, result.expected)

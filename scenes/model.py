@@ -6,7 +6,7 @@ large frame is not stored but applied from the scene's geometry.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -28,6 +28,7 @@ from .shrinkage import shrink_variances
 GROUP_SIZE = 200  # fewest pixels of similar contrast whose variances are shrunk together
 MOST_GROUPS = 24  # of pixels per lens type
 RECORDED = "recorded points"  # method of a model whose every entry was measured by itself
+ROUNDED = 1e-6  # deviation of the sum of a row, about 1, that is float32's rounding
 EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
 
 
@@ -165,37 +166,81 @@ class Model:
             record={key: value for key, value in self.record.items() if key != "agreement"},  # of all lens types
         )
 
-    def variance_from_model(self, image: FloatArray) -> FloatArray:
+    def variance_from_model(self, image: FloatArray, noise: Sequence[FloatArray] = ()) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement of `image`: (M,).
 
         The errors of a row cancel in its sum, since all its entries share their rays, so the rest is about
-        sum over j of var_ij (f_j - (H f)_i)^2. Errors of neighbouring entries cancel too where the image is smooth; the
-        scatter of H f over the batches, shrunk among pixels of a lens type with similar contrast, shows by how much.
+        sum over j of var_ij (f_j - (H f)_i)^2; light that is lost beside the target is one more entry, where f is 0.
+        Errors of neighbouring entries cancel too where the image is smooth; the scatter of H f over the batches, shrunk
+        among pixels of a lens type with similar contrast, shows by how much.
         Entries of recorded points were measured one by one, and nothing cancels: sum over j of var_ij f_j^2.
+
+        noise : random images with the noise of `image`, whose scatter is not that of the true image and is subtracted
         """
         flat = np.asarray(image, dtype=np.float64).ravel()
-        rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
         contrast = flat[self.matrix.indices]
+        level = self.matrix @ flat
         if self.record["method"] != RECORDED:
-            contrast = contrast - (self.matrix @ flat)[rows]
-        variance = self._row_sums(rows, self.variance * contrast**2)
+            contrast = contrast - level[self._rows]
+        variance = self._row_sums(self.variance * contrast**2)
         count = len(self.batches)
         if count < 2:
             return variance
-        scatter = sum(
-            (self._row_sums(rows, batch * contrast) ** 2 for batch in self.batches), np.zeros(self.measurements)
-        )
-        scatter /= count * (count - 1)
+        variance += self._lost_variance * level**2
+        scatter = self._scatter(flat)
+        excess = sum((self._scatter(image) for image in noise), np.zeros(self.measurements)) / max(len(noise), 1)
         if self.record.get("fit"):
             # Entries that follow from a few fitted parameters are correlated in ways that no sum over entries shows.
-            return scatter
+            return np.maximum(scatter - excess, 0.0)
         for pixels in self.camera.type_slices():
             uncertain = pixels.start + np.flatnonzero(variance[pixels] > 0)
             by_contrast = uncertain[np.argsort(variance[uncertain])]
             for group in np.array_split(by_contrast, max(1, min(uncertain.size // GROUP_SIZE, MOST_GROUPS))):
                 if group.size:
                     variance[group] *= shrink_variances(scatter[group] / variance[group], count)
+                    # Ratios of flat pixels have long tails, whose posterior means do not add up to the scatter.
+                    total = max(float(scatter[group].sum() - excess[group].sum()), 0.0)
+                    variance[group] *= total / (float(variance[group].sum()) or 1.0)
         return variance
+
+    def _scatter(self, image: FloatArray) -> FloatArray:
+        """Variance of H f of one image by the batches alone, (M,)."""
+        level, count = self.matrix @ image, len(self.batches)
+        contrast = image[self.matrix.indices] - level[self._rows]
+        squares = (
+            np.square(self._row_sums(batch * contrast) + lost * level)
+            for batch, lost in zip(self.batches, self._lost, strict=True)
+        )
+        return sum(squares, np.zeros(self.measurements)) / (count * (count - 1))
+
+    @cached_property
+    def _lost(self) -> FloatArray:
+        """Deviations of the sum of each row, (B, M), from light lost beside the target; 0 where float32 rounds it."""
+        sums = np.array([self._row_sums(batch) for batch in self.batches]).reshape(-1, self.measurements)
+        return np.where(np.abs(sums) > ROUNDED, sums, 0.0)
+
+    @cached_property
+    def _lost_variance(self) -> FloatArray:
+        """Variance of the sum of each row, (M,)."""
+        count = len(self.batches)
+        if count < 2:
+            return np.zeros(self.measurements)
+        return np.square(self._lost).sum(axis=0) / (count * (count - 1))
+
+    @cached_property
+    def _rows(self) -> IntArray:
+        """The measurement of each stored entry, (nnz,)."""
+        return np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
+
+    @property
+    def error_matrices(self) -> list[sparse.csr_array]:
+        """Deviations of the batches from H, (M, N) each; empty where H has no uncertainty or no batches."""
+        kept = self.matrix if len(self.batches) else None
+        return (
+            []
+            if kept is None
+            else [sparse.csr_array((batch, kept.indices, kept.indptr), shape=kept.shape) for batch in self.batches]
+        )
 
     def spurious_information(self, noise_variance: FloatArray) -> FloatArray:
         """Information on each pixel that the noise of H alone appears to bring: (N,), sum over i of var_ij / Rv_i.
@@ -204,17 +249,18 @@ class Model:
         """
         if not self.variance.size:
             return np.zeros(self.unknowns)
-        rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
-        weights = self.variance / noise_variance[rows]
+        weights = self.variance / noise_variance[self._rows]
         return np.bincount(self.matrix.indices, weights=weights, minlength=self.unknowns).astype(np.float64)
 
-    def prior_variance_from_model(self, prior_variance: FloatArray) -> FloatArray:
+    def prior_variance_from_model(self, prior_variance: FloatArray, prior_mean: float = 0.0) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement under the prior: (M,), sum of var_ij P0_j.
 
-        prior_variance : (N,) of the pixels of f
+        prior_variance : (N,) of the pixels of f;  prior_mean : of every pixel, which light lost beside the target shows
         """
-        rows = np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
-        return self._row_sums(rows, self.variance * prior_variance[self.matrix.indices])
+        variance = self._row_sums(self.variance * prior_variance[self.matrix.indices])
+        if self.record["method"] == RECORDED:
+            return variance + self._row_sums(self.variance) * prior_mean**2
+        return variance + self._lost_variance * prior_mean**2
 
-    def _row_sums(self, rows: IntArray, entries: FloatArray) -> FloatArray:
-        return np.bincount(rows, weights=entries, minlength=self.measurements).astype(np.float64)
+    def _row_sums(self, entries: FloatArray) -> FloatArray:
+        return np.bincount(self._rows, weights=entries, minlength=self.measurements).astype(np.float64)

@@ -63,7 +63,7 @@ def for_prior(setup: Setup) -> StoppingRule:
     def added_error(model: Model) -> float:
         used = np.isfinite(noise) & (np.diff(model.matrix.indptr) > 0)
         model = model_of_f(model, camera, prior)
-        from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance))
+        from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
         causes = {"noise": noise[used], "calibration": from_model[used], **independent_detail(model, used)}
         setting = scene.estimator.noise_variance
         recorded = model.forward(np.full(model.unknowns, prior.mean))

@@ -12,8 +12,8 @@ from ommatid.runtime.errors import InputError
 
 from ..estimator.estimate import Estimate, estimate
 from ..expected_error import Interval, expected_given, interval, solved_columns, variance_of_sum
-from ..methods.dense_method import DRAWS, residual_power, residuals
-from ..methods.method import Method, MethodResult, total_variance
+from ..methods.dense_method import DRAWS, operators_of, residual_power, residuals
+from ..methods.method import Method, MethodResult, PosteriorOperators, total_variance
 from ..misalignment.robust_noise import Whitening, robust_error
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .detailed_model import CAUSE, DetailedModel
@@ -49,6 +49,16 @@ class DetailMethod(Method):
     def estimate_image(self) -> FloatArray:
         """Return f^ alone: (N,)."""
         return self._solved[1].image
+
+    def operators(self) -> PosteriorOperators:
+        """Return the operators of the estimate."""
+        white, solved = self._solved
+        whitened = operators_of(solved.form, lambda values: values)
+
+        def weigh(values: FloatArray) -> FloatArray:
+            return white.multipliers(white.vector(values)[:, None])[:, 0]
+
+        return PosteriorOperators(lambda values: whitened.gain(white.vector(values)), whitened.posterior, weigh)
 
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error; truth : (N,), or better (pixels of the world,), whose detail is known."""

@@ -11,6 +11,7 @@ world is then taken as made of f's pixels, and e is zero.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -62,15 +63,21 @@ class DetailedModel(Model):
         """Return the expected world given f: (N,) to (pixels of the world,)."""
         return self.prior_mean + self.interpolation @ (np.asarray(image).ravel() - self.prior_mean)
 
-    def variance_from_model(self, image: FloatArray) -> FloatArray:
+    def variance_from_model(self, image: FloatArray, noise: Sequence[FloatArray] = ()) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement of `image` and of the detail it leaves open."""
         of_detail = self.fine.prior_variance_from_model(self.unresolved)
-        return self.fine.variance_from_model(self.world_given(image)) + of_detail
+        worlds = [self.interpolation @ image for image in noise]
+        return self.fine.variance_from_model(self.world_given(image), worlds) + of_detail
 
-    def prior_variance_from_model(self, prior_variance: FloatArray) -> FloatArray:
+    def prior_variance_from_model(self, prior_variance: FloatArray, prior_mean: float = 0.0) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement under the prior: (M,)."""
-        detail = self.camera.detail
-        return self.fine.prior_variance_from_model(repetition(self.camera.shape, detail) @ prior_variance)
+        world = repetition(self.camera.shape, self.camera.detail) @ prior_variance
+        return self.fine.prior_variance_from_model(world, prior_mean)
+
+    @property
+    def error_matrices(self) -> list[sparse.csr_array]:
+        """Deviations of the batches of G, (M, N) each."""
+        return [sparse.csr_array(error @ self.interpolation) for error in self.fine.error_matrices]
 
 
 def is_exact_for(scene: Scene, camera: Camera) -> bool:

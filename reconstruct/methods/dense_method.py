@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..expected_error import expected_error, expected_given, variance_of_sum
 from ..forms.form import Form
 from ..problem import Problem
 from ..verdict.residual_power import ResidualInputs, ResidualPower
-from .method import Method, MethodResult, total_variance
+from .method import Method, MethodResult, PosteriorOperators, total_variance
 
 DRAWS = 32  # of images and noise for the expected residual
 
@@ -33,6 +33,11 @@ class DenseMethod(Method):
         """Compute f^ without its error: (N,)."""
         return self.estimate.image
 
+    def operators(self) -> PosteriorOperators | None:
+        """Return the operators of the estimate, None where a measurement has no noise."""
+        form, noise = self.estimate.form, self.task.expected_noise
+        return operators_of(form, lambda values: values / noise) if form.problem.noisy else None
+
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
         solution, actual = self.estimate, total_variance(noise)
@@ -46,6 +51,18 @@ class DenseMethod(Method):
             lambda weights: variance_of_sum(solution.form, weights, actual),
             residual_power(solution.form, actual, expected.leverage, truth),
         )
+
+
+def operators_of(form: Form, weigh: Callable[[FloatArray], FloatArray]) -> PosteriorOperators:
+    """Return the operators of a form; weigh : Rv^-1."""
+
+    def posterior(image: FloatArray) -> FloatArray:
+        problem = form.problem
+        shift = problem.prior.apply_root_transposed(image[:, None])
+        solution, _ = form.solve(shift, np.zeros((problem.measurements, 1)))
+        return problem.prior.apply_root(solution)[:, 0]
+
+    return PosteriorOperators(form.gain, posterior, weigh)
 
 
 def residual_power(

@@ -118,6 +118,18 @@ class MethodResult:
     residual_power: ResidualPower | None
 
 
+@dataclass(frozen=True)
+class PosteriorOperators:
+    """Linear operators of an estimate.
+
+    gain : A, (measurements used,) to (N,);  posterior : C, (N,) to (N,);  weigh : Rv^-1 on (measurements used,)
+    """
+
+    gain: Callable[[FloatArray], FloatArray]
+    posterior: Callable[[FloatArray], FloatArray]
+    weigh: Callable[[FloatArray], FloatArray]
+
+
 class Method(ABC):
     """An estimation method applied to one task."""
 
@@ -134,6 +146,10 @@ class Method(ABC):
     @abstractmethod
     def estimate_image(self) -> FloatArray:
         """Compute f^ without its error: (N,)."""
+
+    def operators(self) -> PosteriorOperators | None:
+        """Return the operators of the estimate, None where this method cannot apply them, or not without noise."""
+        return None
 
     @abstractmethod
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:

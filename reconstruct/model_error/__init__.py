@@ -1,0 +1,1 @@
+"""Effect of the errors of a measured H on the estimate: the contrast they act on, and the attenuation they cause."""

@@ -1,0 +1,161 @@
+"""Attenuation of the estimate by the errors of H that it was computed with (errors in variables).
+
+With H^ = H + E and the gain A of H^, the estimate errs by -A E f. This is not only noise: A is made of the same E. To
+first order of the covariance of E, with rows of independent errors (Fuller 1987, Measurement Error Models, 2.2),
+
+    mean of A E f = C D f,   D = (1 - dof / M) mean of E^T Rv^-1 E,
+
+with C the posterior covariance and dof the trace of A H. It draws the estimate towards an image without contrast, as a
+stronger prior would. D comes from the batches of the calibration; two halves of them give its effect twice with
+independent errors, so that products of the two have the right mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage, sparse
+
+from ommatid.runtime.arrays import BoolArray, FloatArray
+
+from ..expected_error import ExpectedError, Interval, interval
+from ..methods.method import Method, MethodResult, PosteriorOperators
+
+SEED = 20260404  # of the random image for what the measurements do not show
+NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is averaged for the map
+UNCERTAINTY = 0.1  # of the attenuation's part of the error, relative: it is of first order
+FEWEST_BATCHES = 4  # from which two halves have a variance each
+
+
+@dataclass(frozen=True)
+class Attenuation:
+    """C D as an operator, by each half of the batches.
+
+    errors : E of each half as matrices whose squares add up to the covariance of H, (M, N) each
+    residual_share : 1 - dof / M
+    """
+
+    errors: tuple[list[sparse.csr_array], list[sparse.csr_array]]
+    operators: PosteriorOperators
+    used: BoolArray
+    residual_share: float
+
+    @classmethod
+    def of(
+        cls,
+        method: Method,
+        operators: PosteriorOperators,
+        whites: Sequence[FloatArray],
+        noise: Sequence[FloatArray],
+        root: FloatArray,
+    ) -> Attenuation:
+        """Return the attenuation of a method's estimate.
+
+        noise : A of `root` times each of `whites`, whose residuals show the trace of A H (Hutchinson 1990)
+        """
+        task = method.task
+        freedoms = np.mean([white @ (task.observe(image) / root) for white, image in zip(whites, noise, strict=True)])
+        share = float(np.clip(1 - freedoms / root.size, 0.0, 1.0))
+        matrices = task.model.error_matrices
+        halves = _normalised(matrices[0::2], len(matrices)), _normalised(matrices[1::2], len(matrices))
+        return cls(halves, operators, task.used, share)
+
+    def halves(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return C D f by either half of the batches: (N,) each."""
+        first, second = (self._by(errors, image) for errors in self.errors)
+        return first, second
+
+    def _by(self, errors: list[sparse.csr_array], image: FloatArray) -> FloatArray:
+        weighted = np.zeros(self.used.size)
+        total = np.zeros(image.size)
+        for error in errors:
+            weighted[self.used] = self.residual_share * self.operators.weigh((error @ image)[self.used])
+            total += error.T @ weighted
+        return self.operators.posterior(total)
+
+
+def can_be_corrected(method: Method) -> bool:
+    """Return True if the batches of the calibration can show the attenuation."""
+    return method.task.used.any() and len(method.task.model.error_matrices) >= FEWEST_BATCHES
+
+
+def _normalised(matrices: list[sparse.csr_array], batches: int) -> list[sparse.csr_array]:
+    """Return deviations from their own mean, scaled so that their squares add up to the variance of the whole mean."""
+    count = len(matrices)
+    if count < 2:
+        return []
+    first = matrices[0]
+    values = np.array([matrix.data for matrix in matrices], dtype=np.float64)
+    values -= values.mean(axis=0)
+    values /= ((count - 1) * batches) ** 0.5
+    return [sparse.csr_array((data, first.indices, first.indptr), shape=first.shape) for data in values]
+
+
+def with_attenuation(
+    result: MethodResult,
+    method: Method,
+    operators: PosteriorOperators,
+    image: FloatArray,
+    truth: FloatArray | None,
+    actual: FloatArray,
+) -> MethodResult:
+    """Return a result whose Eq. 5 and interval hold the attenuation.
+
+    image : (N,) with the contrast of the true one;  truth : (N,), or None;  actual : (measurements used,) variances
+    """
+    task, rng, root = method.task, np.random.default_rng(SEED), np.sqrt(actual)
+    white = rng.normal(size=root.size)
+    attenuation = Attenuation.of(method, operators, [white], [operators.gain(root * white)], root)
+
+    def hidden(deviation: FloatArray) -> FloatArray:
+        """Return (I - A H) of an image less its mean: what the estimate lacks of it."""
+        return deviation - operators.gain(task.observe(deviation))
+
+    unseen = hidden(task.draw_deviation(rng))
+    whole = image + unseen
+    lacking, (first, second) = hidden(whole - task.prior.mean), attenuation.halves(whole)
+    added = max(_added(lacking, first, second), 0.0)
+    given = result.interval
+    if truth is not None and given is not None:
+        given = _shifted(given, hidden(truth - task.prior.mean), attenuation.halves(truth), method, operators, actual)
+    before = result.variance_of_sum
+    return replace(
+        result,
+        expected=_with_added(result.expected, added, first + second, task.shape),
+        interval=given,
+        variance_of_sum=lambda weights: before(weights) + max(float((weights @ first) * (weights @ second)), 0.0),
+    )
+
+
+def _added(lacking: FloatArray, first: FloatArray, second: FloatArray) -> float:
+    """Return |lacking + b|^2 - |lacking|^2 from two independent estimates of b."""
+    return float(first @ second + lacking @ (first + second))
+
+
+def _with_added(expected: ExpectedError, added: float, shape: FloatArray, size: tuple[int, int]) -> ExpectedError:
+    """Return Eq. 5 with a sum of squares added where `shape` is large, (N,)."""
+    squares = ndimage.uniform_filter(np.square(shape).reshape(size), NEIGHBOURHOOD, mode="nearest").ravel()
+    total = float(squares.sum())
+    if not total or not added:
+        return expected
+    parts = dict(expected.parts)
+    parts["calibration"] = parts.get("calibration", 0.0) + added / shape.size
+    return replace(expected, variance=expected.variance + squares * (added / total), parts=parts)
+
+
+def _shifted(
+    given: Interval,
+    lacking: FloatArray,
+    halves: tuple[FloatArray, FloatArray],
+    method: Method,
+    operators: PosteriorOperators,
+    actual: FloatArray,
+) -> Interval:
+    """Return the interval with the attenuation of the true image: its square, and its product with the noise."""
+    count = lacking.size
+    added = _added(lacking, *halves)
+    along = operators.weigh(method.task.observe(operators.posterior((halves[0] + halves[1]) / 2)))
+    variance = given.variance + 4 * float(actual @ np.square(along)) + (UNCERTAINTY * added) ** 2
+    return interval(max(count * given.mse + added, 0.0), variance, count)

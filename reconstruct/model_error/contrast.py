@@ -1,7 +1,7 @@
 """Contrast of the true image from a noisy estimate, on which the effect of the errors of H depends.
 
 An estimate shows the contrast of the image and that of its own noise, and loses some of the finest. Its power spectrum
-is F = T S + N, with S that of the image, T the power transfer of the estimator, which one random image shows, and N
+is F = T S + N, with S that of the image, T the power transfer of the estimator, which a similar image shows, and N
 that of the noise, which random noise shows. The estimate is filtered so that its spectrum becomes S: each wave keeps
 its place in the image and gets the power that is due. Where noise hides S, a power law continues it, as spectra of
 images follow one (Field 1987, J. Opt. Soc. Am. A 4, 2379).
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import fft
+from scipy import fft, ndimage
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.scenes.model import Model
@@ -27,6 +27,7 @@ FEWEST_WAVES = 8  # in a bin
 SIGNAL = 0.5  # excess over the noise, relative, from which a bin is determined
 FITTED = 5  # bins at the end of the determined range that fix the power law
 TRANSFER = (0.05, 1.2)  # range of T: beyond it, it is chance
+NEIGHBOURHOOD = 11  # pixels, over which the power of a band is averaged
 MANY = 100_000  # pixels above which one noise image is enough
 FEW = 10_000  # pixels below which four are taken
 
@@ -57,10 +58,9 @@ def true_contrast(method: Method, operators: PosteriorOperators, actual: FloatAr
     determined = excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
     first = continued(waves.frequencies, excess, determined)
     attenuation = Attenuation.of(method, operators, whites, noise, root)
-    transfer = _transfer(waves, waves.draw(first, rng), operators, task.model, attenuation, task.used)
+    transfer = _transfer(waves, _placed(waves, deviation, noise, first), operators, task.model, attenuation, task.used)
     spectrum = continued(waves.frequencies, excess / transfer, determined)
-    filtered = waves.scaled(deviation, np.sqrt(spectrum / np.maximum(power, np.finfo(np.float64).tiny)))
-    image = task.prior.mean + filtered
+    image = task.prior.mean + _placed(waves, deviation, noise, spectrum)
     return Contrast(image, noise, _calibration(task.model, method.image, image, noise)[task.used])
 
 
@@ -69,6 +69,27 @@ def _calibration(model: Model, estimate: FloatArray, image: FloatArray, noise: t
     placed, whole = model.variance_from_model(estimate, noise), model.variance_from_model(image)
     total = float(placed.sum())
     return placed * (float(whole.sum()) / total) if total > 0 else placed
+
+
+def _placed(waves: Waves, deviation: FloatArray, noise: tuple[FloatArray, ...], spectrum: FloatArray) -> FloatArray:
+    """Return the estimate less its prior's mean with another spectrum, its power placed where it exceeds the noise.
+
+    In each band of frequency the square of the estimate and that of the noise are averaged over a neighbourhood, whose
+    share of power that is no noise scales the estimate there.
+    """
+    placed = np.full(deviation.size, deviation.mean())
+    for band, (power, count) in enumerate(zip(spectrum, waves.counts, strict=True)):
+        wave = waves.band(deviation, band)
+        by_noise = sum((_local_mean(np.square(waves.band(image, band))) for image in noise), np.zeros(waves.shape))
+        local = _local_mean(np.square(wave))
+        signal = np.maximum(1 - by_noise / len(noise) / np.maximum(local, np.finfo(np.float64).tiny), 0.0)
+        wave = np.sqrt(signal) * wave
+        placed += (wave * (power * count / (float(np.square(wave).sum()) or 1.0)) ** 0.5).ravel()
+    return placed
+
+
+def _local_mean(squares: FloatArray) -> FloatArray:
+    return np.asarray(ndimage.uniform_filter(squares, NEIGHBOURHOOD, mode="reflect"))
 
 
 def _transfer(
@@ -143,19 +164,9 @@ class Waves:
         product = waves * (waves if other is None else self._transform(other))
         return np.bincount(self._bins.ravel() + 1, weights=product.ravel())[1:] / self.counts
 
-    def draw(self, spectrum: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Draw an image with mean 0 and a spectrum, (bins,): (N,)."""
-        return self.scaled(rng.normal(size=self.shape).ravel(), np.sqrt(spectrum), mean=0.0)
-
-    def scaled(self, image: FloatArray, factors: FloatArray, mean: float = 1.0) -> FloatArray:
-        """Return an image with every wave multiplied by the factor of its frequency, and its mean by `mean`."""
-        scale = np.zeros(self.shape)
-        positive = factors > 0
-        if positive.any():
-            known = np.log(self.frequencies[positive]), np.log(factors[positive])
-            scale = np.exp(np.interp(np.log(np.maximum(self._frequency, 1e-300)), *known))
-        scale[0, 0] = mean
-        return np.asarray(fft.idctn(scale * self._transform(image), 2, norm="ortho")).ravel()
+    def band(self, image: FloatArray, number: int) -> FloatArray:
+        """Return the waves of one bin of an image, (N,): (rows, columns)."""
+        return np.asarray(fft.idctn(np.where(self._bins == number, self._transform(image), 0.0), 2, norm="ortho"))
 
     def _transform(self, image: FloatArray) -> FloatArray:
         return np.asarray(fft.dctn(image.reshape(self.shape), 2, norm="ortho"))

@@ -32,6 +32,8 @@ class ExpectedError:
     missing : the prior's part, in run.json "null_space": unseen by the measurements, or hidden by their noise
     resolved : (N,), the diagonal of A H: the share of a pixel's value that comes from the measurements, 0 to 1
     leverage : (M,), the diagonal of H A, where all pixels were solved for; None where it is not known
+    attenuation : mean squared error that the errors of H add by drawing the estimate towards no contrast; None where
+        it was not computed
     """
 
     variance: FloatArray
@@ -39,6 +41,7 @@ class ExpectedError:
     parts: dict[str, float]
     resolved: FloatArray
     leverage: FloatArray | None = None
+    attenuation: float | None = None
 
     @property
     def mse(self) -> float:

@@ -9,6 +9,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
 from .assumptions import Assumptions
+from .expected_error import ExpectedError
 from .measured_error import MeasuredError
 from .methods.method import MethodResult, total_variance
 from .misalignment.robust_noise import CAUSE
@@ -16,6 +17,7 @@ from .verdict.causes import evidence_of, without_pixels
 from .verdict.residual_parts import ResidualPart, WhitenedResidual, residual_parts
 from .verdict.verdict import ErrorCheck, Verdict, judge
 
+CORRECTABLE = 0.2  # share of the error by attenuation, up to which the first order of the noise of H serves
 LEAST_FREEDOMS = 5  # of a sample variance, from which its inverse has a variance
 
 
@@ -37,7 +39,7 @@ def verdict_of(
         mse=None if error is None else error.mse,
         interval=result.interval,
         variance_bound=result.solver.variance_bound,
-        spurious=float(spurious @ expected.variance) / total if total else 0.0,
+        spurious=_spurious(spurious, expected) if total else 0.0,
         spurious_share=float(spurious.mean()),
         calibration_share=expected.parts.get("calibration", 0.0) / expected.mse if expected.mse else 0.0,
         fit_doubtful=assumed.fit is not None and assumed.fit.doubtful,
@@ -48,6 +50,17 @@ def verdict_of(
     light = assumed.method.task.model.light(result.image)
     evidence = evidence_of(stack, model, used, light, assumed.prior.kind == "independent")
     return judge(_parts(stack, model, assumed, result), evidence, check)
+
+
+def _spurious(share: FloatArray, expected: ExpectedError) -> float:
+    """Return how wrong the noise of H may make Eq. 5, relative, beyond the attenuation that Eq. 5 then holds.
+
+    share : (N,) of each pixel's apparent information that the noise of H may have produced
+    """
+    if expected.attenuation is None:
+        return float(share @ expected.variance) / float(expected.variance.sum())
+    corrected = expected.attenuation / expected.mse
+    return corrected if corrected > CORRECTABLE else 0.0
 
 
 def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResult) -> list[ResidualPart]:

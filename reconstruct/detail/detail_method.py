@@ -58,7 +58,9 @@ class DetailMethod(Method):
         def weigh(values: FloatArray) -> FloatArray:
             return white.multipliers(white.vector(values)[:, None])[:, 0]
 
-        return PosteriorOperators(lambda values: whitened.gain(white.vector(values)), whitened.posterior, weigh)
+        return PosteriorOperators(
+            lambda values: whitened.gain(white.vector(values)), whitened.posterior, weigh, whitened.hidden
+        )
 
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error; truth : (N,), or better (pixels of the world,), whose detail is known."""

@@ -22,9 +22,11 @@ from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 
+from ..methods.method import EstimationTask, PosteriorOperators
 from .preconditioner import WORKERS, Preconditioner, preconditioner_for
 
 ACCURACY = 0.01  # numerical error, in posterior standard deviations
+MEAN_ACCURACY = 0.01  # of operators for means over the frame, likewise
 MAX_STEPS = 600
 MAX_STARTS = 3  # each from the recomputed residual
 SAFETY = 0.5  # of the least eigenvalue of P K, which the Lanczos matrix overestimates
@@ -152,6 +154,24 @@ class FrameSystem:
 
     def _precondition(self, image: FloatArray) -> FloatArray:
         return self.preconditioner.solve(image.reshape(self.shape)).ravel()
+
+
+def posterior_operators(system: FrameSystem, task: EstimationTask) -> PosteriorOperators:
+    """Return A, C and their kin for means over the frame.
+
+    The bound on the largest error of a pixel is sqrt(N) times the mean error or more.
+    """
+    accuracy = max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5)
+
+    def posterior(image: FloatArray) -> FloatArray:
+        return system.solve(image, accuracy).image
+
+    return PosteriorOperators(
+        gain=lambda values: posterior(system.right_hand_side(task.on_all_measurements(values, 0.0))),
+        posterior=posterior,
+        weigh=lambda values: values / task.expected_noise,
+        hidden=lambda image: posterior(system.apply_prior_precision(image)),
+    )
 
 
 def _not_reached(bound: float, steps: int, accuracy: float) -> str:

@@ -32,7 +32,7 @@ from ..methods.method import (
 )
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .banded_system import BandedSystem, serves
-from .conjugate_gradients import FrameSystem, Solution
+from .conjugate_gradients import FrameSystem, Solution, posterior_operators
 from .preconditioner import Preconditioner, is_sliding
 from .selected_inverse import frame_variances, whole_variances
 from .variance_map import (
@@ -51,7 +51,6 @@ SOLVING = 0.3  # share of the time that the estimate takes; the error analysis t
 PROBES = 6  # pixels whose exact variance checks the map
 FEW_PROBES = 2
 DRAWS = 2  # of images and noise for the expected residual
-MEAN_ACCURACY = 0.01  # of operators for means over the frame, in posterior standard deviations
 HALO = 5  # boxes of the widest type, beyond which pixels do not affect a variance
 
 
@@ -101,19 +100,8 @@ class FrameMethod(Method):
         return self.solution.image + self.task.prior.mean
 
     def operators(self) -> PosteriorOperators:
-        """Return the operators of the estimate, to an error of a few hundredths of a posterior standard deviation.
-
-        The bound on the largest error of a pixel is sqrt(N) times their mean or more.
-        """
-        task, system = self.task, self.system
-        accuracy = max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5)
-
-        def gain(values: FloatArray) -> FloatArray:
-            return system.solve(system.right_hand_side(task.on_all_measurements(values, 0.0)), accuracy).image
-
-        return PosteriorOperators(
-            gain, lambda image: system.solve(image, accuracy).image, lambda values: values / task.expected_noise
-        )
+        """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
+        return posterior_operators(self.system, self.task)
 
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""

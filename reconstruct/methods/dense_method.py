@@ -62,7 +62,7 @@ def operators_of(form: Form, weigh: Callable[[FloatArray], FloatArray]) -> Poste
         solution, _ = form.solve(shift, np.zeros((problem.measurements, 1)))
         return problem.prior.apply_root(solution)[:, 0]
 
-    return PosteriorOperators(form.gain, posterior, weigh)
+    return PosteriorOperators(form.gain, posterior, weigh, lambda image: image - form.gain(form.problem.matrix @ image))
 
 
 def residual_power(

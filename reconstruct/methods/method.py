@@ -123,11 +123,13 @@ class PosteriorOperators:
     """Linear operators of an estimate.
 
     gain : A, (measurements used,) to (N,);  posterior : C, (N,) to (N,);  weigh : Rv^-1 on (measurements used,)
+    hidden : I - A H = C P0^-1, (N,) to (N,): what the estimate lacks of an image less its mean
     """
 
     gain: Callable[[FloatArray], FloatArray]
     posterior: Callable[[FloatArray], FloatArray]
     weigh: Callable[[FloatArray], FloatArray]
+    hidden: Callable[[FloatArray], FloatArray]
 
 
 class Method(ABC):

@@ -18,7 +18,8 @@ from ommatid.runtime.processors import one_thread, processors
 from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, interval
 from ..verdict.residual_power import ResidualInputs, ResidualPower
-from .method import Method, MethodResult, is_uniform, residual_multipliers, total_variance
+from .iterative_operators import iterative_operators
+from .method import Method, MethodResult, PosteriorOperators, is_uniform, residual_multipliers, total_variance
 from .tile_cost import tile_cost, words
 from .tile_solver import (
     SolvedTiles,
@@ -45,6 +46,10 @@ class TileMethod(Method):
             for tile, values in zip(tiles, solved.image.T, strict=True):
                 image[tile.core] = values.reshape(image[tile.core].shape)
         return image.ravel()
+
+    def operators(self) -> PosteriorOperators | None:
+        """Return the operators of the whole frame, None where a measurement has no noise."""
+        return iterative_operators(self.task) if (self.task.expected_noise > 0).all() else None
 
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""

@@ -78,7 +78,7 @@ class Attenuation:
 
 def can_be_corrected(method: Method) -> bool:
     """Return True if the batches of the calibration can show the attenuation."""
-    return method.task.used.any() and len(method.task.model.error_matrices) >= FEWEST_BATCHES
+    return bool(method.task.used.any()) and len(method.task.model.error_matrices) >= FEWEST_BATCHES
 
 
 def _normalised(matrices: list[sparse.csr_array], batches: int) -> list[sparse.csr_array]:
@@ -109,17 +109,15 @@ def with_attenuation(
     white = rng.normal(size=root.size)
     attenuation = Attenuation.of(method, operators, [white], [operators.gain(root * white)], root)
 
-    def hidden(deviation: FloatArray) -> FloatArray:
-        """Return (I - A H) of an image less its mean: what the estimate lacks of it."""
-        return deviation - operators.gain(task.observe(deviation))
-
-    unseen = hidden(task.draw_deviation(rng))
+    unseen = operators.hidden(task.draw_deviation(rng))
     whole = image + unseen
-    lacking, (first, second) = hidden(whole - task.prior.mean), attenuation.halves(whole)
+    lacking, (first, second) = operators.hidden(whole - task.prior.mean), attenuation.halves(whole)
     added = max(_added(lacking, first, second), 0.0)
     given = result.interval
     if truth is not None and given is not None:
-        given = _shifted(given, hidden(truth - task.prior.mean), attenuation.halves(truth), method, operators, actual)
+        given = _shifted(
+            given, operators.hidden(truth - task.prior.mean), attenuation.halves(truth), method, operators, actual
+        )
     before = result.variance_of_sum
     return replace(
         result,
@@ -137,12 +135,11 @@ def _added(lacking: FloatArray, first: FloatArray, second: FloatArray) -> float:
 def _with_added(expected: ExpectedError, added: float, shape: FloatArray, size: tuple[int, int]) -> ExpectedError:
     """Return Eq. 5 with a sum of squares added where `shape` is large, (N,)."""
     squares = ndimage.uniform_filter(np.square(shape).reshape(size), NEIGHBOURHOOD, mode="nearest").ravel()
-    total = float(squares.sum())
-    if not total or not added:
-        return expected
-    parts = dict(expected.parts)
-    parts["calibration"] = parts.get("calibration", 0.0) + added / shape.size
-    return replace(expected, variance=expected.variance + squares * (added / total), parts=parts)
+    total, mean = float(squares.sum()), added / shape.size
+    if not total:
+        return replace(expected, attenuation=0.0)
+    parts = expected.parts | {"calibration": expected.parts.get("calibration", 0.0) + mean}
+    return replace(expected, variance=expected.variance + squares * (added / total), parts=parts, attenuation=mean)
 
 
 def _shifted(

@@ -58,7 +58,7 @@ def true_contrast(method: Method, operators: PosteriorOperators, actual: FloatAr
     determined = excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
     first = continued(waves.frequencies, excess, determined)
     attenuation = Attenuation.of(method, operators, whites, noise, root)
-    transfer = _transfer(waves, _placed(waves, deviation, noise, first), operators, task.model, attenuation, task.used)
+    transfer = _transfer(waves, _placed(waves, deviation, noise, first), operators, attenuation)
     spectrum = continued(waves.frequencies, excess / transfer, determined)
     image = task.prior.mean + _placed(waves, deviation, noise, spectrum)
     return Contrast(image, noise, _calibration(task.model, method.image, image, noise)[task.used])
@@ -96,12 +96,10 @@ def _transfer(
     waves: Waves,
     image: FloatArray,
     operators: PosteriorOperators,
-    model: Model,
     attenuation: Attenuation,
-    used: BoolArray,
 ) -> FloatArray:
     """Return the power transfer from an image to its estimate with noisy H, by bin of frequency."""
-    seen = operators.gain(model.forward(image)[used])
+    seen = image - operators.hidden(image)
     first, second = attenuation.halves(image)
     power = waves.power(seen) - waves.power(seen, first + second) + waves.power(first, second)
     return np.clip(power / np.maximum(waves.power(image), np.finfo(np.float64).tiny), *TRANSFER)

@@ -76,6 +76,12 @@ def test_the_cells_span_what_the_table_is_to_cover_in_six_hours() -> None:
     assert (min(sizes), max(sizes)) == (19, 479)
 
 
+def test_cells_of_fewer_samples_than_the_scene_asks_for_are_known() -> None:
+    few = {cell.name for cell in CELLS if cell.has_few_samples}
+    assert {"tile19-transport-64", "photo-119-flat-256", "tile19-bright-transport-1024"} <= few
+    assert not few & {"tile19-transport-4096", "photo-119-transport-896", "tile19-ideal", "tile19-points-4096"}
+
+
 def test_runs_differ_in_their_seeds_and_cells_do_too() -> None:
     seeds = [cell.described(number).render.seed for cell in CELLS for number in range(2)]
     assert len(set(seeds)) == len(seeds)
@@ -164,6 +170,16 @@ def test_a_second_start_runs_what_is_missing_or_failed(
     assert capsys.readouterr().out == printed
     assert f"| {CELL.name} | 4 | 0.500 ± 0.000 | 1.000 ± 0.000 | 4 of 4 |" in printed
     assert started == [0, 2, 3]
+
+
+def test_the_cells_that_fail_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in range(20):
+        append(tmp_path, CELL, run_of(number, 3.0 if number < 3 else 1.0, trusted=number > 0))
+        append(tmp_path, BY_NAME["tile19-transport-64"], run_of(number, 1.0))
+    command.command(["-o", str(tmp_path), "--table"])
+    printed = capsys.readouterr().out
+    assert f"in 1 of 2 cells: {CELL.name} (17 of 20 inside, 1 of 20 red)." in printed
+    assert "| tile19-transport-64 † | 20 |" in printed
 
 
 def test_a_run_that_cannot_be_made_is_recorded_as_failed() -> None:

@@ -41,6 +41,14 @@ class Cell:
         scene = read(Path(self.scene), self.changes, self.lenses)
         return fingerprint([scene.plain(), self.name, self.drawn])
 
+    @property
+    def has_few_samples(self) -> bool:
+        """True if H is calibrated with fewer samples than the scene of the gallery asks for."""
+        own, changed = (read(Path(self.scene), changes).calibration for changes in ((), self.changes))
+        if "ideal" in (own.method, changed.method):
+            return False
+        return changed.sample_count < own.sample_count
+
     def described(self, number: int) -> Scene:
         """Return the scene of run `number`, with a seed of its own for data, noise and calibration.
 

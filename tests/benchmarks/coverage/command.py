@@ -13,6 +13,8 @@ from .journal import append, results
 from .run import Failure, Run, measured_run
 from .statistics import markdown, statistics
 
+FEW = "†"
+
 
 def command(arguments: Sequence[str]) -> None:
     """Run the benchmark with the options of its command line."""
@@ -78,6 +80,19 @@ def _line(result: Run | Failure) -> str:
 
 
 def table(cells: Sequence[Cell], folder: Path) -> str:
-    """Return the table of the cells that have results in the folder, in Markdown."""
-    known = [(cell.name, results(folder, cell).values()) for cell in cells]
-    return markdown([statistics(found).row(name) for name, found in known if found])
+    """Return the table of the cells that have results in the folder, in Markdown, and a sentence on those that fail."""
+    known = [(cell, list(results(folder, cell).values())) for cell in cells]
+    judged = [(cell, statistics(found)) for cell, found in known if found]
+    rows = [found.row(_marked(cell)) for cell, found in judged]
+    failing = [
+        f"{_marked(cell)} ({found.inside} of {found.judged} inside, {found.red} of {found.runs} red)"
+        for cell, found in judged
+        if not found.holds
+    ]
+    sentence = f"Too many errors are outside in {len(failing)} of {len(judged)} cells{': ' if failing else ''}"
+    return f"{markdown(rows)}\n\n{sentence}{', '.join(failing)}. {FEW} fewer samples than the scene asks for."
+
+
+def _marked(cell: Cell) -> str:
+    """Return the name of a cell, marked if the samples of its H are fewer than those of the scene."""
+    return f"{cell.name} {FEW}" if cell.has_few_samples else cell.name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from math import comb
 from pathlib import Path
 from typing import get_args
@@ -14,7 +15,7 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Sampler
 from ommatid.scenes.tables.gallery import gallery_names
 
-from ..examples import needs
+from ..examples import GALLERY, needs
 from .coverage import command
 from .coverage.cell import Cell
 from .coverage.cells import CELLS
@@ -143,6 +144,13 @@ def test_an_unfinished_line_costs_its_run_alone(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
     append(tmp_path, CELL, run_of(2, 0.7))
     assert results(tmp_path, CELL) == {0: run_of(0, 1.0), 2: run_of(2, 0.7)}
+
+
+@pytest.mark.parametrize("name", gallery_names())
+def test_the_definition_of_a_cell_is_the_same_in_every_checkout(name: str, tmp_path: Path) -> None:
+    shutil.copytree(GALLERY, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    here, there = (Cell("a cell", scene, (), 1).definition for scene in (name, str(tmp_path / f"{name}.toml")))
+    assert here == there
 
 
 def test_results_of_another_definition_of_a_cell_do_not_count(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import fingerprint
-from ommatid.scenes.scene import Scene, read
+from ommatid.scenes.scene import Scene, read, with_tables
 from ommatid.simulate.sampling.seeds import repeat_seed
 
 SEEDS = 20
@@ -37,8 +37,10 @@ class Cell:
 
     @property
     def definition(self) -> str:
-        """Fingerprint of what the results of a run depend on, besides the program."""
+        """Fingerprint of what the results of a run depend on, besides the program; the same in every checkout."""
         scene = read(Path(self.scene), self.changes, self.lenses)
+        if scene.world is not None:
+            scene = with_tables(scene, world=scene.world.model_copy(update={"file": Path(scene.world.file).name}))
         return fingerprint([scene.plain(), self.name, self.drawn])
 
     @property

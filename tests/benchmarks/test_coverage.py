@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ommatid.reconstruct.method_choice import choose_method
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Sampler
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.gallery import gallery_names
+from ommatid.simulate.validation import check_scene
 
 from ..examples import GALLERY, needs
 from .coverage import command
@@ -75,6 +78,15 @@ def test_the_cells_span_what_the_table_is_to_cover_in_six_hours() -> None:
     assert {len(scene.camera.lens) for scene in scenes} >= {1, 2, 3}
     sizes = {derive(scene).rows for scene in scenes}
     assert (min(sizes), max(sizes)) == (19, 479)
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.name)
+def test_every_cell_has_a_method_and_can_be_rendered(cell: Cell) -> None:
+    needs("llvm_ad_mono")
+    scene = cell.described(0)
+    setup = Setup.from_scene(scene)
+    check_scene(setup)
+    choose_method(scene, setup.camera, setup.has_structured_matrix)
 
 
 def test_cells_of_fewer_samples_than_the_scene_asks_for_are_known() -> None:

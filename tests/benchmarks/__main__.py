@@ -1,7 +1,8 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
 `python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms` and
-`frames`. No speed is asserted. Other load slows both sides of a ratio alike, so compare ratios rather than times.
+`frames`. No speed is asserted. `python -m tests.benchmarks coverage` measures error bars instead, for hours, and is run
+by itself (`coverage --help`). Other load slows both sides of a ratio alike, so compare ratios rather than times.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ommatid.simulate.renderer.variant import unusable_reason
 from .alternation import VARIANTS, Row
 from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
+from .coverage.command import command as coverage
 from .forms import NOISE, form_rows
 from .frame_tables import bandwidth_table, frames_table, growth_table
 from .leaving_out import SAMPLES as LEAVING_OUT_SAMPLES
@@ -36,14 +38,20 @@ from .lenses import lens_rows, transport_rows
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
+COVERAGE = "coverage"
 
 
 def main() -> None:
     """Run the parts that are named on the command line, or all, and print each table as soon as it is complete."""
+    if sys.argv[1:2] == [COVERAGE]:
+        coverage(sys.argv[2:])
+        return
     names = sys.argv[1:] or list(PARTS)
     unknown = [name for name in names if name not in PARTS]
     if unknown:
-        raise SystemExit(f"{unknown[0]!r} is not a part of the benchmarks; expected some of: {', '.join(PARTS)}")
+        raise SystemExit(
+            f"{unknown[0]!r} is not a part of the benchmarks; expected {COVERAGE}, or some of: {', '.join(PARTS)}"
+        )
     console = Console()
     console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell
     for name in names:

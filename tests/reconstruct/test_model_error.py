@@ -1,0 +1,152 @@
+"""Effect of the errors of H: the light that rows lose, the contrast without noise, the attenuation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from ommatid.reconstruct.methods.dense_method import DenseMethod
+from ommatid.reconstruct.methods.iterative_operators import iterative_operators
+from ommatid.reconstruct.methods.method import EstimationTask, Execution, PosteriorOperators
+from ommatid.reconstruct.model_error.attenuation import Attenuation
+from ommatid.reconstruct.model_error.contrast import Waves, continued, true_contrast
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import derive
+from ommatid.scenes.model import Model
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
+from tests.examples import THREE, scene
+
+BATCHES, SPREAD = 8, 0.02
+NOISE = 1e-2
+DRAWS = 24
+
+
+def _exact() -> Model:
+    described = scene(lenses=THREE, noise={"variance": NOISE})
+    model = ideal_model(described, derive(described))
+    return replace(model, stored=ideal_matrix(model.camera))
+
+
+def _measured(exact: Model, rng: np.random.Generator, closed: bool = True, spread: float = SPREAD) -> Model:
+    """Return H as measured by batches with errors of their own, whose rows add up to 0 if no light is lost."""
+    matrix = exact.matrix
+    rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    counts = np.diff(matrix.indptr)
+    batches = spread * BATCHES**0.5 * rng.normal(size=(BATCHES, matrix.nnz)) * matrix.data
+    if closed:
+        for batch in batches:
+            batch -= (np.bincount(rows, batch) / counts)[rows]
+    mean = batches.mean(axis=0)
+    variance = np.square(batches - mean).mean(axis=0) / (BATCHES - 1)
+    stored = sparse.csr_array((matrix.data + mean, matrix.indices, matrix.indptr), shape=matrix.shape)
+    record = {"method": "transport"}
+    return replace(exact, stored=stored, variance=variance, batches=(batches - mean).astype(np.float32), record=record)
+
+
+def _method(model: Model, recorded: FloatArray, noise: FloatArray) -> DenseMethod:
+    described = model.scene
+    used = np.ones(recorded.size, dtype=np.bool_)
+    task = EstimationTask(model, recorded, used, noise, described.prior, described.estimator, described.tiles)
+    return DenseMethod(task, Execution())
+
+
+def _operators(method: DenseMethod) -> PosteriorOperators:
+    operators = method.operators()
+    assert operators is not None
+    return operators
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_light_lost_beside_the_target_is_uncertain_too(closed: bool) -> None:
+    """A bright flat wall shows nothing but the errors of the rows' sums: none where all light meets the target."""
+    exact, wall = _exact(), np.full(361, 200.0)
+    squares, stated = np.zeros(exact.measurements), np.zeros(exact.measurements)
+    for seed in range(DRAWS):
+        model = _measured(exact, np.random.default_rng(seed), closed)
+        squares += np.square((model.matrix - exact.matrix) @ wall)
+        stated += model.variance_from_model(wall)
+    if closed:
+        assert stated.max() < 1e-9
+        return
+    values = DRAWS * exact.measurements
+    assert squares.sum() / stated.sum() == pytest.approx(1, abs=5 * (2 / values + 2 / values / (BATCHES - 1)) ** 0.5)
+
+
+def test_the_attenuation_is_the_mean_effect_of_errors_of_h() -> None:
+    """The mean of A E f over draws of E, against C D f from the batches of each draw."""
+    exact = _exact()
+    image = 127.5 + 60 * np.random.default_rng(1).normal(size=361)
+    effects: list[FloatArray] = []
+    stated: list[float] = []
+    for seed in range(2 * DRAWS):
+        rng = np.random.default_rng([seed, 2])
+        model = _measured(exact, rng)
+        noise = NOISE + model.variance_from_model(image)
+        method = _method(model, exact.matrix @ image, noise)
+        operators, root = _operators(method), np.sqrt(noise)
+        effects.append(operators.gain((model.matrix - exact.matrix) @ image))
+        whites = [rng.normal(size=noise.size) for _ in range(4)]
+        attenuation = Attenuation.of(
+            method, operators, whites, [operators.gain(root * white) for white in whites], root
+        )
+        first, second = attenuation.halves(image)
+        stated.append(float(first @ second))
+    products = np.array(effects) @ np.array(effects).T
+    pairs = [float(products[i, i + DRAWS]) for i in range(DRAWS)]  # of independent draws: unbiased
+    measured, error = np.mean(pairs), np.std(pairs) / DRAWS**0.5
+    assert measured > 5 * error  # there is something to predict
+    assert np.mean(stated) == pytest.approx(measured, abs=4 * error + 0.1 * measured)  # first order to a tenth
+
+
+@pytest.mark.parametrize("contrast", [0.0, 0.3, 20.0])
+def test_the_noise_of_an_estimate_is_not_taken_for_contrast(contrast: float) -> None:
+    """The variance that errors of H add is that for the true image, which the estimate shows noisy."""
+    exact = _exact()
+    true, stated, plain = 0.0, 0.0, 0.0
+    for seed in range(DRAWS):
+        rng = np.random.default_rng([seed, 3])
+        image = 127.5 + contrast * rng.normal(size=361)
+        model = _measured(exact, rng, spread=5e-3)
+        noise = NOISE + model.variance_from_model(image)
+        recorded = exact.matrix @ image + NOISE**0.5 * rng.normal(size=noise.size)
+        method = _method(model, recorded, noise)
+        contrasts = true_contrast(method, _operators(method), noise)
+        true += float(model.variance_from_model(image).sum())
+        stated += float(contrasts.calibration.sum())
+        plain += float(model.variance_from_model(method.image).sum())
+    tiny = 0.02 * plain if contrast < 1 else 0.0
+    assert stated == pytest.approx(true, rel=0.1, abs=5 * tiny)
+    if contrast < 1:
+        assert plain > true + 5 * tiny  # the noise of the estimate alone
+
+
+def test_iterative_operators_are_those_of_the_dense_form() -> None:
+    exact = _exact()
+    rng = np.random.default_rng(5)
+    method = _method(
+        _measured(exact, rng), exact.matrix @ (127.5 + 60 * rng.normal(size=361)), np.full(exact.measurements, NOISE)
+    )
+    dense, iterative = _operators(method), iterative_operators(method.task)
+    image, values = rng.normal(size=361), rng.normal(size=exact.measurements)
+    for name, argument in (("gain", values), ("posterior", image), ("hidden", image), ("weigh", values)):
+        expected = getattr(dense, name)(argument)
+        np.testing.assert_allclose(getattr(iterative, name)(argument), expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_bands_of_frequency_add_up_to_the_image() -> None:
+    waves = Waves((23, 31))
+    image = np.random.default_rng(6).normal(size=23 * 31)
+    bands = sum((waves.band(image, number) for number in range(waves.counts.size)), np.zeros(waves.shape))
+    np.testing.assert_allclose(bands.ravel(), image - image.mean(), atol=1e-12)
+    assert waves.power(image) @ waves.counts == pytest.approx(float(np.square(image - image.mean()).sum()))
+
+
+def test_a_hidden_end_of_a_spectrum_follows_its_power_law() -> None:
+    frequencies = np.geomspace(0.01, 1, 9)
+    spectrum = frequencies**-2.5
+    known = frequencies < 0.2
+    np.testing.assert_allclose(continued(frequencies, np.where(known, spectrum, -1.0), known), spectrum, rtol=1e-9)
+    assert not continued(frequencies, spectrum, np.zeros(9, dtype=np.bool_)).any()

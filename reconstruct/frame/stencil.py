@@ -75,9 +75,11 @@ def box_stencil(camera: Camera, weights: FloatArray, prior: float, rows: slice, 
     return Stencil(values, reach)
 
 
-def even_couplings(widths: tuple[int, ...], weights: tuple[float, ...], prior: float) -> FloatArray:
-    """Return K between a pixel far from the edges and its neighbours, (offsets,), for even weights of each type."""
-    reach = max(widths) - 1
+def even_couplings(widths: list[int], weights: tuple[float, ...], prior: float, reach: int) -> FloatArray:
+    """Return K between a pixel far from the edges and its neighbours, (offsets,), for even weights of each type.
+
+    widths : of the boxes of each type, at most reach + 1
+    """
     couplings = np.zeros(len(half_offsets(reach)))
     for width, weight in zip(widths, weights, strict=True):
         for number, (down, across) in enumerate(half_offsets(reach)):
@@ -145,3 +147,8 @@ def stored_stencil(
     values[number[half], row[half], column[half]] = information.data[half]
     values[0] += prior
     return Stencil(values, reach)
+
+
+def pixel_numbers(shape: tuple[int, int], rows: slice, columns: slice) -> NDArray[np.intp]:
+    """Return the numbers of the pixels of a window of a frame of `shape`: (rows, columns)."""
+    return np.arange(rows.start, rows.stop)[:, None] * shape[1] + np.arange(columns.start, columns.stop)

@@ -51,6 +51,20 @@ def variance_map(perturbed: Callable[[float, float], FloatArray], *, noise_as_ex
     return VarianceMap(posterior, missing, (perturbed(0.0, -STEP) - perturbed(0.0, STEP)) / (2 * STEP))
 
 
+def combined_variances(
+    perturbed: Callable[[float, float], FloatArray], largest: float, *, noise_as_expected: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return the diagonal of C and Eq. 5 as a whole, from fewer evaluations than its parts need.
+
+    perturbed : the diagonal of (K + s P0^-1 + t S / largest)^-1, as of `variance_map`
+    """
+    posterior = perturbed(0.0, 0.0)
+    if noise_as_expected:
+        return posterior, posterior
+    step = STEP / max(largest, 1.0)
+    return posterior, (posterior - perturbed(step, step * largest)) / step
+
+
 def sliding_variance_map(
     system: Preconditioner, actual: tuple[float, ...], posterior: Callable[[Preconditioner], FloatArray]
 ) -> VarianceMap:
@@ -82,10 +96,10 @@ def posterior_variance(system: Preconditioner) -> FloatArray:
             bottom = _strip_variance(system, axis, slice(size - deep, size))
             for rows, part in ((slice(0, half), top[:half]), (slice(size - half, size), bottom[deep - half :])):
                 view[rows] = np.maximum(view[rows], part)
-    return np.where(border > 0, border, _interior_variance(system))
+    return np.where(border > 0, border, interior_variance(system))
 
 
-def _interior_variance(system: Preconditioner) -> float:
+def interior_variance(system: Preconditioner) -> float:
     """Mean of 1 / spectrum over the frequencies of a frame without edges."""
     vertical, horizontal = (
         2 * np.pi * (np.arange(min(size, FINEST)) + 0.5) / min(size, FINEST) for size in system.shape

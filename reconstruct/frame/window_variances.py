@@ -18,7 +18,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.processors import one_thread, processors
 
 from .selected_inverse import stencil_variances
-from .stencil import Source, Stencil, reach_of
+from .stencil import Source, Stencil, half_offsets, reach_of
 
 CORE = 24  # columns of a window whose variances it gives
 LENGTH = 256  # its rows
@@ -33,9 +33,7 @@ class EvenNoise:
     variance: float
 
 
-def frame_variances(
-    source: Source, shape: tuple[int, int], halo: int, even: EvenNoise | None = None
-) -> FloatArray:
+def frame_variances(source: Source, shape: tuple[int, int], halo: int, even: EvenNoise | None = None) -> FloatArray:
     """Return the diagonal of K^-1 for the pixels of a frame: (rows, columns).
 
     source : K of any window;  halo : pixels around the core of a window
@@ -71,6 +69,8 @@ def _correction(even: EvenNoise, size: tuple[int, int], halo: int) -> FloatArray
     window = np.empty((even.couplings.size, size[0] + 2 * halo, size[1] + 2 * halo))
     window[:] = even.couplings[:, None, None]
     reach = reach_of(even.couplings.size)
+    for values, (down, _) in zip(window, half_offsets(reach), strict=True):
+        values[window.shape[1] - down :] = 0.0  # the rows below are known
     return even.variance / stencil_variances(Stencil(window, reach))[halo:-halo, halo:-halo]
 
 

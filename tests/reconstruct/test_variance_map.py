@@ -8,13 +8,14 @@ from scipy import fft, linalg
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.preconditioner import preconditioner_for
-from ommatid.reconstruct.frame.selected_inverse import frame_variances, inverse_diagonal
+from ommatid.reconstruct.frame.selected_inverse import inverse_diagonal
 from ommatid.reconstruct.frame.variance_map import (
     posterior_variance,
     sliding_variance_map,
     small_posterior_variance,
     small_shape,
 )
+from ommatid.reconstruct.frame.window_variances import frame_variances
 from ommatid.reconstruct.prior import spectrum_of
 from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.scenes.tables.estimation import PriorTable

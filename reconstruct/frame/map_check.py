@@ -1,7 +1,7 @@
 """The error of a map of variances, measured at random pixels by exact solutions of the frame's own system.
 
-With x = C z, z random signs at pixels k far from one another and 0 elsewhere, z_k x_k is C_kk: what the others add falls
-with the distance as C does (Tang and Saad 2012). So one solution measures the variances of some hundred pixels.
+With x = C z, z random signs at pixels k far from one another and 0 elsewhere, z_k x_k is C_kk: what the others add
+falls with the distance as C does (Tang and Saad 2012). So one solution measures the variances of some hundred pixels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SPACING = 80  # rows or columns between two pixels of a set, at least
 MOST = 200  # pixels of a set
 TRIALS = 2000  # random pixels that are tried for it
 EDGE = 4  # pixels: how near the edges the first of a set lie
-SETS = 2
+SETS = 2  # of few pixels; one of many
 SINGLE = 6  # pixels where errors are correlated over any distance, and each needs a solution of its own
 FEW_SINGLE = 2  # of many pixels
 MANY = 250_000
@@ -79,8 +79,9 @@ def check_map(
     """
     rng = np.random.default_rng(SEED)
     ratios: list[FloatArray] = []
-    for _ in range(SETS if local else SINGLE if variance.size <= MANY else FEW_SINGLE):
-        pixels = spread_pixels(shape, rng)
+    many = variance.size > MANY
+    for number in range((1 if many else SETS) if local else (FEW_SINGLE if many else SINGLE)):
+        pixels = spread_pixels(shape, rng, edges=local or bool(number % 2))
         if not local:
             pixels = pixels[:1]
         ratios.append(variance[pixels] / exact.at(pixels, posterior, rng) - 1)
@@ -91,15 +92,14 @@ def check_map(
     return MapCheck(worst, min(worst, abs(float(ratio.mean())) + 2 * float(ratio.std()) / ratio.size**0.5))
 
 
-def spread_pixels(shape: tuple[int, int], rng: np.random.Generator) -> Pixels:
-    """Return random pixels of a frame that lie SPACING rows or columns apart, (n,), one or two of them near edges."""
+def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bool) -> Pixels:
+    """Return random pixels of a frame that lie SPACING rows or columns apart, (n,); with `edges` some lie near them."""
     rows, columns = shape
     trials = np.stack([rng.integers(rows, size=TRIALS), rng.integers(columns, size=TRIALS)], axis=1)
-    for number, axis in enumerate(rng.permutation(2)):
+    for number in range(4 if edges else 0):
+        axis, end = divmod(number, 2)
         near = int(rng.integers(min(EDGE, shape[axis])))
-        trials[number, axis] = near if rng.integers(2) else shape[axis] - 1 - near
-    if rng.integers(2):
-        trials = trials[2:]  # every other set begins inside
+        trials[number, axis] = shape[axis] - 1 - near if end else near
     chosen = [trials[0]]
     for pixel in trials[1:]:
         if len(chosen) < MOST and (np.abs(np.array(chosen) - pixel).max(axis=1) >= SPACING).all():

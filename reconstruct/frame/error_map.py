@@ -26,23 +26,22 @@ from .selected_inverse import whole_variances
 from .stencil import Stencil, box_stencil, even_couplings, pixel_numbers, stored_stencil
 from .variance_map import (
     VarianceMap,
-    combined_variances,
     interior_variance,
     posterior_variance,
     sliding_variance_map,
     small_posterior_variance,
     small_shape,
+    unseen_corners,
     variance_map,
 )
 from .window_variances import EvenNoise, frame_variances
 
-MANY = 250_000  # pixels above which each evaluation of the variances takes a minute or more
+MANY = 250_000  # pixels above which a shorter halo saves minutes
 EVEN = 1e-3  # relative range of noise variances that count as equal
 HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
 SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
 LEVELS = 4  # of even noise, for a correlated prior
 LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
-SEED = 20260403  # of the random image that measures the prior's part
 
 
 @dataclass(frozen=True)
@@ -58,13 +57,24 @@ class ErrorMap:
         """Variances of all pixels."""
         if isinstance(self.system, BandedSystem):
             return self._perturbed_map(self._swept)
-        if self.is_even:
-            return self._even_map()
         if not isinstance(self.system.prior, float):
-            return self._interpolated_map()
-        if self.task.model.unknowns <= MANY:
-            return self._perturbed_map(self._windows)
-        return self._many_windows()
+            return self._even_map() if self.is_even else self._interpolated_map()
+        return self._with_corners(self._even_map() if self.is_even else self._perturbed_map(self._windows))
+
+    def _with_corners(self, variances: VarianceMap) -> VarianceMap:
+        """Replace the variances of corner pixels that some lens types do not see by exact solutions."""
+        if not all(is_sliding(lens_type) for lens_type in self.task.model.camera.types):
+            return variances
+        parts = [np.array(part) for part in (variances.posterior, variances.missing, variances.noisy)]
+        noise = self.system.weights**2 * self.task.on_all_measurements(self.actual, 0.0)
+        for corner in unseen_corners(self.system.preconditioner):
+            unit = np.zeros(self.task.shape)
+            unit[corner] = 1.0
+            solved = self.system.solve(unit.ravel(), self.task.settings.accuracy).image
+            parts[0][corner] = solved[np.flatnonzero(unit)[0]]
+            parts[1][corner] = solved @ self.system.apply_prior_precision(solved)
+            parts[2][corner] = noise @ np.square(self.system.observation.forward(solved))
+        return VarianceMap(*parts)
 
     def checked(self, variance: FloatArray) -> MapCheck:
         """Compare a map of Eq. 5, (N,), with exact solutions for random pixels."""
@@ -139,17 +149,6 @@ class ErrorMap:
     @cached_property
     def _by_pixel(self) -> sparse.csc_array:
         return sparse.csc_array(self.task.model.matrix)
-
-    def _many_windows(self) -> VarianceMap:
-        """Variances of many pixels, by windows; the prior's part is known as its mean, from a random image."""
-        posterior, total = combined_variances(
-            self._by_weights(self._windows), self._largest, noise_as_expected=self.as_expected
-        )
-        rng, prior = np.random.default_rng(SEED), float(np.asarray(self.system.prior))
-        solved = self.system.solve(rng.normal(size=total.size), self.task.settings.accuracy).image
-        missing = prior * float(np.mean(np.square(solved)))
-        share = min(missing / float(total.mean()), 1.0)
-        return VarianceMap(posterior, share * total, (1 - share) * total)
 
     def _even_map(self, scale: float = 1.0) -> VarianceMap:
         """Variances of noise that is even over each lens type, with all weights times `scale`.

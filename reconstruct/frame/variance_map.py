@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,20 +51,6 @@ def variance_map(perturbed: Callable[[float, float], FloatArray], *, noise_as_ex
     return VarianceMap(posterior, missing, (perturbed(0.0, -STEP) - perturbed(0.0, STEP)) / (2 * STEP))
 
 
-def combined_variances(
-    perturbed: Callable[[float, float], FloatArray], largest: float, *, noise_as_expected: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Return the diagonal of C and Eq. 5 as a whole, from fewer evaluations than its parts need.
-
-    perturbed : the diagonal of (K + s P0^-1 + t S / largest)^-1, as of `variance_map`
-    """
-    posterior = perturbed(0.0, 0.0)
-    if noise_as_expected:
-        return posterior, posterior
-    step = STEP / max(largest, 1.0)
-    return posterior, (posterior - perturbed(step, step * largest)) / step
-
-
 def sliding_variance_map(
     system: Preconditioner, actual: tuple[float, ...], posterior: Callable[[Preconditioner], FloatArray]
 ) -> VarianceMap:
@@ -97,6 +83,25 @@ def posterior_variance(system: Preconditioner) -> FloatArray:
             for rows, part in ((slice(0, half), top[:half]), (slice(size - half, size), bottom[deep - half :])):
                 view[rows] = np.maximum(view[rows], part)
     return np.where(border > 0, border, interior_variance(system))
+
+
+def unseen_corners(system: Preconditioner) -> list[tuple[int, int]]:
+    """Return the corner pixels, (row, column), where two edges meet that some lens types do not see.
+
+    Errors there reach along both edges to their ends, and no strip shows their variance.
+    """
+    ends = [
+        [
+            place
+            for place, unseen in (
+                (0, any(pair[axis].first > 0 for pair in system.types)),
+                (size - 1, any(pair[axis].end < size for pair in system.types)),
+            )
+            if unseen
+        ]
+        for axis, size in enumerate(system.shape)
+    ]
+    return list(product(*ends))
 
 
 def interior_variance(system: Preconditioner) -> float:

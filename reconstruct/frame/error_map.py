@@ -16,6 +16,8 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.processors import processors
+from ommatid.scenes.camera import Camera
 
 from ..methods.method import EstimationTask, is_uniform
 from .banded_system import BandedSystem, leaves_null_space
@@ -34,7 +36,7 @@ from .variance_map import (
     unseen_corners,
     variance_map,
 )
-from .window_variances import EvenNoise, frame_variances
+from .window_variances import BESIDE, CORE, LENGTH, EvenNoise, frame_variances
 
 MANY = 250_000  # pixels above which a shorter halo saves minutes
 EVEN = 1e-3  # relative range of noise variances that count as equal
@@ -210,6 +212,21 @@ class ErrorMap:
             return posterior_variance(system)
         change = float(system.prior.flat[0]) / float(np.ravel(self.system.prior)[0])
         return small_posterior_variance(system, change * np.array(self.task.precision_on(small_shape(system.shape))))
+
+
+def window_memory(camera: Camera) -> int:
+    """Return the bytes that variances from windows take, for the ideal H: two long edges, one slab, its windows."""
+    widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
+    halo = (HALO if camera.unknowns <= MANY else SHORT_HALO) * widest
+    lines, longest = max(widest - 1, 1), max(camera.shape)
+    slab = min(LENGTH, longest) + 2 * halo
+    offsets = (2 * lines + 1) ** 2 // 2 + 1
+
+    def sweep(length: int, broad: int) -> int:
+        return 2 * 8 * length * lines * broad**2  # an inverse and a link per block of lines
+
+    windows = processors() * sweep(slab, CORE + 2 * halo)
+    return 2 * sweep(longest, 2 * halo + BESIDE) + 8 * offsets * slab * longest + windows
 
 
 def _even(values: FloatArray) -> bool:

@@ -8,7 +8,7 @@ from scipy import fft, linalg, sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.preconditioner import preconditioner_for
-from ommatid.reconstruct.frame.selected_inverse import inverse_diagonal
+from ommatid.reconstruct.frame.selected_inverse import inverse_diagonal, stencil_variances
 from ommatid.reconstruct.frame.stencil import pixel_numbers, stored_stencil
 from ommatid.reconstruct.frame.variance_map import (
     posterior_variance,

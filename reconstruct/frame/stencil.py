@@ -151,4 +151,6 @@ def stored_stencil(
 
 def pixel_numbers(shape: tuple[int, int], rows: slice, columns: slice) -> NDArray[np.intp]:
     """Return the numbers of the pixels of a window of a frame of `shape`: (rows, columns)."""
-    return np.arange(rows.start, rows.stop)[:, None] * shape[1] + np.arange(columns.start, columns.stop)
+    down: NDArray[np.intp] = np.arange(rows.start, rows.stop)
+    across: NDArray[np.intp] = np.arange(columns.start, columns.stop)
+    return down[:, None] * shape[1] + across

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,7 +101,7 @@ def unseen_corners(system: Preconditioner) -> list[tuple[int, int]]:
         ]
         for axis, size in enumerate(system.shape)
     ]
-    return list(product(*ends))
+    return [(row, column) for row in ends[0] for column in ends[1]]
 
 
 def interior_variance(system: Preconditioner) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -78,10 +79,10 @@ def _add_edges(variance: FloatArray, source: Source, margin: int, halo: int) -> 
     """Fill the margins from strips along each edge; pixels beyond a strip count as known: none is too large."""
     rows, columns = variance.shape
     deep = margin + halo
-    jobs = [(slice(0, rows), slice(0, deep)), (slice(0, rows), slice(columns - deep, columns))]
-    jobs += [(slice(0, deep), slice(0, columns)), (slice(rows - deep, rows), slice(0, columns))]
+    broad = [slice(0, rows), slice(0, rows), slice(0, deep), slice(rows - deep, rows)]
+    long = [slice(0, deep), slice(columns - deep, columns), slice(0, columns), slice(0, columns)]
     with ThreadPoolExecutor(min(processors(), 2)) as threads:  # each takes much memory
-        left, right, top, bottom = threads.map(lambda job: _strip_variances(source, *job), jobs)
+        left, right, top, bottom = threads.map(partial(_strip_variances, source), broad, long)
     upright = left[:, :margin], right[:, -margin:]
     for view, part in ((variance[:, :margin], upright[0]), (variance[:, -margin:], upright[1])):
         view[:] = part

@@ -219,11 +219,11 @@ def window_memory(camera: Camera) -> int:
     widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
     halo = (HALO if camera.unknowns <= MANY else SHORT_HALO) * widest
     lines, longest = max(widest - 1, 1), max(camera.shape)
-    slab = min(LENGTH, longest) + 2 * halo
+    slab = min(LENGTH + 2 * halo, longest)
     offsets = (2 * lines + 1) ** 2 // 2 + 1
 
     def sweep(length: int, broad: int) -> int:
-        return 2 * 8 * length * lines * broad**2  # an inverse and a link per block of lines
+        return 2 * 8 * length * lines * min(broad, longest) ** 2  # an inverse and a link per block of lines
 
     windows = processors() * sweep(slab, CORE + 2 * halo)
     return 2 * sweep(longest, 2 * halo + BESIDE) + 8 * offsets * slab * longest + windows

@@ -151,6 +151,6 @@ def stored_stencil(
 
 def pixel_numbers(shape: tuple[int, int], rows: slice, columns: slice) -> NDArray[np.intp]:
     """Return the numbers of the pixels of a window of a frame of `shape`: (rows, columns)."""
-    down: NDArray[np.intp] = np.arange(rows.start, rows.stop)
-    across: NDArray[np.intp] = np.arange(columns.start, columns.stop)
+    down = np.asarray(range(rows.start, rows.stop), dtype=np.intp)
+    across = np.asarray(range(columns.start, columns.stop), dtype=np.intp)
     return down[:, None] * shape[1] + across

@@ -88,7 +88,7 @@ class _StencilBlocks:
         sources: tuple[list[Places], list[Places]] = [], []
         targets: tuple[list[Places], list[Places]] = [], []
         for number, (down, across) in enumerate(half_offsets(reach)):
-            begin: Places = np.arange(max(0, -across), min(columns, columns - across))
+            begin = np.asarray(range(max(0, -across), min(columns, columns - across)), dtype=np.intp)
             for line in range(high):
                 kind, other = divmod(line + down, high)
                 sources[kind].append((number * high + line) * columns + begin)

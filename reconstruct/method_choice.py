@@ -15,6 +15,7 @@ from .detail.detail_method import DetailMethod
 from .detail.detailed_model import detail_memory, is_exact_for
 from .estimator.memory import needed_memory
 from .frame.banded_system import band_width, band_work, leaves_null_space, serves
+from .frame.error_map import window_memory
 from .frame.frame_method import FrameMethod
 from .frame.preconditioner import is_sliding
 from .methods.dense_method import DenseMethod
@@ -155,7 +156,11 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
         band = 8 * camera.unknowns * band_width(camera)
         return PROGRAM_MEMORY + images + entries + 5 * band  # the factor, a copy, and two matrices per block of lines
     if exact:
-        return PROGRAM_MEMORY + images + strips + 8 * 2 * longest * 81 * widest**2 * (widest - 1)
+        return (
+            PROGRAM_MEMORY
+            + images
+            + max(strips + 8 * 2 * longest * 81 * widest**2 * (widest - 1), window_memory(camera))
+        )
     normal_matrix = 12 * 3 * (2 * widest + 1) ** 2 * camera.unknowns  # K, stored
     edges = 2 * 8 * 2 * longest * widest * (40 + 10 * widest) ** 2
     return PROGRAM_MEMORY + images + entries + strips + normal_matrix + edges

@@ -6,13 +6,9 @@ Shares of the mean error come from random noise images, whose squares have the r
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
-from math import ceil
-from typing import Any, cast
 
 import numpy as np
-from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -33,25 +29,13 @@ from ..methods.method import (
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .banded_system import BandedSystem, serves
 from .conjugate_gradients import FrameSystem, Solution, posterior_operators
-from .preconditioner import Preconditioner, is_sliding
-from .selected_inverse import frame_variances, whole_variances
-from .variance_map import (
-    VarianceMap,
-    posterior_variance,
-    sliding_variance_map,
-    small_posterior_variance,
-    small_shape,
-    variance_map,
-)
+from .error_map import MANY, ErrorMap
+from .preconditioner import is_sliding
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 SEED = 20260401  # of random images of the error analysis, different from those of data and calibration
-MANY = 250_000  # pixels above which exact variances and more than a few probes take too long
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
-PROBES = 6  # pixels whose exact variance checks the map
-FEW_PROBES = 2
 DRAWS = 2  # of images and noise for the expected residual
-HALO = 5  # boxes of the widest type, beyond which pixels do not affect a variance
 
 
 class FrameMethod(Method):
@@ -107,21 +91,22 @@ class FrameMethod(Method):
         """Return the estimate and its error for the actual noise."""
         task, actual = self.task, total_variance(noise)
         solution = self.solution
-        variances = self._variances(noise)
+        errors = ErrorMap(task, self.system, actual)
+        variances = errors.maps
         self.execution.progress(0.7)
         variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
-        map_error = self._map_error(variance, actual)
+        check = errors.checked(variance)
         resolved = 1 - variances.posterior.ravel() / task.prior.variance
         self.execution.progress(0.8)
         parts = self._parts(noise, float(variances.noisy.mean()))
         self.execution.progress(0.9)
         expected = ExpectedError(variance, float(variances.missing.mean()), parts, resolved)
-        given = None if truth is None else self._interval(truth - task.prior.mean, actual, expected, map_error)
+        given = None if truth is None else self._interval(truth - task.prior.mean, actual, expected, check.mean)
         solver = Solver(
             method="frame",
             why=NULL_SPACE if self._banded else "every lens type is shift-invariant except at the edges",
             condition=solution.condition,
-            variance_bound=map_error,
+            variance_bound=check.worst,
             bound=solution.bound,
             refinements=solution.steps,
             unit="posterior standard deviation",
@@ -168,88 +153,6 @@ class FrameMethod(Method):
         readings *= self.system.weights
         return readings if self.task.complete else readings[self.task.used]
 
-    def _variances(self, noise: dict[str, FloatArray]) -> VarianceMap:
-        if self._banded:
-            return self._exact_variances(total_variance(noise))
-        uniform = self._is_uniform(noise)
-        if not uniform and self.task.model.unknowns <= MANY and isinstance(self.system.prior, float):
-            return self._exact_variances(total_variance(noise))
-        actual = self._type_means(total_variance(noise))
-        variances = sliding_variance_map(self.system.preconditioner, actual, self._posterior_variance)
-        if uniform:
-            return variances
-        local = self._local_noise().reshape(self.task.shape)
-        return VarianceMap(variances.posterior * local, variances.missing * local, variances.noisy * local)
-
-    def _exact_variances(self, actual: FloatArray) -> VarianceMap:
-        """Variances for any H and noise, pixel by pixel, from strips of the frame."""
-        task, weights, prior = self.task, self.system.weights, float(np.asarray(self.system.prior))
-        widest = max(ceil(lens_type.ratio) for lens_type in task.model.camera.types)
-        information = _gram(task.model.matrix, weights)
-        as_expected = np.allclose(actual, task.expected_noise, rtol=1e-12)
-        largest = float(np.max(actual / task.expected_noise)) or 1.0
-        noise_gram = information
-        if not as_expected:
-            noise_gram = _gram(task.model.matrix, weights**2 * task.on_all_measurements(actual, 0.0)) / largest
-
-        def perturbed(by_prior: float, by_noise: float) -> FloatArray:
-            precision: Any = information.copy()  # SciPy's stubs lack sums of sparse arrays
-            precision += (1 + by_prior) * prior * sparse.eye_array(information.shape[0])
-            if by_noise:
-                precision += by_noise * cast(Any, noise_gram)
-            reach = task.model.reach - 1
-            if self._banded:
-                return whole_variances(sparse.csr_array(precision), task.shape, reach)
-            return frame_variances(sparse.csr_array(precision), task.shape, reach, HALO * widest)
-
-        variances = variance_map(perturbed, noise_as_expected=as_expected)
-        return variances if as_expected else replace(variances, noisy=largest * variances.noisy)
-
-    def _posterior_variance(self, system: Preconditioner) -> FloatArray:
-        if not isinstance(system.prior, np.ndarray):
-            return posterior_variance(system)
-        change = float(system.prior.flat[0]) / float(np.ravel(self.system.prior)[0])
-        return small_posterior_variance(system, change * np.array(self.task.precision_on(small_shape(system.shape))))
-
-    def _is_uniform(self, noise: dict[str, FloatArray]) -> bool:
-        """True if H is exact and both expected and actual noise are uniform over each lens type."""
-        if not (self.task.model.is_exact and self.task.complete):
-            return False
-        parts = [
-            values[part]
-            for values in (self.task.expected_noise, *noise.values())
-            for part in self.task.model.camera.type_slices()
-        ]
-        return all(is_uniform(part) or bool(np.ptp(part) <= 1e-9 * part.max()) for part in parts)
-
-    def _local_noise(self) -> FloatArray:
-        """Noise of the measurements of each pixel relative to the mean: (N,)."""
-        mean_weights = np.empty(self.task.model.measurements)
-        slices = self.task.model.camera.type_slices()
-        for part, weight in zip(slices, self.system.preconditioner.weights, strict=True):
-            mean_weights[part] = weight
-        adjoint = self.system.observation.adjoint
-        local, average = adjoint(self.system.weights), adjoint(mean_weights)
-        return np.divide(average, local, out=np.ones_like(local), where=local > 0)
-
-    def _type_means(self, values: FloatArray) -> tuple[float, ...]:
-        """Mean over the used measurements of each lens type."""
-        everywhere = self.task.on_all_measurements(values, np.nan)
-        return tuple(float(np.nanmean(everywhere[part])) for part in self.task.model.camera.type_slices())
-
-    def _map_error(self, variance: FloatArray, actual: FloatArray) -> float:
-        """Largest relative difference of the map from the exact variance of some random pixels."""
-        rng = np.random.default_rng(SEED)
-        rows, columns = self.task.shape
-        worst = 0.0
-        for probe in range(PROBES if variance.size <= MANY else FEW_PROBES):
-            row = int(rng.integers(rows)) if probe % 2 else int(rng.integers(min(4, rows)))  # every other near an edge
-            pixel = row * columns + int(rng.integers(columns))
-            unit = np.zeros_like(variance)
-            unit[pixel] = 1.0
-            worst = max(worst, abs(variance[pixel] / self._variance_of_sum(unit, actual) - 1))
-        return worst
-
     def _parts(self, noise: dict[str, FloatArray], mean: float) -> dict[str, float]:
         """Share of each cause of noise in the mean of Eq. 5; they add up to `mean`."""
         rng = np.random.default_rng(SEED + 1)
@@ -289,7 +192,3 @@ def _without_matrix(model: Model) -> Model:
         return model
     no_entries = np.zeros(0)
     return Model(model.scene, model.camera, None, no_entries, np.zeros((0, 0), np.float32), {"method": "ideal"})
-
-
-def _gram(matrix: sparse.csr_array, weights: FloatArray) -> sparse.csr_array:
-    return sparse.csr_array(matrix.T @ sparse.csr_array(matrix.multiply(weights[:, None])))

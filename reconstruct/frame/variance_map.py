@@ -82,10 +82,29 @@ def posterior_variance(system: Preconditioner) -> FloatArray:
             bottom = _strip_variance(system, axis, slice(size - deep, size))
             for rows, part in ((slice(0, half), top[:half]), (slice(size - half, size), bottom[deep - half :])):
                 view[rows] = np.maximum(view[rows], part)
-    return np.where(border > 0, border, _interior_variance(system))
+    return np.where(border > 0, border, interior_variance(system))
 
 
-def _interior_variance(system: Preconditioner) -> float:
+def unseen_corners(system: Preconditioner) -> list[tuple[int, int]]:
+    """Return the corner pixels, (row, column), where two edges meet that some lens types do not see.
+
+    Errors there reach along both edges to their ends, and no strip shows their variance.
+    """
+    ends = [
+        [
+            place
+            for place, unseen in (
+                (0, any(pair[axis].first > 0 for pair in system.types)),
+                (size - 1, any(pair[axis].end < size for pair in system.types)),
+            )
+            if unseen
+        ]
+        for axis, size in enumerate(system.shape)
+    ]
+    return [(row, column) for row in ends[0] for column in ends[1]]
+
+
+def interior_variance(system: Preconditioner) -> float:
     """Mean of 1 / spectrum over the frequencies of a frame without edges."""
     vertical, horizontal = (
         2 * np.pi * (np.arange(min(size, FINEST)) + 0.5) / min(size, FINEST) for size in system.shape

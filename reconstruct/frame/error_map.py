@@ -1,0 +1,233 @@
+"""The expected error (Eq. 5) of every pixel of a frame, by the way that its noise, its prior and its lens types allow.
+
+Even noise and an ideal H are served by the transfer function, any other noise and H by windows side by side, lens types
+that leave a null space by one sweep over the frame. A correlated prior takes the maps of even noise at several levels,
+between which each pixel finds that of the measurements near it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil
+
+import numpy as np
+from scipy import sparse
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.processors import processors
+from ommatid.scenes.camera import Camera
+
+from ..methods.method import EstimationTask, is_uniform
+from .banded_system import BandedSystem, leaves_null_space
+from .conjugate_gradients import FrameSystem
+from .map_check import ExactVariances, MapCheck, check_map
+from .preconditioner import Preconditioner, is_sliding
+from .selected_inverse import whole_variances
+from .stencil import Stencil, box_stencil, even_couplings, pixel_numbers, stored_stencil
+from .variance_map import (
+    VarianceMap,
+    interior_variance,
+    posterior_variance,
+    sliding_variance_map,
+    small_posterior_variance,
+    small_shape,
+    unseen_corners,
+    variance_map,
+)
+from .window_variances import BESIDE, CORE, LENGTH, EvenNoise, frame_variances
+
+MANY = 250_000  # pixels above which a shorter halo saves minutes
+EVEN = 1e-3  # relative range of noise variances that count as equal
+HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
+SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
+LEVELS = 4  # of even noise, for a correlated prior
+LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
+
+
+@dataclass(frozen=True)
+class ErrorMap:
+    """Maps of the expected error of a frame whose estimator is `system`; actual : (measurements used,) noise."""
+
+    task: EstimationTask
+    system: FrameSystem
+    actual: FloatArray
+
+    @cached_property
+    def maps(self) -> VarianceMap:
+        """Variances of all pixels."""
+        if isinstance(self.system, BandedSystem):
+            return self._perturbed_map(self._swept)
+        if not isinstance(self.system.prior, float):
+            return self._even_map() if self.is_even else self._interpolated_map()
+        return self._with_corners(self._even_map() if self.is_even else self._perturbed_map(self._windows))
+
+    def _with_corners(self, variances: VarianceMap) -> VarianceMap:
+        """Replace the variances of corner pixels that some lens types do not see by exact solutions."""
+        if not all(is_sliding(lens_type) for lens_type in self.task.model.camera.types):
+            return variances
+        parts = [np.array(part) for part in (variances.posterior, variances.missing, variances.noisy)]
+        noise = self.system.weights**2 * self.task.on_all_measurements(self.actual, 0.0)
+        for corner in unseen_corners(self.system.preconditioner):
+            unit = np.zeros(self.task.shape)
+            unit[corner] = 1.0
+            solved = self.system.solve(unit.ravel(), self.task.settings.accuracy).image
+            parts[0][corner] = solved[np.flatnonzero(unit)[0]]
+            parts[1][corner] = solved @ self.system.apply_prior_precision(solved)
+            parts[2][corner] = noise @ np.square(self.system.observation.forward(solved))
+        return VarianceMap(*parts)
+
+    def checked(self, variance: FloatArray) -> MapCheck:
+        """Compare a map of Eq. 5, (N,), with exact solutions for random pixels."""
+        noise = None
+        if not self.as_expected:
+            noise = self.system.weights**2 * self.task.on_all_measurements(self.actual, 0.0)
+        exact = ExactVariances(self.system, noise, self.task.settings.accuracy)
+        local = isinstance(self.system.prior, float) and not isinstance(self.system, BandedSystem)
+        local = local and not leaves_null_space(self.task.model.camera)
+        return check_map(variance, self.maps.posterior.ravel(), self.task.shape, exact, local=local)
+
+    @cached_property
+    def as_expected(self) -> bool:
+        """True if the actual noise is that which the estimator expects."""
+        return np.allclose(self.actual, self.task.expected_noise, rtol=1e-12)
+
+    @cached_property
+    def is_even(self) -> bool:
+        """True if H is exact and both expected and actual noise are even over each lens type."""
+        if not (self.task.model.is_exact and self.task.complete):
+            return False
+        slices = self.task.model.camera.type_slices()
+        return all(_even(values[part]) for values in (self.task.expected_noise, self.actual) for part in slices)
+
+    @cached_property
+    def _largest(self) -> float:
+        return float(np.max(self.actual / self.task.expected_noise)) or 1.0
+
+    def _perturbed_map(self, posterior: Callable[[FloatArray, float], FloatArray]) -> VarianceMap:
+        """Variances for any H and noise from those of perturbed systems."""
+        as_expected = self.as_expected
+        variances = variance_map(self._by_weights(posterior), noise_as_expected=as_expected)
+        return variances if as_expected else replace(variances, noisy=self._largest * variances.noisy)
+
+    def _by_weights(self, posterior: Callable[[FloatArray, float], FloatArray]) -> Callable[[float, float], FloatArray]:
+        """Return diag((K + s P0^-1 + t S)^-1), S = H^T Rv^-1 Rvm Rv^-1 H over the largest ratio of Rvm to Rv."""
+        weights, prior = self.system.weights, float(np.asarray(self.system.prior))
+        ratios = self.task.on_all_measurements(self.actual / self.task.expected_noise, 0.0) / self._largest
+
+        def perturbed(by_prior: float, by_noise: float) -> FloatArray:
+            changed = weights * (1 + by_noise * ratios) if by_noise else weights
+            return posterior(changed, (1 + by_prior) * prior)
+
+        return perturbed
+
+    def _swept(self, weights: FloatArray, prior: float) -> FloatArray:
+        matrix = self.task.model.matrix
+        information = matrix.T @ sparse.csr_array(matrix.multiply(weights[:, None]))
+        precision = sparse.csr_array(information + prior * sparse.eye_array(matrix.shape[1], format="csr"))
+        return whole_variances(precision, self.task.shape, self.task.model.reach - 1)
+
+    def _windows(self, weights: FloatArray, prior: float) -> FloatArray:
+        """Variances from windows for any H of shift-invariant lens types."""
+        model = self.task.model
+        widths = [ceil(lens_type.ratio) for lens_type in model.camera.types]
+        halo = (HALO if model.unknowns <= MANY else SHORT_HALO) * max(widths)
+        reach = max(widths) - 1 if model.is_exact else model.reach - 1
+
+        def source(rows: slice, columns: slice) -> Stencil:
+            if model.is_exact:
+                return box_stencil(model.camera, weights, prior, rows, columns)
+            pixels = pixel_numbers(model.camera.shape, rows, columns)
+            return stored_stencil(self._by_pixel, weights, prior, pixels, reach)
+
+        even = None
+        if all(is_sliding(lens_type) for lens_type in model.camera.types) and reach >= max(widths) - 1:
+            means = tuple(float(weights[part].mean()) for part in model.camera.type_slices())
+            system = replace(self.system.preconditioner, weights=means, prior=prior)
+            even = EvenNoise(even_couplings(widths, means, prior, reach), interior_variance(system))
+        return frame_variances(source, model.camera.shape, halo, even)
+
+    @cached_property
+    def _by_pixel(self) -> sparse.csc_array:
+        return sparse.csc_array(self.task.model.matrix)
+
+    def _even_map(self, scale: float = 1.0) -> VarianceMap:
+        """Variances of noise that is even over each lens type, with all weights times `scale`.
+
+        Of noise that is not even the means are those of the weights, and of the actual noise with squared weights.
+        """
+        system = self.system.preconditioner
+        weights = tuple(scale * weight for weight in system.weights)
+        actual = tuple(
+            ratio / weight if weight else 0.0 for ratio, weight in zip(self._mean_ratios, weights, strict=True)
+        )
+        return sliding_variance_map(replace(system, weights=weights), actual, self._posterior_variance)
+
+    @cached_property
+    def _mean_ratios(self) -> tuple[float, ...]:
+        """Ratio of the actual to the expected noise of each lens type, weighted as the estimator weighs it."""
+        weights = self.system.weights
+        ratios = self.task.on_all_measurements(self.actual / self.task.expected_noise, 0.0)
+        parts = [(weights[part], ratios[part]) for part in self.task.model.camera.type_slices()]
+        return tuple(float(np.mean(weight * ratio)) / (float(weight.mean()) or 1.0) for weight, ratio in parts)
+
+    def _interpolated_map(self) -> VarianceMap:
+        """Variances of uneven noise from those of even noise, at the level of the measurements of each pixel."""
+        level = np.log(self._local_weight())
+        low, high = float(level.min()), float(level.max())
+        if high - low <= EVEN:
+            return self._even_map()
+        levels = np.linspace(low, high, LEVELS)
+        maps = [self._even_map(float(np.exp(value))) for value in levels]
+        place = np.clip((level - low) / (high - low) * (LEVELS - 1), 0, LEVELS - 1)
+        below = np.minimum(place.astype(np.intp), LEVELS - 2)
+        share = (place - below).reshape(self.task.shape)
+
+        def interpolated(parts: list[FloatArray]) -> FloatArray:
+            logs = np.log(np.maximum(np.array([part.ravel() for part in parts]), np.finfo(float).tiny))
+            pixels = np.arange(below.size)
+            first, second = (logs[number, pixels].reshape(self.task.shape) for number in (below, below + 1))
+            return np.exp(first + share * (second - first))
+
+        return VarianceMap(
+            interpolated([each.posterior for each in maps]),
+            interpolated([each.missing for each in maps]),
+            interpolated([each.noisy for each in maps]),
+        )
+
+    def _local_weight(self) -> FloatArray:
+        """Weights of the measurements of each pixel relative to the means of their types: (N,)."""
+        means = np.empty(self.task.model.measurements)
+        slices = self.task.model.camera.type_slices()
+        for part, weight in zip(slices, self.system.preconditioner.weights, strict=True):
+            means[part] = weight
+        adjoint = self.system.observation.adjoint
+        local, average = adjoint(self.system.weights), adjoint(means)
+        relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
+        return np.maximum(relative, LEAST_LEVEL)
+
+    def _posterior_variance(self, system: Preconditioner) -> FloatArray:
+        if not isinstance(system.prior, np.ndarray):
+            return posterior_variance(system)
+        change = float(system.prior.flat[0]) / float(np.ravel(self.system.prior)[0])
+        return small_posterior_variance(system, change * np.array(self.task.precision_on(small_shape(system.shape))))
+
+
+def window_memory(camera: Camera) -> int:
+    """Return the bytes that variances from windows take, for the ideal H: two long edges, one slab, its windows."""
+    widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
+    halo = (HALO if camera.unknowns <= MANY else SHORT_HALO) * widest
+    lines, longest = max(widest - 1, 1), max(camera.shape)
+    slab = min(LENGTH + 2 * halo, longest)
+    offsets = (2 * lines + 1) ** 2 // 2 + 1
+
+    def sweep(length: int, broad: int) -> int:
+        return 2 * 8 * length * lines * min(broad, longest) ** 2  # an inverse and a link per block of lines
+
+    windows = processors() * sweep(slab, CORE + 2 * halo)
+    return 2 * sweep(longest, 2 * halo + BESIDE) + 8 * offsets * slab * longest + windows
+
+
+def _even(values: FloatArray) -> bool:
+    return is_uniform(values) or bool(np.ptp(values) <= EVEN * values.min())

@@ -48,6 +48,11 @@ class RefinedForm(Form):
         return self._variances[0]
 
     @property
+    def description(self) -> str:
+        """Name of the form that is refined."""
+        return f"{self.form.name}, corrected"
+
+    @property
     def variance_error(self) -> float:
         """A bound on the relative error of every posterior variance."""
         variance, error = self._variances

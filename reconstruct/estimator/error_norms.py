@@ -54,5 +54,5 @@ def distance_from_exact(variance: FloatArray, reference: MultiplePrecision) -> f
     exact_ones, uncertainty = reference.variance(), reference.variance_error
     negligible = NEGLIGIBLE_VARIANCE * reference.problem.prior.variance
     error = np.abs(variance - exact_ones)
-    error[((variance == 0) | (exact_ones == 0)) & (error <= negligible)] = 0.0
+    error[(variance == 0) & (error <= negligible)] = 0.0
     return worst(relative(error, exact_ones)) + uncertainty

@@ -189,7 +189,10 @@ def _exact_solution(residuals: ExactResiduals, recorded: FloatArray | None) -> R
     """Return the estimate of a small problem in multiple precision. Raises InputError for contradictions."""
     if residuals.reference is None or recorded is None:
         return None
-    solution = residuals.reference.estimate(recorded)
+    try:
+        solution = residuals.reference.estimate(recorded)
+    except NotSolvableError as error:
+        raise InputError(f"the estimate is too sensitive: {error}; raise estimator.noise_variance") from error
     _refuse_contradiction(solution.contradiction)
     size = float(np.linalg.norm(solution.high))
     uncertainty = 0.0 if solution.uncertainty == 0 else (solution.uncertainty / size if size > 0 else np.inf)

@@ -17,8 +17,7 @@ from ..prior import Prior
 
 PRIME = 2**61 - 1
 RADIUS = 1e-34  # of a result, relative to it: below the rounding of two float64
-LEAST_FLOAT = 2.0**-1074
-NEGLIGIBLE = 1e-40  # of a variance relative to the prior's, below which it counts as 0
+LEAST_FLOAT = 2.0**-1074  # the smallest float64 above 0
 
 
 def balls(values: FloatArray) -> Any:
@@ -59,25 +58,17 @@ def relative_misfit(matrix: Any, image: Any, measured: Any, row: int) -> float:
     return float(abs((reading - sum(terms)).mid()) / size) if size > 0 else 0.0
 
 
-def negligible_radii(matrix: Any, scale: FloatArray | None) -> bool:
-    """Return True if radii are negligible: relative to their column, or with a `scale` to every number.
-
-    Without a scale they also are where a float64 would be 0.
-    """
-    shape = matrix.nrows(), matrix.ncols()
+def negligible_radii(matrix: Any, *, elementwise: bool) -> bool:
+    """Return True if radii are negligible: relative to their column or to every number, or where a float64 is 0."""
+    width = matrix.ncols()
     entries = matrix.entries()
-    middle = [abs(entry.mid()) for entry in entries]
-    radius = [entry.rad() for entry in entries]
-    if scale is not None:
-        allowed = [
-            max(size * RADIUS, float(least) * NEGLIGIBLE) for size, least in zip(middle, scale.ravel(), strict=True)
-        ]
-        return all(bool(error <= limit) for error, limit in zip(radius, allowed, strict=True))
-    columns = range(shape[1])
-    largest = [max((middle[row * shape[1] + index] for row in range(shape[0])), default=0) for index in columns]
+    size = [abs(entry.mid()) for entry in entries]
+    if not elementwise:
+        largest = [max(size[index::width], default=0) for index in range(width)]
+        size = [largest[place % width] for place in range(len(size))]
     return all(
-        bool(error <= largest[place % shape[1]] * RADIUS) or bool(error <= LEAST_FLOAT)
-        for place, error in enumerate(radius)
+        bool(entry.rad() <= limit * RADIUS) or bool(entry.rad() <= LEAST_FLOAT)
+        for entry, limit in zip(entries, size, strict=True)
     )
 
 

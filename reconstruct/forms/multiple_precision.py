@@ -25,7 +25,6 @@ from ommatid.runtime.arrays import FloatArray
 from ..problem import Problem
 from .balls import (
     LEAST_FLOAT,
-    NEGLIGIBLE,
     ball_matrix,
     balls,
     column,
@@ -128,7 +127,7 @@ class MultiplePrecision(Form):
         )
 
     def variance(self) -> FloatArray:
-        """Return the diagonal of L (I - B^T C^-1 B) L^T; 0 where it is below 1e-40 of the prior's."""
+        """Return the diagonal of L (I - B^T C^-1 B) L^T."""
         return self._variance
 
     @cached_property
@@ -144,8 +143,8 @@ class MultiplePrecision(Form):
             )
             return (column([before - less for before, less in zip(prior, explained, strict=True)]),)
 
-        ((variance, _),) = self._converged(compute, self.problem.prior.variance[:, None])
-        return np.where(variance[:, 0] > NEGLIGIBLE * self.problem.prior.variance, variance[:, 0], 0.0)
+        ((variance, _),) = self._converged(compute, elementwise=True)
+        return np.maximum(variance[:, 0], 0.0)
 
     @property
     def description(self) -> str:
@@ -154,12 +153,11 @@ class MultiplePrecision(Form):
 
     @cached_property
     def variance_error(self) -> float:
-        """Return a bound on the relative error of every posterior variance, from rounding."""
+        """Return a bound on the relative error of every posterior variance above 0, from rounding."""
         variance = self.variance()
-        unit = np.where(self.problem.prior.variance > 0, LEAST_FLOAT, 0.0)
-        relative = np.divide(unit, variance, out=np.where(unit > 0, np.inf, 0.0), where=variance > 0)
-        exactly = (variance == 0) & (NEGLIGIBLE * self.problem.prior.variance > 0)
-        return EPS + float(np.where(exactly, 0.0, relative).max(initial=0.0))
+        return EPS + float(
+            np.divide(LEAST_FLOAT, variance, out=np.zeros_like(variance), where=variance > 0).max(initial=0.0)
+        )
 
     def scaled_condition(self) -> float:
         """Return the 1-norm condition number of C scaled to a unit diagonal."""
@@ -208,11 +206,8 @@ class MultiplePrecision(Form):
         filled[self.kept] = multipliers
         return filled
 
-    def _converged(self, compute: Compute, scale: FloatArray | None = None) -> list[Pair]:
-        """Return results, each the sum of two arrays, in the least precision in which all radii are negligible.
-
-        scale : (n, 1), of results whose every number has to be accurate relative to itself, unless far below it
-        """
+    def _converged(self, compute: Compute, *, elementwise: bool = False) -> list[Pair]:
+        """Return results, each the sum of two arrays, in the least precision in which all radii are negligible."""
         from flint import ctx
 
         before = ctx.prec
@@ -221,7 +216,7 @@ class MultiplePrecision(Form):
                 ctx.prec = self.precision.bits
                 try:
                     results = list(compute(*self._factorised()))
-                    if all(negligible_radii(result, scale) for result in results):
+                    if all(negligible_radii(result, elementwise=elementwise) for result in results):
                         return [floats(result) for result in results]
                 except ZeroDivisionError:
                     pass

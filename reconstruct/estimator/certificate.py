@@ -21,7 +21,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 
 from ..forms.form import Form
-from .double_double import DoubleDouble, column_dots, exact
+from .double_double import DoubleDouble, as_exact, column_dots, exact
 from .error_norms import (
     ALL_CHECKED,
     NEGLIGIBLE_VARIANCE,
@@ -29,6 +29,7 @@ from .error_norms import (
     Residuals,
     distance_from_exact,
     infinite,
+    last_digit,
     norms,
     relative,
     sampled_pixels,
@@ -68,7 +69,7 @@ class RefinedSolution:
 def refine(
     form: Form,
     residuals: ExactResiduals,
-    shift: FloatArray,
+    shift: FloatArray | DoubleDouble,
     recorded: DoubleDouble,
     right: DoubleDouble | None = None,
 ) -> RefinedSolution:
@@ -77,21 +78,28 @@ def refine(
     right : the right u, (K, q), where it is known: then the bound is the distance from it
     """
     with np.errstate(all="ignore"):  # overflow gives a bound that fails every tolerance
-        (u, multipliers), bound, first, steps = _Certifier(form, residuals, shift, recorded, right).refined()
+        certifier = _Certifier(form, residuals, as_exact(shift), recorded, right)
+        (u, multipliers), bound, first, steps = certifier.refined()
         change = relative(norms(u.high - first), norms(u.high))
     return RefinedSolution(u.high, u.low, multipliers.high, bound, change + bound, steps)
 
 
 def exact_variances(form: Form, residuals: ExactResiduals, pixels: Indices) -> tuple[FloatArray, FloatArray]:
-    """Return accurate posterior variances of some pixels and bounds on their errors: (n,) each.
-
-    With c = L^T e_i and r = 0 they are c u + u p - l q up to a term of second order in p and q, |M^-1/2 (p, q)|^2.
-    """
+    """Return accurate posterior variances of some pixels and bounds on their errors: (n,) each."""
     images = np.zeros((form.problem.unknowns, pixels.size))
     images[pixels, np.arange(pixels.size)] = 1.0
-    shift = form.problem.prior.apply_root_transposed(images)
+    return exact_sums(form, residuals, exact(form.problem.prior.apply_root_transposed(images)))
+
+
+def exact_sums(form: Form, residuals: ExactResiduals, shift: DoubleDouble) -> tuple[FloatArray, FloatArray]:
+    """Return accurate posterior variances of sums of pixels and bounds on their errors: (n,) each.
+
+    shift : (K, n), c = L^T w of the weights w of each. With r = 0 they are c u + u p - l q up to a term of second order
+    in p and q, |M^-1/2 (p, q)|^2.
+    """
     with np.errstate(all="ignore"):
-        certifier = _Certifier(form, residuals, shift, exact(np.zeros((form.problem.measurements, pixels.size))))
+        no_data = exact(np.zeros((form.problem.measurements, shift.high.shape[1])))
+        certifier = _Certifier(form, residuals, shift, no_data)
         (u, multipliers), *_ = certifier.refined()
         return certifier.quadratic_form(u, multipliers)
 
@@ -120,7 +128,7 @@ def variance_error(form: Form, residuals: ExactResiduals) -> float:
             signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, 1))
             no_data = exact(np.zeros((form.problem.measurements, 1)))
             largest = max(largest, worst(refine(form, residuals, prior.apply_root_transposed(signs), no_data).first))
-    return SAFETY * largest
+    return SAFETY * largest + last_digit(variance)
 
 
 @dataclass(frozen=True)
@@ -129,13 +137,13 @@ class _Certifier:
 
     form: Form
     system: ExactResiduals
-    shift: FloatArray
+    shift: DoubleDouble
     recorded: DoubleDouble
     right: DoubleDouble | None = None
 
     def refined(self) -> tuple[Solution, FloatArray, FloatArray, int]:
         """Return the best u and l, the bound on u, the first u, and the number of refinements."""
-        first, multiplier = self.form.solve(self.shift, self.recorded.high)
+        first, multiplier = self.form.solve(self.shift.high, self.recorded.high)
         solution: Solution = exact(first), exact(multiplier)
         residuals, bound, estimated = self.residuals_and_bounds(solution)
         best, steps, stalled = (solution, bound), 0, 0
@@ -158,12 +166,12 @@ class _Certifier:
     def residuals_and_bounds(self, solution: Solution) -> tuple[Solution, FloatArray, FloatArray]:
         """Return the residuals of u and l, a certain bound on the error of u relative to |u|, and an estimated one."""
         u, multipliers = solution
-        residuals = self.system.residuals(u, multipliers, exact(self.shift), self.recorded)
+        residuals = self.system.residuals(u, multipliers, self.shift, self.recorded)
         if self.right is not None:
             bound = relative(norms((u - self.right).high), norms(self.right.high))
             return residuals, bound, bound
         values = residuals[0].high, residuals[1].high
-        rounding = self.system.rounding_errors(u.high, multipliers.high, self.shift, self.recorded.high)
+        rounding = self.system.rounding_errors(u.high, multipliers.high, self.shift.high, self.recorded.high)
         bound, size = self._rigorous_distance(values, rounding), norms(u.high)
         distance = bound
         if not (bound <= CONVERGED * size).all() and self.trusted[1]:
@@ -191,9 +199,10 @@ class _Certifier:
 
     def quadratic_form(self, u: DoubleDouble, multipliers: DoubleDouble) -> tuple[FloatArray, FloatArray]:
         """Return c u + u p - l q and a bound on its distance from c u of the exact u: (q,) each, for r = 0."""
-        p, q = self.system.residuals(u, multipliers, exact(self.shift), self.recorded)
-        errors = self.system.rounding_errors(u.high, multipliers.high, self.shift, self.recorded.high)
-        value = (column_dots(self.shift, u) + column_dots(u.high, p) - column_dots(multipliers.high, q)).high
+        p, q = self.system.residuals(u, multipliers, self.shift, self.recorded)
+        errors = self.system.rounding_errors(u.high, multipliers.high, self.shift.high, self.recorded.high)
+        shifted = column_dots(self.shift.high, u) + column_dots(self.shift.low, u)
+        value = (shifted + column_dots(u.high, p) - column_dots(multipliers.high, q)).high
         residuals = p.high, q.high
         second = self._rigorous_distance(residuals, errors)
         if not self.system.problem.noisy:
@@ -203,7 +212,7 @@ class _Certifier:
         if self.trusted[1]:
             second = np.fmin(second, self._estimated_distance(residuals, errors)[1])
         first = np.sum(np.abs(u.high) * errors[0], axis=0) + np.sum(np.abs(multipliers.high) * errors[1], axis=0)
-        rounding = self.system.rounding * np.sum(np.abs(self.shift * u.high), axis=0)
+        rounding = self.system.rounding * np.sum(np.abs(self.shift.high * u.high), axis=0)
         return value, first + second + rounding
 
     def _rigorous_distance(self, residuals: Residuals, rounding: Residuals) -> FloatArray:
@@ -250,13 +259,16 @@ class _Certifier:
     def _meets_noise_free(self, u: FloatArray) -> bool:
         """True if refinement meets noise-free measurements to ROUNDING_MARGIN times the rounding error.
 
-        With c = u they record 0 first, then what H L u' gives for another u': a form that drops one of two nearly equal
-        rows meets 0 with both.
+        With c = u they record 0 first, then what H L u' gives for another u', while those with noise record anything: a
+        form that drops one of two nearly equal rows for one with noise meets 0 with both, and not this.
         """
-        zero = exact(np.zeros((self.system.problem.measurements, u.shape[1])))
-        seen = self.system.forward(exact(np.roll(u, 1, axis=1)[::-1]))
+        other = np.random.default_rng(3)
+        zero = np.zeros((self.system.problem.measurements, u.shape[1]))
+        seen = self.system.forward(exact(other.normal(size=u.shape)))
+        signal = np.where(self.system.problem.noise_variance > 0, self.system.signal, 0.0)
+        seen = seen + exact(signal[:, None] * other.normal(size=zero.shape))
         shift = np.hstack([u, u])
-        right = DoubleDouble(np.hstack([zero.high, seen.high]), np.hstack([zero.low, seen.low]))
+        right = DoubleDouble(np.hstack([zero, seen.high]), np.hstack([zero, seen.low]))
         solution: Solution = exact(np.zeros_like(shift)), exact(np.zeros_like(right.high))
         values: Residuals = shift, right.high
         for _ in range(REPRODUCTION_STEPS):

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 
+from ..forms.balls import LEAST_FLOAT
 from ..forms.multiple_precision import MultiplePrecision
 
 Indices = NDArray[np.intp]
@@ -47,6 +48,12 @@ def relative(error: FloatArray, size: FloatArray) -> FloatArray:
 def worst(bound: FloatArray) -> float:
     """Return the largest bound; NaN counts as infinite."""
     return float(np.nan_to_num(bound, nan=np.inf, posinf=np.inf).max(initial=0.0))
+
+
+def last_digit(variance: FloatArray) -> float:
+    """Return the smallest float64 relative to the least variance above 0."""
+    least = float(variance[variance > 0].min(initial=np.inf))
+    return LEAST_FLOAT / least
 
 
 def distance_from_exact(variance: FloatArray, reference: MultiplePrecision) -> float:

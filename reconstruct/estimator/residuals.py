@@ -77,8 +77,11 @@ class ExactResiduals:
 
     def adjoint(self, measurements: DoubleDouble) -> DoubleDouble:
         """Apply L^T H^T."""
+        return self.root_transposed(self._transposed.times(measurements))
+
+    def root_transposed(self, image: DoubleDouble) -> DoubleDouble:
+        """Apply L^T."""
         prior = self.problem.prior
-        image = self._transposed.times(measurements)
         return image.scaled(prior.root[:, None]) if prior.independent else self._root[1].times(image)
 
     def recorded(self, values: FloatArray) -> DoubleDouble:

@@ -93,6 +93,17 @@ class MultiplePrecision(Form):
         (u, _), (multipliers, _) = self._converged(compute)
         return u, self._on_all(multipliers, residual.shape)
 
+    def solve_sum(self, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Solve for c = L^T w, without rounding c, and r = 0: w, (N, 1), to u, (K, 1), and l, (M, 1)."""
+
+        def compute(observed: Any, inverse: Any) -> tuple[Any, Any]:
+            shift = balls(dense_root(self.problem.prior)).transpose() * balls(weights)
+            multipliers = inverse * (observed * shift)
+            return shift - observed.transpose() * multipliers, multipliers
+
+        (u, _), (multipliers, _) = self._converged(compute)
+        return u, -self._on_all(multipliers, (self.problem.measurements, 1))
+
     def estimate(self, recorded: FloatArray) -> ExactEstimate:
         """Return the estimate for g, (M,) `recorded`.
 

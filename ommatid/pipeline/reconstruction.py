@@ -57,7 +57,8 @@ def reconstruct_files(
         for corner, size in regions
         for mean, deviation in [result.region(corner, size)]
     )
-    report = report.with_changes(region=averages[0] if averages else None, regions=averages)
+    if averages:
+        report = report.with_changes(region=averages[0], regions=averages)
     result_files.write_estimate(output, result, {"title": recorded.scene.title})
     figures.write_estimate(output.with_suffix(".png"), result.estimate.reshape(result.shape))
     return report

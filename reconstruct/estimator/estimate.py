@@ -32,6 +32,7 @@ from ..problem import Problem
 from .certificate import RefinedSolution, refine, variance_error
 from .double_double import DoubleDouble
 from .memory import needed_memory
+from .prior_rounding import estimate_rounding, variance_rounding
 from .refined_form import RefinedForm
 from .residuals import ExactResiduals
 
@@ -152,21 +153,26 @@ def _first_accepted(
     for name in names:
         try:
             form = _factorised(name, problem)
-            solver = Solver(name, why, form.condition, variance_error(form, residuals), tuple(tried))
+            error, rounding = variance_error(form, residuals), variance_rounding(form)
+            solver = Solver(name, why, form.condition, error + rounding, tuple(tried))
+            _check_rounding(error, rounding, tolerance)
             solver, refined = _with_estimate(solver, form, residuals, recorded, reference)
-        except (NotSolvableError, np.linalg.LinAlgError) as error:
-            tried.append((name, str(error)))
+        except (NotSolvableError, np.linalg.LinAlgError) as failure:
+            tried.append((name, str(failure)))
             continue
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
         if solver.bound is None or solver.bound <= tolerance:
             refinable.append(form)
     for form in _last_resorts(residuals, refinable) if method == "auto" else []:
-        solver = Solver(form.description, why, form.condition, form.variance_error, tuple(tried))
+        error = form.variance_error + variance_rounding(form)
+        solver = Solver(form.description, why, form.condition, error, tuple(tried))
         if isinstance(form, RefinedForm):
             solver, refined = _with_estimate(solver, form.form, residuals, recorded, None)
         elif reference is not None:
-            solver, refined = replace(solver, bound=float(reference.bound[0])), reference
+            columns = reference.coefficients[:, 0], reference.multipliers[:, 0]
+            bound = float(reference.bound[0]) + estimate_rounding(form, *columns)
+            solver, refined = replace(solver, bound=bound), reference
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
     if refined is not None and recorded is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND:
@@ -176,6 +182,15 @@ def _first_accepted(
         + "; ".join(f"{name}: {reason}" for name, reason in tried)
         + "); raise estimator.noise_variance or estimator.tolerance"
     )
+
+
+def _check_rounding(error: float, rounding: float, tolerance: float) -> None:
+    """Raise InputError if the rounding of P0 alone exceeds the tolerance; `error` is that of the form."""
+    if error <= tolerance < rounding:
+        raise InputError(
+            f"the prior's covariance is so nearly singular that its rounding changes variances by {rounding:.1e},"
+            f" relative, where {tolerance:g} is allowed; shorten prior.correlation_length, or raise estimator.tolerance"
+        )
 
 
 def _last_resorts(residuals: ExactResiduals, refinable: list[Form]) -> list[RefinedForm] | list[MultiplePrecision]:
@@ -215,6 +230,7 @@ def _with_estimate(
         deviation = residuals.recorded(recorded)
     refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation, right)
     bound = float(refined.bound[0]) + (EPS if reference is None else float(reference.bound[0]))
+    bound += estimate_rounding(form, refined.coefficients[:, 0], refined.multipliers[:, 0])
     if reference is None and bound <= USEFUL_BOUND:
         _check_contradictions(residuals, recorded, refined)
     return replace(solver, bound=bound, refinements=refined.steps), refined

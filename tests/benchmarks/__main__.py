@@ -1,7 +1,7 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms` and
-`frames`. No speed is asserted. Other load slows both sides of a ratio alike, so compare ratios rather than times.
+`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`, `frames`
+and `nasty`, which takes half an hour. No speed is asserted. Other load slows both sides of a ratio alike, so compare ratios rather than times.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from .lenses import SAMPLES as LENS_SAMPLES
 from .lenses import SIDE as LENS_SIDE
 from .lenses import VARIANT as LENS_VARIANT
 from .lenses import lens_rows, transport_rows
+from .nasty import nasty_table
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
@@ -101,6 +102,10 @@ def _frames() -> Iterator[Table]:
         yield table()
 
 
+def _nasty() -> Iterator[Table]:
+    yield nasty_table()
+
+
 def _lenses() -> Iterator[Table]:
     def rows() -> Iterator[tuple[str, Row]]:
         for row in lens_rows():
@@ -134,6 +139,7 @@ PARTS: dict[str, Callable[[], Iterator[Table]]] = {
     "leaving-out": _leaving_out,
     "forms": _forms,
     "frames": _frames,
+    "nasty": _nasty,
 }
 
 

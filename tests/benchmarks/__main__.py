@@ -1,7 +1,8 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
 `python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`, `frames`
-and `nasty`, which takes half an hour. No speed is asserted. Other load slows both sides of a ratio alike, so compare ratios rather than times.
+and `nasty`, which takes half an hour. No speed is asserted. Other load slows both sides of a ratio alike, so compare
+ratios rather than times.
 """
 
 from __future__ import annotations

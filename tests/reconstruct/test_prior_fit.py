@@ -177,3 +177,30 @@ def test_large_footprints_get_larger_tiles() -> None:
     residual = wide @ drawn(prior, 0) + np.random.default_rng(1).normal(size=64)
     fit = fit_prior(Evidence(sparse.csr_array(wide), residual, np.zeros(64), (30, 30), prior, False))
     assert fit.measurements == 64
+
+
+def test_a_search_that_meets_its_bounds_goes_on() -> None:
+    """An image of which the search, at the paper's noise, once returned the point where it had begun."""
+    shape = (24, 24)
+    matrix = ideal_matrix(camera(shape, (("1/3", [3, 3], "fit"), ("1/5", [5, 5], "fit"), ("1/4", [4, 4], "fit"))))
+    rng = np.random.default_rng([1, 5])
+    residual = matrix @ (exponential(0.0, 1000.0, shape, 4.0).root @ rng.normal(size=576))
+    residual = residual + 1e-2 * rng.normal(size=residual.size)
+    whole = Evidence(matrix, residual, np.full(residual.size, 1e-4), shape, None, True)
+    fit = fit_prior(whole)
+    assert fit.variance is not None
+    assert fit.length is not None
+    assert not fit.doubtful
+    assert whole.score(np.log([fit.variance, fit.length]))[0] <= whole.score(np.log([1000.0, 4.0]))[0]
+    assert np.abs(np.log(np.array([fit.variance, fit.length]) / (1000.0, 4.0)) / fit.spread).max() < 4
+
+
+@pytest.mark.parametrize("noise_known", [True, False])
+def test_an_image_that_no_measurement_shows_makes_the_fit_doubtful(noise_known: bool) -> None:
+    """A checkerboard under averages of 2 x 2 and 4 x 4 pixels is grey: the fit would promise almost no error."""
+    shape = (12, 12)
+    matrix = ideal_matrix(camera(shape, (("1/2", [2, 2], "fit"), ("1/4", [4, 4], "fit"))))
+    board = 255.0 * (np.indices(shape).sum(axis=0) % 2).ravel()
+    residual = matrix @ (board - 127.5) + 1e-2 * np.random.default_rng(0).normal(size=matrix.shape[0])
+    known = np.full(residual.size, 1e-4 if noise_known else 0.0)
+    assert fit_prior(Evidence(matrix, residual, known, shape, None, noise_known)).doubtful

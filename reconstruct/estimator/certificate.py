@@ -146,18 +146,19 @@ class _Certifier:
         first, multiplier = self.form.solve(self.shift.high, self.recorded.high)
         solution: Solution = exact(first), exact(multiplier)
         residuals, bound, estimated = self.residuals_and_bounds(solution)
-        best, steps, stalled = (solution, bound), 0, 0
+        best: tuple[Solution, FloatArray] = solution, bound
+        steps, stalled = 0, 0
         while steps < MAX_REFINEMENTS and stalled < MAX_STALLED and not (best[1] <= CONVERGED).all():
             solution = self._corrected(solution, (residuals[0].high, residuals[1].high))
             before = estimated
             residuals, bound, estimated = self.residuals_and_bounds(solution)
             # An estimate may be small by chance; it counts as much as the one before.
-            confirmed = np.fmin(bound, np.maximum(estimated, before))
+            confirmed: FloatArray = np.fmin(bound, np.maximum(estimated, before))
             steps += 1
             stalled = 0 if worst(confirmed) < 0.5 * worst(best[1]) else stalled + 1
             if worst(confirmed) < worst(best[1]):
                 best = solution, confirmed
-        return *best, first, steps
+        return best[0], best[1], first, steps
 
     def _corrected(self, solution: Solution, residuals: Residuals) -> Solution:
         change, step = self.form.solve(*residuals)

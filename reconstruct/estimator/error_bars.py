@@ -78,13 +78,13 @@ def bias_of(form: Form, difference: FloatArray) -> FloatArray:
     With d = L c + e, it is L u + e - A H e, where u solves for c and r = 0; e is 0 or the rounding error of L c.
     """
     prior = form.problem.prior
-    deviation = np.zeros(prior.dimension)
+    deviation: FloatArray = np.zeros(prior.dimension)
     with np.errstate(all="ignore"):
         if prior.independent:
             deviation = np.divide(difference, prior.root, out=np.zeros_like(difference), where=prior.root > 0)
         elif prior.root.shape[0] == prior.root.shape[1]:
             try:
-                deviation = np.linalg.solve(prior.root, difference)
+                deviation = np.asarray(np.linalg.solve(prior.root, difference), dtype=np.float64)
             except np.linalg.LinAlgError:
                 deviation = np.zeros(prior.dimension)
     rest = difference - prior.apply_root(deviation)

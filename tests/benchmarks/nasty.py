@@ -139,7 +139,7 @@ def extreme_prior(rng: Generator) -> NastyProblem:
     """Prior variances of 1e-60 to 1e60, alike or from pixel to pixel."""
     measurements, count = _sizes(rng)
     alike = rng.random() < 0.5
-    deviation = np.broadcast_to(_powers(rng, -30, 30, 1 if alike else count), (count,)).copy()
+    deviation = np.ones(count) * _powers(rng, -30, 30, 1 if alike else count)
     noise = _powers(rng, -30, 10, measurements) * (rng.random() < 0.8)
     return drawn(rng.uniform(0, 1, (measurements, count)), Prior(np.full(count, MEAN), deviation), noise, rng)
 
@@ -150,9 +150,9 @@ def singular_prior(rng: Generator) -> NastyProblem:
     kind = int(rng.integers(3))
     mean = np.full(count, MEAN)
     if kind == 0:
-        prior = Prior(mean, DEVIATION * (rng.random(count) < 0.6))
+        prior = Prior(mean, np.where(rng.random(count) < 0.6, DEVIATION, 0.0))
     else:
-        low_rank = DEVIATION * rng.normal(size=(count, int(rng.integers(1, count + 1))))
+        low_rank: FloatArray = DEVIATION * rng.normal(size=(count, int(rng.integers(1, count + 1))))
         prior = _centred(count) if kind == 1 else Prior(mean, low_rank)
     noise = np.where(rng.random(measurements) < 0.4, 0.0, _powers(rng, -24, 2, measurements))
     return drawn(rng.uniform(0, 1, (measurements, count)), prior, noise, rng)

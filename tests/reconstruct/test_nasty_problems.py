@@ -29,7 +29,9 @@ def test_no_random_problem_is_silently_wrong(family: str) -> None:
     outcomes = [assess(family, seed) for seed in range(EACH)]
     assert [outcome for outcome in outcomes if outcome.outcome == SILENT] == []
     refused = sum(outcome.outcome == "refused" for outcome in outcomes) / EACH
-    assert refused <= {"contradiction": 0.65, "denormal noise": 0.3}.get(family, 0.1)
+    assert refused <= {"contradiction": 0.65, "denormal noise": 0.3, "nearly equal rows, noise-free": 0.15}.get(
+        family, 0.1
+    )
 
 
 def test_a_bound_that_is_small_by_chance_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,8 @@ from scipy import sparse, stats
 
 from ommatid.runtime.arrays import FloatArray
 
+from .estimator.error_bars import bias_of, is_stiff, refined_solutions, sum_variance
+from .estimator.residuals import ExactResiduals
 from .forms.form import Form
 
 Pixels = NDArray[np.intp]
@@ -109,14 +111,15 @@ def expected_given(form: Form, truth: FloatArray, noise_variance: FloatArray) ->
     with mean and variance of the quadratic form: with K = A Rvm A^T, the latter is 4 b^T K b + 2 trace(K^2).
     """
     problem = form.problem
-    difference = truth - problem.prior.mean
-    bias = difference - form.gain(problem.matrix @ difference)
+    bias = bias_of(form, truth - problem.prior.mean)
     trace = squares = 0.0
     for _, _, _, negative in solved_columns(form, np.arange(problem.unknowns)):
         weighted = noise_variance[:, None] * negative
         trace += float(np.sum(weighted * negative))
         squares += float(np.square(form.gain(weighted)).sum())
-    variance = 4 * _parts_of_sum(form, bias, noise_variance)[1] + 2 * squares
+    back = problem.prior.apply_root_transposed(bias[:, None])
+    _, negative = form.solve(back, np.zeros((problem.measurements, 1)))
+    variance = 4 * float(noise_variance @ np.square(negative[:, 0])) + 2 * squares
     return interval(float(bias @ bias) + trace, variance, truth.size)
 
 
@@ -138,22 +141,25 @@ def kernel_widths(resolved: FloatArray) -> FloatArray:
 def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> float:
     """Return the expected squared error (Eq. 5) of a weighted sum of pixels; weights : (N,), such as 1/n in a region.
 
-    Errors of neighbours are correlated, so this is not the sum of their variances.
+    Errors of neighbours are correlated, so this is not the sum of their variances. Raises InputError if it is lost in
+    rounding.
     """
-    missing, noisy = _parts_of_sum(form, weights, noise_variance)
-    return missing + noisy
-
-
-def _parts_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> tuple[float, float]:
-    """Return w^T (I - A H) P0 (I - A H)^T w and w^T A Rvm A^T w."""
-    problem = form.problem
-    u, negative = form.solve(problem.prior.apply_root_transposed(weights[:, None]), np.zeros((problem.measurements, 1)))
-    return float(np.square(u).sum()), float(noise_variance @ np.square(negative[:, 0]))
+    return sum_variance(form, weights, noise_variance)
 
 
 def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, FloatArray, FloatArray]]:
-    """Yield for chunks of pixels their range, indices, u, (K, q), whose squares are the prior's part, and -A^T e_i."""
+    """Yield for chunks of pixels their range, indices, u, (K, q), whose squares are the prior's part, and -A^T e_i.
+
+    They are refined where posterior variances are so far below the prior's that rounding would hide them.
+    """
+    residuals = ExactResiduals(form.problem) if is_stiff(form) else None
     for start in range(0, pixels.size, CHUNK):
         chunk = slice(start, min(start + CHUNK, pixels.size))
-        u, negative = form.pixel_solutions(pixels[chunk])
-        yield chunk, pixels[chunk], u, negative
+        chosen = pixels[chunk]
+        if residuals is None:
+            u, negative = form.pixel_solutions(chosen)
+        else:
+            unit = np.zeros((form.problem.unknowns, chosen.size))
+            unit[chosen, np.arange(chosen.size)] = 1.0
+            u, negative = refined_solutions(form, residuals, form.problem.prior.apply_root_transposed(unit))
+        yield chunk, chosen, u, negative

@@ -15,6 +15,8 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables import estimation
 
+EPS = float(np.finfo(np.float64).eps)
+ROUNDING = 4 * EPS  # of an entry of P0, and of its Cholesky factor
 LEAST_POWER = 1e-12  # relative to the largest; periodic continuation of a covariance may have negative eigenvalues
 DEFAULT_EXPONENT = 2.0  # of the power-law spectrum
 NEEDS_FIT = "prior.kind 'fit' takes a recorded stack; set another kind to predict without one"
@@ -22,10 +24,14 @@ NEEDS_FIT = "prior.kind 'fit' takes a recorded stack; set another kind to predic
 
 @dataclass(frozen=True)
 class Prior:
-    """(N,) `mean`, and L as `root`: (N,) standard deviations of independent pixels, or (N, K) for correlated ones."""
+    """(N,) `mean`, and L as `root`: (N,) standard deviations of independent pixels, or (N, K) for correlated ones.
+
+    rounding : error of L L^T as an approximation of P0, relative to the standard deviations of both pixels
+    """
 
     mean: FloatArray
     root: FloatArray
+    rounding: float = 0.0
 
     @property
     def independent(self) -> bool:
@@ -53,7 +59,9 @@ class Prior:
     def restrict(self, pixels: NDArray[np.intp]) -> Prior:
         """Return the marginal prior of these pixels."""
         rows = self.root[pixels]
-        return Prior(self.mean[pixels], rows if self.independent else covariance_root(rows @ rows.T))
+        if self.independent:
+            return Prior(self.mean[pixels], rows)
+        return Prior(self.mean[pixels], covariance_root(rows @ rows.T), self.rounding)
 
 
 def independent(mean: float, variance: float, unknowns: int) -> Prior:
@@ -152,7 +160,17 @@ def covariance_root(covariance: FloatArray) -> FloatArray:
 
 
 def _stationary(mean: float, shape: tuple[int, int], lags: FloatArray) -> Prior:
-    return Prior(np.full(shape[0] * shape[1], mean), covariance_root(stationary_matrix(lags, shape)))
+    covariance = stationary_matrix(lags, shape)
+    root = covariance_root(covariance)
+    rounding = ROUNDING if np.array_equal(root, np.tril(root)) else _defect(root, covariance)
+    return Prior(np.full(shape[0] * shape[1], mean), root, rounding)
+
+
+def _defect(root: FloatArray, covariance: FloatArray) -> float:
+    """Return the largest error of L L^T by rounding, relative to the standard deviations, and that of P0 itself."""
+    deviation = np.sqrt(np.diagonal(covariance))
+    error = np.abs(root @ root.T - covariance) / (deviation[:, None] * deviation)
+    return ROUNDING + min(float(error.max(initial=0.0)), deviation.size * EPS)
 
 
 def _power_correlation(shape: tuple[int, int], exponent: float | None) -> FloatArray:

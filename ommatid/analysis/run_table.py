@@ -31,7 +31,7 @@ def rows(report: RunReport) -> list[Row]:
         *_verdict_rows(report),
         *_stage_rows(report),
         *_error_rows(report.error),
-        *([] if report.region is None else [_region_row(report.region)]),
+        *(_region_row(region) for region in report.regions),
         *_image_quality_rows(report.error),
         *_solver_rows(report.solver),
         *_diagnostic_rows(report.diagnostics, report.unknowns),

@@ -120,12 +120,13 @@ def changes(sets: list[str] | None, complete: bool = False) -> tuple[str, ...]:
     return (*(sets or ()), *(("render.complete=true",) if complete else ()))
 
 
-def region(text: str) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """Read the corner and the size of `--region`; None without the option. Raises InputError."""
-    if not text:
-        return None
-    row, column, rows, columns = _integers("--region", text, "ROW,COLUMN,ROWS,COLUMNS", "8,8,4,4")
-    return (row, column), (rows, columns)
+def regions(texts: list[str] | None) -> tuple[tuple[tuple[int, int], tuple[int, int]], ...]:
+    """Read the corner and the size of every `--region`. Raises InputError."""
+    corners_and_sizes: list[tuple[tuple[int, int], tuple[int, int]]] = []
+    for text in texts or ():
+        row, column, rows, columns = _integers("--region", text, "ROW,COLUMN,ROWS,COLUMNS", "8,8,4,4")
+        corners_and_sizes.append(((row, column), (rows, columns)))
+    return tuple(corners_and_sizes)
 
 
 def acquisition(

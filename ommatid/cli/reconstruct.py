@@ -12,12 +12,13 @@ from .options import Json, Lenses, Output, Sets, Strict
 
 StackFile = Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")]
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Their observation model, model.npz.")]
-Region = Annotated[
-    str,
+Regions = Annotated[
+    list[str] | None,
     typer.Option(
         "--region",
         metavar="ROW,COLUMN,ROWS,COLUMNS",
-        help="Print the mean of a region with its posterior standard deviation.",
+        help="Print the mean of a region with its posterior standard deviation; may be repeated.",
+        show_default=False,
     ),
 ]
 TileScheduler = Annotated[
@@ -42,7 +43,7 @@ def reconstruct(
     file: Output,
     sets: Sets = None,
     lens: Lenses = "",
-    region: Region = "",
+    region: Regions = None,
     scheduler: TileScheduler = "",
     workers: TileWorkers = None,
     strict: Strict = False,
@@ -53,7 +54,7 @@ def reconstruct(
     from ommatid.pipeline.reconstruction import reconstruct_files
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
-    asked = options.changes(sets), options.lens_names(lens), options.region(region)
+    asked = options.changes(sets), options.lens_names(lens), options.regions(region)
     with output.progress_bar("reconstruct") as progress:
         report = reconstruct_files(stack, model, file, *asked, progress, scheduler, workers)
     output.print_result({"file": str(file), **report.plain()}, [(str(file), run_table.rows(report))], as_json)

@@ -29,14 +29,14 @@ def reconstruct_files(
     output: Path,
     changes: Sequence[str],
     lenses: Sequence[str],
-    region: Region | None,
+    regions: Sequence[Region],
     progress: Progress,
     scheduler: str = "",
     workers: int | None = None,
 ) -> RunReport:
     """Reconstruct a stack with a model, and write the estimate (OpenEXR) and its picture.
 
-    Returns the content of run.json, with the mean of a `region`: row and column of its corner, its rows and columns.
+    Returns the content of run.json, with the means of `regions`: row and column of the corner, rows and columns.
     Raises InputError for wrong files and options, MachineError for a full disk.
     """
     if output.suffix == ".png":
@@ -46,16 +46,19 @@ def reconstruct_files(
     recorded, calibrated = stack_file.read(stack), model_file.read(model)
     if lenses:
         recorded, calibrated = recorded.restrict(tuple(lenses)), calibrated.restrict(tuple(lenses))
-    if region is not None:
+    for region in regions:
         check_region(*region, recorded.camera.shape)
     recorded = result_files.with_estimator_changes(recorded, list(changes), stack)
     truth = result_files.truth_beside(stack, recorded)
     with _tile_workers(scheduler, workers) as pool:
         result, report = result_files.reconstruct(recorded, calibrated, truth, (stack, model), pool, progress)
-    if region is not None:
-        mean, deviation = result.region(*region)
-        average = RegionReport(corner=region[0], size=region[1], mean=mean, deviation=deviation)
-        report = report.with_changes(region=average)
+    averages = tuple(
+        RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
+        for corner, size in regions
+        for mean, deviation in [result.region(corner, size)]
+    )
+    if averages:
+        report = report.with_changes(region=averages[0], regions=averages)
     result_files.write_estimate(output, result, {"title": recorded.scene.title})
     figures.write_estimate(output.with_suffix(".png"), result.estimate.reshape(result.shape))
     return report

@@ -17,17 +17,27 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 
 from ..forms.form import Form
-from .double_double import DoubleDouble, column_dots, exact
+from .double_double import DoubleDouble, as_exact, column_dots, exact
+from .error_norms import (
+    ALL_CHECKED,
+    NEGLIGIBLE_VARIANCE,
+    Indices,
+    Residuals,
+    distance_from_exact,
+    infinite,
+    last_digit,
+    norms,
+    relative,
+    sampled_pixels,
+    worst,
+)
 from .residuals import ExactResiduals
 
-Indices = NDArray[np.intp]
 Solution = tuple[DoubleDouble, DoubleDouble]
-Residuals = tuple[FloatArray, FloatArray]
 
 MAX_REFINEMENTS = 12
 MAX_STALLED = 4  # refinements in a row that do not halve the bound
@@ -39,40 +49,57 @@ SIGN_DRAWS = 6  # for noise-free measurements: a single draw may by chance agree
 REPRODUCTION_STEPS = 4  # solutions after which measurements without noise must be met
 ROUNDING_MARGIN = 1e4  # times the rounding of double-double arithmetic: some 1e-26 of the values
 SAFETY = 10  # for variances, which are checked on a sample and added up by expected errors
-ALL_CHECKED = 128  # pixels, up to which every variance is checked
-SAMPLE = 16  # pixels checked beyond that
-NEGLIGIBLE_VARIANCE = 1e-28  # relative to the prior variance: smaller posterior variances count as 0
 
 
 @dataclass(frozen=True)
 class RefinedSolution:
-    """The refined u, (K, q), and l, (M, q), with relative error bounds: (q,) `bound`, and `first` before refinement."""
+    """The refined u, (K, q), and l, (M, q), with relative error bounds: (q,) `bound`, and `first` before refinement.
+
+    low : (K, q), digits of u beyond those of float64
+    """
 
     coefficients: FloatArray
+    low: FloatArray
     multipliers: FloatArray
     bound: FloatArray
     first: FloatArray
     steps: int
 
 
-def refine(form: Form, residuals: ExactResiduals, shift: FloatArray, recorded: DoubleDouble) -> RefinedSolution:
-    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), with refinement; keep the solution of least bound."""
+def refine(
+    form: Form,
+    residuals: ExactResiduals,
+    shift: FloatArray | DoubleDouble,
+    recorded: DoubleDouble,
+    right: DoubleDouble | None = None,
+) -> RefinedSolution:
+    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), with refinement; keep the solution of least bound.
+
+    right : the right u, (K, q), where it is known: then the bound is the distance from it
+    """
     with np.errstate(all="ignore"):  # overflow gives a bound that fails every tolerance
-        (u, multipliers), bound, first, steps = _Certifier(form, residuals, shift, recorded).refined()
-        change = _relative(_norms(u.high - first), _norms(u.high))
-    return RefinedSolution(u.high, multipliers.high, bound, change + bound, steps)
+        certifier = _Certifier(form, residuals, as_exact(shift), recorded, right)
+        (u, multipliers), bound, first, steps = certifier.refined()
+        change = relative(norms(u.high - first), norms(u.high))
+    return RefinedSolution(u.high, u.low, multipliers.high, bound, change + bound, steps)
 
 
 def exact_variances(form: Form, residuals: ExactResiduals, pixels: Indices) -> tuple[FloatArray, FloatArray]:
-    """Return accurate posterior variances of some pixels and bounds on their errors: (n,) each.
-
-    With c = L^T e_i and r = 0 they are c u + u p - l q up to a term of second order in p and q, |M^-1/2 (p, q)|^2.
-    """
+    """Return accurate posterior variances of some pixels and bounds on their errors: (n,) each."""
     images = np.zeros((form.problem.unknowns, pixels.size))
     images[pixels, np.arange(pixels.size)] = 1.0
-    shift = form.problem.prior.apply_root_transposed(images)
+    return exact_sums(form, residuals, exact(form.problem.prior.apply_root_transposed(images)))
+
+
+def exact_sums(form: Form, residuals: ExactResiduals, shift: DoubleDouble) -> tuple[FloatArray, FloatArray]:
+    """Return accurate posterior variances of sums of pixels and bounds on their errors: (n,) each.
+
+    shift : (K, n), c = L^T w of the weights w of each. With r = 0 they are c u + u p - l q up to a term of second order
+    in p and q, |M^-1/2 (p, q)|^2.
+    """
     with np.errstate(all="ignore"):
-        certifier = _Certifier(form, residuals, shift, exact(np.zeros((form.problem.measurements, pixels.size))))
+        no_data = exact(np.zeros((form.problem.measurements, shift.high.shape[1])))
+        certifier = _Certifier(form, residuals, shift, no_data)
         (u, multipliers), *_ = certifier.refined()
         return certifier.quadratic_form(u, multipliers)
 
@@ -88,18 +115,20 @@ def variance_error(form: Form, residuals: ExactResiduals) -> float:
         variance = form.variance()
         if not np.isfinite(variance).all():
             return float("inf")
-        pixels = _sampled_pixels(variance, prior.variance)
+        if residuals.reference is not None:
+            return distance_from_exact(variance, residuals.reference)
+        pixels = sampled_pixels(variance, prior.variance)
         accurate, uncertainty = exact_variances(form, residuals, pixels)
         # A variance of 0 is right if the accurate one cannot be distinguished from 0.
         negligible = uncertainty <= NEGLIGIBLE_VARIANCE * prior.variance[pixels]
         zero = (variance[pixels] == 0) & (accurate <= uncertainty) & negligible
         error = np.where(zero, 0.0, np.abs(variance[pixels] - accurate) + uncertainty)
-        worst = _worst(_relative(error, accurate))
+        largest = worst(relative(error, accurate))
         if count > ALL_CHECKED:
             signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, 1))
             no_data = exact(np.zeros((form.problem.measurements, 1)))
-            worst = max(worst, _worst(refine(form, residuals, prior.apply_root_transposed(signs), no_data).first))
-    return SAFETY * worst
+            largest = max(largest, worst(refine(form, residuals, prior.apply_root_transposed(signs), no_data).first))
+    return SAFETY * largest + last_digit(variance)
 
 
 @dataclass(frozen=True)
@@ -108,42 +137,54 @@ class _Certifier:
 
     form: Form
     system: ExactResiduals
-    shift: FloatArray
+    shift: DoubleDouble
     recorded: DoubleDouble
+    right: DoubleDouble | None = None
 
     def refined(self) -> tuple[Solution, FloatArray, FloatArray, int]:
         """Return the best u and l, the bound on u, the first u, and the number of refinements."""
-        first, multiplier = self.form.solve(self.shift, self.recorded.high)
+        first, multiplier = self.form.solve(self.shift.high, self.recorded.high)
         solution: Solution = exact(first), exact(multiplier)
-        residuals, bound = self.residuals_and_bound(solution)
-        best, steps, stalled = (solution, bound), 0, 0
-        while steps < MAX_REFINEMENTS and stalled < MAX_STALLED and not (bound <= CONVERGED).all():
+        residuals, bound, estimated = self.residuals_and_bounds(solution)
+        best: tuple[Solution, FloatArray] = solution, bound
+        steps, stalled = 0, 0
+        while steps < MAX_REFINEMENTS and stalled < MAX_STALLED and not (best[1] <= CONVERGED).all():
             solution = self._corrected(solution, (residuals[0].high, residuals[1].high))
-            residuals, bound = self.residuals_and_bound(solution)
+            before = estimated
+            residuals, bound, estimated = self.residuals_and_bounds(solution)
+            # An estimate may be small by chance; it counts as much as the one before.
+            confirmed: FloatArray = np.fmin(bound, np.maximum(estimated, before))
             steps += 1
-            stalled = 0 if _worst(bound) < 0.5 * _worst(best[1]) else stalled + 1
-            if _worst(bound) < _worst(best[1]):
-                best = solution, bound
-        return *best, first, steps
+            stalled = 0 if worst(confirmed) < 0.5 * worst(best[1]) else stalled + 1
+            if worst(confirmed) < worst(best[1]):
+                best = solution, confirmed
+        return best[0], best[1], first, steps
 
     def _corrected(self, solution: Solution, residuals: Residuals) -> Solution:
         change, step = self.form.solve(*residuals)
         return solution[0] + exact(change), solution[1] + exact(step)
 
-    def residuals_and_bound(self, solution: Solution) -> tuple[Solution, FloatArray]:
-        """Return the residuals of u and l, and the bound of the module docstring relative to |u|: (q,)."""
+    def residuals_and_bounds(self, solution: Solution) -> tuple[Solution, FloatArray, FloatArray]:
+        """Return the residuals of u and l, a certain bound on the error of u relative to |u|, and an estimated one."""
         u, multipliers = solution
-        residuals = self.system.residuals(u, multipliers, exact(self.shift), self.recorded)
+        residuals = self.system.residuals(u, multipliers, self.shift, self.recorded)
+        if self.right is not None:
+            bound = relative(norms((u - self.right).high), norms(self.right.high))
+            return residuals, bound, bound
         values = residuals[0].high, residuals[1].high
-        rounding = self.system.rounding_errors(u.high, multipliers.high, self.shift, self.recorded.high)
-        distance, size = self._rigorous_distance(values, rounding), _norms(u.high)
-        if not (distance <= CONVERGED * size).all() and self.trusted[1]:
-            distance = np.fmin(distance, self._estimated_distance(values, rounding)[0])
+        rounding = self.system.rounding_errors(u.high, multipliers.high, self.shift.high, self.recorded.high)
+        bound, size = self._rigorous_distance(values, rounding), norms(u.high)
+        distance = bound
+        if not (bound <= CONVERGED * size).all() and self.trusted[1]:
+            distance = np.fmin(bound, self._estimated_distance(values, rounding)[0])
         if not self.system.problem.noisy:
             noise_free = self._noise_free(values), self._noise_free(self._contradictions(values, rounding))
             trusted = self.trusted[0]
-            distance += self._estimated_distance(*noise_free, SIGN_DRAWS)[0] if trusted else _infinite(noise_free)
-        return residuals, _relative(distance, size)
+            distance = distance + (
+                self._estimated_distance(*noise_free, SIGN_DRAWS)[0] if trusted else infinite(noise_free)
+            )
+            bound = np.full(size.shape, np.inf)
+        return residuals, relative(bound, size), relative(distance, size)
 
     def _contradictions(self, residuals: Residuals, rounding: Residuals) -> Residuals:
         """Uncertainties of noise-free measurements that contradict one another.
@@ -159,26 +200,27 @@ class _Certifier:
 
     def quadratic_form(self, u: DoubleDouble, multipliers: DoubleDouble) -> tuple[FloatArray, FloatArray]:
         """Return c u + u p - l q and a bound on its distance from c u of the exact u: (q,) each, for r = 0."""
-        p, q = self.system.residuals(u, multipliers, exact(self.shift), self.recorded)
-        errors = self.system.rounding_errors(u.high, multipliers.high, self.shift, self.recorded.high)
-        value = (column_dots(self.shift, u) + column_dots(u.high, p) - column_dots(multipliers.high, q)).high
+        p, q = self.system.residuals(u, multipliers, self.shift, self.recorded)
+        errors = self.system.rounding_errors(u.high, multipliers.high, self.shift.high, self.recorded.high)
+        shifted = column_dots(self.shift.high, u) + column_dots(self.shift.low, u)
+        value = (shifted + column_dots(u.high, p) - column_dots(multipliers.high, q)).high
         residuals = p.high, q.high
         second = self._rigorous_distance(residuals, errors)
         if not self.system.problem.noisy:
             noise_free = self._noise_free(residuals), self._noise_free(errors)
-            second += np.sqrt(self._estimated_distance(*noise_free)[1]) if self.trusted[0] else _infinite(noise_free)
+            second += np.sqrt(self._estimated_distance(*noise_free)[1]) if self.trusted[0] else infinite(noise_free)
         second = 4 * second**2
         if self.trusted[1]:
             second = np.fmin(second, self._estimated_distance(residuals, errors)[1])
         first = np.sum(np.abs(u.high) * errors[0], axis=0) + np.sum(np.abs(multipliers.high) * errors[1], axis=0)
-        rounding = self.system.rounding * np.sum(np.abs(self.shift * u.high), axis=0)
+        rounding = self.system.rounding * np.sum(np.abs(self.shift.high * u.high), axis=0)
         return value, first + second + rounding
 
     def _rigorous_distance(self, residuals: Residuals, rounding: Residuals) -> FloatArray:
         """|p| + |S^-1 q| / 2 over the measurements with noise: (q,)."""
         noisy = self.system.problem.noise_variance > 0
         white = (np.abs(residuals[1]) + rounding[1])[noisy] / self.system.problem.deviation[noisy, None]
-        return _norms(np.abs(residuals[0]) + rounding[0]) + 0.5 * _norms(white)
+        return norms(np.abs(residuals[0]) + rounding[0]) + 0.5 * norms(white)
 
     def _noise_free(self, residuals: Residuals) -> Residuals:
         """The part q of measurements without noise; everything else is 0."""
@@ -193,7 +235,7 @@ class _Certifier:
         signs = [[rng.choice([-1.0, 1.0], part.shape) for part in rounding] for _ in range(draws)]
         sides = [residuals, *((rounding[0] * p, rounding[1] * q) for p, q in signs)]
         solved = [(self.form.solve(p, q), p, q) for p, q in sides]
-        distances = [_norms(u) for (u, _), _, _ in solved]
+        distances = [norms(u) for (u, _), _, _ in solved]
         energies = [np.abs(np.sum(u * p, axis=0)) + np.abs(np.sum(pull * q, axis=0)) for (u, pull), p, q in solved]
         return 2 * (distances[0] + np.max(distances[1:], axis=0)), 4 * (energies[0] + np.max(energies[1:], axis=0))
 
@@ -210,49 +252,30 @@ class _Certifier:
         zero = exact(np.zeros_like(u.high)), exact(np.zeros_like(white))
         p, q = self.system.residuals(u, multipliers, *zero)  # minus the right-hand sides that u and l solve exactly
         solution = self.form.solve(-p.high, -q.high)[0] + self.form.solve(-p.low, -q.low)[0]
-        error = np.nan_to_num(_relative(_norms(solution - u.high), _norms(u.high)), nan=np.inf)
+        error = np.nan_to_num(relative(norms(solution - u.high), norms(u.high)), nan=np.inf)
         met = bool(noisy.all()) or self._meets_noise_free(u.high[:, :PROBES])
         right = error <= REPRODUCTION_TOLERANCE
         return met and bool(right[:PROBES].all()), met and bool(right.all())
 
-    def _meets_noise_free(self, shift: FloatArray) -> bool:
-        """True if refinement meets r = 0 of noise-free measurements to ROUNDING_MARGIN times the rounding error."""
-        right = exact(shift), exact(np.zeros((self.system.problem.measurements, shift.shape[1])))
-        solution: Solution = exact(np.zeros_like(shift)), right[1]
-        values: Residuals = shift, right[1].high
+    def _meets_noise_free(self, u: FloatArray) -> bool:
+        """True if refinement meets noise-free measurements to ROUNDING_MARGIN times the rounding error.
+
+        With c = u they record 0 first, then what H L u' gives for another u', while those with noise record anything: a
+        form that drops one of two nearly equal rows for one with noise meets 0 with both, and not this.
+        """
+        other = np.random.default_rng(3)
+        zero = np.zeros((self.system.problem.measurements, u.shape[1]))
+        seen = self.system.forward(exact(other.normal(size=u.shape)))
+        signal = np.where(self.system.problem.noise_variance > 0, self.system.signal, 0.0)
+        seen = seen + exact(signal[:, None] * other.normal(size=zero.shape))
+        shift = np.hstack([u, u])
+        right = DoubleDouble(np.hstack([zero, seen.high]), np.hstack([zero, seen.low]))
+        solution: Solution = exact(np.zeros_like(shift)), exact(np.zeros_like(right.high))
+        values: Residuals = shift, right.high
         for _ in range(REPRODUCTION_STEPS):
             solution = self._corrected(solution, values)
-            coefficients, multipliers = self.system.residuals(solution[0], solution[1], right[0], right[1])
+            coefficients, multipliers = self.system.residuals(solution[0], solution[1], exact(shift), right)
             values = coefficients.high, multipliers.high
-        rounding = self.system.rounding_errors(solution[0].high, solution[1].high, shift, right[1].high)[1]
+        rounding = self.system.rounding_errors(solution[0].high, solution[1].high, shift, right.high)[1]
         noise_free = self.system.problem.noise_variance == 0
         return bool((np.abs(values[1]) <= ROUNDING_MARGIN * rounding)[noise_free].all())
-
-
-def _sampled_pixels(variance: FloatArray, prior: FloatArray) -> Indices:
-    if variance.size <= ALL_CHECKED:
-        return np.arange(variance.size)
-    ratio = np.divide(variance, prior, out=np.ones_like(variance), where=prior > 0)
-    extremes = [variance.argmin(), variance.argmax(), ratio.argmin(), ratio.argmax()]
-    others = np.random.default_rng(2).choice(variance.size, SAMPLE - len(extremes), replace=False)
-    return np.concatenate([extremes, others])
-
-
-def _norms(values: FloatArray) -> FloatArray:
-    """The 2-norm of every column, without overflow: (q,)."""
-    largest = np.abs(values).max(axis=0, initial=0.0)
-    scale = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
-    return scale * np.linalg.norm(values / scale, axis=0)
-
-
-def _infinite(pairs: tuple[Residuals, Residuals]) -> FloatArray:
-    """Infinity for every column with a value other than 0, else 0: (q,)."""
-    return np.where(np.any([part.any(axis=0) for pair in pairs for part in pair], axis=0), np.inf, 0.0)
-
-
-def _relative(error: FloatArray, size: FloatArray) -> FloatArray:
-    return np.divide(error, size, out=np.where(error == 0, 0.0, np.inf), where=size > 0)  # NaN is not 0
-
-
-def _worst(bound: FloatArray) -> float:
-    return float(np.nan_to_num(bound, nan=np.inf, posinf=np.inf).max(initial=0.0))

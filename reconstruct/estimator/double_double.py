@@ -44,6 +44,11 @@ def exact(values: FloatArray) -> DoubleDouble:
     return DoubleDouble(values, np.zeros_like(values))
 
 
+def as_exact(values: FloatArray | DoubleDouble) -> DoubleDouble:
+    """Return double-double numbers as they are, and convert a float64 array without error."""
+    return values if isinstance(values, DoubleDouble) else exact(values)
+
+
 @dataclass(frozen=True)
 class SparseRows:
     """A matrix stored for `times`: (width, rows) `data` and the column `index` of each entry."""

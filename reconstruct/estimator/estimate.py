@@ -24,12 +24,15 @@ from ..forms.covariance import covariance
 from ..forms.dual import dual
 from ..forms.form import Form, NotSolvableError
 from ..forms.information import information
+from ..forms.multiple_precision import MultiplePrecision
 from ..forms.square_root_covariance import square_root_covariance
 from ..forms.square_root_information import square_root_information
 from ..forms.svd import svd
 from ..problem import Problem
 from .certificate import RefinedSolution, refine, variance_error
+from .double_double import DoubleDouble
 from .memory import needed_memory
+from .prior_rounding import estimate_rounding, variance_rounding
 from .refined_form import RefinedForm
 from .residuals import ExactResiduals
 
@@ -72,7 +75,8 @@ class Solver:
     @property
     def digits(self) -> float:
         """Correct decimal digits of the estimate according to the bound."""
-        return -log10(max(self.bound if self.bound is not None else self.variance_bound, EPS))
+        bound = self.bound if self.bound is not None else self.variance_bound
+        return -log10(max(bound, EPS)) if bound >= 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,7 @@ class Estimate:
 
 def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, Solver]:
     """Return the form whose posterior variances are accurate to `tolerance`. Raises InputError if there is none."""
-    form, solver, _ = _first_accepted(problem, method, tolerance, None)
+    form, solver, _ = _first_accepted(ExactResiduals(problem), method, tolerance, None)
     return form, solver
 
 
@@ -105,11 +109,19 @@ def estimate(problem: Problem, recorded: FloatArray, method: str = "auto", toler
         raise InputError(
             f"expected {problem.measurements} finite measurements, got others; leave dead pixels out first"
         )
-    form, solver, refined = _first_accepted(problem, method, tolerance, recorded)
+    residuals = ExactResiduals(problem)
+    form, solver, refined = _first_accepted(residuals, method, tolerance, recorded)
     if refined is None:
         raise RuntimeError("measurements were given, but no estimate was computed")
-    image = problem.prior.mean + problem.prior.apply_root(refined.coefficients[:, 0])
-    return Estimate(image, refined.coefficients[:, 0], refined.multipliers[:, 0], form, solver)
+    multipliers = refined.multipliers[:, 0]
+    with np.errstate(all="ignore"):
+        image = residuals.image(DoubleDouble(refined.coefficients, refined.low)).high[:, 0]
+    if not (np.isfinite(image).all() and np.isfinite(multipliers).all()):
+        raise InputError(
+            "the estimate or its multipliers leave the range of double precision; scale H, or raise"
+            " estimator.noise_variance"
+        )
+    return Estimate(image, refined.coefficients[:, 0], multipliers, form, solver)
 
 
 def _candidates(problem: Problem, method: str) -> tuple[list[str], str]:
@@ -130,33 +142,40 @@ def _candidates(problem: Problem, method: str) -> tuple[list[str], str]:
 
 
 def _first_accepted(
-    problem: Problem, method: str, tolerance: float, recorded: FloatArray | None
+    residuals: ExactResiduals, method: str, tolerance: float, recorded: FloatArray | None
 ) -> tuple[Form, Solver, RefinedSolution | None]:
+    problem = residuals.problem
     names, why = _candidates(problem, method)
-    residuals = ExactResiduals(problem)
+    reference = _exact_solution(residuals, recorded)
     tried: list[tuple[str, str]] = []
-    refined: RefinedSolution | None = None
-    solver = Solver("", why, 0.0, 0.0)
     refinable: list[Form] = []  # forms whose estimate is accurate and whose variances are not
+    solver, refined = Solver("", why, 0.0, 0.0), None
     for name in names:
         try:
             form = _factorised(name, problem)
-        except NotSolvableError as error:
-            tried.append((name, str(error)))
+            error, rounding = variance_error(form, residuals), variance_rounding(form)
+            solver = Solver(name, why, form.condition, error + rounding, tuple(tried))
+            _check_rounding(error, rounding, tolerance)
+            solver, refined = _with_estimate(solver, form, residuals, recorded, reference)
+        except (NotSolvableError, np.linalg.LinAlgError) as failure:
+            tried.append((name, str(failure)))
             continue
-        solver = Solver(name, why, form.condition, variance_error(form, residuals), tuple(tried))
-        solver, refined = _with_estimate(solver, form, residuals, recorded)
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
-        if (solver.bound or 0.0) <= tolerance:
+        if solver.bound is None or solver.bound <= tolerance:
             refinable.append(form)
-    for form in reversed(refinable if method == "auto" else []):
-        corrected = RefinedForm(problem, form.condition, form, residuals)
-        solver = Solver(f"{form.name}, corrected", why, form.condition, corrected.variance_error, tuple(tried))
-        solver, refined = _with_estimate(solver, form, residuals, recorded)
+    for form in _last_resorts(residuals, refinable) if method == "auto" else []:
+        error = form.variance_error + variance_rounding(form)
+        solver = Solver(form.description, why, form.condition, error, tuple(tried))
+        if isinstance(form, RefinedForm):
+            solver, refined = _with_estimate(solver, form.form, residuals, recorded, None)
+        elif reference is not None:
+            columns = reference.coefficients[:, 0], reference.multipliers[:, 0]
+            bound = float(reference.bound[0]) + estimate_rounding(form, *columns)
+            solver, refined = replace(solver, bound=bound), reference
         if _accepted(solver, tolerance, tried):
-            return corrected, solver, refined
-    if refined is not None and recorded is not None and (solver.bound or 0.0) < UNKNOWN_BOUND:
+            return form, solver, refined
+    if refined is not None and recorded is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND:
         _check_contradictions(residuals, recorded, refined)
     raise InputError(
         f"no form of the estimator reaches a relative error of {tolerance:g} here ("
@@ -165,28 +184,74 @@ def _first_accepted(
     )
 
 
+def _check_rounding(error: float, rounding: float, tolerance: float) -> None:
+    """Raise InputError if the rounding of P0 alone exceeds the tolerance; `error` is that of the form."""
+    if error <= tolerance < rounding:
+        raise InputError(
+            f"the prior's covariance is so nearly singular that its rounding changes variances by {rounding:.1e},"
+            f" relative, where {tolerance:g} is allowed; shorten prior.correlation_length, or raise estimator.tolerance"
+        )
+
+
+def _last_resorts(residuals: ExactResiduals, refinable: list[Form]) -> list[RefinedForm] | list[MultiplePrecision]:
+    """Return multiple precision for a small problem, else forms whose every solution is refined, most robust first."""
+    if residuals.reference is not None:
+        return [residuals.reference]
+    return [RefinedForm(form.problem, form.condition, form, residuals) for form in reversed(refinable)]
+
+
+def _exact_solution(residuals: ExactResiduals, recorded: FloatArray | None) -> RefinedSolution | None:
+    """Return the estimate of a small problem in multiple precision. Raises InputError for contradictions."""
+    if residuals.reference is None or recorded is None:
+        return None
+    try:
+        solution = residuals.reference.estimate(recorded)
+    except NotSolvableError as error:
+        raise InputError(f"the estimate is too sensitive: {error}; raise estimator.noise_variance") from error
+    _refuse_contradiction(solution.contradiction)
+    size = float(np.linalg.norm(solution.high))
+    uncertainty = 0.0 if solution.uncertainty == 0 else (solution.uncertainty / size if size > 0 else np.inf)
+    bound = np.array([uncertainty + EPS])
+    columns = solution.high[:, None], solution.low[:, None], solution.multipliers[:, None]
+    return RefinedSolution(*columns, bound, bound, 0)
+
+
 def _with_estimate(
-    solver: Solver, form: Form, residuals: ExactResiduals, recorded: FloatArray | None
+    solver: Solver,
+    form: Form,
+    residuals: ExactResiduals,
+    recorded: FloatArray | None,
+    reference: RefinedSolution | None,
 ) -> tuple[Solver, RefinedSolution | None]:
     if recorded is None:
         return solver, None
-    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), residuals.recorded(recorded))
-    bound = float(refined.bound[0]) + EPS
-    if bound <= USEFUL_BOUND:
+    right = None if reference is None else DoubleDouble(reference.coefficients, reference.low)
+    with np.errstate(all="ignore"):
+        deviation = residuals.recorded(recorded)
+    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation, right)
+    bound = float(refined.bound[0]) + (EPS if reference is None else float(reference.bound[0]))
+    bound += estimate_rounding(form, refined.coefficients[:, 0], refined.multipliers[:, 0])
+    if reference is None and bound <= USEFUL_BOUND:
         _check_contradictions(residuals, recorded, refined)
     return replace(solver, bound=bound, refinements=refined.steps), refined
 
 
 def _accepted(solver: Solver, tolerance: float, tried: list[tuple[str, str]]) -> bool:
-    worst = max(solver.variance_bound, solver.bound or 0.0)
-    if worst > tolerance:
-        quantity = "variances are" if solver.variance_bound > tolerance else "the estimate is"
+    """Return True if both bounds meet the tolerance, which NaN does not; else note the reason."""
+    met = solver.variance_bound <= tolerance and (solver.bound is None or solver.bound <= tolerance)
+    if not met:
+        bad = not solver.variance_bound <= tolerance
+        quantity, worst = ("variances are", solver.variance_bound) if bad else ("the estimate is", solver.bound)
         tried.append((solver.method, f"{quantity} accurate to {worst:.1e} only"))
-    return worst <= tolerance
+    return met
 
 
 def _check_contradictions(residuals: ExactResiduals, recorded: FloatArray, refined: RefinedSolution) -> None:
-    misfit = residuals.contradiction(recorded, refined.coefficients[:, 0])
+    with np.errstate(all="ignore"):
+        _refuse_contradiction(residuals.contradiction(recorded, DoubleDouble(refined.coefficients, refined.low)))
+
+
+def _refuse_contradiction(misfit: float) -> None:
     if misfit > CONTRADICTION:
         raise InputError(
             f"measurements without noise contradict one another or the prior by {misfit:.2g} of their values; set"

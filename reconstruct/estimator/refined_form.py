@@ -17,6 +17,7 @@ from ommatid.runtime.arrays import FloatArray
 from ..forms.form import Form
 from .certificate import exact_variances, refine
 from .double_double import exact
+from .error_norms import last_digit
 from .residuals import ExactResiduals
 
 CHUNK = 256  # pixels solved together
@@ -48,8 +49,14 @@ class RefinedForm(Form):
         return self._variances[0]
 
     @property
+    def description(self) -> str:
+        """Name of the form that is refined."""
+        return f"{self.form.name}, corrected"
+
+    @property
     def variance_error(self) -> float:
         """A bound on the relative error of every posterior variance."""
         variance, error = self._variances
         error = np.where(error >= 0, error, np.inf)  # NaN counts as an unbounded error
-        return float(np.divide(error, variance, out=np.where(error > 0, np.inf, 0.0), where=variance > 0).max())
+        relative = np.divide(error, variance, out=np.where(error > 0, np.inf, 0.0), where=variance > 0)
+        return float(relative.max(initial=0.0)) + last_digit(variance)

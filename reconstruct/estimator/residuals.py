@@ -17,6 +17,8 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 
+from ..forms.form import NotSolvableError
+from ..forms.multiple_precision import MultiplePrecision, multiple_precision
 from ..prior import Prior
 from ..problem import Problem
 from .double_double import ROUNDING, DoubleDouble, SparseRows, exact, sparse_rows
@@ -47,6 +49,14 @@ class ExactResiduals:
         prior = self.problem.prior
         return abs(self.problem.matrix), Prior(prior.mean, np.abs(prior.root))
 
+    @cached_property
+    def reference(self) -> MultiplePrecision | None:
+        """The problem in multiple precision; None if it is not small."""
+        try:
+            return multiple_precision(self.problem)
+        except NotSolvableError:
+            return None
+
     @property
     def rounding(self) -> float:
         """Relative rounding error of the residuals, from the number of terms in their longest sum."""
@@ -67,8 +77,11 @@ class ExactResiduals:
 
     def adjoint(self, measurements: DoubleDouble) -> DoubleDouble:
         """Apply L^T H^T."""
+        return self.root_transposed(self._transposed.times(measurements))
+
+    def root_transposed(self, image: DoubleDouble) -> DoubleDouble:
+        """Apply L^T."""
         prior = self.problem.prior
-        image = self._transposed.times(measurements)
         return image.scaled(prior.root[:, None]) if prior.independent else self._root[1].times(image)
 
     def recorded(self, values: FloatArray) -> DoubleDouble:
@@ -92,14 +105,19 @@ class ExactResiduals:
         q = np.abs(recorded) + matrix @ prior.apply_root(u) + self.problem.noise_variance[:, None] * multipliers
         return self.rounding * p, self.rounding * q
 
-    def contradiction(self, recorded: FloatArray, u: FloatArray) -> float:
+    def image(self, u: DoubleDouble) -> DoubleDouble:
+        """Return f0 + L u, (N, 1), of u, (K, 1)."""
+        prior = self.problem.prior
+        deviation = u.scaled(prior.root[:, None]) if prior.independent else self._root[0].times(u)
+        return exact(prior.mean[:, None]) + deviation
+
+    def contradiction(self, recorded: FloatArray, u: DoubleDouble) -> float:
         """Return the largest relative misfit |g - H f|_i / (|g| + |H| |f|)_i of the measurements without noise.
 
-        Rounding leaves 1e-16, float32 measurements 1e-7; contradictory measurements leave more.
+        Rounding leaves 1e-16, float32 measurements 1e-7; contradictory measurements leave more. NaN counts as 1.
         """
         noise_free = self.problem.noise_variance == 0
-        misfit = (self.recorded(recorded) - self.forward(exact(u[:, None]))).high[:, 0]
-        matrix, prior = self._magnitudes
-        size = np.abs(recorded) + matrix @ (np.abs(prior.mean) + prior.apply_root(np.abs(u)))
-        relative = np.divide(np.abs(misfit), size, out=np.zeros_like(size), where=noise_free & (size > 0))
-        return float(relative.max(initial=0.0))
+        misfit = (self.recorded(recorded) - self.forward(u)).high[:, 0]
+        size = np.abs(recorded) + self._magnitudes[0] @ np.abs(self.image(u).high[:, 0])
+        relative = np.divide(np.abs(misfit), size, out=np.zeros_like(size), where=noise_free & (size != 0))
+        return float(np.nan_to_num(relative, nan=1.0).max(initial=0.0))

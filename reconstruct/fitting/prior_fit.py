@@ -2,7 +2,8 @@
 
 A larger image is cut into tiles, whose likelihoods are multiplied as if they were independent, so that the cost grows
 with the number of pixels and not with its cube (Stein, Chi and Welty 2004). The search starts from the best points of a
-grid, since the likelihood has a second maximum where the whole image is explained as noise, or all noise as image.
+grid, since the likelihood has a second maximum where the whole image is explained as noise, or all noise as image. A
+fit is doubtful unless it is a maximum inside the range, and the stack shows an image at all.
 """
 
 from __future__ import annotations
@@ -10,16 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 from math import log
-from typing import Any
 
 import numpy as np
-from scipy import linalg, optimize, sparse
+from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from ..methods.method import EstimationTask
 from .evidence import Evidence
+from .evidence_search import Score, SearchResult, search
 
 TILE = 24  # pixels, side of the tiles that a larger image is cut into
 MAX_COMPLETE = 10_000  # pixels, of an image all of whose tiles are used
@@ -30,11 +31,8 @@ GRID_LENGTHS = (1.0, 5.0, 25.0)  # pixels
 GRID_NOISES = (1e-8, 1e-5, 1e-3, 1e-1)  # of the measurements' mean square
 STARTS = 2  # points of the grid from which a search starts
 RANGE = 1e12  # variances lie within this factor of the measurements' mean square
-STOP = {"ftol": 1e-7}  # a thousandth of one unit of log likelihood, far below what it can distinguish
-STEP = 1e-3  # of the logarithms, for the curvature
+SEEN = 7.0  # units of log likelihood by which an image must be more likely than none: p = 1e-3 for two parameters
 MIN_MEASUREMENTS = 10  # for three parameters
-FAILED = 1e300  # score where float64 does not suffice
-ON_BOUND = 1e-6  # distance of a logarithm from its bound below which the fit is doubtful
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,9 @@ class PriorFit:
 
     spread : standard deviations of the logarithms of the fitted parameters, in this order, from the curvature of the
         likelihood; NaN where it is not positive
-    measurements : number used;  doubtful : True if a parameter lies on the bound of its range
+    measurements : number used
+    doubtful : True if a parameter lies on the bound of its range, if the likelihood has no maximum there, or if none of
+        its parameters is needed to explain the measurements
     """
 
     variance: float | None
@@ -105,23 +105,25 @@ def fit_prior(evidence: Evidence, blocks: list[Evidence] | None = None) -> Prior
     def score(logarithms: FloatArray) -> tuple[float, FloatArray]:
         try:
             parts = [block.score(logarithms) for block in blocks]
-        except linalg.LinAlgError:  # the noise is too small beside the prior for float64
-            return FAILED, np.zeros(logarithms.size)
-        return sum(value for value, _ in parts), np.sum([slope for _, slope in parts], axis=0)
+        except (linalg.LinAlgError, OverflowError):  # the noise is too small beside the prior for float64
+            return float("inf"), np.zeros(logarithms.size)
+        value, slope = sum(value for value, _ in parts), np.sum([slope for _, slope in parts], axis=0)
+        return (value, slope) if np.isfinite([value, *slope]).all() else (float("inf"), np.zeros(logarithms.size))
 
     bounds, starts = _bounds(evidence), _starts(evidence)
-    starts = sorted(starts, key=lambda start: score(start)[0])[:STARTS]
-    minimize: Any = optimize.minimize
-    results = [minimize(score, start, jac=True, method="L-BFGS-B", bounds=bounds, options=STOP) for start in starts]
-    best: FloatArray = min(results, key=lambda result: float(result.fun)).x
-    doubtful = any(min(value - low, high - value) < ON_BOUND for value, (low, high) in zip(best, bounds, strict=True))
-    parameters = [float(number) for number in np.exp(best)]
+    best = search(score, sorted(starts, key=lambda start: score(start)[0])[:STARTS], bounds)
+    if not np.isfinite(best.value):
+        raise InputError(
+            "the prior cannot be fitted in double precision; raise estimator.noise_variance, or set it to 'fit'"
+        )
+    doubtful = best.on_bound or not best.is_maximum or not _shows_image(score, evidence, best)
+    parameters = [float(number) for number in np.exp(best.point)]
     prior_known = evidence.prior is not None
     return PriorFit(
         variance=None if prior_known else parameters[0],
         length=None if prior_known else parameters[1],
         noise_variance=None if evidence.noise_known else parameters[-1],
-        spread=_spread([score(best + step)[1] - score(best - step)[1] for step in STEP * np.eye(best.size)]),
+        spread=best.spread,
         measurements=used,
         doubtful=doubtful,
     )
@@ -158,12 +160,16 @@ def _bounds(evidence: Evidence) -> list[tuple[float, float]]:
     return ([variances, lengths] if evidence.prior is None else []) + ([] if evidence.noise_known else [variances])
 
 
-def _spread(differences: list[FloatArray]) -> tuple[float, ...]:
-    """Return standard deviations from differences of the gradient over twice the step of each parameter."""
-    curvature = np.array(differences) / (2 * STEP)
-    try:
-        inverse = np.diagonal(np.linalg.inv(0.5 * (curvature + curvature.T)))
-    except np.linalg.LinAlgError:
-        inverse = np.full(len(differences), np.nan)
-    with np.errstate(invalid="ignore"):
-        return tuple(float(value) for value in np.sqrt(inverse))
+def _shows_image(score: Score, evidence: Evidence, best: SearchResult) -> bool:
+    """Return True if the measurements are much less likely with noise alone: a variance of the prior of almost 0.
+
+    A known prior is not asked for; where the noise is fitted, it explains the whole mean square instead.
+    """
+    if evidence.prior is not None:
+        return True
+    bounds = _bounds(evidence)
+    without = best.point.copy()
+    without[0] = bounds[0][0]
+    if not evidence.noise_known:
+        without[2] = _log_mean_square(evidence)
+    return score(without)[0] > best.value + SEEN

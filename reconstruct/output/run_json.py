@@ -250,6 +250,7 @@ class RunReport(Record):
     spent: TimeReport
     held_out: HeldOutReport | None = None
     region: RegionReport | None = None
+    regions: tuple[RegionReport, ...] = ()
     depth: tuple[DepthBin, ...] = ()
     study: tuple[StudyCase, ...] = ()
 

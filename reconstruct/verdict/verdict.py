@@ -190,8 +190,8 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
         )
     if check.fit_doubtful:
         findings.reasons.append(
-            "a fitted value of the prior or of the noise lies on the bound of its range, so the stack does not"
-            " determine it"
+            "the stack does not determine the fitted prior or noise: a value lies on the bound of its range, the"
+            " likelihood has no maximum there, or noise alone explains the measurements"
         )
     if check.left_out:
         findings.notes.append(

@@ -1,8 +1,9 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms` and
-`frames`. No speed is asserted. `python -m tests.benchmarks coverage` measures error bars instead, for hours, and is run
-by itself (`coverage --help`). Other load slows both sides of a ratio alike, so compare ratios rather than times.
+`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`, `frames`
+and `nasty`, which takes half an hour. No speed is asserted. `python -m tests.benchmarks coverage` measures error bars
+instead, for hours, and is run by itself (`coverage --help`). Other load slows both sides of a ratio alike, so compare
+ratios rather than times.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from .lenses import SAMPLES as LENS_SAMPLES
 from .lenses import SIDE as LENS_SIDE
 from .lenses import VARIANT as LENS_VARIANT
 from .lenses import lens_rows, transport_rows
+from .nasty import nasty_table
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
@@ -109,6 +111,10 @@ def _frames() -> Iterator[Table]:
         yield table()
 
 
+def _nasty() -> Iterator[Table]:
+    yield nasty_table()
+
+
 def _lenses() -> Iterator[Table]:
     def rows() -> Iterator[tuple[str, Row]]:
         for row in lens_rows():
@@ -142,6 +148,7 @@ PARTS: dict[str, Callable[[], Iterator[Table]]] = {
     "leaving-out": _leaving_out,
     "forms": _forms,
     "frames": _frames,
+    "nasty": _nasty,
 }
 
 

@@ -10,6 +10,7 @@ from scipy import sparse, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.fitting.evidence import Evidence
+from ommatid.reconstruct.fitting.evidence_search import search
 from ommatid.reconstruct.fitting.prior_fit import PriorFit, fit_prior
 from ommatid.reconstruct.prior import Prior, exponential, independent, prior_of
 from ommatid.reconstruct.problem import Problem
@@ -177,3 +178,48 @@ def test_large_footprints_get_larger_tiles() -> None:
     residual = wide @ drawn(prior, 0) + np.random.default_rng(1).normal(size=64)
     fit = fit_prior(Evidence(sparse.csr_array(wide), residual, np.zeros(64), (30, 30), prior, False))
     assert fit.measurements == 64
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_prior_fits_at_the_noise_of_the_paper(seed: int) -> None:
+    """A search over the whole range steps to its bounds there, finds no evidence, and returns where it began."""
+    shape = (14, 14)
+    matrix = ideal_matrix(camera(shape, (("1/3", [3, 3], "fit"), ("1/5", [5, 5], "fit"), ("1/4", [4, 4], "fit"))))
+    rng = np.random.default_rng([seed, 5])
+    residual = matrix @ (exponential(0.0, 1000.0, shape, 4.0).root @ rng.normal(size=shape[0] * shape[1]))
+    residual = residual + 1e-2 * rng.normal(size=residual.size)
+    whole = Evidence(matrix, residual, np.full(residual.size, 1e-4), shape, None, True)
+    fit = fit_prior(whole)
+    assert fit.variance is not None
+    assert fit.length is not None
+    assert not fit.doubtful
+    assert whole.score(np.log([fit.variance, fit.length]))[0] <= whole.score(np.log([1000.0, 4.0]))[0]
+    assert np.abs(np.log(np.array([fit.variance, fit.length]) / (1000.0, 4.0)) / fit.spread).max() < 4
+
+
+def test_a_search_keeps_out_of_where_no_evidence_is() -> None:
+    """The minimum of a steep valley beside a region without a score, found to a hundredth of its width."""
+
+    def score(point: FloatArray) -> tuple[float, FloatArray]:
+        if point[0] > 6 or point.sum() > 9:
+            return float("inf"), np.zeros(2)
+        across, along = point[0] - point[1] - 3, point.sum() - 7
+        slope = np.array([2e4 * across + 20 * along, -2e4 * across + 20 * along])
+        return 1e4 * across**2 + 10 * along**2 - 2000, slope
+
+    result = search(score, [np.array([-10.0, 4.0]), np.array([5.9, 3.0])], [(-30.0, 30.0), (-30.0, 30.0)])
+    assert result.is_maximum
+    assert not result.on_bound
+    assert np.abs(result.point - (5.0, 2.0)).max() < 0.01 * max(result.spread) + 1e-3
+    assert result.spread == pytest.approx([(1 / 80 + 1 / 8e4) ** 0.5] * 2, rel=1e-2)
+
+
+@pytest.mark.parametrize("noise_known", [True, False])
+def test_an_image_that_no_measurement_shows_makes_the_fit_doubtful(noise_known: bool) -> None:
+    """A checkerboard under averages of 2 x 2 and 4 x 4 pixels is grey: the fit would promise almost no error."""
+    shape = (12, 12)
+    matrix = ideal_matrix(camera(shape, (("1/2", [2, 2], "fit"), ("1/4", [4, 4], "fit"))))
+    board = 255.0 * (np.indices(shape).sum(axis=0) % 2).ravel()
+    residual = matrix @ (board - 127.5) + 1e-2 * np.random.default_rng(0).normal(size=matrix.shape[0])
+    known = np.full(residual.size, 1e-4 if noise_known else 0.0)
+    assert fit_prior(Evidence(matrix, residual, known, shape, None, noise_known)).doubtful

@@ -189,7 +189,9 @@ def test_a_region_from_the_command_line(kept: Path, ommatid: Command) -> None:
     report = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["region"]
     assert (report["corner"], report["size"]) == ([2, 3], [4, 5])
     assert report["deviation"] > 0
-    assert "mean of 4 x 5 pixels at 2, 3" in ommatid("reconstruct", *files, "2,3,4,5").out
+    both = ommatid("reconstruct", *files, "2,3,4,5", "--region", "0,0,2,2").out
+    assert "mean of 4 x 5 pixels at 2, 3" in both
+    assert "mean of 2 x 2 pixels at 0, 0" in both
     for wrong in ("2,3", "a,b,c,d", "0,0,99,99"):
         assert ommatid("reconstruct", *files, wrong).code == 2
 

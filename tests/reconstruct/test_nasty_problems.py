@@ -1,0 +1,145 @@
+"""The estimator's silent losses: problems at the limits of float64 against rational numbers and other exact methods."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from ommatid.reconstruct.estimator import residuals
+from ommatid.reconstruct.estimator.error_bars import bias_of, sum_variance
+from ommatid.reconstruct.estimator.estimate import estimate, factorise
+from ommatid.reconstruct.forms.form import NotSolvableError
+from ommatid.reconstruct.forms.multiple_precision import multiple_precision
+from ommatid.reconstruct.prior import Prior, exponential, independent
+from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.errors import InputError
+
+from ..benchmarks.nasty import FAMILIES, SILENT, assess, nearly_equal_exact, nearly_equal_noisy
+from ..exact_rationals import rational_answer, relative_error
+
+EACH = 334  # problems of every family in the whole suite: 5,010
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_no_random_problem_is_silently_wrong(family: str) -> None:
+    """Every one is right to its stated bound, or refused; of most families nine in ten are answered."""
+    outcomes = [assess(family, seed) for seed in range(EACH)]
+    assert [outcome for outcome in outcomes if outcome.outcome == SILENT] == []
+    refused = sum(outcome.outcome == "refused" for outcome in outcomes) / EACH
+    assert refused <= {"contradiction": 0.65, "denormal noise": 0.3, "nearly equal rows, noise-free": 0.15}.get(
+        family, 0.1
+    )
+
+
+def test_a_bound_that_is_small_by_chance_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A problem of 2 x 2 whose first refinement happens to find 1e-17 where 1e-7 is left."""
+    _without_multiple_precision(monkeypatch)
+    matrix = np.array([[-0.24424669002776175, -0.21412895875953997], [-0.24424669002776692, -0.21412895875953805]])
+    prior = Prior(np.array([127.5, 127.5]), np.array([5906.196726545196, 9.316377290829726]))
+    noise = np.array([7.4696738971771692e-15, 1.4598793799778568e-22])
+    _right_or_refused(
+        Problem(sparse.csr_array(matrix), prior, noise), np.array([-2111.8053177040797, -2111.805317724425])
+    )
+    for seed in range(20):
+        nasty = nearly_equal_noisy(np.random.default_rng(seed))
+        _right_or_refused(nasty.problem, nasty.recorded)
+
+
+def test_a_dropped_row_without_noise_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows that differ in the last bit beside rows with noise, by the certificate of larger problems."""
+    _without_multiple_precision(monkeypatch)
+    for seed in range(30):
+        nasty = nearly_equal_exact(np.random.default_rng(seed))
+        if (nasty.problem.noise_variance == 0).sum() == 2:
+            _right_or_refused(nasty.problem, nasty.recorded)
+
+
+def _without_multiple_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: Problem) -> None:
+        raise NotSolvableError("too large")
+
+    monkeypatch.setattr(residuals, "multiple_precision", refuse)
+
+
+def _right_or_refused(problem: Problem, recorded: np.ndarray) -> None:
+    try:
+        solution = estimate(problem, recorded)
+    except InputError:
+        return
+    exact = rational_answer(problem, recorded)
+    bound = solution.solver.bound
+    assert bound is not None
+    assert relative_error(solution.coefficients, exact.coefficients) <= max(10 * bound, 1e-9)
+
+
+@pytest.mark.parametrize("size", [1e300, 1e150, 1e-100])
+def test_entries_at_the_ends_of_float64(size: float) -> None:
+    """A bound that is NaN is none: the answer is right, or refused with a sentence."""
+    index = np.arange(3)
+    problem = Problem(
+        sparse.csr_array(size / (index[:, None] + index + 1.0)), independent(127.5, 5461.25, 3), np.full(3, 1e-4)
+    )
+    recorded = size * np.array([200.0, 150.0, 120.0])
+    _right_or_refused(problem, recorded)
+    for form in ("svd", "dual", "information"):
+        try:
+            solution = estimate(problem, recorded, form)
+        except InputError:
+            continue
+        assert relative_error(solution.coefficients, rational_answer(problem, recorded).coefficients) < 1e-9
+
+
+@pytest.mark.parametrize("mean", [0.0, 127.5, 1e4, 1e8, 1e10])
+def test_contradictions_are_relative_to_the_image(mean: float) -> None:
+    """Readings 1 and 2 of one pixel without noise contradict each other however large the prior's mean is."""
+    twice = sparse.csr_array(np.ones((2, 1)))
+    problem = Problem(twice, Prior(np.array([mean]), np.array([max(mean, 73.9)])), np.zeros(2))
+    with pytest.raises(InputError, match="contradict one another"):
+        estimate(problem, np.array([1.0, 2.0]))
+    assert estimate(problem, np.array([1.5, 1.5])).image == pytest.approx([1.5], abs=1e-15 * max(mean, 1.5))
+
+
+def test_multiple_precision_reads_sums_and_estimates_alike() -> None:
+    """The variance of a sum is that of rational numbers: w^T (P0 - P0 H^T C^-1 H P0) w of two pixels, by hand."""
+    noise = 1e-30
+    problem = Problem(sparse.csr_array(np.array([[0.5, 0.5]])), independent(0.0, 4.0, 2), np.array([noise]))
+    weights = np.array([0.5, 0.5])
+    innovation = Fraction(2) + Fraction(noise)
+    exact = Fraction(2) - Fraction(2) ** 2 / innovation
+    form, _ = factorise(problem)
+    assert sum_variance(form, weights, problem.noise_variance) == pytest.approx(float(exact), rel=1e-12)
+    doubled = sum_variance(form, weights, 2 * problem.noise_variance)
+    assert doubled == pytest.approx(2 * float(exact), rel=1e-9)  # the prior's part is noise^2
+    with pytest.raises(NotSolvableError, match="at most 64"):
+        multiple_precision(Problem(sparse.csr_array((65, 65)), independent(0.0, 1.0, 65), np.ones(65)))
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-20, 1e-30])
+def test_error_bars_keep_their_digits_beyond_multiple_precision(noise: float) -> None:
+    """80 pixels, each seen by its own measurement: variance and bias of a sum in closed form."""
+    count = 80
+    problem = Problem(sparse.csr_array(np.eye(count)), independent(0.0, 4.0, count), np.full(count, noise))
+    form, _ = factorise(problem, "covariance")
+    posterior = noise / (1 + noise / 4)
+    weights = np.full(count, 1 / count)
+    assert sum_variance(form, weights, problem.noise_variance) == pytest.approx(posterior / count, rel=1e-9)
+    difference = np.random.default_rng(0).normal(size=count)
+    share = (noise / 4) / (1 + noise / 4)
+    np.testing.assert_allclose(bias_of(form, difference), share * difference, rtol=1e-9)
+
+
+def test_the_rounding_of_a_nearly_singular_prior_counts() -> None:
+    """Pixels correlated over 1e9 of them: their covariance is known to 1e-16, the difference of two of them to 1e-7."""
+    matrix = sparse.csr_array(np.random.default_rng(0).uniform(0, 1, (13, 9)))
+    recorded = matrix @ np.full(9, 130.0)
+    for length, answered in ((1e3, True), (1e9, False)):
+        problem = Problem(matrix, exponential(127.5, 5461.25, (3, 3), length), np.full(13, 1e-6))
+        if answered:
+            assert estimate(problem, recorded).solver.variance_bound < 1e-8
+            continue
+        with pytest.raises(InputError, match="nearly singular"):
+            estimate(problem, recorded)
+        assert estimate(problem, recorded, tolerance=1e-4).solver.variance_bound > 1e-7

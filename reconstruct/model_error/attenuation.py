@@ -119,11 +119,15 @@ def with_attenuation(
             given, operators.hidden(truth - task.prior.mean), attenuation.halves(truth), method, operators, actual
         )
     before = result.variance_of_sum
+
+    def variance_of_sum(weights: FloatArray) -> float:
+        return before(weights) + max(float((weights @ first) * (weights @ second)), 0.0)
+
     return replace(
         result,
         expected=_with_added(result.expected, added, first + second, task.shape),
         interval=given,
-        variance_of_sum=lambda weights: before(weights) + max(float((weights @ first) * (weights @ second)), 0.0),
+        variance_of_sum=variance_of_sum,
     )
 
 

@@ -137,10 +137,11 @@ class Waves:
         if not ordered.size:
             return np.full(self.shape, -1)
         edges, last = [0.0], 0
-        for edge in np.geomspace(ordered[0], ordered[-1], BINS + 1)[1:-1]:
+        geometric: FloatArray = np.geomspace(ordered[0], ordered[-1], BINS + 1)
+        for edge in geometric[1:-1].tolist():
             place = int(np.searchsorted(ordered, edge))
             if place - last >= FEWEST_WAVES and ordered.size - place >= FEWEST_WAVES:
-                edges.append(float(edge))
+                edges.append(edge)
                 last = place
         bins = np.searchsorted(edges, self._frequency, side="right") - 1
         bins[0, 0] = -1

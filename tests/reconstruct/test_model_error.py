@@ -81,24 +81,24 @@ def test_the_attenuation_is_the_mean_effect_of_errors_of_h() -> None:
     image = 127.5 + 60 * np.random.default_rng(1).normal(size=361)
     effects: list[FloatArray] = []
     stated: list[float] = []
-    for seed in range(2 * DRAWS):
+    for seed in range(4 * DRAWS):
         rng = np.random.default_rng([seed, 2])
         model = _measured(exact, rng)
         noise = NOISE + model.variance_from_model(image)
         method = _method(model, exact.matrix @ image, noise)
         operators, root = _operators(method), np.sqrt(noise)
         effects.append(operators.gain((model.matrix - exact.matrix) @ image))
-        whites = [rng.normal(size=noise.size) for _ in range(4)]
+        whites = [rng.normal(size=noise.size)]
         attenuation = Attenuation.of(
             method, operators, whites, [operators.gain(root * white) for white in whites], root
         )
         first, second = attenuation.halves(image)
         stated.append(float(first @ second))
     products = np.array(effects) @ np.array(effects).T
-    pairs = [float(products[i, i + DRAWS]) for i in range(DRAWS)]  # of independent draws: unbiased
-    measured, error = np.mean(pairs), np.std(pairs) / DRAWS**0.5
-    assert measured > 5 * error  # there is something to predict
-    assert np.mean(stated) == pytest.approx(measured, abs=4 * error + 0.1 * measured)  # first order to a tenth
+    pairs = products[~np.eye(len(effects), dtype=np.bool_)]  # of independent draws: unbiased
+    measured, error = float(pairs.mean()), float(pairs.std()) / (len(effects) / 2**0.5)
+    assert measured > 4 * error  # there is something to predict
+    assert np.mean(stated) == pytest.approx(measured, abs=3 * error + 0.2 * measured)  # first order in the variances
 
 
 @pytest.mark.parametrize("contrast", [0.0, 0.3, 20.0])

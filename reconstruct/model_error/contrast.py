@@ -137,8 +137,9 @@ class Waves:
         if not ordered.size:
             return np.full(self.shape, -1)
         edges, last = [0.0], 0
-        geometric: FloatArray = np.geomspace(ordered[0], ordered[-1], BINS + 1)
-        for edge in geometric[1:-1].tolist():
+        ratio = float(ordered[-1] / ordered[0])
+        for step in range(1, BINS):
+            edge = float(ordered[0]) * ratio ** (step / BINS)
             place = int(np.searchsorted(ordered, edge))
             if place - last >= FEWEST_WAVES and ordered.size - place >= FEWEST_WAVES:
                 edges.append(edge)

@@ -133,7 +133,7 @@ class Waves:
     @cached_property
     def _bins(self) -> IntArray:
         """Index of the bin of each wave, (rows, columns); the mean has -1."""
-        ordered = np.sort(self._frequency.ravel())[1:]
+        ordered: FloatArray = np.sort(self._frequency, axis=None)[1:]
         if not ordered.size:
             return np.full(self.shape, -1)
         edges, last = [0.0], 0

@@ -140,7 +140,7 @@ class Waves:
         ratio = float(ordered[-1] / ordered[0])
         for step in range(1, BINS):
             edge = float(ordered[0]) * ratio ** (step / BINS)
-            place = int(np.searchsorted(ordered, edge))
+            place = int(np.count_nonzero(ordered < edge))
             if place - last >= FEWEST_WAVES and ordered.size - place >= FEWEST_WAVES:
                 edges.append(edge)
                 last = place

@@ -31,6 +31,7 @@ from ommatid.simulate.sampling.seeds import repeat_seed
 
 from ..calibration_goal import for_stack
 
+ERRORS = 1  # stream of the errors of H
 Assumptions = tuple[str, ...]
 
 
@@ -152,21 +153,22 @@ def _traced_matrix(setup: Setup, uncertain: pilot.Pilot | None, plans: pilot.Pla
 
 
 def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Assumptions]:
-    """Return the true H with the uncertainty that the scene's calibration leaves."""
+    """Return H as the scene's calibration may measure it: the true one with errors, and their uncertainty."""
     if camera.pilot is None:
         raise ValueError("expected a scene whose H is calibrated, got one with the ideal H")
     true = camera.model.matrix
     model = camera.pilot.around(true)
     model = replace(model, record={**model.record, "method": setup.scene.calibration.method})
+    rng = np.random.default_rng([setup.scene.render.seed, ERRORS])
     if setup.scene.calibration.samples != "auto":
-        return model, ()
+        return pilot.with_errors(model, rng), ()
     adds = for_stack(stack).added_error(model)
     said = (
         f"the uncertainty of H adds {100 * min(adds, AIM):.2g} %, which calibration.samples 'auto' aims at or finds",
     )
-    if adds <= DONE:
-        return model, said
-    return replace(camera.pilot.around(true, AIM / adds), record=model.record), said
+    if adds > DONE:
+        model = replace(camera.pilot.around(true, AIM / adds), record=model.record)
+    return pilot.with_errors(model, rng), said
 
 
 def _rendering_variance(setup: Setup, camera: _Camera, image: FloatArray) -> tuple[FloatArray, Assumptions]:

@@ -233,14 +233,20 @@ class Model:
         return np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
 
     @property
-    def error_matrices(self) -> list[sparse.csr_array]:
-        """Deviations of the batches from H, (M, N) each; empty where H has no uncertainty or no batches."""
-        kept = self.matrix if len(self.batches) else None
-        return (
-            []
-            if kept is None
-            else [sparse.csr_array((batch, kept.indices, kept.indptr), shape=kept.shape) for batch in self.batches]
-        )
+    def error_halves(self) -> tuple[list[sparse.csr_array], list[sparse.csr_array]]:
+        """Errors of H by either half of the batches, (M, N) each; empty where there are fewer than four batches.
+
+        The products of a half's errors with themselves add up to an estimate of the covariance of H.
+        """
+        first, second = (self._errors(self.batches[start::2]) for start in (0, 1))
+        return (first, second) if first and second else ([], [])
+
+    def _errors(self, batches: Float32Array) -> list[sparse.csr_array]:
+        if len(batches) < 2:
+            return []
+        kept = self.matrix
+        scaled = (batches - batches.mean(axis=0)) / np.float32(((len(batches) - 1) * len(self.batches)) ** 0.5)
+        return [sparse.csr_array((errors, kept.indices, kept.indptr), shape=kept.shape) for errors in scaled]
 
     def spurious_information(self, noise_variance: FloatArray) -> FloatArray:
         """Information on each pixel that the noise of H alone appears to bring: (N,), sum over i of var_ij / Rv_i.

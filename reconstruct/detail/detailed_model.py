@@ -75,9 +75,12 @@ class DetailedModel(Model):
         return self.fine.prior_variance_from_model(world, prior_mean)
 
     @property
-    def error_matrices(self) -> list[sparse.csr_array]:
-        """Deviations of the batches of G, (M, N) each."""
-        return [sparse.csr_array(error @ self.interpolation) for error in self.fine.error_matrices]
+    def error_halves(self) -> tuple[list[sparse.csr_array], list[sparse.csr_array]]:
+        """Errors of G by either half of the batches, (M, N) each."""
+        first, second = (
+            [sparse.csr_array(error @ self.interpolation) for error in errors] for errors in self.fine.error_halves
+        )
+        return first, second
 
 
 def is_exact_for(scene: Scene, camera: Camera) -> bool:

@@ -26,7 +26,6 @@ from ..methods.method import Method, MethodResult, PosteriorOperators
 SEED = 20260404  # of the random image for what the measurements do not show
 NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is averaged for the map
 UNCERTAINTY = 0.1  # of the attenuation's part of the error, relative: it is of first order
-FEWEST_BATCHES = 4  # from which two halves have a variance each
 
 
 @dataclass(frozen=True)
@@ -58,9 +57,7 @@ class Attenuation:
         task = method.task
         freedoms = np.mean([white @ (task.observe(image) / root) for white, image in zip(whites, noise, strict=True)])
         share = float(np.clip(1 - freedoms / root.size, 0.0, 1.0))
-        matrices = task.model.error_matrices
-        halves = _normalised(matrices[0::2], len(matrices)), _normalised(matrices[1::2], len(matrices))
-        return cls(halves, operators, task.used, share)
+        return cls(task.model.error_halves, operators, task.used, share)
 
     def halves(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return C D f by either half of the batches: (N,) each."""
@@ -78,19 +75,7 @@ class Attenuation:
 
 def can_be_corrected(method: Method) -> bool:
     """Return True if the batches of the calibration can show the attenuation."""
-    return bool(method.task.used.any()) and len(method.task.model.error_matrices) >= FEWEST_BATCHES
-
-
-def _normalised(matrices: list[sparse.csr_array], batches: int) -> list[sparse.csr_array]:
-    """Return deviations from their own mean, scaled so that their squares add up to the variance of the whole mean."""
-    count = len(matrices)
-    if count < 2:
-        return []
-    first = matrices[0]
-    values = np.array([matrix.data for matrix in matrices], dtype=np.float64)
-    values -= values.mean(axis=0)
-    values /= ((count - 1) * batches) ** 0.5
-    return [sparse.csr_array((data, first.indices, first.indptr), shape=first.shape) for data in values]
+    return bool(method.task.used.any()) and bool(method.task.model.error_halves[0])
 
 
 def with_attenuation(

@@ -49,7 +49,8 @@ class ErrorCheck:
 
     mse, interval : measured and expected error of the image, None if not known
     variance_bound : on the relative error of variances
-    spurious : relative error of Eq. 5 by the noise of H;  spurious_share : of a pixel's information, on average
+    spurious : relative error of Eq. 5 by the noise of H beyond what it counts
+    spurious_share : of a pixel's information, on average
     calibration_share : of the predicted error that the uncertainty of H causes
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
     """
@@ -179,9 +180,9 @@ def error_p_value(mse: float, interval: Interval) -> float:
 def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
     if check.spurious > SIZE:
         findings.reasons.append(
-            "the lens types leave pixels undetermined, and the noise of H adds spurious information about them, so the"
-            " predicted error is too small; raise calibration.samples, or take calibration.method = 'ideal' if the"
-            " camera is"
+            "the noise of H adds spurious information about pixels that the lens types determine poorly, more than the"
+            " predicted error can count; raise calibration.samples, or take calibration.method = 'ideal' if the camera"
+            " is"
         )
     elif check.spurious_share > SPURIOUS_SHARE:
         findings.notes.append(

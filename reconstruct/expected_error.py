@@ -68,7 +68,7 @@ class ExpectedError:
 class Interval:
     """Expectation of the mean squared error given the image, and the interval that holds it in 99 of 100 cases.
 
-    variance : of the sum of the squares of all pixels
+    variance : of the mean squared error, a gamma variate; 0 where it is certain, or where the interval is wider
     """
 
     mse: float
@@ -129,7 +129,7 @@ def interval(mean: float, variance: float, count: int) -> Interval:
         return Interval(mean / count, mean / count, mean / count)
     shape, scale = mean**2 / variance, variance / mean
     low, high = (float(stats.gamma.ppf(level, shape, scale=scale)) for level in COVERAGE)
-    return Interval(mean / count, low / count, high / count, variance)
+    return Interval(mean / count, low / count, high / count, variance / count**2)
 
 
 def kernel_widths(resolved: FloatArray) -> FloatArray:

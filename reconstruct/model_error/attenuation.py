@@ -3,9 +3,9 @@
 With H^ = H + E and the gain A of H^, the estimate errs by -A E f. This is not only noise: A is made of the same E. To
 first order of the covariance of E, with rows of independent errors (Fuller 1987, Measurement Error Models, 2.2),
 
-    mean of A E f = C D f,   D = (1 - dof / M) mean of E^T Rv^-1 E,
+    mean of A E f = C D f,   D = mean of E^T Rv^-1 diag(I - H A) E,
 
-with C the posterior covariance and dof the trace of A H. It draws the estimate towards an image without contrast, as a
+with C the posterior covariance. It draws the estimate towards an image without contrast, as a
 stronger prior would. D comes from the batches of the calibration; two halves of them give its effect twice with
 independent errors, so that products of the two have the right mean.
 """
@@ -25,6 +25,8 @@ from ..methods.method import Method, MethodResult, PosteriorOperators
 
 SEED = 20260404  # of the random image for what the measurements do not show
 NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is averaged for the map
+GROUP_SIZE = 200  # fewest measurements over which a leverage is averaged
+MOST_GROUPS = 24  # per lens type
 UNCERTAINTY = 0.1  # of the attenuation's part of the error, relative: it is of first order
 
 
@@ -33,13 +35,13 @@ class Attenuation:
     """C D as an operator, by each half of the batches.
 
     errors : E of each half as matrices whose squares add up to the covariance of H, (M, N) each
-    residual_share : 1 - dof / M
+    residual_share : (measurements used,) 1 - (H A)_ii
     """
 
     errors: tuple[list[sparse.csr_array], list[sparse.csr_array]]
     operators: PosteriorOperators
     used: BoolArray
-    residual_share: float
+    residual_share: FloatArray
 
     @classmethod
     def of(
@@ -52,11 +54,20 @@ class Attenuation:
     ) -> Attenuation:
         """Return the attenuation of a method's estimate.
 
-        noise : A of `root` times each of `whites`, whose residuals show the trace of A H (Hutchinson 1990)
+        noise : A of `root` times each of `whites`, whose products show the diagonal of H A (Hutchinson 1990), on
+            average over measurements of a lens type with similar noise
         """
         task = method.task
-        freedoms = np.mean([white @ (task.observe(image) / root) for white, image in zip(whites, noise, strict=True)])
-        share = float(np.clip(1 - freedoms / root.size, 0.0, 1.0))
+        products = [white * task.observe(image) / root for white, image in zip(whites, noise, strict=True)]
+        leverage = np.mean(products, axis=0)
+        share = np.empty_like(leverage)
+        used = np.flatnonzero(task.used)
+        for part in task.model.camera.type_slices():
+            rows = np.flatnonzero((used >= part.start) & (used < part.stop))
+            for group in np.array_split(
+                rows[np.argsort(root[rows])], max(1, min(rows.size // GROUP_SIZE, MOST_GROUPS))
+            ):
+                share[group] = np.clip(1 - leverage[group].mean(), 0.0, 1.0) if group.size else 1.0
         return cls(task.model.error_halves, operators, task.used, share)
 
     def halves(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -143,5 +154,5 @@ def _shifted(
     count = lacking.size
     added = _added(lacking, *halves)
     along = operators.weigh(method.task.observe(operators.posterior((halves[0] + halves[1]) / 2)))
-    variance = given.variance + 4 * float(actual @ np.square(along)) + (UNCERTAINTY * added) ** 2
+    variance = count**2 * given.variance + 4 * float(actual @ np.square(along)) + (UNCERTAINTY * added) ** 2
     return interval(max(count * given.mse + added, 0.0), variance, count)

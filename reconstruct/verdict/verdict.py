@@ -163,9 +163,11 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
 
 def error_p_value(mse: float, interval: Interval) -> float:
     """Return the probability of an error this far on its side of the expected one, as a gamma variate."""
+    above = mse > interval.mse
+    if interval.variance > 0:
+        return _tail(interval.mse**2 / interval.variance, mse / interval.mse, above)
     if not interval.low < interval.mse < interval.high:
         return float(mse == interval.mse)
-    above = mse > interval.mse
     level, end = (COVERAGE[1], interval.high) if above else (COVERAGE[0], interval.low)
 
     def difference(logarithm: float) -> float:
@@ -173,8 +175,12 @@ def error_p_value(mse: float, interval: Interval) -> float:
         return float(stats.gamma.ppf(level, shape)) / shape - end / interval.mse
 
     shape = float(np.exp(cast(Any, optimize).brentq(difference, *SHAPES)))
-    value = shape * mse / interval.mse
-    return float(stats.gamma.sf(value, shape) if above else stats.gamma.cdf(value, shape))
+    return _tail(shape, mse / interval.mse, above)
+
+
+def _tail(shape: float, ratio: float, above: bool) -> float:
+    """Return the probability of a gamma variate of mean 1 beyond `ratio`."""
+    return float(stats.gamma.sf(shape * ratio, shape) if above else stats.gamma.cdf(shape * ratio, shape))
 
 
 def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:

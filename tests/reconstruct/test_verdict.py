@@ -285,3 +285,12 @@ def test_the_noise_that_is_known_counts_not_the_one_that_the_estimator_assumes()
     """Eq. 5 takes the known noise whatever the estimator expects, so its error bars hold."""
     for assumed in (1e-4, 1.0):
         assert verdict(stack_of(estimator={"noise_variance": assumed}), drawn_image()).trusted
+
+
+@pytest.mark.parametrize("spread", [1e-3, 0.3, 1.0, 5.0])
+def test_the_p_value_is_that_of_the_interval(spread: float) -> None:
+    """At either end of the interval it is that of its level, however wide the interval."""
+    whole = interval(50.0, (50.0 * spread) ** 2, 10)
+    assert error_p_value(whole.high, whole) == pytest.approx(0.005)
+    if whole.low > 0:
+        assert error_p_value(whole.low, whole) == pytest.approx(0.005)

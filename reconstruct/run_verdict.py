@@ -17,7 +17,7 @@ from .verdict.causes import evidence_of, without_pixels
 from .verdict.residual_parts import ResidualPart, WhitenedResidual, residual_parts
 from .verdict.verdict import ErrorCheck, Verdict, judge
 
-CORRECTABLE = 0.2  # share of the error by attenuation, up to which the first order of the noise of H serves
+CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
 LEAST_FREEDOMS = 5  # of a sample variance, from which its inverse has a variance
 
 

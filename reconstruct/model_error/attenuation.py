@@ -27,6 +27,7 @@ SEED = 20260404  # of the random image for what the measurements do not show
 NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is averaged for the map
 GROUP_SIZE = 200  # fewest measurements over which a leverage is averaged
 MOST_GROUPS = 24  # per lens type
+FIRST_ORDER = 0.5  # share of the posterior's spread that attenuation takes, up to which the first order serves
 UNCERTAINTY = 0.1  # of the attenuation's part of the error, relative: it is of first order
 
 
@@ -75,6 +76,11 @@ class Attenuation:
         first, second = (self._by(errors, image) for errors in self.errors)
         return first, second
 
+    def strength(self, image: FloatArray) -> float:
+        """Return the share of an image that attenuation takes away: f^T C D f / f^T f, from 0 to 1 but for chance."""
+        first, second = self.halves(image)
+        return float(image @ (first + second)) / (2 * float(image @ image) or 1.0)
+
     def _by(self, errors: list[sparse.csr_array], image: FloatArray) -> FloatArray:
         weighted = np.zeros(self.used.size)
         total = np.zeros(image.size)
@@ -97,15 +103,18 @@ def with_attenuation(
     truth: FloatArray | None,
     actual: FloatArray,
 ) -> MethodResult:
-    """Return a result whose Eq. 5 and interval hold the attenuation.
+    """Return a result whose Eq. 5 and interval hold the attenuation, or the same where its first order does not serve.
 
     image : (N,) with the contrast of the true one;  truth : (N,), or None;  actual : (measurements used,) variances
     """
     task, rng, root = method.task, np.random.default_rng(SEED), np.sqrt(actual)
     white = rng.normal(size=root.size)
-    attenuation = Attenuation.of(method, operators, [white], [operators.gain(root * white)], root)
+    noise = operators.gain(root * white)
+    attenuation = Attenuation.of(method, operators, [white], [noise], root)
 
     unseen = operators.hidden(task.draw_deviation(rng))
+    if not attenuation.strength(noise + unseen) <= FIRST_ORDER:
+        return result
     whole = image + unseen
     lacking, (first, second) = operators.hidden(whole - task.prior.mean), attenuation.halves(whole)
     added = max(_added(lacking, first, second), 0.0)

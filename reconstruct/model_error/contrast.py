@@ -19,12 +19,13 @@ from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.scenes.model import Model
 
 from ..methods.method import Method, PosteriorOperators
-from .attenuation import Attenuation
+from .attenuation import FIRST_ORDER, Attenuation
 
 SEED = 20260403  # of random images and noise, different from those of the other analyses
 BINS = 12  # of frequency
 FEWEST_WAVES = 8  # in a bin
 SIGNAL = 0.5  # excess over the noise, relative, from which a bin is determined
+FAINT = 1e-12  # power relative to the largest, below which a bin is empty
 FITTED = 5  # bins at the end of the determined range that fix the power law
 TRANSFER = (0.25, 1.2)  # range of T: beyond it, it is chance, or waves that no lens type shows
 NEIGHBOURHOOD = 11  # pixels, over which the power of a band is averaged
@@ -58,8 +59,9 @@ def true_contrast(method: Method, operators: PosteriorOperators, actual: FloatAr
     determined = excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
     first = continued(waves.frequencies, excess, determined)
     attenuation = Attenuation.of(method, operators, whites, noise, root)
-    transfer = _transfer(waves, _placed(waves, deviation, noise, first), operators, attenuation)
-    spectrum = continued(waves.frequencies, excess / transfer, determined)
+    if attenuation.strength(noise[0]) <= FIRST_ORDER:
+        excess = excess / _transfer(waves, _placed(waves, deviation, noise, first), operators, attenuation)
+    spectrum = continued(waves.frequencies, excess, determined)
     image = task.prior.mean + _placed(waves, deviation, noise, spectrum)
     return Contrast(image, noise, _calibration(task.model, method.image, image, noise)[task.used])
 
@@ -82,7 +84,8 @@ def _placed(waves: Waves, deviation: FloatArray, noise: tuple[FloatArray, ...], 
         wave = waves.band(deviation, band)
         by_noise = sum((_local_mean(np.square(waves.band(image, band))) for image in noise), np.zeros(waves.shape))
         local = _local_mean(np.square(wave))
-        signal = np.maximum(1 - by_noise / len(noise) / np.maximum(local, np.finfo(np.float64).tiny), 0.0)
+        excess = local - by_noise / len(noise)
+        signal = np.divide(excess, local, out=np.zeros_like(local), where=excess > 0)
         wave = np.sqrt(signal) * wave
         placed += (wave * (power * count / (float(np.square(wave).sum()) or 1.0)) ** 0.5).ravel()
     return placed
@@ -102,7 +105,8 @@ def _transfer(
     seen = image - operators.hidden(image)
     first, second = attenuation.halves(image)
     power = waves.power(seen) - waves.power(seen, first + second) + waves.power(first, second)
-    return np.clip(power / np.maximum(waves.power(image), np.finfo(np.float64).tiny), *TRANSFER)
+    whole = waves.power(image)
+    return np.clip(np.divide(power, whole, out=np.ones_like(whole), where=whole > FAINT * whole.max()), *TRANSFER)
 
 
 def continued(frequencies: FloatArray, spectrum: FloatArray, determined: BoolArray) -> FloatArray:

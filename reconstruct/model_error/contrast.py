@@ -70,7 +70,7 @@ def _calibration(model: Model, estimate: FloatArray, image: FloatArray, noise: t
     """Return the variance that H's uncertainty adds, (M,): placed as by the estimate, in sum as by the image."""
     placed, whole = model.variance_from_model(estimate, noise), model.variance_from_model(image)
     total = float(placed.sum())
-    return placed * (float(whole.sum()) / total) if total > 0 else placed
+    return placed * (float(whole.sum()) / total) if total > 0 else whole
 
 
 def _placed(waves: Waves, deviation: FloatArray, noise: tuple[FloatArray, ...], spectrum: FloatArray) -> FloatArray:

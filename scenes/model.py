@@ -29,6 +29,7 @@ GROUP_SIZE = 200  # fewest pixels of similar contrast whose variances are shrunk
 MOST_GROUPS = 24  # of pixels per lens type
 RECORDED = "recorded points"  # method of a model whose every entry was measured by itself
 ROUNDED = 1e-6  # deviation of the sum of a row, about 1, that is float32's rounding
+FEWEST_BATCHES = 4  # that have two halves with a variance each
 EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
 
 
@@ -233,17 +234,19 @@ class Model:
         return np.repeat(np.arange(self.measurements), np.diff(self.matrix.indptr))
 
     @property
+    def has_error_halves(self) -> bool:
+        """True if each half of the batches has a variance of its own."""
+        return len(self.batches) >= FEWEST_BATCHES
+
+    @property
     def error_halves(self) -> tuple[list[sparse.csr_array], list[sparse.csr_array]]:
-        """Errors of H by either half of the batches, (M, N) each; empty where there are fewer than four batches.
+        """Errors of H by either half of the batches, (M, N) each, where there are such halves.
 
         The products of a half's errors with themselves add up to an estimate of the covariance of H.
         """
-        first, second = (self._errors(self.batches[start::2]) for start in (0, 1))
-        return (first, second) if first and second else ([], [])
+        return self._errors(self.batches[0::2]), self._errors(self.batches[1::2])
 
     def _errors(self, batches: Float32Array) -> list[sparse.csr_array]:
-        if len(batches) < 2:
-            return []
         kept = self.matrix
         scaled = (batches - batches.mean(axis=0)) / np.float32(((len(batches) - 1) * len(self.batches)) ** 0.5)
         return [sparse.csr_array((errors, kept.indices, kept.indptr), shape=kept.shape) for errors in scaled]

@@ -75,6 +75,11 @@ class DetailedModel(Model):
         return self.fine.prior_variance_from_model(world, prior_mean)
 
     @property
+    def has_error_halves(self) -> bool:
+        """True if each half of the batches of H has a variance of its own."""
+        return self.fine.has_error_halves
+
+    @property
     def error_halves(self) -> tuple[list[sparse.csr_array], list[sparse.csr_array]]:
         """Errors of G by either half of the batches, (M, N) each."""
         first, second = (

@@ -225,16 +225,20 @@ class MultiplePrecision(Form):
         try:
             while self.precision.bits <= MOST_BITS:
                 ctx.prec = self.precision.bits
-                try:
-                    results = list(compute(*self._factorised()))
-                    if all(negligible_radii(result, elementwise=elementwise) for result in results):
-                        return [floats(result) for result in results]
-                except ZeroDivisionError:
-                    pass
+                results = self._attempt(compute)
+                if results is not None and all(negligible_radii(result, elementwise=elementwise) for result in results):
+                    return [floats(result) for result in results]
                 self.precision.bits, self.precision.inverse = 2 * self.precision.bits, None
         finally:
             ctx.prec = before
         raise NotSolvableError(f"{MOST_BITS} bits do not suffice")
+
+    def _attempt(self, compute: Compute) -> list[Any] | None:
+        """Return results in the present precision, None where its balls hold 0 and cannot be divided by."""
+        try:
+            return list(compute(*self._factorised()))
+        except ZeroDivisionError:
+            return None
 
     def _factorised(self) -> tuple[Any, Any]:
         """Return B and C^-1. Raises ZeroDivisionError if balls are too wide to divide by."""

@@ -59,7 +59,8 @@ class Attenuation:
             average over measurements of a lens type with similar noise
         """
         task = method.task
-        products = [white * task.observe(image) / root for white, image in zip(whites, noise, strict=True)]
+        inverse = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0)
+        products = [inverse * white * task.observe(image) for white, image in zip(whites, noise, strict=True)]
         leverage = np.mean(products, axis=0)
         share = np.empty_like(leverage)
         used = np.flatnonzero(task.used)
@@ -92,7 +93,7 @@ class Attenuation:
 
 def can_be_corrected(method: Method) -> bool:
     """Return True if the batches of the calibration can show the attenuation."""
-    return bool(method.task.used.any()) and bool(method.task.model.error_halves[0])
+    return bool(method.task.used.any()) and method.task.model.has_error_halves
 
 
 def with_attenuation(

@@ -191,7 +191,7 @@ def _true_contrast(method: Method, noise: Noise) -> Contrast | None:
     if float(noise["calibration"].sum()) <= NEGLIGIBLE * float(actual.sum()):
         return None
     operators = method.operators()
-    return None if operators is None else true_contrast(method, operators, actual)
+    return None if operators is None else true_contrast(method, operators, noise)
 
 
 def _certain(noise: Noise) -> Noise:

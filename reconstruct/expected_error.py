@@ -35,7 +35,7 @@ class ExpectedError:
     resolved : (N,), the diagonal of A H: the share of a pixel's value that comes from the measurements, 0 to 1
     leverage : (M,), the diagonal of H A, where all pixels were solved for; None where it is not known
     attenuation : mean squared error that the errors of H add by drawing the estimate towards no contrast; None where
-        it was not computed
+        it was not computed;  second_order : the next order of the errors of H relative to that
     """
 
     variance: FloatArray
@@ -44,6 +44,7 @@ class ExpectedError:
     resolved: FloatArray
     leverage: FloatArray | None = None
     attenuation: float | None = None
+    second_order: float = 0.0
 
     @property
     def mse(self) -> float:

@@ -18,6 +18,7 @@ from .verdict.residual_parts import ResidualPart, WhitenedResidual, residual_par
 from .verdict.verdict import ErrorCheck, Verdict, judge
 
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
+BEYOND = 0.1  # share of the error by the next order, likewise
 LEAST_FREEDOMS = 5  # of a sample variance, from which its inverse has a variance
 
 
@@ -60,7 +61,7 @@ def _spurious(share: FloatArray, expected: ExpectedError) -> float:
     if expected.attenuation is None:
         return float(share @ expected.variance) / float(expected.variance.sum())
     corrected = expected.attenuation / expected.mse
-    return corrected if corrected > CORRECTABLE else 0.0
+    return corrected if corrected > CORRECTABLE or corrected * expected.second_order > BEYOND else 0.0
 
 
 def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResult) -> list[ResidualPart]:

@@ -188,8 +188,8 @@ class Model:
         if count < 2:
             return variance
         variance += self._lost_variance * level**2
-        scatter = self._scatter(flat)
-        excess = sum((self._scatter(image) for image in noise), np.zeros(self.measurements)) / max(len(noise), 1)
+        scatter = self.scatter(flat)
+        excess = sum((self.scatter(image) for image in noise), np.zeros(self.measurements)) / max(len(noise), 1)
         if self.record.get("fit"):
             # Entries that follow from a few fitted parameters are correlated in ways that no sum over entries shows.
             return np.maximum(scatter - excess, 0.0)
@@ -204,8 +204,8 @@ class Model:
                     variance[group] *= total / (float(variance[group].sum()) or 1.0)
         return variance
 
-    def _scatter(self, image: FloatArray) -> FloatArray:
-        """Variance of H f of one image by the batches alone, (M,)."""
+    def scatter(self, image: FloatArray) -> FloatArray:
+        """Variance of H f of one image, (N,), by the batches alone, where there are two or more: (M,)."""
         level, count = self.matrix @ image, len(self.batches)
         contrast = image[self.matrix.indices] - level[self._rows]
         squares = (

@@ -5,11 +5,64 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from scipy import optimize, special
+from scipy import ndimage, optimize, signal, special
 
 from ommatid.runtime.arrays import FloatArray
 
 FEW = 0.1  # share of the quantities that varied, below which they are rare events
+MANY = 1000  # that varied, from which their distribution shows that of the true variances
+GROUP_SIZE = 2000  # fewest quantities with similar neighbours that are taken together
+MOST_GROUPS = 24
+STEP = 0.0625  # of the logarithm, in standard deviations of that of a sample variance
+KERNEL = 4  # steps: standard deviation of the kernel that smooths their distribution
+LEAST_FREEDOM = 10  # of a sample variance, below which passes are too few for that
+
+
+def posterior_variances_among(variance: FloatArray, likely: FloatArray, repeats: int) -> FloatArray:
+    """Posterior means of true variances, (n,), each among those of which `likely`, (n,), says about the same.
+
+    likely : increases with the expected true variance, and does not depend on the sample variance of its own quantity
+    """
+    means = np.empty_like(variance)
+    groups = max(1, min(variance.size // GROUP_SIZE, MOST_GROUPS))
+    for group in np.array_split(np.argsort(likely), groups):
+        means[group] = posterior_variances(variance[group], repeats)
+    return means
+
+
+def posterior_variances(variance: FloatArray, repeats: int) -> FloatArray:
+    """Posterior means of true variances, as `shrink_variances`, but where there are many without a form for their law.
+
+    A sample variance x of v degrees of freedom is the true one times a chi-squared variate over v. If f is the density
+    of all sample variances, the mean of the true ones at x is, whatever their distribution (after Robbins 1956, Third
+    Berkeley Symposium 1, 157, for the scale of a gamma variate),
+
+        (v / 2) x^(v/2 - 1) / f(x) times the integral of t^(1 - v/2) f(t) from x to infinity.
+    """
+    known = variance > 0
+    freedom = repeats - 1
+    if int(known.sum()) < MANY or freedom < LEAST_FREEDOM:
+        return shrink_variances(variance, repeats)
+    logarithms = np.log(variance[known])
+    step = STEP * (2 / freedom) ** 0.5
+    numbers = 3 * KERNEL + ((logarithms - logarithms.min()) / step).astype(np.intp)
+    counts = np.bincount(numbers, minlength=int(numbers.max()) + 1 + 3 * KERNEL).astype(np.float64)
+    middles = logarithms.min() + step * (np.arange(counts.size) - 3 * KERNEL + 0.5)
+    density = ndimage.gaussian_filter1d(counts, KERNEL, mode="constant", truncate=3)
+    # The integral from one bin on is that from the next on, times e^(1 - v/2) per unit of the logarithm, and its own.
+    ratio = np.exp((1 - freedom / 2) * step)
+    above = signal.lfilter([1.0], [1.0, -ratio], density[::-1])[::-1] - density / 2
+    shrinkage = np.divide(freedom / 2 * step * above, density, out=np.zeros_like(above), where=density > 0)
+    # Where the density is small it is uncertain, and the means rise: neighbours are averaged until they do.
+    means = np.exp(middles[0]) * isotonic(np.exp(middles - middles[0]) * shrinkage, density)
+    result = shrink_variances(variance, repeats)
+    result[known] = np.interp(logarithms, middles, means)
+    return result
+
+
+def isotonic(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the nearest values that do not fall, by weighted least squares."""
+    return np.asarray(optimize.isotonic_regression(values, weights=np.maximum(weights, np.finfo(float).tiny)).x)
 
 
 def shrink_variances(variance: FloatArray, repeats: int) -> FloatArray:

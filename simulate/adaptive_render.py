@@ -24,7 +24,7 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.shrinkage import shrink_variances
+from ommatid.scenes.shrinkage import posterior_variances
 
 from .noise_target import allowed_variance
 from .renderer.renderer import Renderer
@@ -212,7 +212,7 @@ class AdaptiveRounds:
             tally.add(values)
         floor = rounding_variance(tally.mean, self._renderer.float32_samples(work.samples))
         self.mean[start + pixels] = tally.mean
-        self.variance[start + pixels] = np.maximum(shrink_variances(tally.variance, work.passes), floor)
+        self.variance[start + pixels] = np.maximum(posterior_variances(tally.variance, work.passes), floor)
         sub.add_round(work, tally.variance)
         self._plan_next(index, start + pixels)
 

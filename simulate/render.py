@@ -7,6 +7,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import digest, fingerprint
@@ -16,7 +17,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.recording import Recording
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.shrinkage import shrink_variances
+from ommatid.scenes.shrinkage import posterior_variances_among
 from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
@@ -24,6 +25,8 @@ from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint
 from .sampling.passes import OverPasses, Plan, Tally, plan, rounding_variance
 from .sampling.seeds import sampler_seeds
+
+NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,24 @@ class Rendering(OverPasses):
     direct_only: bool
 
     def stated_variance(self, camera: Camera) -> FloatArray:
-        """Return the variance, (M,), shrunk towards its sub-image's mean and never below float32's rounding."""
-        shrunk = np.concatenate([shrink_variances(self.variance[rows], self.passes) for rows in camera.slices()])
-        return np.maximum(shrunk, rounding_variance(self.mean, self.samples))
+        """Return the variance, (M,), shrunk among pixels with like neighbours, and never below float32's rounding."""
+        around = np.concatenate(
+            [
+                _mean_of_neighbours(self.variance[pixels].reshape(sub.type.pixels)).ravel()
+                for sub, pixels in zip(camera.sub_imagers, camera.slices(), strict=True)
+            ]
+        )
+        shrunk = [
+            posterior_variances_among(self.variance[part], around[part], self.passes) for part in camera.type_slices()
+        ]
+        return np.maximum(np.concatenate(shrunk), rounding_variance(self.mean, self.samples))
+
+
+def _mean_of_neighbours(image: FloatArray) -> FloatArray:
+    """Return the mean of the other pixels in the neighbourhood of each pixel of an image."""
+    count = NEIGHBOURHOOD**2
+    sums = count * ndimage.uniform_filter(image, NEIGHBOURHOOD, mode="nearest")
+    return (sums - image) / (count - 1)
 
 
 def made_from(setup: Setup) -> str:

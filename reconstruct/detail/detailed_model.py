@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from .world_prior import WorldPrior, averaging, repetition
 MAX_WORLD = 32_000  # pixels of the world, and
 MAX_MEASUREMENTS = 1_500  # measurements, up to which the exact moments take seconds
 CAUSE = "detail"  # in the error budget
+SEED = 20260405  # of random detail, different from those of data, calibration and the other analyses
+DRAWS = 4
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class DetailedModel(Model):
 
     fine : the model on the world's grid;  interpolation : B, (pixels of the world, N);  prior_mean : of every pixel
     offset : (M,) Hf w0 - G f0
-    unresolved : variance of every pixel of the world given f, (pixels of the world,)
+    unresolved : variance of every pixel of the world given f, (pixels of the world,);  world : its prior, or None
     detail_variance : (M,) the diagonal of cov e;  detail_covariance : (M, M), None where it is too large
     """
 
@@ -47,6 +50,7 @@ class DetailedModel(Model):
     prior_mean: float
     offset: FloatArray
     unresolved: FloatArray
+    world: WorldPrior | None
     detail_variance: FloatArray
     detail_covariance: FloatArray | None
 
@@ -65,9 +69,25 @@ class DetailedModel(Model):
 
     def variance_from_model(self, image: FloatArray, noise: Sequence[FloatArray] = ()) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement of `image` and of the detail it leaves open."""
-        of_detail = self.fine.prior_variance_from_model(self.unresolved)
         worlds = [self.interpolation @ image for image in noise]
-        return self.fine.variance_from_model(self.world_given(image), worlds) + of_detail
+        return self.fine.variance_from_model(self.world_given(image), worlds) + self._variance_from_detail
+
+    @cached_property
+    def _variance_from_detail(self) -> FloatArray:
+        """Variance that the uncertainty of H adds for the detail that f leaves open: (M,).
+
+        Errors of neighbouring entries cancel where detail is smooth; random detail of the prior shows by how much.
+        """
+        variance = self.fine.prior_variance_from_model(self.unresolved)
+        total = float(variance.sum())
+        if self.world is None or len(self.fine.batches) < 2 or not total:
+            return variance
+        rng = np.random.default_rng(SEED)
+        worlds = (self.world.draw(rng) for _ in range(DRAWS))
+        details = (
+            world - self.interpolation @ (averaging(self.camera.shape, self.camera.detail) @ world) for world in worlds
+        )
+        return variance * (sum(float(self.fine.scatter(detail).sum()) for detail in details) / (DRAWS * total))
 
     def prior_variance_from_model(self, prior_variance: FloatArray, prior_mean: float = 0.0) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement under the prior: (M,)."""
@@ -134,7 +154,7 @@ def _without_detail(model: Model, camera: Camera, mean: float) -> DetailedModel:
     expansion = repetition(camera.shape, camera.detail)
     zeros = np.zeros(model.measurements)
     matrix = sparse.csr_array(_fine_matrix(model) @ expansion)
-    return _detailed(model, camera, mean, matrix, expansion, np.zeros(model.unknowns), zeros, None)
+    return _detailed(model, camera, mean, matrix, expansion, np.zeros(model.unknowns), None, zeros, None)
 
 
 def _exact(model: Model, camera: Camera, mean: float, world: WorldPrior) -> DetailedModel:
@@ -145,7 +165,7 @@ def _exact(model: Model, camera: Camera, mean: float, world: WorldPrior) -> Deta
     covariance = (left + left.T) / 2
     variance = np.maximum(np.diagonal(covariance), 0.0)
     matrix = sparse.csr_array(gain)
-    return _detailed(model, camera, mean, matrix, world.interpolation, world.unresolved, variance, covariance)
+    return _detailed(model, camera, mean, matrix, world.interpolation, world.unresolved, world, variance, covariance)
 
 
 def _local(model: Model, camera: Camera, prior: PriorTable, world: WorldPrior, window: WorldPrior) -> DetailedModel:
@@ -155,7 +175,7 @@ def _local(model: Model, camera: Camera, prior: PriorTable, world: WorldPrior, w
     middle = tuple(slice(n // 2 * camera.detail, (n // 2 + 1) * camera.detail) for n in window.shape)
     phases = window.unresolved.reshape(window.fine_shape)[middle]
     unresolved = np.tile(phases, camera.shape).ravel()
-    return _detailed(model, camera, prior.mean, matrix, interpolation, unresolved, variance, None)
+    return _detailed(model, camera, prior.mean, matrix, interpolation, unresolved, world, variance, None)
 
 
 def _detailed(
@@ -165,6 +185,7 @@ def _detailed(
     matrix: sparse.csr_array,
     interpolation: sparse.csr_array | FloatArray,
     unresolved: FloatArray,
+    world: WorldPrior | None,
     variance: FloatArray,
     covariance: FloatArray | None,
 ) -> DetailedModel:
@@ -183,6 +204,7 @@ def _detailed(
         prior_mean=mean,
         offset=offset,
         unresolved=unresolved,
+        world=world,
         detail_variance=variance,
         detail_covariance=covariance,
         **entries,

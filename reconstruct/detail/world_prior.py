@@ -63,6 +63,12 @@ class WorldPrior:
             product[:, start : start + COLUMNS] = spread.reshape(len(part), -1).T
         return product
 
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Draw a world less its mean: (pixels of the world,)."""
+        rows, columns = self.fine_shape
+        waves = fft.rfft2(rng.normal(size=self.lags.shape)) * np.sqrt(np.maximum(self._spectrum, 0.0))
+        return np.asarray(fft.irfft2(waves, s=self.lags.shape)[:rows, :columns], dtype=np.float64).ravel()
+
     @cached_property
     def averages(self) -> FloatArray:
         """P A^T, the covariances of the world's pixels with those of f: (pixels of the world, N)."""

@@ -42,17 +42,43 @@ MANY = 250_000  # pixels above which a shorter halo saves minutes
 EVEN = 1e-3  # relative range of noise variances that count as equal
 HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
 SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
+LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies a thousandfold
+WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
 LEVELS = 4  # of even noise, for a correlated prior
 LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Maps of the expected error of a frame whose estimator is `system`; actual : (measurements used,) noise."""
+    """Maps of the expected error of a frame whose estimator is `system`.
+
+    actual : (measurements used,) noise;  halo : of windows, in boxes of the widest lens type
+    """
 
     task: EstimationTask
     system: FrameSystem
     actual: FloatArray
+    halo: int
+
+    @classmethod
+    def of(cls, task: EstimationTask, system: FrameSystem, actual: FloatArray) -> tuple[ErrorMap, MapCheck]:
+        """Return the maps and their error at random pixels; with a long halo where that of a short one is too large."""
+        maps = cls(task, system, actual, HALO if task.model.unknowns <= MANY else SHORT_HALO)
+        check = maps.checked()
+        if not maps.has_windows or (check.worst <= WORST and check.mean <= MEAN):
+            return maps, check
+        longer = replace(maps, halo=LONG_HALO)
+        return longer, longer.checked()
+
+    @property
+    def variance(self) -> FloatArray:
+        """Eq. 5 of all pixels, (N,)."""
+        return np.maximum(self.maps.missing + self.maps.noisy, 0.0).ravel()
+
+    @property
+    def has_windows(self) -> bool:
+        """True if the maps come from windows."""
+        return not isinstance(self.system, BandedSystem) and isinstance(self.system.prior, float) and not self.is_even
 
     @cached_property
     def maps(self) -> VarianceMap:
@@ -78,15 +104,15 @@ class ErrorMap:
             parts[2][corner] = noise @ np.square(self.system.observation.forward(solved))
         return VarianceMap(*parts)
 
-    def checked(self, variance: FloatArray) -> MapCheck:
-        """Compare a map of Eq. 5, (N,), with exact solutions for random pixels."""
+    def checked(self) -> MapCheck:
+        """Compare the map of Eq. 5 with exact solutions for random pixels."""
         noise = None
         if not self.as_expected:
             noise = self.system.weights**2 * self.task.on_all_measurements(self.actual, 0.0)
         exact = ExactVariances(self.system, noise, self.task.settings.accuracy)
         local = isinstance(self.system.prior, float) and not isinstance(self.system, BandedSystem)
         local = local and not leaves_null_space(self.task.model.camera)
-        return check_map(variance, self.maps.posterior.ravel(), self.task.shape, exact, local=local)
+        return check_map(self.variance, self.maps.posterior.ravel(), self.task.shape, exact, local=local)
 
     @cached_property
     def as_expected(self) -> bool:
@@ -132,7 +158,7 @@ class ErrorMap:
         """Variances from windows for any H of shift-invariant lens types."""
         model = self.task.model
         widths = [ceil(lens_type.ratio) for lens_type in model.camera.types]
-        halo = (HALO if model.unknowns <= MANY else SHORT_HALO) * max(widths)
+        halo = self.halo * max(widths)
         reach = max(widths) - 1 if model.is_exact else model.reach - 1
 
         def source(rows: slice, columns: slice) -> Stencil:
@@ -217,7 +243,7 @@ class ErrorMap:
 def window_memory(camera: Camera) -> int:
     """Return the bytes that variances from windows take, for the ideal H: two long edges, one slab, its windows."""
     widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
-    halo = (HALO if camera.unknowns <= MANY else SHORT_HALO) * widest
+    halo = LONG_HALO * widest
     lines, longest = max(widest - 1, 1), max(camera.shape)
     slab = min(LENGTH + 2 * halo, longest)
     offsets = (2 * lines + 1) ** 2 // 2 + 1

@@ -91,11 +91,9 @@ class FrameMethod(Method):
         """Return the estimate and its error for the actual noise."""
         task, actual = self.task, total_variance(noise)
         solution = self.solution
-        errors = ErrorMap(task, self.system, actual)
-        variances = errors.maps
+        errors, check = ErrorMap.of(task, self.system, actual)
+        variances, variance = errors.maps, errors.variance
         self.execution.progress(0.7)
-        variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
-        check = errors.checked(variance)
         resolved = 1 - variances.posterior.ravel() / task.prior.variance
         self.execution.progress(0.8)
         parts = self._parts(noise, float(variances.noisy.mean()))
@@ -119,15 +117,20 @@ class FrameMethod(Method):
             expected,
             given,
             lambda weights: self._variance_of_sum(weights, actual),
-            self._residual_power(actual, truth),
+            self._residual_power(actual, truth, expected.degrees_of_freedom),
         )
 
-    def _residual_power(self, actual: FloatArray, truth: FloatArray | None) -> ResidualPower:
-        """Return the expected squares of the residual, by solutions for random images and noise."""
+    def _residual_power(self, actual: FloatArray, truth: FloatArray | None, freedoms: float) -> ResidualPower:
+        """Return the expected squares of the residual, by solutions for random images and noise.
+
+        freedoms : trace of A H of independent pixels
+        """
         task, system = self.task, self.system
         deviation = None if truth is None else truth - task.prior.mean
         draws = DRAWS if task.model.unknowns <= MANY else 1
-        inputs = ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws)
+        is_known = task.prior.kind == "independent" and np.allclose(actual, task.expected_noise, rtol=1e-9)
+        total = max(actual.size - freedoms, 0.0) or None if is_known else None
+        inputs = ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws, total=total)
         residuals = (
             column - task.observe(self._solve(system.right_hand_side(task.on_all_measurements(column, 0.0))))
             for column in inputs.columns()

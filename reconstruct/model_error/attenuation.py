@@ -21,7 +21,8 @@ from scipy import ndimage, sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray
 
 from ..expected_error import ExpectedError, Interval, interval
-from ..methods.method import Method, MethodResult, PosteriorOperators
+from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
+from ..verdict.residual_power import ResidualPower
 
 SEED = 20260404  # of the random image for what the measurements do not show
 NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is averaged for the map
@@ -29,6 +30,24 @@ GROUP_SIZE = 200  # fewest measurements over which a leverage is averaged
 MOST_GROUPS = 24  # per lens type
 FIRST_ORDER = 0.5  # share of the posterior's spread that attenuation takes, up to which the first order serves
 UNCERTAINTY = 0.1  # of the attenuation's part of the error, relative: it is of first order
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What the errors of H do to the estimate of an image, (N,).
+
+    lacking : (N,) what the estimate lacks of it without such errors;  halves : C D image by either half of the batches
+    """
+
+    image: FloatArray
+    lacking: FloatArray
+    halves: tuple[FloatArray, FloatArray]
+
+    @property
+    def added(self) -> float:
+        """|lacking + C D image|^2 - |lacking|^2, from two independent estimates of C D image."""
+        first, second = self.halves
+        return float(first @ second + self.lacking @ (first + second))
 
 
 @dataclass(frozen=True)
@@ -56,19 +75,18 @@ class Attenuation:
         """Return the attenuation of a method's estimate.
 
         noise : A of `root` times each of `whites`, whose products show the diagonal of H A (Hutchinson 1990), on
-            average over measurements of a lens type with similar noise
+            average over measurements of a lens type of about the same leverage
         """
         task = method.task
         inverse = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0)
         products = [inverse * white * task.observe(image) for white, image in zip(whites, noise, strict=True)]
         leverage = np.mean(products, axis=0)
-        share = np.empty_like(leverage)
+        share, likely = np.empty_like(leverage), _likely_leverage(task)
         used = np.flatnonzero(task.used)
         for part in task.model.camera.type_slices():
             rows = np.flatnonzero((used >= part.start) & (used < part.stop))
-            for group in np.array_split(
-                rows[np.argsort(root[rows])], max(1, min(rows.size // GROUP_SIZE, MOST_GROUPS))
-            ):
+            groups = max(1, min(rows.size // GROUP_SIZE, MOST_GROUPS))
+            for group in np.array_split(rows[np.argsort(likely[rows])], groups):
                 share[group] = np.clip(1 - leverage[group].mean(), 0.0, 1.0) if group.size else 1.0
         return cls(task.model.error_halves, operators, task.used, share)
 
@@ -82,6 +100,24 @@ class Attenuation:
         first, second = self.halves(image)
         return float(image @ (first + second)) / (2 * float(image @ image) or 1.0)
 
+    def effect(self, image: FloatArray, mean: float) -> Effect:
+        """Return the effect on the estimate of an image, (N,); mean : of the prior."""
+        return Effect(image, self.operators.hidden(image - mean), self.halves(image))
+
+    def residual_change(self, task: EstimationTask, effect: Effect) -> FloatArray:
+        """Return what the errors of H add to the mean square of each whitened residual, (measurements used,).
+
+        The estimate is image - lacking - C D image, on average, and it is this image that E acts upon in the residual.
+        """
+        seen = [task.observe(half) for half in effect.halves]
+        change = seen[0] * self.operators.weigh(seen[1])
+        change += task.observe(effect.lacking) * self.operators.weigh(seen[0] + seen[1])
+        for errors, other in zip(self.errors, reversed(effect.halves), strict=True):
+            for error in errors:
+                weighted = self.operators.weigh((error @ (other + effect.lacking))[self.used])
+                change -= self.residual_share * (error @ effect.image)[self.used] * weighted
+        return change
+
     def _by(self, errors: list[sparse.csr_array], image: FloatArray) -> FloatArray:
         weighted = np.zeros(self.used.size)
         total = np.zeros(image.size)
@@ -89,6 +125,17 @@ class Attenuation:
             weighted[self.used] = self.residual_share * self.operators.weigh((error @ image)[self.used])
             total += error.T @ weighted
         return self.operators.posterior(total)
+
+
+def _likely_leverage(task: EstimationTask) -> FloatArray:
+    """Return a quantity that orders measurements by their leverage, (measurements used,), as for pixels by themselves.
+
+    A pixel near an edge, or seen with little noise by few measurements, leaves each of them a larger leverage.
+    """
+    squares = task.model.matrix[task.used].power(2)
+    weights = np.divide(1.0, task.expected_noise, out=np.zeros(squares.shape[0]), where=task.expected_noise > 0)
+    information = squares.T @ weights + 1 / task.prior.variance
+    return np.asarray(weights * (squares @ (1 / information)))
 
 
 def can_be_corrected(method: Method) -> bool:
@@ -116,30 +163,35 @@ def with_attenuation(
     unseen = operators.hidden(task.draw_deviation(rng))
     if not attenuation.strength(noise + unseen) <= FIRST_ORDER:
         return result
-    whole = image + unseen
-    lacking, (first, second) = operators.hidden(whole - task.prior.mean), attenuation.halves(whole)
-    added = max(_added(lacking, first, second), 0.0)
-    given = result.interval
-    if truth is not None and given is not None:
-        given = _shifted(
-            given, operators.hidden(truth - task.prior.mean), attenuation.halves(truth), method, operators, actual
-        )
-    before = result.variance_of_sum
+    average = attenuation.effect(image + unseen, task.prior.mean)
+    given = None if truth is None else attenuation.effect(truth, task.prior.mean)
+    interval_given, power, before = result.interval, result.residual_power, result.variance_of_sum
+    if given is not None and interval_given is not None:
+        interval_given = _shifted(interval_given, given, method, operators, actual)
+    if power is not None:
+        change = None if given is None else attenuation.residual_change(task, given)
+        power = _with_change(power, attenuation.residual_change(task, average), change)
+    first, second = average.halves
 
     def variance_of_sum(weights: FloatArray) -> float:
         return before(weights) + max(float((weights @ first) * (weights @ second)), 0.0)
 
     return replace(
         result,
-        expected=_with_added(result.expected, added, first + second, task.shape),
-        interval=given,
+        expected=replace(
+            _with_added(result.expected, max(average.added, 0.0), first + second, task.shape),
+            second_order=max(attenuation.strength(first + second), 0.0),
+        ),
+        interval=interval_given,
         variance_of_sum=variance_of_sum,
+        residual_power=power,
     )
 
 
-def _added(lacking: FloatArray, first: FloatArray, second: FloatArray) -> float:
-    """Return |lacking + b|^2 - |lacking|^2 from two independent estimates of b."""
-    return float(first @ second + lacking @ (first + second))
+def _with_change(power: ResidualPower, average: FloatArray, given: FloatArray | None) -> ResidualPower:
+    """Return expected squares with their changes for images of the prior, and for the true one if it is known."""
+    noise = power.noise if power.noise is None or given is None else power.noise + given
+    return replace(power, prior=power.prior + average, noise=noise)
 
 
 def _with_added(expected: ExpectedError, added: float, shape: FloatArray, size: tuple[int, int]) -> ExpectedError:
@@ -153,16 +205,10 @@ def _with_added(expected: ExpectedError, added: float, shape: FloatArray, size: 
 
 
 def _shifted(
-    given: Interval,
-    lacking: FloatArray,
-    halves: tuple[FloatArray, FloatArray],
-    method: Method,
-    operators: PosteriorOperators,
-    actual: FloatArray,
+    without: Interval, effect: Effect, method: Method, operators: PosteriorOperators, actual: FloatArray
 ) -> Interval:
     """Return the interval with the attenuation of the true image: its square, and its product with the noise."""
-    count = lacking.size
-    added = _added(lacking, *halves)
-    along = operators.weigh(method.task.observe(operators.posterior((halves[0] + halves[1]) / 2)))
-    variance = count**2 * given.variance + 4 * float(actual @ np.square(along)) + (UNCERTAINTY * added) ** 2
-    return interval(max(count * given.mse + added, 0.0), variance, count)
+    count, (first, second) = effect.image.size, effect.halves
+    along = operators.weigh(method.task.observe(operators.posterior((first + second) / 2)))
+    variance = count**2 * without.variance + 4 * float(actual @ np.square(along)) + (UNCERTAINTY * effect.added) ** 2
+    return interval(max(count * without.mse + effect.added, 0.0), variance, count)

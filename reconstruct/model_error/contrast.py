@@ -18,7 +18,7 @@ from scipy import fft, ndimage
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.scenes.model import Model
 
-from ..methods.method import Method, PosteriorOperators
+from ..methods.method import Method, PosteriorOperators, total_variance
 from .attenuation import FIRST_ORDER, Attenuation
 
 SEED = 20260403  # of random images and noise, different from those of the other analyses
@@ -28,6 +28,9 @@ SIGNAL = 0.5  # excess over the noise, relative, from which a bin is determined
 FAINT = 1e-12  # power relative to the largest, below which a bin is empty
 FITTED = 5  # bins at the end of the determined range that fix the power law
 TRANSFER = (0.25, 1.2)  # range of T: beyond it, it is chance, or waves that no lens type shows
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of two placements of the uncertainty of H
+HALF = 0.5
+LEAST = 0.05  # of the residual's share of the noise
 NEIGHBOURHOOD = 11  # pixels, over which the power of a band is averaged
 MANY = 100_000  # pixels above which one noise image is enough
 FEW = 10_000  # pixels below which four are taken
@@ -45,9 +48,12 @@ class Contrast:
     calibration: FloatArray
 
 
-def true_contrast(method: Method, operators: PosteriorOperators, actual: FloatArray) -> Contrast:
-    """Return the contrast of the image that a method has estimated; actual : (measurements used,) noise variances."""
-    task = method.task
+def true_contrast(method: Method, operators: PosteriorOperators, by_cause: dict[str, FloatArray]) -> Contrast:
+    """Return the contrast of the image that a method has estimated.
+
+    by_cause : (measurements used,) noise variances, with those that the uncertainty of H adds as "calibration"
+    """
+    task, actual = method.task, total_variance(by_cause)
     rng, waves = np.random.default_rng(SEED), Waves(task.shape)
     count = 1 if task.model.unknowns > MANY else 2 if task.model.unknowns > FEW else 4
     whites = [rng.normal(size=actual.size) for _ in range(count)]
@@ -63,14 +69,44 @@ def true_contrast(method: Method, operators: PosteriorOperators, actual: FloatAr
         excess = excess / _transfer(waves, _placed(waves, deviation, noise, first), operators, attenuation)
     spectrum = continued(waves.frequencies, excess, determined)
     image = task.prior.mean + _placed(waves, deviation, noise, spectrum)
-    return Contrast(image, noise, _calibration(task.model, method.image, image, noise)[task.used])
+    first, second = (values[task.used] for values in _placements(task.model, method.image, image, noise))
+    share = HALF if task.model.camera.detail > 1 else None
+    if share is None:
+        rest = np.maximum(actual - by_cause["calibration"], 0.0)
+        share = likeliest_share(_residual(method) / np.maximum(attenuation.residual_share, LEAST), rest, first, second)
+    return Contrast(image, noise, (1 - share) * first + share * second)
 
 
-def _calibration(model: Model, estimate: FloatArray, image: FloatArray, noise: tuple[FloatArray, ...]) -> FloatArray:
-    """Return the variance that H's uncertainty adds, (M,): placed as by the estimate, in sum as by the image."""
+def _placements(
+    model: Model, estimate: FloatArray, image: FloatArray, noise: tuple[FloatArray, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the variance that H's uncertainty adds, (M,), placed as by the estimate and as by the image.
+
+    Either has the sum of the image's. The estimate shows more where its noise is small, the image where it is large.
+    """
     placed, whole = model.variance_from_model(estimate, noise), model.variance_from_model(image)
     total = float(placed.sum())
-    return placed * (float(whole.sum()) / total) if total > 0 else whole
+    return placed * (float(whole.sum()) / total) if total > 0 else whole, whole
+
+
+def _residual(method: Method) -> FloatArray:
+    """Return the squares of g - H f^, (measurements used,)."""
+    task = method.task
+    return np.square(task.recorded[task.used] - task.observe(method.image))
+
+
+def likeliest_share(squares: FloatArray, rest: FloatArray, first: FloatArray, second: FloatArray) -> float:
+    """Return the share of `second` in a mean with `first` by which normal errors of these squares are likeliest.
+
+    rest : variance of the errors without either
+    """
+
+    def unlikelihood(share: float) -> float:
+        variance = rest + (1 - share) * first + share * second
+        known = variance > 0
+        return float(np.sum(np.log(variance[known]) + squares[known] / variance[known]))
+
+    return min(SHARES, key=unlikelihood)
 
 
 def _placed(waves: Waves, deviation: FloatArray, noise: tuple[FloatArray, ...], spectrum: FloatArray) -> FloatArray:

@@ -46,6 +46,7 @@ class ResidualInputs:
     leverage : (M,) exact (H A)_ii where the noise is as expected, None where it is not known
     optimal : True if the estimate is that of minimum variance
     whiten : applied to the noise where the estimator whitens correlated measurements, None where it does not
+    total : sum of the expected squares where the noise is as expected, None where it is not known better than by draws
     """
 
     observe: Callable[[FloatArray], FloatArray]
@@ -56,6 +57,7 @@ class ResidualInputs:
     leverage: FloatArray | None = None
     optimal: bool = True
     whiten: Callable[[FloatArray], FloatArray] | None = None
+    total: float | None = None
 
     @property
     def count(self) -> int:
@@ -93,6 +95,9 @@ class ResidualInputs:
             return ResidualPower(np.clip(1 - self.leverage, 0.0, 1.0), bias, noise, 0 if bias is None else self.draws)
         samples = None if self.optimal else np.zeros((self.draws, white.size), np.float32)
         noise, image = (self._mean_square(white, residuals, samples) for _ in range(2))
+        if self.total is not None:
+            scale = self.total / float((noise + image).sum())
+            noise, image = scale * noise, scale * image
         return ResidualPower(noise + image, bias, None if bias is None else noise, self.draws, samples)
 
     def _mean_square(

@@ -12,7 +12,7 @@ from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.iterative_operators import iterative_operators
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, PosteriorOperators
 from ommatid.reconstruct.model_error.attenuation import Attenuation
-from ommatid.reconstruct.model_error.contrast import Waves, continued, true_contrast
+from ommatid.reconstruct.model_error.contrast import Waves, continued, likeliest_share, true_contrast
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.model import Model
@@ -101,6 +101,39 @@ def test_the_attenuation_is_the_mean_effect_of_errors_of_h() -> None:
     assert np.mean(stated) == pytest.approx(measured, abs=3 * error + 0.2 * measured)  # first order in the variances
 
 
+def test_errors_of_h_fit_the_residual_as_they_attenuate_the_estimate() -> None:
+    """The residual with errors of H, less that of the same errors by the gain of another H, as the batches show it."""
+    exact = _exact()
+    image = 127.5 + 60 * np.random.default_rng(1).normal(size=361)
+    changes: list[float] = []
+    stated: list[float] = []
+    for seed in range(2 * DRAWS):
+        rng = np.random.default_rng([seed, 4])
+        model, other = (_measured(exact, rng, spread=0.06) for _ in range(2))
+        noise = NOISE + model.variance_from_model(image)
+        method, unrelated = (_method(one, exact.matrix @ image, noise) for one in (model, other))
+        residual = exact.matrix @ image - model.matrix @ method.image
+        errors, operators = (exact.matrix - model.matrix) @ image, _operators(unrelated)
+        apart = errors - other.matrix @ (operators.gain(errors) - operators.hidden(image - 127.5))
+        changes.append(float(np.sum((residual**2 - apart**2) / noise)))
+        operators, root = _operators(method), np.sqrt(noise)
+        white = rng.choice([-1.0, 1.0], size=root.size)
+        attenuation = Attenuation.of(method, operators, [white], [operators.gain(root * white)], root)
+        stated.append(float(attenuation.residual_change(method.task, attenuation.effect(image, 127.5)).sum()))
+    measured, error = np.mean(changes), np.std(changes) / len(changes) ** 0.5
+    assert measured < -4 * error  # there is something to predict
+    assert np.mean(stated) == pytest.approx(measured, abs=3 * error + 0.25 * abs(measured))
+
+
+def test_residuals_show_where_the_uncertainty_of_h_lies() -> None:
+    rng = np.random.default_rng(7)
+    rest = np.full(4000, NOISE)
+    first, second = NOISE * np.exp(rng.normal(size=(2, rest.size)))
+    for share in (0.0, 0.5, 1.0):
+        variance = rest + (1 - share) * first + share * second
+        assert likeliest_share(variance * rng.chisquare(1, rest.size), rest, first, second) == share
+
+
 @pytest.mark.parametrize("contrast", [0.0, 0.3, 20.0])
 def test_the_noise_of_an_estimate_is_not_taken_for_contrast(contrast: float) -> None:
     """The variance that errors of H add is that for the true image, which the estimate shows noisy."""
@@ -113,7 +146,8 @@ def test_the_noise_of_an_estimate_is_not_taken_for_contrast(contrast: float) -> 
         noise = NOISE + model.variance_from_model(image)
         recorded = exact.matrix @ image + NOISE**0.5 * rng.normal(size=noise.size)
         method = _method(model, recorded, noise)
-        contrasts = true_contrast(method, _operators(method), noise)
+        by_cause = {"noise": np.full(noise.size, NOISE), "calibration": noise - NOISE}
+        contrasts = true_contrast(method, _operators(method), by_cause)
         true += float(model.variance_from_model(image).sum())
         stated += float(contrasts.calibration.sum())
         plain += float(model.variance_from_model(method.image).sum())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from ommatid.scenes.shrinkage import shrink_variances
+from ommatid.scenes.shrinkage import posterior_variances, posterior_variances_among, shrink_variances
 
 
 @pytest.mark.parametrize("freedom", [3, 15, 63])
@@ -76,3 +76,52 @@ def test_lognormal_variances_are_not_underestimated(spread: float, bound: float)
         ratios.append(float(shrink_variances(sample, 16).sum() / true.sum()))
     standard_error = np.std(ratios) / np.sqrt(len(ratios))
     assert 1 - 3 * standard_error < np.mean(ratios) < bound
+
+
+@pytest.mark.parametrize("law", ["two values", "log-uniform"])
+def test_posterior_variances_are_means_whatever_the_law_of_the_true_ones(law: str) -> None:
+    """Groups of like posterior means have true variances of that mean; a wrong law would show in the tails.
+
+    The tolerance is five standard errors of a group's mean, and what the width of the kernel adds: most where the law
+    has sharp edges.
+    """
+    rng = np.random.default_rng(8)
+    drawn = {
+        "two values": rng.choice([1e-3, 1.0], size=100_000, p=[0.7, 0.3]),
+        "log-uniform": 10 ** rng.uniform(-6, 1, 100_000),
+    }
+    true, width = drawn[law], {"two values": 0.07, "log-uniform": 0.02}
+    means = posterior_variances(true * rng.chisquare(15, true.size) / 15, 16)
+    assert means.sum() == pytest.approx(true.sum(), rel=0.015)
+    for group in np.array_split(np.argsort(means), 20):
+        ratio = true[group] / means[group]
+        assert ratio.mean() == pytest.approx(1, abs=width[law] + 5 * ratio.std() / group.size**0.5)
+
+
+def test_posterior_variances_of_few_are_shrunk_and_of_none_are_zero() -> None:
+    rng = np.random.default_rng(9)
+    few = rng.chisquare(15, 200) / 15
+    np.testing.assert_array_equal(posterior_variances(few, 16), shrink_variances(few, 16))
+    many = np.where(np.arange(20_000) % 2 == 0, rng.chisquare(15, 20_000), 0.0)
+    np.testing.assert_array_equal(posterior_variances(np.zeros(5000), 16), np.zeros(5000))
+    assert np.isfinite(posterior_variances(many, 16)).all()
+    scaled = posterior_variances(1e-200 * many, 16)
+    np.testing.assert_allclose(scaled, 1e-200 * posterior_variances(many, 16), rtol=1e-2)
+
+
+def test_what_the_neighbours_say_corrects_variances_place_by_place() -> None:
+    """Where variances are large on average, a small sample is more often an underestimate than elsewhere."""
+    rng = np.random.default_rng(10)
+    typical = np.repeat([0.1, 1.0, 10.0], 20_000)
+    true = typical * 10 / rng.chisquare(10, typical.size)
+    sample = true * rng.chisquare(15, true.size) / 15
+    for means, error in (
+        (posterior_variances(sample, 16), 0.2),
+        (posterior_variances_among(sample, typical, 16), 0.02),
+    ):
+        weights = 1 / means
+        ratios = [
+            (weights * true)[typical == one].sum() / (weights * means)[typical == one].sum() for one in (0.1, 10.0)
+        ]
+        assert max(np.abs(np.array(ratios) - 1)) < error
+        assert error < 0.1 or max(np.abs(np.array(ratios) - 1)) > 0.03

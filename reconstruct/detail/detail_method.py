@@ -67,15 +67,23 @@ class DetailMethod(Method):
         white, solved = self._solved
         unit = np.ones(self.task.expected_noise.size)
         expected = robust_error(solved.form, white, noise, CAUSE)
+        given = total_variance(noise if truth is None else self._noise_given(truth, noise))
         return MethodResult(
             solved.image,
             solved.multipliers / np.sqrt(self.task.expected_noise),  # their squares times the noise are chi-squared
             solved.solver,
             expected,
-            None if truth is None else self._interval(truth, total_variance(noise)),
+            None if truth is None else self._interval(truth, given),
             lambda weights: variance_of_sum(solved.form, weights, unit),
-            self._residual_power(truth, total_variance(noise), expected.leverage),
+            self._residual_power(truth, given, expected.leverage),
         )
+
+    def _noise_given(self, truth: FloatArray, noise: dict[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return the noise with the variance that the uncertainty of H adds for a world whose detail is known."""
+        fine = self._model.fine
+        if "calibration" not in noise or truth.size != fine.unknowns:
+            return noise
+        return noise | {"calibration": fine.variance_from_model(truth)[self.task.used]}
 
     def _residual_power(
         self, truth: FloatArray | None, actual: FloatArray, leverage: FloatArray | None

@@ -19,6 +19,7 @@ from ommatid.scenes.tables.estimation import PriorTable
 from .detail.detailed_model import CAUSE as DETAIL
 from .detail.detailed_model import DetailedModel, independent_detail, model_of_f
 from .detail.world_fit import fit_world
+from .expected_error import interval
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
@@ -39,6 +40,7 @@ from .noise import (
 Result = TypeVar("Result")
 
 NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
+RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
 CERTAIN = ("rendering", "calibration", DETAIL)  # noise that stays known when the rest of it is to be fitted
 
 
@@ -61,13 +63,23 @@ class Assumptions:
 
         truth : (N,), or (pixels of the world,) for a method that takes detail into account
         """
-        method, result = self.method, self.method.result(self.noise, truth)
+        method, result = self.method, self._without_attenuation(truth)
         operators = None if self.contrast is None else method.operators()
         if self.contrast is None or operators is None:
             return result
         known = truth if truth is not None and truth.size == method.task.model.unknowns else None
         actual = total_variance(self.noise)
         return with_attenuation(result, method, operators, self.contrast.image, known, actual)
+
+    def _without_attenuation(self, truth: FloatArray | None) -> MethodResult:
+        """Return the result of the method, whose interval allows for what is not known of the rendering's variance."""
+        result = self.method.result(self.noise, truth)
+        unknown = RENDERING * result.expected.parts.get("rendering", 0.0)
+        if result.interval is None or not unknown:
+            return result
+        given, count = result.interval, result.image.size
+        wider = interval(count * given.mse, count**2 * (given.variance + unknown**2), count)
+        return replace(result, interval=wider if given.variance else given)
 
 
 def method_for(stack: Stack, model: Model) -> Method:

@@ -29,7 +29,7 @@ NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is average
 GROUP_SIZE = 200  # fewest measurements over which a leverage is averaged
 MOST_GROUPS = 24  # per lens type
 FIRST_ORDER = 0.5  # share of the posterior's spread that attenuation takes, up to which the first order serves
-UNCERTAINTY = 0.1  # of the attenuation's part of the error, relative: it is of first order
+UNCERTAINTY = 0.07  # of what the errors of H add to the error, relative: noise and attenuation are of first order
 
 
 @dataclass(frozen=True)
@@ -165,24 +165,20 @@ def with_attenuation(
         return result
     average = attenuation.effect(image + unseen, task.prior.mean)
     given = None if truth is None else attenuation.effect(truth, task.prior.mean)
-    interval_given, power, before = result.interval, result.residual_power, result.variance_of_sum
-    if given is not None and interval_given is not None:
-        interval_given = _shifted(interval_given, given, method, operators, actual)
-    if power is not None:
-        change = None if given is None else attenuation.residual_change(task, given)
-        power = _with_change(power, attenuation.residual_change(task, average), change)
     first, second = average.halves
+    before, power = result.variance_of_sum, result.residual_power
 
     def variance_of_sum(weights: FloatArray) -> float:
         return before(weights) + max(float((weights @ first) * (weights @ second)), 0.0)
 
+    if power is not None:
+        change = None if given is None else attenuation.residual_change(task, given)
+        power = _with_change(power, attenuation.residual_change(task, average), change)
+    expected = _with_added(result.expected, max(average.added, 0.0), first + second, task.shape)
     return replace(
         result,
-        expected=replace(
-            _with_added(result.expected, max(average.added, 0.0), first + second, task.shape),
-            second_order=max(attenuation.strength(first + second), 0.0),
-        ),
-        interval=interval_given,
+        expected=replace(expected, second_order=max(attenuation.strength(first + second), 0.0)),
+        interval=result.interval if given is None else _shifted(result, given, method, operators, actual),
         variance_of_sum=variance_of_sum,
         residual_power=power,
     )
@@ -205,10 +201,13 @@ def _with_added(expected: ExpectedError, added: float, shape: FloatArray, size: 
 
 
 def _shifted(
-    without: Interval, effect: Effect, method: Method, operators: PosteriorOperators, actual: FloatArray
-) -> Interval:
+    result: MethodResult, effect: Effect, method: Method, operators: PosteriorOperators, actual: FloatArray
+) -> Interval | None:
     """Return the interval with the attenuation of the true image: its square, and its product with the noise."""
-    count, (first, second) = effect.image.size, effect.halves
+    without, count, (first, second) = result.interval, effect.image.size, effect.halves
+    if without is None:
+        return None
     along = operators.weigh(method.task.observe(operators.posterior((first + second) / 2)))
-    variance = count**2 * without.variance + 4 * float(actual @ np.square(along)) + (UNCERTAINTY * effect.added) ** 2
+    unknown = UNCERTAINTY * (effect.added + count * result.expected.parts.get("calibration", 0.0))
+    variance = count**2 * without.variance + 4 * float(actual @ np.square(along)) + unknown**2
     return interval(max(count * without.mse + effect.added, 0.0), variance, count)

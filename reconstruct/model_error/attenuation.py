@@ -29,6 +29,7 @@ NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is average
 GROUP_SIZE = 200  # fewest measurements over which a leverage is averaged
 MOST_GROUPS = 24  # per lens type
 FIRST_ORDER = 0.5  # share of the posterior's spread that attenuation takes, up to which the first order serves
+LEAST_LEFT = 0.05  # of an expected square of the residual
 UNCERTAINTY = 0.07  # of what the errors of H add to the error, relative: noise and attenuation are of first order
 
 
@@ -186,8 +187,12 @@ def with_attenuation(
 
 def _with_change(power: ResidualPower, average: FloatArray, given: FloatArray | None) -> ResidualPower:
     """Return expected squares with their changes for images of the prior, and for the true one if it is known."""
-    noise = power.noise if power.noise is None or given is None else power.noise + given
-    return replace(power, prior=power.prior + average, noise=noise)
+
+    def changed(squares: FloatArray, change: FloatArray) -> FloatArray:
+        return np.maximum(squares + change, LEAST_LEFT * squares)
+
+    noise = power.noise if power.noise is None or given is None else changed(power.noise, given)
+    return replace(power, prior=changed(power.prior, average), noise=noise)
 
 
 def _with_added(expected: ExpectedError, added: float, shape: FloatArray, size: tuple[int, int]) -> ExpectedError:

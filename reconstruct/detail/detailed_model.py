@@ -82,12 +82,14 @@ class DetailedModel(Model):
         total = float(variance.sum())
         if self.world is None or len(self.fine.batches) < 2 or not total:
             return variance
-        rng = np.random.default_rng(SEED)
-        worlds = (self.world.draw(rng) for _ in range(DRAWS))
-        details = (
-            world - self.interpolation @ (averaging(self.camera.shape, self.camera.detail) @ world) for world in worlds
-        )
-        return variance * (sum(float(self.fine.scatter(detail).sum()) for detail in details) / (DRAWS * total))
+        rng, scatter, power = np.random.default_rng(SEED), 0.0, 0.0
+        average = averaging(self.camera.shape, self.camera.detail)
+        for _ in range(DRAWS):
+            world = self.world.draw(rng)
+            detail = world - self.interpolation @ (average @ world)
+            scatter += float(self.fine.scatter(detail).sum())
+            power += float(detail @ detail)
+        return variance * (scatter / power * float(self.unresolved.sum()) / total)
 
     def prior_variance_from_model(self, prior_variance: FloatArray, prior_mean: float = 0.0) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement under the prior: (M,)."""

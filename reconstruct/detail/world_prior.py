@@ -64,7 +64,11 @@ class WorldPrior:
         return product
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
-        """Draw a world less its mean: (pixels of the world,)."""
+        """Draw a world less its mean: (pixels of the world,).
+
+        What is negative in the spectrum of twice the size counts as 0, which adds to the finest detail where the world
+        is only a few correlation lengths wide.
+        """
         rows, columns = self.fine_shape
         waves = fft.rfft2(rng.normal(size=self.lags.shape)) * np.sqrt(np.maximum(self._spectrum, 0.0))
         return np.asarray(fft.irfft2(waves, s=self.lags.shape)[:rows, :columns], dtype=np.float64).ravel()

@@ -160,6 +160,24 @@ def test_neighbourhoods_replace_the_exact_moments() -> None:
     np.testing.assert_allclose(exact.detail_variance, brute, rtol=1e-6)
 
 
+def test_random_worlds_have_the_covariance_of_the_prior() -> None:
+    """Variances of a weighted sum and of what f leaves open, over draws, against P and P - B A P.
+
+    The world is two correlation lengths wide, where clipping the spectrum adds most: 15 % to what f leaves open.
+    """
+    described = scene(lenses=THREE, prior=EXPONENTIAL, calibration={"method": "ideal"})
+    world, rng = WorldPrior.of(described.prior, (7, 9), 1.0, 3), np.random.default_rng(3)
+    draws = np.array([world.draw(rng) for _ in range(4000)])
+    weights = rng.normal(size=draws.shape[1])
+    tolerance = 5 * (2 / len(draws)) ** 0.5
+    expected = float(weights @ world.apply(weights[:, None])[:, 0])
+    assert np.mean(np.square(draws @ weights)) == pytest.approx(expected, rel=tolerance)
+    open_detail = draws - (draws @ averaging((7, 9), 3).T) @ world.interpolation.T
+    ratios = np.square(open_detail).mean(axis=0) / world.unresolved
+    assert 0.98 < ratios.mean() < 1.15
+    assert ratios.std() < 0.08
+
+
 def test_a_camera_of_whole_pixels_has_no_detail() -> None:
     """For the paper's camera G is H and the covariance of detail zero, so nothing is computed on the world's grid."""
     described = scene(lenses=THREE, prior=EXPONENTIAL, calibration={"method": "ideal"})

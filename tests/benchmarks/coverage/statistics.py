@@ -46,7 +46,8 @@ class Mean:
         return cls(float(sample.mean()), error)
 
     def __str__(self) -> str:
-        return "-" if np.isnan(self.value) else f"{self.value:.3f} ± {self.error:.3f}"
+        error = "" if np.isnan(self.error) else f" ± {self.error:.3f}"
+        return "-" if np.isnan(self.value) else f"{self.value:.3f}{error}"
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ class Rendering(OverPasses):
         """Return the variance, (M,), shrunk among pixels with like neighbours, and never below float32's rounding."""
         around = np.concatenate(
             [
-                _mean_of_neighbours(self.variance[pixels].reshape(sub.type.pixels)).ravel()
+                mean_of_neighbours(self.variance[pixels].reshape(sub.type.pixels)).ravel()
                 for sub, pixels in zip(camera.sub_imagers, camera.slices(), strict=True)
             ]
         )
@@ -54,11 +54,13 @@ class Rendering(OverPasses):
         return np.maximum(np.concatenate(shrunk), rounding_variance(self.mean, self.samples))
 
 
-def _mean_of_neighbours(image: FloatArray) -> FloatArray:
-    """Return the mean of the other pixels in the neighbourhood of each pixel of an image."""
-    count = NEIGHBOURHOOD**2
-    sums = count * ndimage.uniform_filter(image, NEIGHBOURHOOD, mode="nearest")
-    return (sums - image) / (count - 1)
+def mean_of_neighbours(image: FloatArray) -> FloatArray:
+    """Return the mean of the other pixels in the neighbourhood of each pixel of an image, as far as it lies inside."""
+    sums, counts = (
+        NEIGHBOURHOOD**2 * ndimage.uniform_filter(values, NEIGHBOURHOOD, mode="constant")
+        for values in (image, np.ones_like(image))
+    )
+    return (sums - image) / np.maximum(counts - 1, 1)
 
 
 def made_from(setup: Setup) -> str:

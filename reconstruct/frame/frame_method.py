@@ -128,8 +128,10 @@ class FrameMethod(Method):
         task, system = self.task, self.system
         deviation = None if truth is None else truth - task.prior.mean
         draws = DRAWS if task.model.unknowns <= MANY else 1
-        is_known = task.prior.kind == "independent" and np.allclose(actual, task.expected_noise, rtol=1e-9)
-        total = max(actual.size - freedoms, 0.0) or None if is_known else None
+        total = None
+        as_expected = task.prior.kind == "independent" and np.allclose(actual, task.expected_noise, rtol=1e-9)
+        if as_expected and actual.size > freedoms:
+            total = actual.size - freedoms
         inputs = ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws, total=total)
         residuals = (
             column - task.observe(self._solve(system.right_hand_side(task.on_all_measurements(column, 0.0))))

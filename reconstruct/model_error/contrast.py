@@ -29,7 +29,6 @@ FAINT = 1e-12  # power relative to the largest, below which a bin is empty
 FITTED = 5  # bins at the end of the determined range that fix the power law
 TRANSFER = (0.25, 1.2)  # range of T: beyond it, it is chance, or waves that no lens type shows
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of two placements of the uncertainty of H
-HALF = 0.5
 LEAST = 0.05  # of the residual's share of the noise
 NEIGHBOURHOOD = 11  # pixels, over which the power of a band is averaged
 MANY = 100_000  # pixels above which one noise image is enough
@@ -70,8 +69,9 @@ def true_contrast(method: Method, operators: PosteriorOperators, by_cause: dict[
     spectrum = continued(waves.frequencies, excess, determined)
     image = task.prior.mean + _placed(waves, deviation, noise, spectrum)
     first, second = (values[task.used] for values in _placements(task.model, method.image, image, noise))
-    share = HALF if task.model.camera.detail > 1 else None
-    if share is None:
+    if task.model.camera.detail > 1:  # the residual shows detail, too
+        share = 0.5
+    else:
         rest = np.maximum(actual - by_cause["calibration"], 0.0)
         share = likeliest_share(_residual(method) / np.maximum(attenuation.residual_share, LEAST), rest, first, second)
     return Contrast(image, noise, (1 - share) * first + share * second)

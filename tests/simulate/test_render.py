@@ -13,7 +13,7 @@ from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
-from ommatid.simulate.render import made_from, render
+from ommatid.simulate.render import made_from, mean_of_neighbours, render
 
 from ..examples import THREE, VARIANTS, needs, scene
 from ..modules import existing
@@ -82,3 +82,12 @@ def test_the_fingerprint_changes_with_the_inputs_of_the_values_only() -> None:
     assert made_from(Setup(scene(noise={"variance": 1.0}), camera, image)) != first
     assert made_from(Setup(scene(render={"seed": 3}), camera, image)) != first
     assert made_from(Setup(plain, camera, image + 1)) != first
+
+
+def test_the_neighbours_of_a_pixel_do_not_hold_its_own_value() -> None:
+    """At edges and corners, too: what tells how large a sample variance should be must not depend on it."""
+    image = np.random.default_rng(4).uniform(1, 2, (6, 7))
+    for place in np.ndindex(image.shape):
+        changed = image.copy()
+        changed[place] = 100.0
+        assert mean_of_neighbours(changed)[place] == pytest.approx(mean_of_neighbours(image)[place], rel=1e-12)

@@ -2,7 +2,7 @@
 
 The samples of one pixel are adjacent lanes, so that a pixel's sum is the sum of a block, in float64 and the same on any
 number of threads. A random number is drawn for an effect only if the lenses have it: two for the position in the pixel,
-two more for an aperture, two more for diffraction. Lengths are millimetres.
+two more for an aperture, one more for several wavelengths. Lengths are millimetres.
 """
 
 # pyright: basic
@@ -91,7 +91,7 @@ class RayGenerator:
             z = corner_z + axes[4] * at.x + axes[5] * at.y
         else:
             x, y, z = corner_x + at.x, corner_y + at.y, corner_z
-        start, direction, weight = self.lens.emit(x, y, -z, self.sampler)
+        start, direction, weight = self.lens.emit(x, y, -z, self.sampler, (lens_x, lens_y))
         ray = dr.zeros(mi.RayDifferential3f, lanes)
         ray.o = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
         ray.d = dr.normalize(mi.Vector3f(*direction))
@@ -122,4 +122,10 @@ def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
 
         return RealLens(camera, lens_type)
     aperture = lens_type.optics.aperture
-    return LensModel(camera, lens_type) if aperture is None else ThinLens(camera, lens_type, aperture)
+    if aperture is None:
+        return LensModel(camera, lens_type)
+    if camera.wavelengths:
+        from .diffracting_lens import DiffractingLens
+
+        return DiffractingLens(camera, lens_type, aperture)
+    return ThinLens(camera, lens_type, aperture)

@@ -9,11 +9,11 @@ import numpy as np
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.blur import Blur
+from ommatid.scenes.optics.diffraction import QUANTILES, end_of
 
 from ..lenses.prescription import prescription_of
 from ..lenses.ray_trace import Functions, exit_disk_of, path, trace
-from .lens import Emission, LensModel, sample_displacement, slope_table
+from .lens import Emission, LensModel, Point
 
 
 class RealLens(LensModel):
@@ -31,19 +31,26 @@ class RealLens(LensModel):
         numbers = path(lens, exit_disk_of(camera, lens_type, lens))
         self._numbers = [dr.opaque(mi.Float, float(number)) for number in numbers]
         self._functions = Functions(dr.sqrt, dr.select, dr.maximum)
-        self._radii = None
+        self._table = None
         if camera.wavelength is not None:
-            slope = camera.wavelength * lens.working_f_number(depth) / np.pi / depth
-            blur = Blur(airy=slope * camera.distance / camera.target_pitch)
-            self.tail, self._radii = blur.reach, slope_table(blur, camera)
+            from .diffracting_lens import BandTable
 
-    def emit(self, x: Any, y: Any, depth: Any, sampler: Any) -> Emission:
+            self._slope = camera.wavelength * lens.working_f_number(depth) / np.pi / depth
+            self.tail = end_of(0.0) * self._slope * camera.distance / camera.target_pitch
+            self._table = BandTable(np.zeros(2), 0.0, QUANTILES)
+            self.captured = self._table.captured
+
+    def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
+        import drjit as dr
         import mitsuba as mi
 
+        del lens
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
         (at_x, at_y), (u, v, w), weight = trace(self._numbers, x, y, on_disk.x, on_disk.y, depth, self._functions)
-        if self._radii is None:
+        if self._table is None:
             return (at_x, at_y, 0), (u, v, w), weight
-        shift = sample_displacement(self._radii, sampler.next_2d())
-        return (at_x, at_y, 0), (u / w + shift[0], v / w + shift[1], 1), weight
+        sample = sampler.next_2d()
+        radius = self._table.at(0.0, dr.sqrt(sample.x) * QUANTILES)[0] * self._slope
+        sine, cosine = dr.sincos(2 * np.pi * sample.y)
+        return (at_x, at_y, 0), (u / w + radius * cosine, v / w + radius * sine, 1), weight

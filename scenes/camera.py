@@ -111,6 +111,11 @@ class Camera:
         return () if self.wavelength is None else ((self.wavelength, 1.0),)
 
     @property
+    def has_width(self) -> bool:
+        """True if a lens type has an aperture or surfaces: not all are pinholes."""
+        return any(lens.optics.aperture is not None or lens.optics.surfaces is not None for lens in self.types)
+
+    @property
     def half_diagonal(self) -> float:
         """Distance from the middle of the target to its corner: r = 1 of a distortion."""
         return self.target_pitch * hypot(self.rows, self.columns) / 2

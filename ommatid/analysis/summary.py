@@ -46,6 +46,7 @@ def describe(
             "height": camera.rows * camera.target_pitch,
             "distance": camera.distance,
         },
+        "light_as": _light_words(camera),
         "lens_types": [_lens_type(camera, lens_type) for lens_type in camera.types],
         "measurements": camera.measurements,
         "unknowns": camera.unknowns,
@@ -58,6 +59,14 @@ def describe(
         "plan": _plan(scene, camera, variant, choice),
         "skipped": [skipped.describe() for skipped in setup.skipped],
     }
+
+
+def _light_words(camera: Camera) -> str:
+    if not camera.has_width:
+        return "rays through pinholes"
+    if not camera.wavelengths:
+        return "rays, which do not diffract: camera.wavelength is 'none'"
+    return ", ".join(f"{wavelength * 1e6:.4g} nm" for wavelength, _ in camera.wavelengths)
 
 
 def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
@@ -115,6 +124,7 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
     geometry = [
         ("target", f"{target['rows']} x {target['columns']} pixels, {target['height']:g} x {target['width']:g} mm"),
         ("distance", f"{target['distance']:g} mm"),
+        ("light", description["light_as"]),
         ("measurements", f"{description['measurements']} for {description['unknowns']} unknowns"),
     ]
     if description["pixels_seen_by_fewer_types"]:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from ..camera import Camera
-from ..constants import AIRY_FIRST_ZERO, WHITE
+from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
 from ..lens_type import LensOptics, LensType
 from ..scene import Scene
 
@@ -170,6 +170,36 @@ def _change(camera: Camera, lens_type: LensType, reduced: Blur) -> tuple[float, 
     row = sparse.csr_array(matrix(small, single, *blurs) - matrix(small, single, (reduced, 1.0))).data
     most = WHITE * max(float(row[row > 0].sum()), -float(row[row < 0].sum()))
     return most, float(np.square(row).sum())
+
+
+def light_kept_in_focus(side: float) -> float:
+    """Share of the light of a sensor pixel's square that stays in it behind a circular aperture in focus.
+
+    side : of the square, in wavelengths times the f-number
+    """
+    # By Parseval: the square's autocorrelation, transformed, times the transfer function, in polar coordinates.
+    nodes, weights = np.polynomial.legendre.leggauss(200 + ceil(4 * side))
+    q, turn = (1 + nodes[:, None]) / 2, np.pi / 8 * (1 + nodes)
+    transfer = 2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q**2))
+    square = np.sinc(side * q * np.cos(turn)) ** 2 * np.sinc(side * q * np.sin(turn)) ** 2
+    return float(side**2 * np.pi / 2 * (weights[:, None] * weights * q * transfer * square).sum())
+
+
+def change_by_diffraction(camera: Camera, lens_type: LensType, aperture: float, focus: float) -> float:
+    """Bound on the change of a measurement of values from 0 to 255 by 550 nm diffraction at an aperture.
+
+    The light that leaves a sensor pixel's footprint with diffraction, and without it by defocus. Both lengths in mm.
+    """
+    from .blur import MOST_WAVES, Blur, transfer
+
+    footprint = float(lens_type.ratio) * camera.target_pitch
+    disk = aperture * abs(1 - camera.distance / focus) / footprint
+    airy = GREEN * camera.distance / np.pi / (aperture * footprint)
+    waves, rays = Blur(disk, airy), Blur(disk)
+    if waves.waves > MOST_WAVES:
+        waves = rays
+    kept = [float(transfer(1.0, np.array([0]), 1, blur)[0, 0]) for blur in (waves, rays)]
+    return WHITE * min(1.0, sum(1 - share for share in kept))
 
 
 def _illumination_change(camera: Camera, lens_type: LensType) -> float:

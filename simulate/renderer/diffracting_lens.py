@@ -27,7 +27,7 @@ from ..lenses import thin_lens
 from ..lenses.ray_trace import reach
 from .lens import Distance, Emission, LensModel, Point
 
-FEW_QUANTILES = 2**14  # where the defocus varies
+FEW_QUANTILES = 2**12  # where the defocus varies
 STEP, GROWTH, LINEAR = 0.05, 1.02, 3.0  # between tabulated defoci, in waves: up to LINEAR, and as a factor beyond
 SAME = 1e-3  # waves by which defocus may vary without a table of several
 BEYOND = 1 - 1e-5  # focus over distance beyond the focus: below 1, since a side that rounding decides is no random one

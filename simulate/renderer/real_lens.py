@@ -51,6 +51,6 @@ class RealLens(LensModel):
         if self._table is None:
             return (at_x, at_y, 0), (u, v, w), weight
         sample = sampler.next_2d()
-        radius = self._table.at(0.0, dr.sqrt(sample.x) * QUANTILES)[0] * self._slope
+        radius = self._table.at(0.0, sample.x, all_light=False)[0] * self._slope
         sine, cosine = dr.sincos(2 * np.pi * sample.y)
         return (at_x, at_y, 0), (u / w + radius * cosine, v / w + radius * sine, 1), weight

@@ -81,6 +81,7 @@ def test_predict_with_saturated_pixels_and_with_blurred_lenses(ommatid: Command)
     """Saturated pixels are left out of both; a cost without closed form is reported as missing."""
     loose = ("--set", 'camera.tolerance.position="10 nm"')
     aperture = [part for name in ["I", "II", "III"] for part in ("--set", f'camera.lens.{name}.aperture="0.4 mm"')]
+    aperture += ["--set", 'camera.wavelength="none"']
     sensor = ("--set", "noise=", "--set", 'sensor.illuminance="500 lux"', "--set", 'sensor.exposure="10 ms"')
     bright = document(ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
     assert bright["measurements"] < 706

@@ -90,6 +90,12 @@ class LensType:
         )
         return rows, columns
 
+    def gaps(self, shape: tuple[int, int]) -> tuple[tuple[int, Fraction], ...]:
+        """Pixels of f before and after what all sub-imagers together see, along the rows and columns of `shape`."""
+        return tuple(
+            (start, size - span - start) for start, span, size in zip(self.origin, self.span, shape, strict=True)
+        )
+
 
 @dataclass(frozen=True)
 class SubImager:

@@ -302,8 +302,7 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
     optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale)
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics)
-    origin = floor((rows - lens_type.span[0]) / 2), floor((columns - lens_type.span[1]) / 2)
-    return replace(lens_type, origin=origin)
+    return lens_type.centred(rows, columns)
 
 
 def _check_overlap(camera: Camera, scene: Scene) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,8 @@ class LensType:
     """An array of equal sub-imagers.
 
     ratio : m, pixels of f that a sensor pixel covers along one axis
-    origin : row and column of f where the view of sub-imager (0, 0) begins
+    origin : row and column of f where the view of sub-imager (0, 0) begins; whole ones, so that the array stands at
+        most half a pixel of f off the target's middle
     left : columns of sub-imagers of other types to its left; None: those of the types listed before it
     """
 
@@ -89,6 +91,17 @@ class LensType:
             self.ratio * pixels + (count - 1) * self.step for count, pixels in zip(self.array, self.pixels, strict=True)
         )
         return rows, columns
+
+    def centred(self, rows: int, columns: int) -> LensType:
+        """The same lens type in the middle of a target, to the nearest whole pixel of f, the lower one of two."""
+        top, left = (ceil((size - span - 1) / 2) for size, span in zip((rows, columns), self.span, strict=True))
+        return replace(self, origin=(top, left))
+
+    def gaps(self, shape: tuple[int, int]) -> tuple[tuple[int, Fraction], ...]:
+        """Pixels of f before and after what all sub-imagers together see, along the rows and columns of `shape`."""
+        return tuple(
+            (start, size - span - start) for start, span, size in zip(self.origin, self.span, shape, strict=True)
+        )
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,7 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "step": str(lens_type.step),
         "sees_rows": [lens_type.origin[0], float(lens_type.origin[0] + lens_type.span[0])],
         "sees_columns": [lens_type.origin[1], float(lens_type.origin[1] + lens_type.span[1])],
+        "off_centre": [float(before - after) / 2 for before, after in lens_type.gaps(camera.shape)],
         "sensor_depth": camera.depth(lens_type),
         "focal_length": camera.focal_length(lens_type),
         "sub_image_width": lens_type.pixels[1] * camera.pixel_pitch,
@@ -94,7 +95,12 @@ def _unseen_edges(camera: Camera) -> list[str]:
         edges = (("top", top), ("bottom", bottom), ("left", left), ("right", right))
         missed = [f"{float(width):g} at the {edge}" for edge, width in edges if width > 0]
         if missed:
-            sentences.append(f"type {lens_type.name} does not see the pixels {', '.join(missed)}")
+            sentence = f"type {lens_type.name} does not see the pixels {', '.join(missed)}"
+            rows, columns = (float(before - after) / 2 for before, after in lens_type.gaps(camera.shape))
+            offset = (
+                f": its middle is {rows:+g} rows and {columns:+g} columns from the target's" if rows or columns else ""
+            )
+            sentences.append(sentence + offset)
     return sentences
 
 

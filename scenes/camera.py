@@ -74,7 +74,7 @@ class Camera:
     @property
     def covers_whole_pixels(self) -> bool:
         """True if every sensor pixel averages whole pixels of f, so that detail finer than f changes no measurement."""
-        whole = all(lens.ratio.denominator == lens.step.denominator == 1 for lens in self.types)
+        whole = all(number.denominator == 1 for lens in self.types for number in (lens.ratio, *lens.step))
         sharp = all(lens.optics.surfaces is None for lens in self.types) and self.has_box_footprints
         return whole and sharp and self.tolerance is None
 
@@ -164,7 +164,7 @@ class Camera:
         left = sum(other.array[1] for other in self.types[:index]) if lens_type.left is None else lens_type.left
         lens_x = ((columns - 1) / 2 - (left + l)) * self.lens_pitch
         lens_y = ((lens_type.array[0] - 1) / 2 - k) * self.lens_pitch
-        window = lens_type.origin[0] + k * lens_type.step, lens_type.origin[1] + l * lens_type.step
+        window = lens_type.window(k, l)
         x, y = self.position(*lens_type.middle(window))
         depth = self.depth(lens_type)
         shrink = depth / self.distance
@@ -189,8 +189,7 @@ class Camera:
         for lens_type in self.types:
             axes = [np.zeros(size, dtype=np.int64) for size in self.shape]
             for axis, seen in enumerate(axes):
-                for number in range(lens_type.array[axis]):
-                    start = lens_type.origin[axis] + number * lens_type.step
+                for start in lens_type.starts(axis):
                     seen[ceil(start) : floor(start + lens_type.ratio * lens_type.pixels[axis])] = 1
             count += np.outer(*axes)
         return count
@@ -221,7 +220,7 @@ class Camera:
                 "magnification": str(1 / lens_type.ratio),
                 "array": list(lens_type.array),
                 "pixels": list(lens_type.pixels),
-                "step": str(lens_type.step),
+                "step": lens_type.described_step,
                 **lens_type.optics.describe(),
             }
         if not self.is_ideal_pinhole:  # sub-images of ideal pinholes do not depend on where the lenses are
@@ -286,7 +285,8 @@ def _wavelength(scene: Scene) -> float | None:
 def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensType:
     ratio = 1 / lens.magnification
     most = tuple(
-        floor((size - (count - 1) * lens.step) / ratio) for size, count in zip((rows, columns), lens.array, strict=True)
+        floor((size - (count - 1) * step) / ratio)
+        for size, count, step in zip((rows, columns), lens.array, lens.step, strict=True)
     )
     if min(most) < 1:
         raise InputError(

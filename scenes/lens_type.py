@@ -50,6 +50,7 @@ class LensType:
     """An array of equal sub-imagers.
 
     ratio : m, pixels of f that a sensor pixel covers along one axis
+    step : pixels of f from one window to the next, down and across
     origin : row and column of f where the view of sub-imager (0, 0) begins; whole ones, so that the array stands at
         most half a pixel of f off the target's middle
     left : columns of sub-imagers of other types to its left; None: those of the types listed before it
@@ -59,7 +60,7 @@ class LensType:
     ratio: Fraction
     array: tuple[int, int]
     pixels: tuple[int, int]
-    step: Fraction
+    step: tuple[Fraction, Fraction]
     origin: tuple[int, int]
     optics: LensOptics = LensOptics()
     left: int | None = None
@@ -77,7 +78,22 @@ class LensType:
     def finer(self, detail: int) -> LensType:
         """The same lens type on a grid of the target that is `detail` times finer along both axes."""
         origin = self.origin[0] * detail, self.origin[1] * detail
-        return replace(self, ratio=self.ratio * detail, step=self.step * detail, origin=origin)
+        step = self.step[0] * detail, self.step[1] * detail
+        return replace(self, ratio=self.ratio * detail, step=step, origin=origin)
+
+    def window(self, k: int, l: int) -> tuple[Fraction, Fraction]:  # noqa: E741
+        """Row and column of f where the view of sub-imager (k, l) begins."""
+        return self.origin[0] + k * self.step[0], self.origin[1] + l * self.step[1]
+
+    def starts(self, axis: int) -> tuple[Fraction, ...]:
+        """Row (axis 0) or column (1) of f where the view of each sub-imager along this axis begins."""
+        return tuple(self.origin[axis] + number * self.step[axis] for number in range(self.array[axis]))
+
+    @property
+    def described_step(self) -> str:
+        """The step as text: one number, or two if they differ."""
+        down, across = self.step
+        return str(down) if down == across else f"{down} down, {across} across"
 
     def middle(self, window: tuple[Fraction, Fraction]) -> tuple[float, float]:
         """Row and column of f in the middle of the view of a sub-imager whose view begins at `window`."""
@@ -88,7 +104,8 @@ class LensType:
     def span(self) -> tuple[Fraction, Fraction]:
         """Rows and columns of f that all sub-imagers together see."""
         rows, columns = (
-            self.ratio * pixels + (count - 1) * self.step for count, pixels in zip(self.array, self.pixels, strict=True)
+            self.ratio * pixels + (count - 1) * step
+            for count, pixels, step in zip(self.array, self.pixels, self.step, strict=True)
         )
         return rows, columns
 

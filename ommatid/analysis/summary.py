@@ -75,7 +75,7 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "magnification": str(1 / lens_type.ratio),
         "array": list(lens_type.array),
         "pixels": list(lens_type.pixels),
-        "step": str(lens_type.step),
+        "step": lens_type.described_step,
         "sees_rows": [lens_type.origin[0], float(lens_type.origin[0] + lens_type.span[0])],
         "sees_columns": [lens_type.origin[1], float(lens_type.origin[1] + lens_type.span[1])],
         "off_centre": [float(before - after) / 2 for before, after in lens_type.gaps(camera.shape)],

@@ -8,10 +8,9 @@ types as listed, sub-imagers (k, l) by rows, then pixels by rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from math import ceil, floor, hypot
 from typing import Any
 
@@ -22,12 +21,12 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
 from .formats.picture import target_shape
-from .lens_type import LensOptics, LensType, SubImager
+from .lens_type import LensOptics, LensType, SubImager, adjacent_slices
+from .optics.spectrum import wavelengths_of
 from .scene import Scene
 from .tables.camera import LensTable, ToleranceTable
 
 MOST_MEASUREMENTS = 2**30
-MOST_SUB_IMAGERS = 2**14
 PLANES = 4  # arrays of the target's or the sensor's size that every stage holds at once
 
 
@@ -37,6 +36,7 @@ class Camera:
 
     lens_columns : columns of sub-imagers on the sensor, those of types left out by `restrict` included
     detail : the world's grid is so many times finer than f
+    wavelength : the mean, if there are several;  bands : each wavelength and the share of electrons that it frees
     """
 
     rows: int
@@ -50,6 +50,12 @@ class Camera:
     tolerance: ToleranceTable | None = None
     lens_columns: int | None = None
     detail: int = 1
+    bands: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def wavelengths(self) -> tuple[tuple[float, float], ...]:
+        """Wavelengths over which diffraction and dispersion are averaged, with weights of sum 1; none: rays alone."""
+        return () if self.wavelength is None else self.bands or ((self.wavelength, 1.0),)
 
     @property
     def world(self) -> Camera:
@@ -166,11 +172,11 @@ class Camera:
 
     def slices(self) -> list[slice]:
         """The measurements of each sub-imager."""
-        return _slices(sub.type.pixels[0] * sub.type.pixels[1] for sub in self.sub_imagers)
+        return adjacent_slices(sub.type.pixels[0] * sub.type.pixels[1] for sub in self.sub_imagers)
 
     def type_slices(self) -> list[slice]:
         """The measurements of each lens type."""
-        return _slices(lens_type.measurements for lens_type in self.types)
+        return adjacent_slices(lens_type.measurements for lens_type in self.types)
 
     def types_seeing(self) -> IntArray:
         """Number of lens types that see each pixel of f as a whole: (rows, columns)."""
@@ -219,20 +225,18 @@ class Camera:
             description["target.detail"] = self.detail
         if self.wavelength is not None:
             description["camera.wavelength"] = self.wavelength
+        if self.bands:
+            description["camera.bands"] = [list(band) for band in self.bands]
         if self.tolerance is not None:
             description["camera.tolerance"] = self.tolerance.model_dump(mode="json")
         return description
-
-
-def _slices(sizes: Iterable[int]) -> list[slice]:
-    """Adjacent slices of the given sizes, from 0."""
-    return [slice(first, last) for first, last in pairwise(accumulate(sizes, initial=0))]
 
 
 def derive(scene: Scene) -> Camera:
     """Derive the camera of a scene. Raises InputError if arrays do not fit the target, or sub-images the sensor."""
     rows, columns = target_shape(scene)
     types = tuple(_lens_type(lens, rows, columns, scene) for lens in scene.camera.lens)
+    wavelength, bands = wavelengths_of(scene)
     lefts = list(accumulate((lens_type.array[1] for lens_type in types), initial=0))
     camera = Camera(
         rows=rows,
@@ -242,17 +246,14 @@ def derive(scene: Scene) -> Camera:
         pixel_pitch=scene.camera.pixel_pitch,
         lens_pitch=scene.camera.lens_pitch,
         types=tuple(replace(lens_type, left=left) for lens_type, left in zip(types, lefts, strict=False)),
-        wavelength=scene.camera.wavelength,
+        wavelength=wavelength,
         tolerance=scene.camera.tolerance,
         lens_columns=lefts[-1],
         detail=scene.target.detail,
+        bands=bands,
     )
     for lens_type in types:
-        if lens_type.count > MOST_SUB_IMAGERS:
-            raise InputError(
-                f"{scene.source}: camera.lens.{lens_type.name}.array has {lens_type.count} sub-imagers, expected at"
-                f" most {MOST_SUB_IMAGERS} per lens type; use fewer"
-            )
+        lens_type.check_count(scene.source)
     needed = PLANES * 8 * (camera.world.unknowns + camera.measurements)
     check_memory(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
     if camera.measurements > MOST_MEASUREMENTS:
@@ -280,7 +281,7 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
             f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}"
         )
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
-    optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale)
+    optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating)
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics)
     origin = floor((rows - lens_type.span[0]) / 2), floor((columns - lens_type.span[1]) / 2)
     return replace(lens_type, origin=origin)

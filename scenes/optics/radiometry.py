@@ -1,9 +1,8 @@
 """Electrons that the target's light frees in a sensor pixel, by photometry, radiometry and the lens's geometry.
 
 A pixel of the target of value f reflects f / 255 of the illuminance E equally into all directions (Lambert), so that
-its luminance is E / pi f / 255. The light is monochromatic and is converted at the peak of the eye's sensitivity, 683
-lm/W, whatever its wavelength. (Lux of a colour to which the eye is less sensitive corresponds to more photons.) Lengths
-are millimetres.
+its luminance is E / pi f / 255. Lux are converted to photons by the eye's sensitivity V(lambda), integrated over the
+spectrum of the light (`spectrum`). Lengths are millimetres.
 """
 
 from __future__ import annotations
@@ -18,24 +17,22 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
-from ..constants import GREEN, WHITE
+from ..constants import WHITE
 from ..lens_type import LensType, SubImager
 from ..pose import Pose, corner_offset, poses
 from ..recording import clips_dark_noise, dark_electrons, expected_recording, saturation_electrons
 from ..scene import Scene
 from ..tables.sensor import SensorTable
+from .spectrum import efficacy, electrons_per_lumen
 
-PLANCK, LIGHT_SPEED, EFFICACY = 6.62607015e-34, 299792458.0, 683.0  # J s, m/s, lm/W: exact in the SI
 METRES = 1e-3  # per millimetre
 
 
 def electrons_per_steradian(scene: Scene, sensor: SensorTable) -> float:
     """Electrons per unit of f and per steradian of projected solid angle in one pixel."""
-    wavelength = (scene.camera.wavelength or GREEN) * METRES
-    radiance = sensor.illuminance / pi / WHITE / EFFICACY  # W / (m^2 sr) per unit of f
-    photons = radiance * wavelength / (PLANCK * LIGHT_SPEED)
+    luminance = sensor.illuminance / pi / WHITE  # lm / (m^2 sr) per unit of f
     area = (scene.camera.pixel_pitch * METRES) ** 2
-    return photons * area * sensor.exposure * sensor.quantum_efficiency
+    return luminance * area * sensor.exposure * electrons_per_lumen(scene)
 
 
 def solid_angle(aperture: float, depth: float) -> float:
@@ -67,7 +64,8 @@ def electrons(
 ) -> FloatArray:
     """Electrons per unit of f in every pixel during the exposure: (M,).
 
-    solid_angles : sr by the name of the lens type, projected and on the axis, for lens types with surfaces
+    solid_angles : sr by the name of the lens type, projected and on the axis, times the share of light transmitted, for
+        lens types with surfaces; thin lenses lose nothing
     illumination : (M,) relative to the axis, for pixels behind surfaces, absent: 1; thin lenses follow cos^4
     Raises ValueError without a sensor, or if a solid angle of a lens with surfaces is missing.
     """
@@ -125,6 +123,7 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
     white : electrons at 255, averaged over the type's pixels;  mean : electrons at the prior's mean
     saturation : value that saturates the brightest pixel;  saturates : True if that is below 255
     noise : standard deviation of a value for a target at the prior's mean, in units of f, rms over the pixels
+    efficacy : of the light, lm/W;  wavelengths : in mm, which stand for a spectrum, and the share of each
     cut_off : True if noise of the dark reaches below a digital number of 0 (EMVA 1288 asks for a higher black level)
     """
     if scene.sensor is None:
@@ -145,4 +144,10 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
                 "noise": float(np.sqrt(alive.mean())) if alive.size else None,
             }
         )
-    return {"lens_types": lens_types, "dark": dark_electrons(sensor), "cut_off": clips_dark_noise(sensor)}
+    return {
+        "efficacy": efficacy(scene),
+        "wavelengths": [list(band) for band in camera.bands],
+        "lens_types": lens_types,
+        "dark": dark_electrons(sensor),
+        "cut_off": clips_dark_noise(sensor),
+    }

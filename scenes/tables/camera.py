@@ -76,6 +76,13 @@ class LensTable(Table):
         description='scale of the surfaces; "fit": to the focal length that the magnification requires',
     )
 
+    coating: float | None = Field(
+        default=None,
+        ge=0,
+        lt=1,
+        description="reflectance of each surface to air; absent: uncoated, by Fresnel's equations",
+    )
+
     @field_validator("pixels", mode="before")
     @classmethod
     def _check_pixels(cls, value: object) -> object:
@@ -100,8 +107,10 @@ class LensTable(Table):
                     raise ValueError(f"{name} belongs to a thin lens, and surfaces imply it; remove one, got both")
             if self.focus is not None and isinstance(self.scale, float | int):
                 raise ValueError('a number as scale fixes the focus; take scale "fit", got focus too')
-        elif self.scale is not None:
-            raise ValueError("scale belongs to surfaces, got none")
+        else:
+            for name in ("scale", "coating"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} belongs to surfaces, got none")
         if self.focus is not None and self.aperture is None and self.surfaces is None:
             raise ValueError("focus belongs to a lens with an aperture or surfaces, got a pinhole")
         return self
@@ -125,4 +134,16 @@ class CameraTable(Table):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"expected a different name for every lens type, got {name!r} twice")
+        return self
+
+    @model_validator(mode="after")
+    def _check_apertures(self) -> CameraTable:
+        if sum(lens.array[0] * lens.array[1] for lens in self.lens) == 1:
+            return self  # a single lens has no neighbour
+        for lens in self.lens:
+            if lens.aperture is not None and lens.aperture > self.lens_pitch * (1 + 1e-9):
+                raise ValueError(
+                    f"expected lens.{lens.name}.aperture of at most lens_pitch, {self.lens_pitch:g} mm, got"
+                    f" {lens.aperture:g} mm; make the aperture smaller or lens_pitch larger"
+                )
         return self

@@ -36,7 +36,7 @@ NOISY: dict[str, Any] = {"noise": {"variance": 100.0}}
 RULES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "in focus": ({"aperture": "0.4 mm"}, {}),
     "nearly in focus": ({"aperture": "0.4 mm", "focus": "970 mm"}, {}),
-    "hardly diffracting": ({"aperture": "2.6 mm"}, {"wavelength": "550 nm"}),
+    "hardly diffracting": ({"aperture": "2.6 mm"}, {"wavelength": "550 nm", "lens_pitch": "3 mm"}),
 }
 
 

@@ -21,11 +21,12 @@ from ommatid.simulate.render import light
 from ..examples import OPTICS, TWO, assert_student, familywise, needs, with_optics
 
 SAMPLES = 2**14
+DIFFRACTS = {"wavelength": "550 nm", "lens_pitch": "1 mm"}
 FEWEST = 25  # rays expected in an entry, above which their number is normal
 CLOSED = OPTICS | {
     "a thin lens in focus": ({"aperture": "0.4 mm"}, {}),
     "far out of focus": ({"aperture": "0.4 mm", "focus": "700 mm"}, {}),
-    "diffraction out of focus": ({"aperture": "0.8 mm", "focus": "900 mm"}, {"wavelength": "550 nm"}),
+    "diffraction out of focus": ({"aperture": "0.8 mm", "focus": "900 mm"}, DIFFRACTS),
     "distorted and misaligned": ({"distortion": [-0.04, 0.02]}, OPTICS["misaligned"][1]),
 }
 

@@ -40,14 +40,11 @@ def checked(points: object, largest: float = LARGEST) -> Curve:
 
 
 def _point(point: object) -> tuple[float, float]:
+    given = shortened_repr(point)
     numbers = list(cast(Iterable[object], point)) if isinstance(point, list | tuple) else []
-    if len(numbers) != 2:
-        raise ValueError(f"expected pairs of a wavelength in nm and a value, got {shortened_repr(point)}")
-    values: list[float] = []
-    for number in numbers:
-        if not isinstance(number, int | float) or isinstance(number, bool) or not isfinite(number):
-            raise ValueError(f"expected pairs of a wavelength in nm and a value, got {shortened_repr(point)}")
-        values.append(float(number))
+    values = [float(number) for number in numbers if isinstance(number, int | float) and not isinstance(number, bool)]
+    if len(numbers) != 2 or len(values) != 2 or not all(isfinite(value) for value in values):
+        raise ValueError(f"expected pairs of a wavelength in nm and a value, got {given}")
     return values[0], values[1]
 
 

@@ -49,14 +49,14 @@ def spectrum_of(scene: Scene) -> Spectrum:
     if interval is not None and interval[0] == interval[1]:
         return Spectrum(np.array([interval[0] * MILLIMETRE]), np.ones(1))
     if interval is not None:
-        points = np.array([(round(end * MILLIMETRE, 6), 1.0) for end in interval])
+        points: FloatArray = np.array([(round(end * MILLIMETRE, 6), 1.0) for end in interval])
     else:
         points = np.array(table(spectrum) if isinstance(spectrum, str) else spectrum)
-    first, last = points[0, 0], points[-1, 0]
+    first, last = float(points[0, 0]), float(points[-1, 0])
     # Between the points of all curves, V's among them, the integrand is smooth: the trapezoidal rule suffices.
-    even = np.arange(np.ceil(first / STEP), last / STEP) * STEP
-    corners = points[:, 0], np.array(_efficiency_curve(scene))[:, 0]
-    grid = np.unique(np.concatenate([even, np.linspace(first, last, FEWEST), *corners]))
+    even: FloatArray = np.arange(np.ceil(first / STEP), last / STEP) * STEP
+    corners: tuple[FloatArray, ...] = points[:, 0], np.array(_efficiency_curve(scene))[:, 0]
+    grid: FloatArray = np.unique(np.concatenate([even, np.linspace(first, last, FEWEST), *corners]))
     grid = grid[(grid >= first) & (grid <= last)]
     gaps = np.diff(grid)
     share = np.concatenate([gaps, [0.0]]) / 2 + np.concatenate([[0.0], gaps]) / 2
@@ -71,16 +71,18 @@ def table(name: str) -> Curve:
 
 def photopic(wavelength: FloatArray) -> FloatArray:
     """V(lambda), the eye's relative sensitivity in daylight; 0 outside 360 to 830 nm."""
-    known, value = np.array(table("photopic")).T
-    return np.interp(wavelength, known, value, left=0.0, right=0.0)
+    return _between(table("photopic"), wavelength)
 
 
 def quantum_efficiency(scene: Scene, wavelength: FloatArray) -> FloatArray:
     """Electrons per photon, 0 outside the range of a curve; 1 without a [sensor]."""
-    known, value = np.array(_efficiency_curve(scene)).T
-    if known.size == 1:
-        return np.full(wavelength.shape, value[0])
-    return np.interp(wavelength, known, value, left=0.0, right=0.0)
+    curve = _efficiency_curve(scene)
+    return np.full(wavelength.shape, curve[0][1]) if len(curve) == 1 else _between(curve, wavelength)
+
+
+def _between(curve: Curve, wavelength: FloatArray) -> FloatArray:
+    known: FloatArray = np.array(curve)
+    return np.interp(wavelength, known[:, 0], known[:, 1], left=0.0, right=0.0)
 
 
 def _efficiency_curve(scene: Scene) -> Curve:
@@ -88,7 +90,7 @@ def _efficiency_curve(scene: Scene) -> Curve:
     efficiency = 1.0 if scene.sensor is None else scene.sensor.quantum_efficiency
     if isinstance(efficiency, str):
         raise InputError(f"sensor.quantum_efficiency: the file '{efficiency}' has not been read; read the scene's file")
-    return ((0.0, efficiency),) if isinstance(efficiency, float) else efficiency
+    return efficiency if isinstance(efficiency, tuple) else ((0.0, float(efficiency)),)
 
 
 def detected(scene: Scene) -> FloatArray:
@@ -98,7 +100,7 @@ def detected(scene: Scene) -> FloatArray:
 
 
 def electrons_per_lumen(scene: Scene) -> float:
-    """Electrons that one lumen of the light frees in a second. Raises InputError for light that nobody sees."""
+    """Electrons that one lumen of the light frees in a second. Raises InputError for invisible light."""
     return float(np.sum(detected(scene)) / np.sum(spectrum_of(scene).power)) / efficacy(scene)
 
 
@@ -141,12 +143,13 @@ def wavelengths_of(scene: Scene) -> tuple[float | None, Bands]:
 def nodes(wavelength: FloatArray, weight: FloatArray, tolerance: float = TOLERANCE) -> tuple[FloatArray, FloatArray]:
     """Nodes and weights, of sum 1, of the smallest of Gauss's rules that keeps the contrast within a tolerance."""
     wavelength, weight = wavelength[weight > 0], weight[weight > 0] / weight.sum()
-    frequency = np.linspace(0.0, 1.0 / wavelength[0], FREQUENCIES)[:, None]
+    frequency: FloatArray = np.linspace(0.0, 1.0 / float(wavelength[0]), FREQUENCIES)[:, None]
     exact = _contrast(frequency * wavelength) @ weight
-    for count in range(1, MOST_WAVELENGTHS + 1):
-        at, share = gauss(wavelength, weight, count)
+    at, share = gauss(wavelength, weight, 1)
+    for count in range(2, MOST_WAVELENGTHS + 1):
         if np.abs(_contrast(frequency * at) @ share - exact).max() < tolerance:
             break
+        at, share = gauss(wavelength, weight, count)
     return at, share
 
 

@@ -2,8 +2,8 @@
 
 The irradiance of a sensor point over the radiance of a uniform world, from rays that start evenly spread over the exit
 pupil's disk. `ommatid.scenes.optics.radiometry` computes electrons from it, and from the share of light that surfaces
-transmit: each reflects ((n - n') / (n + n'))^2 at normal incidence (Fresnel). At 30 degrees glass of index 1.5 reflects
-0.15 % more of unpolarised light; light that is reflected twice is left out.
+transmit: each reflects ((n - n') / (n + n'))^2 at normal incidence (Fresnel). For the rays of the gallery's lenses,
+unpolarised, that is right to 4e-5; light that is reflected twice is left out.
 """
 
 from __future__ import annotations

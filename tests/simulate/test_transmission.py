@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import asin, atan2, cos, hypot, sin, sqrt
+from math import asin, atan2, cos, sin, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -73,16 +73,16 @@ def transmitted(lens: Prescription, height: float, slope: float) -> float | None
 @pytest.mark.parametrize("name", ["doublet", "planoconvex"])
 @pytest.mark.parametrize("field", [0.0, 0.03])
 def test_rays_at_every_height_lose_what_the_axis_loses(name: str, field: float) -> None:
-    """The mean over the meridional rays of a bundle from afar, by polarisation and incidence, to 1e-3."""
+    """The mean over the meridional rays of a bundle from afar, by polarisation and incidence, to 1e-4."""
     lens = first_lens(name)
     widest = float(lens.entrance_pupil.radius)
     middle = -field * float(lens.entrance_pupil.position)
     heights = np.linspace(-widest, widest, 41)
-    shares = [(transmitted(lens, middle + height, field), hypot(height, 0)) for height in heights]
+    shares = [(transmitted(lens, middle + height, field), abs(height)) for height in heights]  # rings of the pupil
     seen = [(share, weight) for share, weight in shares if share is not None]
     assert len(seen) > 36
     mean = float(np.average([share for share, _ in seen], weights=[weight for _, weight in seen]))
-    assert transmission(lens) == pytest.approx(mean, abs=1e-3)
+    assert transmission(lens) == pytest.approx(mean, abs=1e-4)
 
 
 def test_the_gallery_s_lenses_lose_what_fresnel_s_equations_say() -> None:
@@ -97,10 +97,9 @@ def test_the_gallery_s_lenses_lose_what_fresnel_s_equations_say() -> None:
 def test_a_coating_takes_the_place_of_surfaces_to_air() -> None:
     lens = first_lens("doublet")
     assert transmission(lens, 0.005) == pytest.approx(0.995**2 * (1 - CEMENT), abs=2e-6)
-    assert transmission(lens, 0.0) == pytest.approx(1 - cement, abs=2e-6)
-    assert transmission(replace(first_lens("planoconvex"), index=np.ones(3)), 0.5) == 1, (
-        "a stop in air reflects nothing"
-    )
+    assert transmission(lens, 0.0) == pytest.approx(1 - CEMENT, abs=2e-6)
+    in_air = replace(first_lens("planoconvex"), index=np.ones(3))
+    assert transmission(in_air, 0.5) == 1, "a stop in air reflects nothing"
 
 
 def test_electrons_are_those_that_pass() -> None:

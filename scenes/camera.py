@@ -37,6 +37,7 @@ class Camera:
     lens_columns : columns of sub-imagers on the sensor, those of types left out by `restrict` included
     detail : the world's grid is so many times finer than f
     wavelength : the mean, if there are several;  bands : each wavelength and the share of electrons that it frees
+    walls : False if light of every lens reaches every patch
     """
 
     rows: int
@@ -51,6 +52,7 @@ class Camera:
     lens_columns: int | None = None
     detail: int = 1
     bands: tuple[tuple[float, float], ...] = ()
+    walls: bool = True
 
     @property
     def wavelengths(self) -> tuple[tuple[float, float], ...]:
@@ -122,8 +124,9 @@ class Camera:
 
     @property
     def has_box_footprints(self) -> bool:
-        """True if the designed H averages f over boxes: no distortion, and no blur of a thin lens."""
-        return all(lens_type.optics.distortion is None and not self.is_blurred(lens_type) for lens_type in self.types)
+        """True if the designed H averages f over boxes: no distortion, no blur of a thin lens, and walls."""
+        sharp = (lens_type.optics.distortion is None and not self.is_blurred(lens_type) for lens_type in self.types)
+        return self.walls and all(sharp)
 
     def is_blurred(self, lens_type: LensType) -> bool:
         """True if a thin lens images a point of the target as a disk, by defocus or diffraction."""
@@ -135,7 +138,7 @@ class Camera:
     def has_sharp_footprints(self) -> bool:
         """True if footprints have a closed form even when misaligned: no surfaces, and no blur."""
         defocused = self.tolerance is not None and (self.tolerance.focal_length or self.tolerance.tilt)
-        return not any(
+        return self.walls and not any(
             lens_type.optics.surfaces is not None
             or self.is_blurred(lens_type)
             or (lens_type.optics.aperture is not None and defocused)
@@ -161,8 +164,7 @@ class Camera:
         lens_y = ((lens_type.array[0] - 1) / 2 - k) * self.lens_pitch
         window = lens_type.origin[0] + k * lens_type.step, lens_type.origin[1] + l * lens_type.step
         x, y = self.position(*lens_type.middle(window))
-        depth = self.depth(lens_type)
-        shrink = depth / self.distance
+        depth, shrink = self.depth(lens_type), self.depth(lens_type) / self.distance
         patch = lens_x + (lens_x - x) * shrink, lens_y + (lens_y - y) * shrink
         return SubImager(lens_type, k, l, window, (lens_x, lens_y), patch, depth)
 
@@ -221,12 +223,10 @@ class Camera:
             }
         if not self.is_ideal_pinhole:  # sub-images of ideal pinholes do not depend on where the lenses are
             description["camera.places"] = [self.lens_columns, *(lens_type.left for lens_type in self.types)]
-        if self.detail != 1:
-            description["target.detail"] = self.detail
-        if self.wavelength is not None:
-            description["camera.wavelength"] = self.wavelength
-        if self.bands:
-            description["camera.bands"] = [list(band) for band in self.bands]
+        bands = [list(band) for band in self.bands] or None
+        optional = ("target.detail", self.detail, 1), ("camera.wavelength", self.wavelength, None)
+        optional += ("camera.bands", bands, None), ("camera.walls", self.walls, True)
+        description |= {key: value for key, value, default in optional if value != default}
         if self.tolerance is not None:
             description["camera.tolerance"] = self.tolerance.model_dump(mode="json")
         return description
@@ -234,9 +234,8 @@ class Camera:
 
 def derive(scene: Scene) -> Camera:
     """Derive the camera of a scene. Raises InputError if arrays do not fit the target, or sub-images the sensor."""
-    rows, columns = target_shape(scene)
+    (rows, columns), (wavelength, bands) = target_shape(scene), wavelengths_of(scene)
     types = tuple(_lens_type(lens, rows, columns, scene) for lens in scene.camera.lens)
-    wavelength, bands = wavelengths_of(scene)
     lefts = list(accumulate((lens_type.array[1] for lens_type in types), initial=0))
     camera = Camera(
         rows=rows,
@@ -251,6 +250,7 @@ def derive(scene: Scene) -> Camera:
         lens_columns=lefts[-1],
         detail=scene.target.detail,
         bands=bands,
+        walls=scene.camera.walls,
     )
     for lens_type in types:
         lens_type.check_count(scene.source)

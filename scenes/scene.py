@@ -146,6 +146,11 @@ class Scene(Table):
     def _check_combination(self) -> Scene:
         if self.noise is not None and self.sensor is not None:
             raise ValueError("expected [noise] for an ideal sensor or [sensor] for a real one, got both; remove one")
+        if not self.camera.walls and (self.calibration.method != "transport" or self.calibration.fit is not None):
+            raise ValueError(
+                "camera.walls = false leaves H without a closed form: expected calibration.method 'transport', no fit,"
+                f" got '{self.calibration.method}'"
+            )
         if self.light is not None and self.camera.wavelength is not None:
             raise ValueError("expected camera.wavelength or light.spectrum, got both; remove one")
         if self.target.image is None and self.world is None:

@@ -28,6 +28,10 @@ def _in_rendering(scene: Scene, camera: Camera) -> list[SkippedEffect]:
         skipped.append(SkippedEffect("samples of an aperture", "every lens is a pinhole in focus"))
     elif camera.wavelength is None:
         skipped.append(SkippedEffect("diffraction", "the scene has no camera.wavelength: light is rays"))
+    lenses = [lens_type.optics for lens_type in camera.types]
+    if camera.walls and any(optics.aperture is not None or optics.surfaces is not None for optics in lenses):
+        why = "walls between the channels keep it out (camera.walls)"
+        skipped.append(SkippedEffect("light through neighbouring lenses", why))
     if scene.world is None:
         why = "there is nothing but the luminous target: paths have one segment"
         skipped.append(SkippedEffect("interreflection", why))

@@ -8,6 +8,7 @@ spectrum of the light (`spectrum`). Lengths are millimetres.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import pi
 from typing import Any
 
@@ -74,12 +75,27 @@ def electrons(
     unit = electrons_per_steradian(scene, scene.sensor)
     response = np.empty(camera.measurements)
     for sub, pixels, pose in zip(camera.sub_imagers, camera.slices(), poses(camera), strict=True):
+        if not camera.walls:
+            response[pixels] = unit * _through_all_lenses(camera, sub, pose)
+            continue
         angle = _solid_angle(sub.type, sub.depth, solid_angles or {})
         if sub.type.optics.surfaces is None:
             response[pixels] = unit * angle * relative_illumination(camera, sub, pose)
         else:
             response[pixels] = unit * angle * (1.0 if illumination is None else illumination[pixels])
     return response
+
+
+def _through_all_lenses(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
+    """Projected solid angle, sr, of all lenses together at each pixel of a sub-imager: (its pixels,)."""
+    total = np.zeros(sub.type.pixels[0] * sub.type.pixels[1])
+    for other, place in zip(camera.sub_imagers, poses(camera), strict=True):
+        if other.type.optics.aperture is None:
+            raise ValueError(f"lens type '{other.type.name}' has no aperture; light without walls needs one")
+        shift = np.array([pose.lens[0] - place.lens[0], pose.lens[1] - place.lens[1], 0.0])
+        seen = replace(pose, middle=pose.middle + shift)
+        total += solid_angle(other.type.optics.aperture, sub.depth) * relative_illumination(camera, sub, seen)
+    return total
 
 
 def _solid_angle(lens_type: LensType, depth: float, known: Mapping[str, float]) -> float:

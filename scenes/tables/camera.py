@@ -125,6 +125,9 @@ class CameraTable(Table):
         default=None,
         description="wavelength of the light; absent: no diffraction, 550 nm for glasses and sensors",
     )
+    walls: bool = Field(
+        default=True, description="light of a lens reaches its own patch of the sensor only; false: those of all lenses"
+    )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]
 
@@ -134,6 +137,16 @@ class CameraTable(Table):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"expected a different name for every lens type, got {name!r} twice")
+        return self
+
+    @model_validator(mode="after")
+    def _check_walls(self) -> CameraTable:
+        for lens in self.lens:
+            if not self.walls and (lens.aperture is None or lens.distortion is not None):
+                raise ValueError(
+                    f"walls = false needs thin lenses with an aperture and without distortion, which weigh their light,"
+                    f" got lens type '{lens.name}'; add an aperture or keep the walls"
+                )
         return self
 
     @model_validator(mode="after")

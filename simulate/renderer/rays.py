@@ -2,7 +2,7 @@
 
 The samples of one pixel are adjacent lanes, so that a pixel's sum is the sum of a block, in float64 and the same on any
 number of threads. A random number is drawn for an effect only if the lenses have it: two for the position in the pixel,
-two more for an aperture, two more for diffraction. Lengths are millimetres.
+two more for an aperture, two more for diffraction, and without walls one for the lens. Lengths are millimetres.
 """
 
 # pyright: basic
@@ -58,6 +58,14 @@ class RayGenerator:
         self._tables = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in _tables(camera, types)]
         dr.make_opaque(self._tables)
         self._pitch = float(camera.pixel_pitch)
+        self._crossing, self._own = None, None
+        if not camera.walls:
+            from .crosstalk import Crosstalk
+
+            models = {lens_type.name: lens_of(camera, lens_type) for lens_type in camera.types}
+            self._crossing = Crosstalk(camera, models)
+            self._own = mi.UInt32(own_lenses(camera, types).astype(np.uint32))
+            self.lens.tail = self._crossing.tail
 
     def blocks(self, samples: int, pixels: int | None = None) -> list[slice]:
         """Divide all pixels, or `pixels` of them, into blocks whose rays start together and fit into memory."""
@@ -91,7 +99,11 @@ class RayGenerator:
             z = corner_z + axes[4] * at.x + axes[5] * at.y
         else:
             x, y, z = corner_x + at.x, corner_y + at.y, corner_z
-        start, direction, weight = self.lens.emit(x, y, -z, self.sampler)
+        if self._crossing is None:
+            start, direction, weight = self.lens.emit(x, y, -z, self.sampler)
+        else:
+            own = dr.gather(mi.UInt32, self._own, index)
+            start, direction, weight = self._crossing.emit(own, (x, y, -z), self.sampler)
         ray = dr.zeros(mi.RayDifferential3f, lanes)
         ray.o = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
         ray.d = dr.normalize(mi.Vector3f(*direction))
@@ -113,6 +125,13 @@ def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[FloatArray]:
         constants = np.repeat(np.array(constant)[:, None], row.size, axis=1)
         parts.append(np.concatenate([pose.middle[:, None] + pose.axes @ corner, constants]))
     return list(np.concatenate(parts, axis=1))
+
+
+def own_lenses(camera: Camera, types: tuple[LensType, ...]) -> IntArray:
+    """Return the number of each pixel's sub-imager in the camera, (pixels,)."""
+    numbers = [np.full(rows.stop - rows.start, number) for number, rows in enumerate(camera.slices())]
+    chosen = zip(camera.sub_imagers, numbers, strict=True)
+    return np.concatenate([number for sub, number in chosen if sub.type in types])
 
 
 def lens_of(camera: Camera, lens_type: LensType) -> LensModel:

@@ -191,4 +191,15 @@ def prescription_of(camera: Camera, lens_type: LensType) -> Prescription:
             f"{key}: the sensor would lie {-room:.4g} mm inside the lens, {camera.depth(lens_type):.4g} mm behind its"
             " rear principal plane; turn the lens round, make it thinner or scale it"
         )
+    _check_width(camera, lens_type, scaled)
     return scaled
+
+
+def _check_width(camera: Camera, lens_type: LensType, scaled: Prescription) -> None:
+    """Raise InputError if lenses would reach into their neighbours."""
+    widest, room = 2 * float(scaled.semi_diameter.max()), camera.lens_pitch
+    if widest > room * (1 + 1e-9) and len(camera.sub_imagers) > 1:
+        raise InputError(
+            f"camera.lens.{lens_type.name}.surfaces: expected openings of at most camera.lens_pitch, {room:.4g} mm, got"
+            f" a diameter of {widest:.4g} mm after scaling; reduce semi_diameter or widen the pitch"
+        )

@@ -25,6 +25,7 @@ from ommatid.simulate.sampling.passes import Plan
 from ..examples import OPTICS, TWO, assert_student, familywise, needs, with_optics
 
 SAMPLES = 2**14
+DIFFRACTS = {"wavelength": "550 nm", "lens_pitch": "1 mm"}
 FEWEST = 25  # rays expected in an entry, above which their number is normal
 RAYS = {"wavelength": "none"}
 WAVES = {"0.1 waves": 266.67, "0.3 waves": 108.11, "1 wave": 35.088, "3 waves": 11.976}  # focus, mm, at 550 nm
@@ -74,7 +75,7 @@ def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str)
     renderer = Renderer(camera, choose("auto"), "independent", together=False)
     group, work = next(iter(renderer.groups)), Plan(64, SAMPLES // 64)
     for generator in renderer._generators.values():  # pyright: ignore[reportPrivateUsage]
-        generator.lens.follow(renderer._distance)  # pyright: ignore[reportPrivateUsage]
+        generator.follow(renderer._distance)  # pyright: ignore[reportPrivateUsage]
     rows = renderer.rows(group)
     total = sparse.csr_array((rows.stop - rows.start, camera.unknowns))
     (block,) = renderer.blocks(group, work.samples)

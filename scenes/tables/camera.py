@@ -9,8 +9,9 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from ommatid.runtime.errors import shortened_repr
 
+from ..zemax.dispersion import Dispersion
 from .table import Table
-from .units import Angle, Length, Magnification, Pair, Radius, Step, file_name, pair
+from .units import Angle, FileName, Length, Magnification, Pair, Radius, Step, file_name, pair
 
 Distortion = Annotated[float, Field(ge=-1000, le=1000)]
 STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
@@ -26,6 +27,11 @@ class Surface(Table):
     thickness: Length | None = Field(default=None, description="distance to the next surface; absent for the last one")
     glass: str | None = Field(default=None, description="glass behind the surface, such as N-BK7; absent: air")
     index: float | None = Field(default=None, ge=1, le=5, description="refractive index, in place of a glass")
+    dispersion: Dispersion | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="index of refraction of the glass as a function of the wavelength; absent: of a built-in glass",
+    )
     semi_diameter: Length = Field(description="half the diameter of its clear aperture")
     conic: float = Field(default=0.0, ge=-100, le=100, description="0: a sphere, -1: a paraboloid")
     aspheric: Annotated[tuple[float, ...], BeforeValidator(pair), Field(min_length=1, max_length=7)] | None = Field(
@@ -39,6 +45,8 @@ class Surface(Table):
     def _check_medium(self) -> Surface:
         if self.glass is not None and self.index is not None:
             raise ValueError("expected a glass or an index of refraction, got both")
+        if self.dispersion is not None and self.index is not None:
+            raise ValueError("expected a dispersion or an index of refraction, got both")
         return self
 
     @model_validator(mode="after")
@@ -131,6 +139,11 @@ class CameraTable(Table):
     wavelength: Length | None = Field(
         default=None,
         description="wavelength of the light; absent: no diffraction, 550 nm for glasses and sensors",
+    )
+    glass_catalogue: FileName | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="glass catalogue (AGF) with glasses of surfaces beside the built-in ones",
     )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]

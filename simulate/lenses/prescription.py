@@ -170,7 +170,7 @@ def prescribe(surfaces: Sequence[Surface], wavelength: float | None = None) -> P
     marked = [index for index, surface in enumerate(surfaces) if surface.stop]
     if len(marked) > 1:
         raise InputError(f"expected one aperture stop at most, got {len(marked)}; mark the smallest alone")
-    index = [surface.index or glass.index(surface.glass or glass.AIR, wavelength or GREEN) for surface in surfaces]
+    index = [glass.index_behind(surface, wavelength or GREEN) for surface in surfaces]
     if index[-1] != 1:
         raise InputError(
             f"expected air behind the last surface, got an index of {index[-1]:g}; end the list with the surface"

@@ -3,7 +3,8 @@
 Spheres, conics and even aspheres are read (STANDARD, EVENASPH), with curvature, thickness, semi-diameter, conic and
 glass. Curvatures have the sign used here, positive if the centre lies towards the image. The object, the image and flat
 surfaces without glass on either side are left out, unless they are the stop. The distance to the image is ignored,
-because the magnification determines it. So are wavelengths and fields, and everything else that is no surface.
+because the magnification determines it. So are wavelengths, fields, the system aperture (the stop is as wide as its
+semi-diameter) and everything else that is no surface.
 
 A glass without a name, by its index nd and Abbe number vd (a "model" glass), has the index A + B / w^2 with that nd and
 vd, from 400 to 700 nm; it differs from real glasses of the same nd and vd by some 1e-4 at 550 nm.

@@ -9,11 +9,13 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from ommatid.runtime.errors import shortened_repr
 
+from ..zemax.dispersion import Dispersion
 from .table import Table
-from .units import Angle, Length, Magnification, Pair, Radius, Step, file_name, pair
+from .units import Angle, FileName, Length, Magnification, Pair, Radius, Step, file_name, pair
 
 Distortion = Annotated[float, Field(ge=-1000, le=1000)]
 RAYS = "none"  # wavelength of light that does not diffract
+STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
 
@@ -26,14 +28,36 @@ class Surface(Table):
     thickness: Length | None = Field(default=None, description="distance to the next surface; absent for the last one")
     glass: str | None = Field(default=None, description="glass behind the surface, such as N-BK7; absent: air")
     index: float | None = Field(default=None, ge=1, le=5, description="refractive index, in place of a glass")
+    dispersion: Dispersion | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="index of refraction of the glass as a function of the wavelength; absent: of a built-in glass",
+    )
     semi_diameter: Length = Field(description="half the diameter of its clear aperture")
     conic: float = Field(default=0.0, ge=-100, le=100, description="0: a sphere, -1: a paraboloid")
+    aspheric: Annotated[tuple[float, ...], BeforeValidator(pair), Field(min_length=1, max_length=7)] | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="a4, a6, ... to a16 of a sag a4 r^4 + a6 r^6 + ... beside the conic's, r and sag in mm",
+    )
     stop: bool = Field(default=False, description="true for the aperture stop; for one surface only")
 
     @model_validator(mode="after")
     def _check_medium(self) -> Surface:
         if self.glass is not None and self.index is not None:
             raise ValueError("expected a glass or an index of refraction, got both")
+        if self.dispersion is not None and self.index is not None:
+            raise ValueError("expected a dispersion or an index of refraction, got both")
+        return self
+
+    @model_validator(mode="after")
+    def _check_aspheric(self) -> Surface:
+        for power, term in zip(range(4, 17, 2), self.aspheric or (), strict=False):
+            if abs(term) * self.semi_diameter ** (power - 1) > STEEPEST_TERM:
+                raise ValueError(
+                    f"expected an aspheric term that adds at most {STEEPEST_TERM:g} semi-diameters at the rim,"
+                    f" got a{power} = {term:g} mm^-{power - 1}; its unit is a power of mm"
+                )
         return self
 
 
@@ -128,6 +152,11 @@ class CameraTable(Table):
     )
     walls: bool = Field(
         default=True, description="light of a lens reaches its own patch of the sensor only; false: those of all lenses"
+    )
+    glass_catalogue: FileName | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="glass catalogue (AGF) with glasses of surfaces beside the built-in ones",
     )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]

@@ -12,7 +12,8 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.diffraction import QUANTILES, end_of
 
 from ..lenses.prescription import prescription_of
-from ..lenses.ray_trace import Functions, exit_disk_of, path, trace
+from ..lenses.ray_trace import exit_disk_of, path, trace
+from ..lenses.surface_shapes import Functions
 from .lens import Emission, LensModel, Point
 
 
@@ -29,7 +30,7 @@ class RealLens(LensModel):
 
         lens, depth = prescription_of(camera, lens_type), camera.depth(lens_type)
         numbers = path(lens, exit_disk_of(camera, lens_type, lens))
-        self._numbers = [dr.opaque(mi.Float, float(number)) for number in numbers]
+        self._numbers = numbers.converted(lambda number: dr.opaque(mi.Float, float(number)))
         self._functions = Functions(dr.sqrt, dr.select, dr.maximum)
         self._table = None
         if camera.wavelength is not None:

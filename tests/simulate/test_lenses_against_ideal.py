@@ -61,6 +61,23 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
 
 
+def test_traced_h_of_several_wavelengths_is_the_closed_form() -> None:
+    """Every ray has one of the wavelengths, with its share of the light; H of one wavelength is another."""
+    needs("llvm_ad_mono")
+    lens = {"aperture": "0.4 mm", "focus": "108.11 mm"}
+    render = {"sampler": "independent", "complete": True}
+    tables: dict[str, Any] = {"calibration": {"samples": SAMPLES}, "render": render, "light": {"spectrum": "LED-B3"}}
+    described, camera = with_optics(lens, {}, **tables)
+    assert len(camera.wavelengths) > 2
+    traced = responses_from_rays(Setup(described, camera))
+    found = scores(traced.matrix, ideal_matrix(camera), SAMPLES)
+    assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
+    assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
+    _, blue = with_optics(lens, {"wavelength": "450 nm"})
+    other = scores(traced.matrix, ideal_matrix(blue), SAMPLES)
+    assert np.abs(other).max() > 2 * stats.norm.isf(familywise(other.size) / 2)
+
+
 @pytest.mark.parametrize("kind", WAVES)
 def test_the_focus_has_these_waves(kind: str) -> None:
     _, camera = with_optics(*CLOSED[kind])

@@ -101,7 +101,7 @@ class NoiseTable(Table):
         default=None,
         ge=-LARGEST,
         le=LARGEST,
-        description="largest recorded value; saturated pixels are excluded; absent: no limit",
+        description="largest recorded value; a saturated pixel counts as at least that; absent: no limit",
     )
 
     @property

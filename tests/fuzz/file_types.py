@@ -15,7 +15,7 @@ import numpy as np
 
 from ommatid.runtime.files import digest
 from ommatid.scenes import camera, model_file, scene, stack
-from ommatid.scenes.formats import picture
+from ommatid.scenes.formats import curve, picture
 from ommatid.scenes.hardware import frames, source_positions
 from ommatid.scenes.tables import lens_file
 
@@ -143,6 +143,10 @@ def read_lens(path: Path) -> str:
     return fingerprint(lens_file.read_lens(path))
 
 
+def read_curve(path: Path) -> str:
+    return fingerprint([list(point) for point in curve.read_curve(path)])
+
+
 # Stacks and models
 
 
@@ -221,6 +225,7 @@ def read_world(path: Path) -> str:
 
 SHOW = ("show", "{file}", "--json")
 LENS = ("show", SCENE, "--json", "--set", "camera.lens.I.surfaces={file}")
+LIGHT = ("show", SCENE, "--json", "--set", "light.spectrum={file}")
 STACK = ("reconstruct", "{file}", "sound.npz", "-o", "new.exr", "--json")
 MODEL = ("reconstruct", "sound.exr", "{file}", "-o", "new.exr", "--json")
 PICTURE = ("show", SCENE, "--json", "--set", "target.image={file}", "--set", "target.origin=", "--set", "target.shape=")
@@ -242,6 +247,7 @@ FILE_TYPES = {
         FileType("lens, TOML", "lens.toml", LENSES_TOML, damaged, read_lens, LENS),
         FileType("lens, keys and values", "lens.toml", LENSES_TOML, scene_mutated, read_lens, LENS),
         FileType("lens, rows", "lens.dat", LENSES_DAT, rows_damaged, read_lens, LENS),
+        FileType("curve, CSV", "curve.csv", gallery_files("spectra/*5.csv"), damaged, read_curve, LIGHT),
         FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
         FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
         FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),

@@ -37,7 +37,9 @@ def _interval(text: str) -> tuple[float, float] | None:
         raise ValueError(f'expected the shorter wavelength first, as in "450-650 nm", got {shortened_repr(text)}')
     for end in (shortest, longest):
         if not curve.SHORTEST <= end * MILLIMETRE <= curve.LONGEST:
-            raise ValueError(f"expected wavelengths from {curve.SHORTEST:g} to {curve.LONGEST:g} nm, got {text!r}")
+            raise ValueError(
+                f"expected wavelengths from {curve.SHORTEST:g} to {curve.LONGEST:g} nm, got {shortened_repr(text)}"
+            )
     return shortest, longest
 
 

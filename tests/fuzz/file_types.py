@@ -15,7 +15,7 @@ import numpy as np
 
 from ommatid.runtime.files import digest
 from ommatid.scenes import camera, model_file, scene, stack
-from ommatid.scenes.formats import picture
+from ommatid.scenes.formats import curve, picture
 from ommatid.scenes.hardware import frames, source_positions
 from ommatid.scenes.tables import lens_file
 from ommatid.scenes.zemax.agf import read_catalogue
@@ -150,6 +150,10 @@ def read_glasses(path: Path) -> str:
     return fingerprint([(each.model_dump(mode="json"), each.index(550e-6)) for each in dispersions])
 
 
+def read_curve(path: Path) -> str:
+    return fingerprint([list(point) for point in curve.read_curve(path)])
+
+
 # Stacks and models
 
 
@@ -228,6 +232,7 @@ def read_world(path: Path) -> str:
 
 SHOW = ("show", "{file}", "--json")
 LENS = ("show", SCENE, "--json", "--set", "camera.lens.I.surfaces={file}")
+LIGHT = ("show", SCENE, "--json", "--set", "light.spectrum={file}")
 STACK = ("reconstruct", "{file}", "sound.npz", "-o", "new.exr", "--json")
 ZMX = b"""UNIT MM X W X CM
 SURF 0
@@ -285,6 +290,7 @@ FILE_TYPES = {
         FileType("lens, rows", "lens.dat", LENSES_DAT, rows_damaged, read_lens, LENS),
         FileType("lens, ZMX", "lens.zmx", lambda _: [ZMX], rows_damaged, read_lens, LENS),
         FileType("glasses, AGF", "glass.agf", lambda _: [AGF], rows_damaged, read_glasses, ()),
+        FileType("curve, CSV", "curve.csv", gallery_files("spectra/*5.csv"), damaged, read_curve, LIGHT),
         FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
         FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
         FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),

@@ -104,7 +104,7 @@ def matrix(camera: Camera, lens_type: LensType, blur: Blur) -> sparse.csr_array:
     and that gradient is the weighted disk's minus that of a uniform one of the height of its rim. Neglected are the
     second order, 12 weight (s / depth)^2 of an entry, and the variation of w within a sensor pixel.
     """
-    unit = lcm(*(number.denominator for number in (lens_type.ratio, *lens_type.step)))
+    unit = lcm(*(number.denominator for number in (lens_type.ratio, *lens_type.step, *lens_type.origin)))
     down, across = (_axis(camera, lens_type, blur, axis, unit) for axis in (0, 1))
     offsets = np.unique(np.abs(np.concatenate([down.offset.ravel(), across.offset.ravel()])))  # symmetric
     needed = TABLES * 8 * offsets.size**2
@@ -209,7 +209,7 @@ class _Axis:
 
 def _axis(camera: Camera, lens_type: LensType, blur: Blur, axis: int, unit: int) -> _Axis:
     size, count, length = camera.shape[axis], lens_type.array[axis], int(lens_type.ratio * unit)
-    begin = lens_type.origin[axis] * unit + int(lens_type.step[axis] * unit) * np.arange(count)
+    begin = int(lens_type.origin[axis] * unit) + int(lens_type.step[axis] * unit) * np.arange(count)
     starts = begin[:, None] + length * np.arange(lens_type.pixels[axis])
     reached = _reached(lens_type, blur, size)
     first = np.clip(np.floor(starts / unit - blur.reach).astype(np.int64), 0, size - reached)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
-from math import ceil, floor, hypot
+from math import floor, hypot
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
 from .formats.picture import target_shape
+from .layout.windows import check_overlap, whole_pixels, with_steering
 from .lens_type import LensOptics, LensType, SubImager, adjacent_slices
 from .optics.spectrum import wavelengths_of
 from .scene import Scene
@@ -81,7 +82,7 @@ class Camera:
     @property
     def covers_whole_pixels(self) -> bool:
         """True if every sensor pixel averages whole pixels of f, so that detail finer than f changes no measurement."""
-        whole = all(number.denominator == 1 for lens in self.types for number in (lens.ratio, *lens.step))
+        whole = all(lens.covers_whole_pixels for lens in self.types)
         sharp = all(lens.optics.surfaces is None for lens in self.types) and self.has_box_footprints
         return whole and sharp and self.tolerance is None
 
@@ -125,13 +126,15 @@ class Camera:
     @property
     def is_ideal_pinhole(self) -> bool:
         """True for well-aligned pinholes without distortion, whose H is a product of overlaps of intervals."""
-        return self.tolerance is None and all(lens_type.optics.is_pinhole for lens_type in self.types)
+        return self.tolerance is None and all(
+            lens_type.optics.is_pinhole and not lens_type.is_rotated for lens_type in self.types
+        )
 
     @property
     def has_box_footprints(self) -> bool:
-        """True if the designed H averages f over boxes: no distortion, no blur of a thin lens, and walls."""
-        sharp = (lens_type.optics.distortion is None and not self.is_blurred(lens_type) for lens_type in self.types)
-        return self.walls and all(sharp)
+        """True if the designed H averages f over boxes: without distortion, rotation and blur, and with walls."""
+        bent = (lens.optics.distortion is not None or self.is_blurred(lens) or lens.is_rotated for lens in self.types)
+        return self.walls and not any(bent)
 
     def is_blurred(self, lens_type: LensType) -> bool:
         """True if a thin lens images a point of the target as a disk, by defocus or diffraction."""
@@ -166,12 +169,20 @@ class Camera:
         columns = sum(other.array[1] for other in self.types) if self.lens_columns is None else self.lens_columns
         left = sum(other.array[1] for other in self.types[:index]) if lens_type.left is None else lens_type.left
         lens_x = ((columns - 1) / 2 - (left + l)) * self.lens_pitch
-        lens_y = ((lens_type.array[0] - 1) / 2 - k) * self.lens_pitch
-        window = lens_type.window(k, l)
-        x, y = self.position(*lens_type.middle(window))
+        above, rows = lens_type.above or (0, lens_type.array[0])
+        lens_y = ((rows - 1) / 2 - above - k) * self.lens_pitch
+        view = lens_type.view(k, l)
+        x, y = self.position(*lens_type.middle(view.window))
         depth, shrink = self.depth(lens_type), self.depth(lens_type) / self.distance
         patch = lens_x + (lens_x - x) * shrink, lens_y + (lens_y - y) * shrink
-        return SubImager(lens_type, k, l, window, (lens_x, lens_y), patch, depth)
+        return SubImager(lens_type, k, l, view.window, (lens_x, lens_y), patch, depth, view.rotation)
+
+    @cached_property
+    def on_grids(self) -> Camera:
+        """The same camera, in which every sub-imager of an array with steered ones is a lens type of its own."""
+        if not any(lens_type.steered for lens_type in self.types):
+            return self
+        return replace(self, types=tuple(part for lens_type in self.types for part in lens_type.on_grids))
 
     def position(self, row: float, column: float) -> tuple[float, float]:
         """(x, y) on the target plane of a point given in pixels of f."""
@@ -189,11 +200,7 @@ class Camera:
         """Number of lens types that see each pixel of f as a whole: (rows, columns)."""
         count = np.zeros(self.shape, dtype=np.int64)
         for lens_type in self.types:
-            axes = [np.zeros(size, dtype=np.int64) for size in self.shape]
-            for axis, seen in enumerate(axes):
-                for start in lens_type.starts(axis):
-                    seen[ceil(start) : floor(start + lens_type.ratio * lens_type.pixels[axis])] = 1
-            count += np.outer(*axes)
+            count += whole_pixels(lens_type, self.shape)
         return count
 
     def restrict(self, names: tuple[str, ...]) -> tuple[Camera, BoolArray]:
@@ -224,6 +231,7 @@ class Camera:
                 "pixels": list(lens_type.pixels),
                 "step": lens_type.described_step,
                 **lens_type.optics.describe(),
+                **({"sub_imagers": [each.describe() for each in lens_type.steered]} if lens_type.steered else {}),
             }
         if not self.is_ideal_pinhole:  # sub-images of ideal pinholes do not depend on where the lenses are
             description["camera.places"] = [self.lens_columns, *(lens_type.left for lens_type in self.types)]
@@ -264,7 +272,7 @@ def derive(scene: Scene) -> Camera:
         raise InputError(
             f"{scene.source}: the lens arrays have {camera.measurements} pixels, expected at most 2^30; use fewer"
         )
-    _check_overlap(camera, scene)
+    check_overlap(camera.types, camera.sub_imager, camera.pixel_pitch, scene.source)
     return camera
 
 
@@ -288,17 +296,4 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
     optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating)
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics)
-    return lens_type.centred(rows, columns)
-
-
-def _check_overlap(camera: Camera, scene: Scene) -> None:
-    # The patches of a type form a regular grid and the types lie side by side, so these neighbours suffice.
-    pitch, source = camera.pixel_pitch, scene.source
-    for index, lens_type in enumerate(camera.types):
-        first = camera.sub_imager(index, 0, 0)
-        if lens_type.array[0] > 1:
-            first.check_apart(camera.sub_imager(index, 1, 0), 0, pitch, source)
-        if lens_type.array[1] > 1:
-            first.check_apart(camera.sub_imager(index, 0, 1), 1, pitch, source)
-        if index:
-            camera.sub_imager(index - 1, 0, camera.types[index - 1].array[1] - 1).check_apart(first, 1, pitch, source)
+    return with_steering(lens_type.centred(rows, columns), lens.sub_imager or (), (rows, columns), scene.source)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import accumulate, pairwise
+from itertools import accumulate, pairwise, product
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,23 @@ def adjacent_slices(sizes: Iterable[int]) -> list[slice]:
 
 
 @dataclass(frozen=True)
+class Steering:
+    """The view of sub-imager (k, l), which differs from that of the grid.
+
+    window : row and column of f where it begins;  rotation : of the sensor patch, clockwise in the upright picture
+    """
+
+    k: int
+    l: int  # noqa: E741  (the paper's letter)
+    window: tuple[Fraction, Fraction]
+    rotation: float = 0.0
+
+    def describe(self) -> list[Any]:
+        """The steering in JSON's types; part of fingerprints."""
+        return [self.k, self.l, *map(str, self.window), *([self.rotation] if self.rotation else [])]
+
+
+@dataclass(frozen=True)
 class LensType:
     """An array of equal sub-imagers.
 
@@ -65,6 +82,8 @@ class LensType:
     origin : row and column of f where the view of sub-imager (0, 0) begins; whole ones, so that the array stands at
         most half a pixel of f off the target's middle
     left : columns of sub-imagers of other types to its left; None: those of the types listed before it
+    steered : sub-imagers off the grid;  rotation : of all sensor patches
+    above : rows of lenses above it, and rows of all, of a part of an array; None of a whole array
     """
 
     name: str
@@ -72,9 +91,12 @@ class LensType:
     array: tuple[int, int]
     pixels: tuple[int, int]
     step: tuple[Fraction, Fraction]
-    origin: tuple[int, int]
+    origin: tuple[int | Fraction, int | Fraction]
     optics: LensOptics = LensOptics()
     left: int | None = None
+    steered: tuple[Steering, ...] = ()
+    rotation: float = 0.0
+    above: tuple[int, int] | None = None
 
     @property
     def count(self) -> int:
@@ -98,14 +120,64 @@ class LensType:
         """The same lens type on a grid of the target that is `detail` times finer along both axes."""
         origin = self.origin[0] * detail, self.origin[1] * detail
         step = self.step[0] * detail, self.step[1] * detail
-        return replace(self, ratio=self.ratio * detail, step=step, origin=origin)
+        steered = tuple(
+            replace(each, window=(each.window[0] * detail, each.window[1] * detail)) for each in self.steered
+        )
+        return replace(self, ratio=self.ratio * detail, step=step, origin=origin, steered=steered)
 
-    def window(self, k: int, l: int) -> tuple[Fraction, Fraction]:  # noqa: E741
-        """Row and column of f where the view of sub-imager (k, l) begins."""
-        return self.origin[0] + k * self.step[0], self.origin[1] + l * self.step[1]
+    def view(self, k: int, l: int) -> Steering:  # noqa: E741
+        """Window and rotation of sub-imager (k, l)."""
+        for each in self.steered:
+            if (each.k, each.l) == (k, l):
+                return each
+        return Steering(k, l, (self.origin[0] + k * self.step[0], self.origin[1] + l * self.step[1]), self.rotation)
+
+    @property
+    def is_rotated(self) -> bool:
+        """True if the patch of some sub-imager is rotated."""
+        return bool(self.rotation) or any(each.rotation for each in self.steered)
+
+    @property
+    def on_grids(self) -> tuple[LensType, ...]:
+        """Lens types on regular grids that have the same sub-imagers in the same order: itself, or one for each."""
+        if not self.steered:
+            return (self,)
+        left, rows = self.left or 0, self.array[0]
+        views = [self.view(k, l) for k, l in product(*map(range, self.array))]  # noqa: E741
+        return tuple(
+            replace(
+                self,
+                array=(1, 1),
+                origin=view.window,
+                left=left + view.l,
+                steered=(),
+                rotation=view.rotation,
+                above=(view.k, rows),
+            )
+            for view in views
+        )
+
+    @property
+    def covers_whole_pixels(self) -> bool:
+        """True if footprints of pinholes are whole pixels of f."""
+        ends = [number for part in self.on_grids for number in (*part.origin, *part.step, part.ratio)]
+        return not self.is_rotated and all(number.denominator == 1 for number in ends)
+
+    @property
+    def bounds(self) -> tuple[tuple[Fraction, Fraction], tuple[Fraction, Fraction]]:
+        """First row and end of the rows of f that some sub-imager sees, and the same of columns, without rotation."""
+        parts = self.on_grids
+        rows, columns = (
+            (
+                Fraction(min(part.origin[axis] for part in parts)),
+                max(part.origin[axis] + part.span[axis] for part in parts),
+            )
+            for axis in (0, 1)
+        )
+        return rows, columns
 
     def starts(self, axis: int) -> tuple[Fraction, ...]:
-        """Row (axis 0) or column (1) of f where the view of each sub-imager along this axis begins."""
+        """Row (axis 0) or column (1) of f where the view of each sub-imager of the grid along this axis begins."""
         return tuple(self.origin[axis] + number * self.step[axis] for number in range(self.array[axis]))
 
     @property
@@ -121,7 +193,7 @@ class LensType:
 
     @property
     def span(self) -> tuple[Fraction, Fraction]:
-        """Rows and columns of f that all sub-imagers together see."""
+        """Rows and columns of f that all sub-imagers of the grid together see."""
         rows, columns = (
             self.ratio * pixels + (count - 1) * step
             for count, pixels, step in zip(self.array, self.pixels, self.step, strict=True)
@@ -133,10 +205,11 @@ class LensType:
         top, left = (ceil((size - span - 1) / 2) for size, span in zip((rows, columns), self.span, strict=True))
         return replace(self, origin=(top, left))
 
-    def gaps(self, shape: tuple[int, int]) -> tuple[tuple[int, Fraction], ...]:
+    def gaps(self, shape: tuple[int, int]) -> tuple[tuple[Fraction, Fraction], ...]:
         """Pixels of f before and after what all sub-imagers together see, along the rows and columns of `shape`."""
         return tuple(
-            (start, size - span - start) for start, span, size in zip(self.origin, self.span, shape, strict=True)
+            (Fraction(start), size - span - start)
+            for start, span, size in zip(self.origin, self.span, shape, strict=True)
         )
 
 
@@ -145,7 +218,7 @@ class SubImager:
     """One lens and the sensor patch behind it.
 
     window : row and column of f where its view begins
-    lens, patch : (x, y) of their centres;  depth : distance from the lens to the patch
+    lens, patch : (x, y) of their centres;  depth : distance from the lens to the patch;  rotation : of the patch
     """
 
     type: LensType
@@ -155,6 +228,7 @@ class SubImager:
     lens: tuple[float, float]
     patch: tuple[float, float]
     depth: float
+    rotation: float = 0.0
 
     @property
     def name(self) -> str:

@@ -51,7 +51,7 @@ def pose_of(sub: SubImager, misalignment: Misalignment = NO_MISALIGNMENT) -> Pos
     lens = sub.lens[0] + misalignment.position[0], sub.lens[1] + misalignment.position[1]
     depth = sub.depth * (1 + misalignment.focal_length)
     middle = np.array([sub.patch[0] - lens[0], sub.patch[1] - lens[1], -depth])
-    (about_x, about_y), angle = misalignment.tilt, misalignment.rotation
+    (about_x, about_y), angle = misalignment.tilt, sub.rotation + misalignment.rotation
     tilted = np.array([[cos(about_y), sin(about_x) * sin(about_y)], [0.0, cos(about_x)]])
     rotated = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]]) @ tilted
     return Pose(lens, middle, np.vstack([rotated, [-sin(about_y), sin(about_x) * cos(about_y)]]))

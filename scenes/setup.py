@@ -89,6 +89,6 @@ class Setup:
         for lens_type in camera.types:
             if lens_type.optics.surfaces is not None:
                 return False
-            if lens_type.optics.distortion is not None and camera.is_blurred(lens_type):
+            if (lens_type.optics.distortion is not None or lens_type.is_rotated) and camera.is_blurred(lens_type):
                 return False
         return camera.tolerance is None or camera.has_sharp_footprints

@@ -7,6 +7,8 @@ those blurred by defocus and diffraction from the blur's own transform.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import sparse
 
@@ -32,27 +34,28 @@ def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
 def ideal_matrix(camera: Camera) -> sparse.csr_array:
     """Return H of all sub-imagers as designed: (M, N).
 
-    Lenses of surfaces count as perfect ones in focus. Raises InputError for a lens type that is both distorted and
-    blurred, and for a camera without walls, which have no closed form.
+    Lenses of surfaces count as perfect ones in focus. Raises InputError for a lens type that is blurred and distorted
+    or rotated, and for a camera without walls, which have no closed form.
     """
     if not camera.walls:
         raise InputError(
             "camera.walls = false: light through several lenses has no closed form; run with calibration.method"
             " 'transport', or keep the walls"
         )
-    return sparse.csr_array(sparse.vstack([_type_matrix(camera, lens) for lens in camera.types], format="csr"))
+    grids = camera.on_grids
+    return sparse.csr_array(sparse.vstack([_type_matrix(grids, lens) for lens in grids.types], format="csr"))
 
 
 def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
     blurred = camera.is_blurred(lens_type)
-    if lens_type.optics.distortion is not None:
+    if lens_type.optics.distortion is not None or lens_type.is_rotated:
         from ommatid.scenes.optics import footprints
 
         if blurred:
             raise InputError(
-                f"camera.lens.{lens_type.name}: distortion with defocus or diffraction has no closed form; run with"
-                " calibration.method 'transport', or remove one of them"
+                f"camera.lens.{lens_type.name}: distortion or a rotated sub-imager with defocus or diffraction has no"
+                " closed form; run with calibration.method 'transport', or remove one of them"
             )
         parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
     elif blurred:
@@ -67,11 +70,11 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
 def matrix_as_designed(camera: Camera, sub: SubImager) -> sparse.csr_array:
     """Return H of one sub-imager, for every kind of lens: (its pixels, N). Raises as `ideal_matrix` does."""
     lens_type = sub.type
-    if lens_type.optics.distortion is None and not camera.is_blurred(lens_type):
+    if lens_type.optics.distortion is None and not camera.is_blurred(lens_type) and not lens_type.is_rotated:
         return sub_matrix(camera, sub)
     size = lens_type.pixels[0] * lens_type.pixels[1]
     first = (sub.k * lens_type.array[1] + sub.l) * size
-    return _type_matrix(camera, lens_type)[first : first + size]
+    return ideal_matrix(replace(camera, types=(lens_type,)))[first : first + size]
 
 
 def true_matrix(camera: Camera) -> sparse.csr_array:

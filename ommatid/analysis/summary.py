@@ -76,8 +76,9 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "array": list(lens_type.array),
         "pixels": list(lens_type.pixels),
         "step": lens_type.described_step,
-        "sees_rows": [lens_type.origin[0], float(lens_type.origin[0] + lens_type.span[0])],
-        "sees_columns": [lens_type.origin[1], float(lens_type.origin[1] + lens_type.span[1])],
+        **({"steered": len(lens_type.steered)} if lens_type.steered else {}),
+        "sees_rows": [float(end) for end in lens_type.bounds[0]],
+        "sees_columns": [float(end) for end in lens_type.bounds[1]],
         "off_centre": [float(before - after) / 2 for before, after in lens_type.gaps(camera.shape)],
         "sensor_depth": camera.depth(lens_type),
         "focal_length": camera.focal_length(lens_type),
@@ -90,8 +91,8 @@ def _unseen_edges(camera: Camera) -> list[str]:
     """Return one sentence per lens type that does not see all edges of the target."""
     sentences: list[str] = []
     for lens_type in camera.types:
-        top, left = lens_type.origin
-        bottom, right = camera.rows - top - lens_type.span[0], camera.columns - left - lens_type.span[1]
+        (top, last_row), (left, last_column) = lens_type.bounds
+        bottom, right = camera.rows - last_row, camera.columns - last_column
         edges = (("top", top), ("bottom", bottom), ("left", left), ("right", right))
         missed = [f"{float(width):g} at the {edge}" for edge, width in edges if width > 0]
         if missed:
@@ -167,4 +168,5 @@ def _lens_words(lens: dict[str, Any]) -> str:
         f" {lens['sub_image_width']:.3g} mm wide,"
         f" focal length {lens['focal_length']:.4g} mm, sensor {lens['sensor_depth']:.4g} mm behind the lens,"
         f" rows {lens['sees_rows'][0]:g} to {lens['sees_rows'][1]:g}"
+        + (f", {lens['steered']} of them steered" if "steered" in lens else "")
     )

@@ -248,7 +248,12 @@ def _factorised_strip(system: Preconditioner, prior: float, axis: int, part: sli
 def is_sliding(lens_type: LensType) -> bool:
     """Return True if the type's sensor pixels are all the averages over boxes inside its field (shift-invariant)."""
     ratio = lens_type.ratio
-    return lens_type.step == (1, 1) and ratio.denominator == 1 and lens_type.array == (int(ratio), int(ratio))
+    return (
+        not lens_type.steered
+        and lens_type.step == (1, 1)
+        and ratio.denominator == 1
+        and lens_type.array == (int(ratio), int(ratio))
+    )
 
 
 def preconditioner_for(camera: Camera, weights: tuple[float, ...], prior: float | FloatArray) -> Preconditioner:
@@ -259,7 +264,7 @@ def preconditioner_for(camera: Camera, weights: tuple[float, ...], prior: float 
         if not is_sliding(lens_type):
             raise ValueError(f"lens type '{lens_type.name}' does not see every box of {ratio} x {ratio} pixels")
         vertical, horizontal = (
-            BoxMeans(int(ratio), first, int(first + span), size)
+            BoxMeans(int(ratio), int(first), int(first + span), size)
             for first, span, size in zip(lens_type.origin, lens_type.span, camera.shape, strict=True)
         )
         types.append((vertical, horizontal))

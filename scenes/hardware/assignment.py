@@ -40,7 +40,7 @@ class FootprintAssignment:
 
     @cached_property
     def _axes(self) -> list[tuple[FootprintInterval, FootprintInterval]]:
-        return [(_interval(lens_type, 0), _interval(lens_type, 1)) for lens_type in self.camera.types]
+        return [(_interval(lens_type, 0), _interval(lens_type, 1)) for lens_type in self.camera.on_grids.types]
 
     def reached(self, row: int, column: int) -> tuple[IntArray, FloatArray]:
         """Sensor pixels that a source may reach, and the distances of their footprints: (n,) each.
@@ -50,7 +50,7 @@ class FootprintAssignment:
         pixels: list[IntArray] = []
         distances: list[FloatArray] = []
         for lens_type, first, (down, across) in zip(
-            self.camera.types, self.camera.type_slices(), self._axes, strict=True
+            self.camera.on_grids.types, self.camera.on_grids.type_slices(), self._axes, strict=True
         ):
             (rows, row_distance), (columns, column_distance) = (
                 down.near(row, self.margin),
@@ -100,7 +100,7 @@ def _interval(lens_type: LensType, axis: int) -> FootprintInterval:
 def unrecorded(camera: Camera, positions: IntArray) -> IntArray:
     """Indices of the pixels of f that lie in some footprint but are not in `positions`, (n, 2) rows and columns."""
     seen = np.zeros(camera.shape, dtype=bool)
-    for lens_type in camera.types:
+    for lens_type in camera.on_grids.types:
         down, across = _interval(lens_type, 0), _interval(lens_type, 1)
         rows = [bool(down.near(row, 0.0)[0].size) for row in range(camera.rows)]
         columns = [bool(across.near(column, 0.0)[0].size) for column in range(camera.columns)]

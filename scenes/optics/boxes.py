@@ -130,11 +130,15 @@ class BoxFootprints:
 
     @cached_property
     def boxes(self) -> tuple[Box, ...]:
-        """H of each lens type."""
-        camera = self.camera
+        """H of each lens type, or of each sub-imager of a type with steered ones."""
+        camera = self._grids
         return tuple(
             Box(lens_type, _axis(camera, lens_type, 0), _axis(camera, lens_type, 1)) for lens_type in camera.types
         )
+
+    @property
+    def _grids(self) -> Camera:
+        return self.camera.on_grids
 
     @property
     def entries(self) -> int:
@@ -145,7 +149,7 @@ class BoxFootprints:
         """H f: (N,) or (rows, columns) to (M,)."""
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.camera.shape)
         out = np.empty(self.camera.measurements)
-        for box, pixels in zip(self.boxes, self.camera.type_slices(), strict=True):
+        for box, pixels in zip(self.boxes, self._grids.type_slices(), strict=True):
             box.forward(grid, out[pixels])
         return out
 
@@ -153,7 +157,7 @@ class BoxFootprints:
         """H^T g: (M,) to (N,)."""
         out = np.zeros(self.camera.shape)
         readings = np.ascontiguousarray(measurements, dtype=np.float64)
-        for box, pixels in zip(self.boxes, self.camera.type_slices(), strict=True):
+        for box, pixels in zip(self.boxes, self._grids.type_slices(), strict=True):
             box.adjoint(readings[pixels], out)
         return out.ravel()
 
@@ -163,7 +167,7 @@ class BoxFootprints:
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Indices of the measurements that see nothing outside a window of f: (m,)."""
-        pairs = zip(self.camera.type_slices(), self.boxes, strict=True)
+        pairs = zip(self._grids.type_slices(), self.boxes, strict=True)
         return np.concatenate([pixels.start + box.measurements_inside(rows, columns) for pixels, box in pairs])
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:

@@ -169,7 +169,7 @@ def _change(camera: Camera, lens_type: LensType, reduced: Blur, prior: PriorTabl
 
     blurs = blurs_of(camera, lens_type)
     margin = ceil(max(blur.reach for blur, _ in blurs)) + 1
-    nearest = (min(start, floor(end)) for start, end in lens_type.gaps(camera.shape))
+    nearest = (floor(min(start, end)) for start, end in lens_type.gaps(camera.shape))
     largest = mean_square = 0.0
     for origin in ((margin, margin), tuple(min(max(gap, 0), margin) for gap in nearest)):
         rows, columns = (start + ceil(lens_type.ratio) + 1 + margin for start in origin)

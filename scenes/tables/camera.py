@@ -11,7 +11,20 @@ from ommatid.runtime.errors import shortened_repr
 
 from ..zemax.dispersion import Dispersion
 from .table import Table
-from .units import Angle, FileName, Length, Magnification, Pair, Radius, Step, file_name, pair
+from .units import (
+    Angle,
+    Corner,
+    FileName,
+    Length,
+    Magnification,
+    Pair,
+    Radius,
+    SignedAngle,
+    Step,
+    Window,
+    file_name,
+    pair,
+)
 
 Distortion = Annotated[float, Field(ge=-1000, le=1000)]
 RAYS = "none"  # wavelength of light that does not diffract
@@ -76,6 +89,18 @@ class ToleranceTable(Table):
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the random draw: another seed is another camera")
 
 
+class SubImagerTable(Table):
+    """One sub-imager of an array that looks at a window of its own."""
+
+    at: Corner = Field(description="row and column of the sub-imager in its array, from 0")
+    window: Window | None = Field(
+        default=None, description="row and column of the target where its view begins; absent: on the grid"
+    )
+    rotation: SignedAngle | None = Field(
+        default=None, description="rotation of its sensor patch about the axis, clockwise in its view; absent: none"
+    )
+
+
 class LensTable(Table):
     """One lens type: an array of equal sub-imagers."""
 
@@ -107,6 +132,9 @@ class LensTable(Table):
         lt=1,
         description="reflectance of each surface to air; absent: uncoated, by Fresnel's equations",
     )
+    sub_imager: Annotated[tuple[SubImagerTable, ...], BeforeValidator(pair), Field(min_length=1)] | None = Field(
+        default=None, description="sub-imagers with a window or an orientation of their own; absent: all on the grid"
+    )
 
     @field_validator("pixels", mode="before")
     @classmethod
@@ -123,6 +151,20 @@ class LensTable(Table):
     @classmethod
     def _check_file_name(cls, value: object) -> object:
         return file_name(value) if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _check_sub_imagers(self) -> LensTable:
+        named: set[tuple[int, int]] = set()
+        for table in self.sub_imager or ():
+            (k, l), (rows, columns) = table.at, self.array  # noqa: E741
+            if k >= rows or l >= columns:
+                raise ValueError(f"sub_imager at [{k}, {l}] is not in an array of {rows} x {columns}, counted from 0")
+            if table.at in named:
+                raise ValueError(f"expected each sub_imager once, got the one at [{k}, {l}] twice")
+            if table.window is None and table.rotation is None:
+                raise ValueError(f"sub_imager at [{k}, {l}] needs a window, a rotation or both, got neither")
+            named.add(table.at)
+        return self
 
     @model_validator(mode="after")
     def _check_kind_of_lens(self) -> LensTable:

@@ -110,13 +110,27 @@ def _step(value: object) -> tuple[Fraction, Fraction]:
     return down, across
 
 
+def _window(value: object) -> tuple[Fraction, Fraction]:
+    numbers: tuple[object, ...] = tuple(cast(Sequence[object], value)) if isinstance(value, list | tuple) else ()
+    if len(numbers) == 2:
+        row, column = _ratio(numbers[0]), _ratio(numbers[1])
+        if row >= 0 and column >= 0:
+            return row, column
+    said = shortened_repr(cast(object, value))
+    raise ValueError(f'expected a row and a column of the target of 0 or more, such as [12, "7/2"], got {said}')
+
+
 def pair(value: object) -> object:
     """Convert a list of TOML to the tuple that frozen tables hold; return anything else unchanged."""
     return tuple(value) if isinstance(value, list) else value  # type: ignore[arg-type]
 
 
+def _plain_ratios(ratios: tuple[Fraction, ...]) -> list[str | int]:
+    return [_plain_ratio(ratio) for ratio in ratios]
+
+
 def _plain_step(step: tuple[Fraction, Fraction]) -> str | int | list[str | int]:
-    return _plain_ratio(step[0]) if step[0] == step[1] else [_plain_ratio(number) for number in step]
+    return _plain_ratio(step[0]) if step[0] == step[1] else _plain_ratios(step)
 
 
 def _plain_ratio(ratio: Fraction) -> str | int:
@@ -212,6 +226,12 @@ Angle = Annotated[
     _to_text("rad"),
     _text_schema('an angle with its unit, such as "0.1 deg"'),
 ]
+SignedAngle = Annotated[
+    float,
+    _from_text("rad", "an angle", "1 deg", "-2 mrad", signed=True),
+    _to_text("rad"),
+    _text_schema('an angle with its unit and its sign, such as "-1 deg"'),
+]
 Illuminance = Annotated[
     float,
     _from_text("lux", "an illuminance", "500 lux", "1 klux"),
@@ -220,6 +240,12 @@ Illuminance = Annotated[
 ]
 Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_plain_ratio), _RATIO]
 Step = Annotated[tuple[Fraction, Fraction], BeforeValidator(_step), PlainSerializer(_plain_step), _STEP]
+Window = Annotated[
+    tuple[Fraction, Fraction],
+    BeforeValidator(_window),
+    PlainSerializer(_plain_ratios),
+    WithJsonSchema({"type": "array", "items": {"type": ["string", "number"]}, "minItems": 2, "maxItems": 2}),
+]
 Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[tuple[Count, Count], BeforeValidator(pair)]
 Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(pair)]

@@ -61,7 +61,8 @@ def rendered_model(
 
 def _compared(responses: Responses, variance: FloatArray, camera: Camera) -> dict[str, Any]:
     """Compare H with the ideal one, if that has a closed form."""
-    if not camera.walls or any(lens.optics.distortion is not None and camera.is_blurred(lens) for lens in camera.types):
+    bent = (lens for lens in camera.types if lens.optics.distortion is not None or lens.is_rotated)
+    if not camera.walls or any(camera.is_blurred(lens) for lens in bent):
         return {}
     return {"agreement": agreement(responses.matrix, variance, camera, responses.passes)}
 

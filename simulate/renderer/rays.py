@@ -126,8 +126,9 @@ class RayGenerator:
 
 
 def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[FloatArray]:
-    """Return rows of (pixels,): x, y, z of each pixel's corner from its lens, x and y of the lens, and with a
-    tolerance the axes of the patch."""
+    """Return rows of (pixels,): x, y, z of each pixel's corner from its lens, x and y of the lens, and the axes of the
+    patch where patches are tilted or rotated."""
+    turned = camera.tolerance is not None or any(lens_type.is_rotated for lens_type in camera.types)
     parts: list[FloatArray] = []
     for sub, pose in zip(camera.sub_imagers, poses(camera), strict=True):
         if sub.type not in types:
@@ -135,7 +136,7 @@ def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[FloatArray]:
         row, column = (index.ravel() for index in np.indices(sub.type.pixels))
         u, v = corner_offset(camera, sub)
         corner = np.stack([u + column * camera.pixel_pitch, v + row * camera.pixel_pitch])
-        constant = [*pose.lens, *(pose.axes.ravel() if camera.tolerance is not None else ())]
+        constant = [*pose.lens, *(pose.axes.ravel() if turned else ())]
         constants = np.repeat(np.array(constant)[:, None], row.size, axis=1)
         parts.append(np.concatenate([pose.middle[:, None] + pose.axes @ corner, constants]))
     return list(np.concatenate(parts, axis=1))

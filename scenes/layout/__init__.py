@@ -1,0 +1,1 @@
+"""Where the sub-imagers of an array look, and where their patches lie on the sensor."""

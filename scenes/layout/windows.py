@@ -1,0 +1,117 @@
+"""Windows of single sub-imagers off the grid of their array: what they see, and that their patches lie apart.
+
+Positions are rows and columns of f, from its top left corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import product
+from math import ceil, cos, floor, sin
+from pathlib import Path
+
+import numpy as np
+
+from ommatid.runtime.arrays import BoolArray
+from ommatid.runtime.errors import InputError
+
+from ..lens_type import LensType, Steering, SubImager
+from ..tables.camera import SubImagerTable
+
+
+def with_steering(
+    lens_type: LensType, tables: Sequence[SubImagerTable], shape: tuple[int, int], source: Path
+) -> LensType:
+    """Return a lens type whose named sub-imagers look at their own windows.
+
+    shape : rows and columns of f
+    Raises InputError, which names the scene file, for a window that reaches beyond the target.
+    """
+    most = [size - lens_type.ratio * count for size, count in zip(shape, lens_type.pixels, strict=True)]
+    steered: list[Steering] = []
+    for table in tables:
+        window = lens_type.view(*table.at).window if table.window is None else table.window
+        if window[0] > most[0] or window[1] > most[1]:
+            raise InputError(
+                f"{source}: camera.lens.{lens_type.name}.sub_imager: the window of the one at {list(table.at)} begins"
+                f" at row {window[0]}, column {window[1]}, expected at most row {most[0]}, column {most[1]}, so that it"
+                f" lies in a target of {shape[0]} x {shape[1]} pixels"
+            )
+        steered.append(Steering(*table.at, window, table.rotation or 0.0))
+    return replace(lens_type, steered=tuple(steered))
+
+
+def whole_pixels(lens_type: LensType, shape: tuple[int, int]) -> BoolArray:
+    """Return True for the pixels of f, (rows, columns), that some sub-imager of a lens type sees as a whole."""
+    seen = np.zeros(shape, dtype=np.bool_)
+    for part in lens_type.on_grids:
+        if part.rotation:
+            seen |= _in_rotated_window(part, shape)
+            continue
+        axes = [np.zeros(size, dtype=np.bool_) for size in shape]
+        for axis, pixels in enumerate(axes):
+            for start in part.starts(axis):
+                pixels[ceil(start) : floor(start + part.ratio * part.pixels[axis])] = True
+        seen |= np.logical_and.outer(*axes)
+    return seen
+
+
+def _in_rotated_window(single: LensType, shape: tuple[int, int]) -> BoolArray:
+    """Return True for the pixels whose four corners lie in the rotated window of a lens type's only sub-imager."""
+    middle = single.middle(single.view(0, 0).window)
+    edges = [np.arange(size + 1) - at for size, at in zip(shape, middle, strict=True)]
+    down, across = edges[0][:, None], edges[1][None, :]
+    along = cos(single.rotation) * down - sin(single.rotation) * across
+    aside = sin(single.rotation) * down + cos(single.rotation) * across
+    half = [float(single.ratio) * count / 2 * (1 + 1e-12) for count in single.pixels]
+    corners = (np.abs(along) <= half[0]) & (np.abs(aside) <= half[1])
+    return corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
+
+
+def check_overlap(
+    types: Sequence[LensType], sub_imager: Callable[[int, int, int], SubImager], pixel_pitch: float, source: Path
+) -> None:
+    """Raise InputError, which names the scene file, if patches overlap on the sensor.
+
+    sub_imager : from the index of a lens type, k and l
+    """
+    if any(lens_type.steered for lens_type in types):
+        indices = [
+            (index, k, l)
+            for index, each in enumerate(types)
+            for k, l in product(*map(range, each.array))  # noqa: E741
+        ]
+        _check_all_apart([sub_imager(*each) for each in indices], pixel_pitch, source)
+        return
+    # The patches of a type form a regular grid and the types lie side by side, so these neighbours suffice.
+    for index, lens_type in enumerate(types):
+        first = sub_imager(index, 0, 0)
+        if lens_type.array[0] > 1:
+            first.check_apart(sub_imager(index, 1, 0), 0, pixel_pitch, source)
+        if lens_type.array[1] > 1:
+            first.check_apart(sub_imager(index, 0, 1), 1, pixel_pitch, source)
+        if index:
+            sub_imager(index - 1, 0, types[index - 1].array[1] - 1).check_apart(first, 1, pixel_pitch, source)
+
+
+def _check_all_apart(subs: Sequence[SubImager], pixel_pitch: float, source: Path) -> None:
+    """Check every pair of patches; a rotated one counts as the upright box around it."""
+    middles = np.array([sub.patch for sub in subs])
+    halves = np.array([_half_extent(sub) for sub in subs]) * pixel_pitch
+    for index, sub in enumerate(subs[:-1]):
+        needed = (halves[index + 1 :] + halves[index]) * (1 - 1e-9)
+        overlapping = (np.abs(middles[index + 1 :] - middles[index]) < needed).all(axis=1)
+        if overlapping.any():
+            other = subs[index + 1 + int(overlapping.argmax())]
+            raise InputError(
+                f"{source}: camera.lens.{sub.type.name}.sub_imager: the sub-images {sub.name} and {other.name} overlap"
+                " on the sensor; move one of their windows, or widen camera.lens_pitch"
+            )
+
+
+def _half_extent(sub: SubImager) -> tuple[float, float]:
+    """Return half the width and height, in pixels, of the upright box around a patch."""
+    rows, columns = sub.type.pixels
+    along, aside = abs(cos(sub.rotation)), abs(sin(sub.rotation))
+    return (along * columns + aside * rows) / 2, (along * rows + aside * columns) / 2

@@ -116,13 +116,13 @@ class Camera:
 
     @property
     def has_box_footprints(self) -> bool:
-        """True if the designed H averages f over boxes: no distortion, and no blur of a thin lens."""
+        """True if the designed H averages f over boxes: no distortion, and no blur."""
         return all(lens_type.optics.distortion is None and not self.is_blurred(lens_type) for lens_type in self.types)
 
     def is_blurred(self, lens_type: LensType) -> bool:
-        """True if a thin lens images a point of the target as a disk, by defocus or diffraction."""
+        """True if a point of the target is imaged as more than a point: by surfaces, defocus or diffraction."""
         if lens_type.optics.aperture is None:
-            return False
+            return lens_type.optics.surfaces is not None
         return self.wavelength is not None or self.focus(lens_type) != self.distance
 
     @property

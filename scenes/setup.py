@@ -85,8 +85,6 @@ class Setup:
         """True if H of the simulated camera with its misalignments has a closed form."""
         camera = self.simulated
         for lens_type in camera.types:
-            if lens_type.optics.surfaces is not None:
-                return False
             if lens_type.optics.distortion is not None and camera.is_blurred(lens_type):
                 return False
         return camera.tolerance is None or camera.has_sharp_footprints

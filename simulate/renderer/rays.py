@@ -46,15 +46,18 @@ class Rays:
 class RayGenerator:
     """Generates the rays of all sub-imagers of some lens types: one type, or several that are all pinholes."""
 
-    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: Sampler) -> None:
-        """Load the tables of the pixels into the renderer; a fast variant has to be active."""
+    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: Sampler, flat: bool = True) -> None:
+        """Load the tables of the pixels into the renderer; a fast variant has to be active.
+
+        flat : False before a world with depth
+        """
         import drjit as dr
         import mitsuba as mi
 
         self._sampler_name: Sampler = sampler
         self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": fitting(sampler, 16)})
         self.pixels = sum(lens_type.measurements for lens_type in types)
-        self.lens = lens_of(camera, types[0])
+        self.lens = lens_of(camera, types[0], flat)
         self._tables = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in _tables(camera, types)]
         dr.make_opaque(self._tables)
         self._pitch = float(camera.pixel_pitch)
@@ -115,11 +118,11 @@ def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[FloatArray]:
     return list(np.concatenate(parts, axis=1))
 
 
-def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
-    """Create the lens model of a lens type."""
+def lens_of(camera: Camera, lens_type: LensType, flat: bool = True) -> LensModel:
+    """Create the lens model of a lens type; `flat` is False before a world with depth."""
     if lens_type.optics.surfaces is not None:
-        from .real_lens import RealLens
+        from .real_lens import real_lens
 
-        return RealLens(camera, lens_type)
+        return real_lens(camera, lens_type, flat)
     aperture = lens_type.optics.aperture
     return LensModel(camera, lens_type) if aperture is None else ThinLens(camera, lens_type, aperture)

@@ -77,4 +77,5 @@ def turned_round(lens: Prescription) -> Prescription:
         semi_diameter=lens.semi_diameter[::-1],
         conic=lens.conic[::-1],
         stop=lens.radius.size - 1 - lens.stop,
+        aspheric=tuple(tuple(-term for term in row) for row in lens.aspheric[::-1]),
     )

@@ -13,6 +13,7 @@ from .table import Table
 from .units import Angle, Length, Magnification, Pair, Radius, Step, file_name, pair
 
 Distortion = Annotated[float, Field(ge=-1000, le=1000)]
+STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
 
@@ -27,12 +28,27 @@ class Surface(Table):
     index: float | None = Field(default=None, ge=1, le=5, description="refractive index, in place of a glass")
     semi_diameter: Length = Field(description="half the diameter of its clear aperture")
     conic: float = Field(default=0.0, ge=-100, le=100, description="0: a sphere, -1: a paraboloid")
+    aspheric: Annotated[tuple[float, ...], BeforeValidator(pair), Field(min_length=1, max_length=7)] | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="a4, a6, ... to a16 of a sag a4 r^4 + a6 r^6 + ... beside the conic's, r and sag in mm",
+    )
     stop: bool = Field(default=False, description="true for the aperture stop; for one surface only")
 
     @model_validator(mode="after")
     def _check_medium(self) -> Surface:
         if self.glass is not None and self.index is not None:
             raise ValueError("expected a glass or an index of refraction, got both")
+        return self
+
+    @model_validator(mode="after")
+    def _check_aspheric(self) -> Surface:
+        for power, term in zip(range(4, 17, 2), self.aspheric or (), strict=False):
+            if abs(term) * self.semi_diameter ** (power - 1) > STEEPEST_TERM:
+                raise ValueError(
+                    f"expected an aspheric term that adds at most {STEEPEST_TERM:g} semi-diameters at the rim,"
+                    f" got a{power} = {term:g} mm^-{power - 1}; its unit is a power of mm"
+                )
         return self
 
 

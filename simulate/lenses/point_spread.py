@@ -3,15 +3,16 @@
 Lengths are millimetres on the target, frequencies cycles per millimetre there. |U|^2 / wavelength^2 is the share of the
 light per area: by Parseval's theorem it integrates to 1 over the whole plane, so that no sum over a grid that ends
 somewhere enters the normalisation. The wave's nodes are irregular and the grid is regular: a non-uniform fast Fourier
-transform of type 1 (A. H. Barnett, J. Magland, L. af Klinteberg, SIAM J. Sci. Comput. 41, C479 (2019)) computes U on
-the grid to the requested precision, from nodes that integrate over the sharp edge of the pupil to high order; a Cartesian
-pupil would have an edge of steps.
+transform of type 1 (finufft: A. H. Barnett, J. Magland, L. af Klinteberg, SIAM J. Sci. Comput. 41, C479 (2019)) computes
+U on the grid to the requested precision, from nodes that integrate up to the sharp edge of the pupil with high order. A
+fast Fourier transform of a Cartesian pupil would have an edge of steps.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil, pi
+from typing import Any
 
 import numpy as np
 
@@ -89,7 +90,8 @@ def grid_of(wave: Wavefront, cells: int = CELLS) -> tuple[float, float]:
 def point_spread(wave: Wavefront, grid: tuple[float, float] | None = None) -> PointSpread:
     """Return the point-spread function on a grid, cut off beyond.
 
-    grid : from `grid_of`, of this wave or of a wider one; None: its own, widened until 99.5 per cent of the light is inside
+    grid : from `grid_of`, of this wave or of a wider one; None: its own, and wider until it holds 99.5 per cent of the
+        light
     The wave's nodes must serve the whole grid, as those of `wavefront_of` with a `reach` of REACH do. Raises InputError
     for a grid of more than MOST_CELLS cells along an axis.
     """
@@ -108,18 +110,19 @@ def point_spread(wave: Wavefront, grid: tuple[float, float] | None = None) -> Po
 
 
 def _on_grid(wave: Wavefront, cell: float, count: int) -> FloatArray:
-    import finufft
+    import finufft  # pyright: ignore[reportMissingTypeStubs]
 
     wavelength = _wavelength(wave)
     # The middle of the cosines turns the phase of U alone; without it the nodes lie within the period of the grid.
-    x, y = (2 * pi * cell / wavelength * (wave.cosines - wave.middle[:, None])).astype(np.float64)
+    x, y = (2 * pi * cell / wavelength * (wave.cosines - wave.middle[:, None])
     strength = wave.amplitude * np.exp(2j * pi / wavelength * wave.path)
-    field = finufft.nufft2d1(y, x, strength, (count, count), eps=PRECISION, isign=-1, nthreads=1)
-    return np.square(np.abs(field)) * (cell / wavelength) ** 2
+    transform: Any = finufft.nufft2d1  # pyright: ignore[reportUnknownMemberType]
+    field = transform(y, x, strength, (count, count), eps=PRECISION, isign=-1, nthreads=1)
+    return np.asarray(np.square(np.abs(field)) * (cell / wavelength) ** 2, dtype=np.float64)
 
 
 def strehl_ratio(wave: Wavefront) -> float:
-    """Return the largest |U|^2 relative to that of the same pupil without aberrations, at the best point near the centre."""
+    """Return the largest |U|^2 relative to that of the same pupil without aberrations."""
     cell, count = wave.resolution / 8, 2 * ceil(8 * (1 + wave.spot_radius / wave.resolution)) + 1
     values = _on_grid(wave, cell, count)
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)

@@ -39,6 +39,8 @@ class Prescription:
     radius : of curvature, infinite if flat;  thickness : to the next surface, 0 for the last one
     index : of refraction behind each;  semi_diameter : of its opening;  conic : 0 a sphere, -1 a paraboloid
     stop : index of the aperture stop
+    aspheric : for each surface a4, a6, ... of the sag a4 r^4 + a6 r^6 + ... added to that of the conic, empty for a
+        conic, in mm^-3, mm^-5, ...; absent: all are conics
     """
 
     radius: FloatArray
@@ -47,6 +49,7 @@ class Prescription:
     semi_diameter: FloatArray
     conic: FloatArray
     stop: int
+    aspheric: tuple[tuple[float, ...], ...] = ()
 
     def scaled(self, factor: float) -> Prescription:
         """Return the lens with all its lengths times a factor."""
@@ -55,6 +58,11 @@ class Prescription:
             radius=self.radius * factor,
             thickness=self.thickness * factor,
             semi_diameter=self.semi_diameter * factor,
+            aspheric=tuple(
+                # A factor whose power is 0 in float64 is too small for any ray.
+                tuple(term / max(factor**power, 1e-300) for power, term in zip(range(3, 16, 2), row, strict=False))
+                for row in self.aspheric
+            ),
         )
 
     @cached_property
@@ -69,8 +77,28 @@ class Prescription:
 
     def sag(self, height: float) -> FloatArray:
         """Return the sag of each surface, towards the sensor, at a height above the axis, or at its edge if lower."""
-        square = np.minimum(height, self.semi_diameter) ** 2 / self.radius
-        return square / (1 + np.sqrt(np.maximum(1 - (1 + self.conic) * square / self.radius, 0.0)))
+        lower = np.minimum(height, self.semi_diameter)
+        square = lower**2 / self.radius
+        sag = square / (1 + np.sqrt(np.maximum(1 - (1 + self.conic) * square / self.radius, 0.0)))
+        if not self.aspheric:
+            return sag
+        shares = (lower / self.semi_diameter).tolist()
+        rows = zip(self.rim_sags(), shares, strict=True)
+        return sag + np.array([sum(term * share ** (4 + 2 * n) for n, term in enumerate(row)) for row, share in rows])
+
+    def rim_sags(self) -> tuple[tuple[float, ...], ...]:
+        """Return for each surface the sag at the rim that each of its aspheric terms adds, from r^4 on."""
+        rows = self.aspheric or ((),) * self.radius.size
+        return tuple(
+            tuple(term * rim**power for power, term in zip(range(4, 17, 2), row, strict=False))
+            for row, rim in zip(rows, self.semi_diameter.tolist(), strict=True)
+        )
+
+    def last_extent(self) -> tuple[float, float]:
+        """Return the least and the largest sag of the last surface, towards the sensor, 0 at its vertex."""
+        heights = self.semi_diameter[-1] * np.linspace(0, 1, 65) if self.aspheric and self.aspheric[-1] else [inf]
+        sags = [0.0, *(float(self.sag(height)[-1]) for height in heights)]
+        return min(sags), max(sags)
 
     def matrix(self, first: int, last: int) -> FloatArray:
         """Return the ray matrix, (2, 2), from before surface `first` to before surface `last`, or behind the lens."""
@@ -148,6 +176,7 @@ def prescribe(surfaces: Sequence[Surface], wavelength: float | None = None) -> P
             f"expected air behind the last surface, got an index of {index[-1]:g}; end the list with the surface"
             " where the light leaves the glass"
         )
+    aspheric = tuple(surface.aspheric or () for surface in surfaces)
     lens = Prescription(
         radius=np.array([surface.radius or inf for surface in surfaces]),
         thickness=np.array([surface.thickness or 0.0 for surface in surfaces[:-1]] + [0.0]),
@@ -155,6 +184,7 @@ def prescribe(surfaces: Sequence[Surface], wavelength: float | None = None) -> P
         semi_diameter=np.array([surface.semi_diameter for surface in surfaces]),
         conic=np.array([surface.conic for surface in surfaces]),
         stop=marked[0] if marked else 0,
+        aspheric=aspheric if any(aspheric) else (),
     )
     if marked:
         return lens
@@ -184,7 +214,7 @@ def prescription_of(camera: Camera, lens_type: LensType) -> Prescription:
         )
     scale = lens_type.optics.scale
     scaled = lens.scaled(scale if isinstance(scale, float | int) else camera.focal_length(lens_type) / focal_length)
-    edge = scaled.vertices[-1] + max(0.0, float(scaled.sag(inf)[-1]))
+    edge = scaled.vertices[-1] + scaled.last_extent()[1]
     room = scaled.rear_principal + camera.depth(lens_type) - edge
     if room <= 0:
         raise InputError(

@@ -2,10 +2,9 @@
 
 Plain functions of coordinates; the arrays may be NumPy's or Dr.Jit's, see `Functions`. Lengths are millimetres, in the
 coordinates of the lens: z grows towards the target, z = 0 is the plane of the lenses, where the front principal plane
-lies, and the sensor is `depth` behind the rear principal plane. A surface is a conic of revolution,
-c (x^2 + y^2 + (1 + k) z^2) = 2 z about its vertex, c its curvature and k its conic constant; a ray meets it and is
-refracted there by Snell's law (G. H. Spencer, M. V. R. K. Murty, J. Opt. Soc. Am. 52, 672 (1962)). Every step is
-relative to the vertex of its surface, so that float32 suffices.
+lies, and the sensor is `depth` behind the rear principal plane. A ray meets a conic or an even asphere
+(`surface_shapes`) and is refracted there by Snell's law (G. H. Spencer, M. V. R. K. Murty, J. Opt. Soc. Am. 52, 672
+(1962)). Every step is relative to the vertex of its surface, so that float32 suffices.
 
 Rays start on the sensor and go through points spread evenly over a disk, the exit pupil a little enlarged. The
 irradiance of a sensor point before a uniform radiance L is then
@@ -15,7 +14,7 @@ irradiance of a sensor point before a uniform radiance L is then
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from math import pi
 from typing import Any, NamedTuple
 
@@ -28,24 +27,12 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.pose import poses
 
 from .prescription import Prescription
+from .surface_shapes import NUMPY, Direction, Functions, Meeting, meet_asphere, meet_conic
 
 WIDE = 1e15  # an opening that blocks nothing; its square is a float32
-PER_SURFACE = 5
 MARGIN = 1.02
 
 Point = tuple[Any, Any]
-Direction = tuple[Any, Any, Any]
-
-
-class Functions(NamedTuple):
-    """Functions that differ between NumPy and Dr.Jit."""
-
-    sqrt: Callable[..., Any]
-    where: Callable[..., Any]
-    maximum: Callable[..., Any]
-
-
-NUMPY = Functions(np.sqrt, np.where, np.maximum)
 
 
 class Disk(NamedTuple):
@@ -55,17 +42,40 @@ class Disk(NamedTuple):
     radius: float
 
 
-def path(prescription: Prescription, disk: Disk, surfaces: int = 0) -> FloatArray:
-    """Return the numbers of a lens for `trace`, from the sensor to the target.
+class LensPath(NamedTuple):
+    """The numbers of a lens for `trace`, from the sensor to the target.
 
-    First the disk's height and radius; then for every surface its distance from the previous one (for the first: from
-    the disk), its curvature (positive if the centre lies towards the target), 1 + conic, the index on the sensor's side
-    over that on the target's, and the square of its semi-diameter; at last the plane of the lenses, which changes
-    nothing. Paths of fewer `surfaces` are filled up with such planes, so that paths of several lenses fit one table.
+    height, radius : of the disk
+    rows : for every surface its distance from the previous one (for the first: from the disk), its curvature (positive
+        if the centre lies towards the target), 1 + conic, the index on the sensor's side over that on the target's, the
+        square of its semi-diameter, and for an even asphere the sag at the rim that each term, from r^4 on, adds; at
+        last the plane of the lenses, which changes nothing
     """
+
+    height: Any
+    radius: Any
+    rows: tuple[tuple[Any, ...], ...]
+
+    def converted(self, convert: Callable[[float], Any]) -> LensPath:
+        """Return the path with every number converted, such as to Dr.Jit's."""
+        rows = tuple(tuple(convert(number) for number in row) for row in self.rows)
+        return LensPath(convert(self.height), convert(self.radius), rows)
+
+
+class Step(NamedTuple):
+    """A ray behind one surface: its length up to there since the previous one, its point, direction and fate."""
+
+    run: Any
+    point: Point
+    direction: Direction
+    passed: Any
+
+
+def path(prescription: Prescription, disk: Disk) -> LensPath:
+    """Return the numbers of a lens for `trace`."""
     vertices = prescription.front_principal - prescription.vertices[::-1]
     start = prescription.front_principal - prescription.rear_principal + disk.height
-    rows = np.column_stack(
+    conics = np.column_stack(
         [
             np.diff(vertices, prepend=start),
             -1 / prescription.radius[::-1],
@@ -74,14 +84,13 @@ def path(prescription: Prescription, disk: Disk, surfaces: int = 0) -> FloatArra
             prescription.semi_diameter[::-1] ** 2,
         ]
     )
-    fill = max(surfaces - len(rows), 0) + 1
-    planes = np.tile([0.0, 0.0, 1.0, 1.0, WIDE**2], (fill, 1))
-    planes[0, 0] = -vertices[-1]
-    return np.concatenate([[disk.height, disk.radius], rows.ravel(), planes.ravel()])
+    terms = [[-float(term) for term in row] for row in prescription.rim_sags()[::-1]]
+    rows = [(*conic.tolist(), *row) for conic, row in zip(conics, terms, strict=True)]
+    return LensPath(disk.height, disk.radius, (*rows, (-float(vertices[-1]), 0.0, 1.0, 1.0, WIDE**2)))
 
 
 def trace(
-    numbers: Sequence[Any] | FloatArray,
+    numbers: LensPath,
     x: Any,
     y: Any,
     across: Any,
@@ -91,59 +100,87 @@ def trace(
 ) -> tuple[Point, Direction, Any]:
     """Trace the ray from the sensor point (x, y), `depth` behind the rear principal plane, out to the target.
 
-    numbers : of `path`, each a number or an array, such as the entries of a table for the ray's lens type
     across, down : point of the unit disk through which the ray leaves
 
     Returns (x, y) where it crosses z = 0, its direction, of length 1 and with z > 0, and its weight: cos^4 of its angle
     at the sensor, 0 if it is blocked by a rim or by total reflection; then the direction is the axis.
     """
-    along = depth + numbers[0]
-    at_x, at_y = across * numbers[1], down * numbers[1]
-    u, v = (at_x - x) / along, (at_y - y) / along
-    cosine = 1 / functions.sqrt(1 + u * u + v * v)
-    point, direction, passed = through(
-        numbers[2:], (at_x, at_y), (u * cosine, v * cosine, cosine), functions, along > 0
-    )
+    start = _start(numbers, x, y, across, down, depth, functions)
+    point, direction, passed = through(numbers.rows, start.point, start.direction, functions, start.passed)
+    cosine = start.direction[2]
     return point, direction, functions.where(passed, (cosine * cosine) * (cosine * cosine), 0.0)
 
 
+def trace_path(
+    prescription: Prescription, disk: Disk, x: Any, y: Any, across: Any, down: Any, depth: Any
+) -> tuple[Point, Direction, FloatArray, FloatArray]:
+    """Trace rays as `trace` does, and return also their optical path from the sensor point to z = 0, in mm.
+
+    The optical path is the sum of index times length, negative where a ray is followed backwards, such as from the
+    plane of the last surface to the plane of the lenses behind it. It is 0 for a blocked ray. Rays of one sensor point
+    are perpendicular to the surfaces of equal path (Malus and Dupin): its gradient by the point in z = 0 is (u, v).
+    """
+    numbers = path(prescription, disk)
+    step = _start(numbers, x, y, across, down, depth, NUMPY)
+    cosine, length, index = step.direction[2], step.run, 1.0
+    steps = _steps(numbers.rows, step.point, step.direction, NUMPY, step.passed)
+    for row, step in zip(numbers.rows, steps, strict=True):
+        length = length + index * step.run
+        index = index / row[3]
+    weight = np.where(step.passed, (cosine * cosine) * (cosine * cosine), 0.0)
+    return step.point, step.direction, weight, np.where(step.passed, length, 0.0)
+
+
+def _start(numbers: LensPath, x: Any, y: Any, across: Any, down: Any, depth: Any, functions: Functions) -> Step:
+    """Return the ray from a sensor point in the plane of the disk."""
+    along = depth + numbers.height
+    at_x, at_y = across * numbers.radius, down * numbers.radius
+    u, v = (at_x - x) / along, (at_y - y) / along
+    slant = functions.sqrt(1 + u * u + v * v)
+    cosine = 1 / slant
+    return Step(along * slant, (at_x, at_y), (u * cosine, v * cosine, cosine), along > 0)
+
+
 def through(
-    numbers: Sequence[Any] | FloatArray, point: Point, direction: Direction, functions: Functions, passed: Any
+    rows: Sequence[Sequence[Any]], point: Point, direction: Direction, functions: Functions, passed: Any
 ) -> tuple[Point, Direction, Any]:
-    """Trace a ray that crosses a plane at `point` through surfaces, whose numbers are those of `path`.
+    """Trace a ray that crosses a plane at `point` through surfaces, whose numbers are those of `LensPath.rows`.
 
     Returns (x, y) in the last plane, the direction of length 1, and True if it got there; else the axis and False.
     """
+    for step in _steps(rows, point, direction, functions, passed):
+        point, direction, passed = step.point, step.direction, step.passed
+    return point, direction, passed
+
+
+def _steps(
+    rows: Sequence[Sequence[Any]], point: Point, direction: Direction, functions: Functions, passed: Any
+) -> Iterator[Step]:
+    """Trace a ray through surfaces, one at a time."""
     (x, y), z = point, 0.0
-    for first in range(0, len(numbers), PER_SURFACE):
-        step, *surface = numbers[first : first + PER_SURFACE]
-        run = (step - z) / direction[2]
+    for distance, *surface in rows:
+        run = (distance - z) / direction[2]
         x, y = x + run * direction[0], y + run * direction[1]
-        (x, y, z), direction, passed = _refract(surface, x, y, direction, functions, passed)
-    return (x, y), direction, passed
+        curvature, shape, ratio, opening, *terms = surface
+        if terms:
+            meeting = meet_asphere((curvature, shape, opening, *terms), x, y, direction, functions, passed)
+        else:
+            meeting = meet_conic(curvature, shape, x, y, direction, functions, passed)
+        (x, y, z), direction, passed = _refract(meeting, ratio, opening, direction, functions)
+        yield Step(run + meeting.run, (x, y), direction, passed)
 
 
 def _refract(
-    surface: Sequence[Any], x: Any, y: Any, direction: Direction, functions: Functions, passed: Any
+    meeting: Meeting, ratio: Any, opening: Any, direction: Direction, functions: Functions
 ) -> tuple[Direction, Direction, Any]:
-    """Refract a ray that crosses the vertex plane at (x, y): where it meets the surface, and its new direction."""
-    curvature, shape, ratio, opening = surface
+    """Refract a ray where it meets a surface: return the point, the new direction, and whether it passes."""
     where, root = functions.where, functions.sqrt
+    (x, y, z), (normal_x, normal_y, normal_z), passed = meeting.point, meeting.normal, meeting.passed
     u, v, w = direction
-    # a t^2 - 2 b t + c = 0; in this form the nearer root loses no digit, and a plane is no special case
-    a = curvature * (u * u + v * v + shape * w * w)
-    b = w - curvature * (x * u + y * v)
-    c = curvature * (x * x + y * y)
-    square = b * b - a * c
-    cosine = root(functions.maximum(square, 0.0))
-    passed = passed & (square > 0) & (b + cosine > 0)
-    run = where(passed, c / where(passed, b + cosine, 1.0), 0.0)
-    x, y, z = x + run * u, y + run * v, run * w
-    normal_x, normal_y, normal_z = -curvature * x, -curvature * y, 1 - curvature * shape * z
     length = root(normal_x * normal_x + normal_y * normal_y + normal_z * normal_z)
-    cosine = cosine / where(passed, length, 1.0)
+    cosine = meeting.cosine / where(passed, length, 1.0)
     square = 1 - ratio * ratio * (1 - cosine * cosine)  # below 0: total reflection
-    passed = passed & (x * x + y * y <= opening) & (square > 0) & (normal_z > 0)
+    passed = passed & (x * x + y * y <= opening) & (square > 0)
     turn = (root(functions.maximum(square, 0.0)) - ratio * cosine) / where(passed, length, 1.0)
     u, v, w = ratio * u + turn * normal_x, ratio * v + turn * normal_y, ratio * w + turn * normal_z
     passed = passed & (w > 0)
@@ -171,8 +208,7 @@ def exit_disk(prescription: Prescription, depth: float | Sequence[float], field:
 def _disk(prescription: Prescription, depths: FloatArray, field: float, rear: float, height: float) -> Disk:
     """Return the disk at one height; `rear` is that of the last surface."""
     # No unblocked ray misses the last surface, wherever within its edge it meets that.
-    sag = min(0.0, float(prescription.sag(np.inf)[-1])), max(0.0, float(prescription.sag(np.inf)[-1]))
-    grow = np.array([(depths + height) / (depths + rear - edge) for edge in sag])
+    grow = np.array([(depths + height) / (depths + rear - edge) for edge in prescription.last_extent()])
     radius = float(np.max(prescription.semi_diameter[-1] * grow + field * np.abs(grow - 1)))
     rings, turns = np.arange(1, 65) / 64, np.linspace(-pi / 2, pi / 2, 25)  # the other half is its mirror image
     across, down = rings[:, None] * np.cos(turns), rings[:, None] * np.sin(turns)

@@ -3,14 +3,15 @@
 Lengths are pixels of f. An entry is the mean of overlap(y, dy) overlap(x, dx) over the displacements (dx, dy) of the
 point-spread function, where overlap is the share of the footprint [a, b] + d along an axis that lies in the texel. The
 footprint is the box between the middles of the light of the pixel's edges, so that distortion is part of it. An
-overlap is the second difference B(b - c) - B(b - d) + B(a - d) - B(a - c) of B(t) = |t| / 2. On a grid of cells D wide the
-point-spread function holds no frequency above 1 / 2D; the sum over the grid is exact where B is freed of these too,
+overlap is the second difference B(b - c) - B(b - d) + B(a - d) - B(a - c) of B(t) = |t| / 2. On a grid of cells D wide
+the point-spread function holds no frequency above 1 / 2D; the sum over the grid is exact where B is freed of these too,
 
     B(t) = (t Si(W t) + cos(W t) / W) / pi,   W = pi / D,   Si the sine integral (Shannon's sampling theorem).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby
@@ -102,8 +103,9 @@ def _rows(camera: Camera, field: LensField, pixels: _Pixels) -> sparse.csr_array
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 
 
-def _by_rays(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray):
-    for pixel in lit:
+def _by_rays(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray) -> Iterator[tuple[int, FloatArray]]:
+    """Compute the entries, (rows, columns) of f, of each lit pixel from the rays of the nodes beside its height."""
+    for pixel in lit.tolist():
         x, y = float(pixels.x[pixel]), float(pixels.y[pixel])
         values = np.zeros(camera.shape)
         for wave, share in field.between(float(np.hypot(x, y))):
@@ -114,21 +116,20 @@ def _by_rays(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray):
         yield pixel, values
 
 
-def _by_waves(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray):
-    cell = field.grid[0] / camera.target_pitch
+def _by_waves(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray) -> Iterator[tuple[int, FloatArray]]:
+    """Compute the entries, (rows, columns) of f, of each lit pixel; pixels with one point-spread function in turn."""
+    cell, levels = field.grid[0] / camera.target_pitch, [max(steps, 1) for steps in field.steps]
     keys = {int(pixel): _key(field, float(pixels.x[pixel]), float(pixels.y[pixel])) for pixel in lit}
     for (level, turn), members in groupby(sorted(keys, key=keys.__getitem__), key=keys.__getitem__):
-        steps = field.steps
-        height = field.field * level / max(steps[0], 1)
-        spread = field.spread(height, pi / 2 * turn / max(steps[1], 1))
+        spread = field.spread(field.field * level / levels[0], pi / 2 * turn / levels[1])
+        offsets: FloatArray = cell * (np.arange(len(spread), dtype=np.float64) - len(spread) // 2)
         for pixel in members:
             x, y = pixels.x[pixel], pixels.y[pixel]
             turned = spread.T if abs(x) > abs(y) else spread
             turned = turned[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1]
-            offsets = (np.arange(len(spread)) - len(spread) // 2) * cell
             down = _overlaps(pixels.rows[pixel], -offsets, camera.rows, cell)
             beside = _overlaps(pixels.columns[pixel], -offsets, camera.columns, cell)
-            yield pixel, down.T @ turned @ beside
+            yield pixel, np.asarray(down.T @ turned @ beside, dtype=np.float64)
 
 
 def _key(field: LensField, x: float, y: float) -> tuple[int, int]:

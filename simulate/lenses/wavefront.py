@@ -5,7 +5,9 @@ source on the sensor. Rays carry that field to the plane of the lenses, z = 0: p
 weight w(a), a the point of the exit disk through which a ray leaves. About the point t0 of the target that the rays
 meet on average (Fraunhofer's approximation, exact in defocus and aberrations),
 
-    U(t) = integral over a of sqrt(w |dq/da|) exp(2 pi i / lambda (L + |x - t0| - q . (t - t0))),   q = (x - t0) / |x - t0|.
+    U(t) = integral over a of sqrt(w |dq/da|) exp(2 pi i / lambda (L + |x - t0| - q . (t - t0))),
+
+    q = (x - t0) / |x - t0|.
 
 The nodes of the integral are polar: by direction from the middle of the clear part of the exit disk, whose edge is
 found by bisection along each direction, and by Gauss-Legendre along the radius, so that a vignetted pupil has a sharp
@@ -24,7 +26,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from .prescription import Prescription
-from .ray_trace import Disk, path, spread, trace, trace_path
+from .ray_trace import Disk, LensPath, path, spread, trace, trace_path
 
 SCOUTS = 4096  # rays that find the middle of the clear part of the disk
 EDGE_STEPS = 48  # of the bisection
@@ -70,7 +72,7 @@ class Wavefront:
 
     @cached_property
     def half_width(self) -> float:
-        """Half of the largest range of direction cosines, which limits the frequencies of |U|^2 to 2 / wavelength of it."""
+        """Half of the largest range of direction cosines; |U|^2 has no frequency above the whole over the wavelength."""
         return float(np.ptp(self.cosines, axis=1).max() / 2)
 
     @cached_property
@@ -140,7 +142,7 @@ def wavefront_of(
 def _middle(prescription: Prescription, disk: Disk, depth: float, height: float) -> FloatArray | None:
     """Return the middle of the light on the exit disk, as a point of the unit disk, or None if there is none."""
     points = np.array(spread(SCOUTS))
-    weight: FloatArray = trace(path(prescription, disk), 0.0, height, *points, depth)[2]
+    weight: FloatArray = trace(path(prescription, disk), 0.0, height, points[0], points[1], depth)[2]
     total = float(weight.sum())
     return points @ weight / total if total > 0 else None
 
@@ -187,7 +189,7 @@ def _traced(
     )
 
 
-def _rays(numbers: FloatArray, height: float, at: FloatArray, depth: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _rays(numbers: LensPath, height: float, at: FloatArray, depth: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Trace rays through points of the disk, (5, 2, n): points and slopes, (2, 5, n), and weights, (5, n)."""
     (x, y), (u, v, w), weight = trace(numbers, 0.0, height, at[:, 0], at[:, 1], depth)
     return np.stack([x, y]), np.stack([u / w, v / w]), weight

@@ -14,7 +14,8 @@ from ommatid.scenes.skipped import reason_for_rays
 
 from ..lenses.field import LensField, bands, field_of, sampling_tables
 from ..lenses.prescription import prescription_of
-from ..lenses.ray_trace import Functions, exit_disk_of, path, trace
+from ..lenses.ray_trace import exit_disk_of, path, trace
+from ..lenses.surface_shapes import Functions
 from .lens import Emission, LensModel
 
 SAMPLED_CELLS = 8  # of the grid that offsets are drawn from, per wavelength times f-number
@@ -34,7 +35,7 @@ class RealLens(LensModel):
 
         lens = prescription_of(camera, lens_type)
         numbers = path(lens, exit_disk_of(camera, lens_type, lens))
-        self._numbers = [dr.opaque(mi.Float, float(number)) for number in numbers]
+        self._numbers = numbers.converted(lambda number: dr.opaque(mi.Float, float(number)))
         self._functions = Functions(dr.sqrt, dr.select, dr.maximum)
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any) -> Emission:
@@ -68,7 +69,7 @@ class WaveLens(LensModel):
 
         del depth  # that of the design: `real_lens` sees to it
         sample, begin = sampler.next_2d(), 0.0
-        chosen = sampler.next_1d() if len(self._bands) > 1 else None
+        chosen = sampler.next_1d() if len(self._bands) > 1 else 0.0
         at_x, at_y, weight = self._bands[0].emit(x, y, sample)
         for before, band in zip(self._bands, self._bands[1:], strict=False):
             begin += before.weight
@@ -92,8 +93,7 @@ class _Band:
         self._scale = _table(field.centre(near, np.zeros(HEIGHTS))[0] / near)
         self._light = _table(field.brightness(heights) / field.brightness(np.zeros(1)))
         tables, self._width = sampling_tables(field, SAMPLED_CELLS)
-        nodes = field.nodes[0].astype(np.float32)
-        self._offsets = mi.MarginalContinuous2D1(tables.astype(np.float32), [nodes])
+        self._offsets: Any = mi.MarginalContinuous2D1(tables.astype(np.float32), [field.nodes[0].tolist()])
 
     def emit(self, x: Any, y: Any, sample: Any) -> tuple[Any, Any, Any]:
         """Return the point of the target that a ray meets, from the lens's axis, and its weight."""

@@ -1,0 +1,207 @@
+"""Even aspheres against other descriptions of the same surface, and optical paths against Malus and Descartes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import comb, inf
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ommatid.runtime.errors import InputError
+from ommatid.simulate.lenses.prescription import Prescription, prescription_of
+from ommatid.simulate.lenses.ray_trace import Disk, exit_disk, path, spread, through, trace, trace_path
+from ommatid.simulate.lenses.surface_shapes import NUMPY
+
+from ..lenses import BICONVEX, camera_with, lens, turned_round
+
+Array = NDArray[np.float64]
+
+
+def expansion(radius: float, conic: float, of: float) -> tuple[float, ...]:
+    """Return a4 to a16 that turn a conic of constant `of` into one of constant `conic`, from the series of the root.
+
+    z = sum over n of C(n) (1 + k)^(n - 1) r^(2 n) / (2^(2 n - 1) n R^(2 n - 1)), C(n) = binomial(2 n - 2, n - 1).
+    """
+    return tuple(
+        comb(2 * n - 2, n - 1) / n / (2 * radius) ** (2 * n - 1) * ((1 + conic) ** (n - 1) - (1 + of) ** (n - 1))
+        for n in range(2, 9)
+    )
+
+
+def same(first: Any, second: Any, tolerance: float) -> None:
+    for one, other in zip((*first[0], *first[1], *first[2:]), (*second[0], *second[1], *second[2:]), strict=True):
+        np.testing.assert_allclose(one, other, atol=tolerance)
+
+
+@pytest.mark.parametrize("of", [-1.0, -3.0, 0.6])
+def test_a_sphere_is_another_conic_and_a_polynomial(of: float) -> None:
+    """Up to r^18 / (2 R)^17 times some thousands: 1e-13 at r / R = 0.15."""
+    sphere = lens([1.0, -1.2], [0.2], [1.5, 1.0], 0.15)
+    other = replace(
+        sphere,
+        conic=np.array([of, of]),
+        aspheric=(expansion(1.0, 0.0, of), expansion(-1.2, 0.0, of)),
+    )
+    disk = exit_disk(sphere, 1.5, 0.1)
+    across, down = spread(500)
+    first, second = (trace_path(one, disk, 0.1, 0.02, across, down, 1.5) for one in (sphere, other))
+    same(first, second, 1e-12)
+    assert 0.5 < np.mean(first[2] > 0) < 1
+    without = trace_path(replace(other, aspheric=()), disk, 0.1, 0.02, across, down, 1.5)
+    assert np.abs(without[3] - first[3]).max() > 1e-6
+    assert other.sag(0.1) == pytest.approx(sphere.sag(0.1), rel=1e-12)
+    assert other.last_extent() == pytest.approx(sphere.last_extent(), abs=1e-14)
+
+
+def test_rays_meet_the_surface_of_the_formula() -> None:
+    """A strong asphere of a flat base, from its own formula; Snell's law about the gradient of its sag."""
+    terms = (0.9, -1.3, 0.7, 2.0, -1.0, 0.4, 0.2)
+    one = lens([inf], [], [1.6], 0.8)
+    one = replace(one, aspheric=(terms,))
+    rng = np.random.default_rng(3)
+    x, y, u, v = rng.uniform(-0.5, 0.5, (4, 300)) * [[1], [1], [0.4], [0.4]]
+    w = np.sqrt(1 - u * u - v * v)
+    # the lens has no power on the axis, so its rows are made by hand: of -sag, as the ray's z runs to the target
+    row = (0.0, 0.0, 1.0, 1 / 1.6, 0.8**2, *(-term for term in one.rim_sags()[0]))
+    (a, b), out, passed = through([row], (x, y), (u, v, w), NUMPY, np.full(300, True))
+    assert np.all(passed)
+    square = a * a + b * b
+    z = -sum(term * square ** (2 + n) for n, term in enumerate(terms))
+    np.testing.assert_allclose(np.cross(np.stack([a - x, b - y, z]).T, np.stack([u, v, w]).T), 0, atol=1e-13)
+    slope = -sum((4 + 2 * n) * term * square ** (1 + n) for n, term in enumerate(terms))
+    normal = np.stack([-slope * a, -slope * b, np.ones(300)]).T
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    before, behind = np.stack([u, v, w]).T, np.stack(out).T
+    np.testing.assert_allclose(np.cross(before, normal), 1.6 * np.cross(behind, normal), atol=1e-12)
+    assert np.abs(slope).max() > 0.5
+
+
+def test_an_asphere_corrects_a_sphere() -> None:
+    """Of a plano-convex lens turned to a hyperbola by its polynomial alone, all rays meet at one point."""
+    index = 1.6
+    sphere = lens([inf, -1.0], [0.2], [index, 1.0], 0.12, stop=1)
+    perfect = replace(sphere, aspheric=((), expansion(-1.0, -(index**2), 0.0)))
+    disk = exit_disk(sphere, sphere.focal_length, 0.0)
+    sines = [
+        trace(path(one, disk), 0.0, 0.0, np.linspace(-0.9, 0.9, 7), np.zeros(7), one.focal_length)[1][0]
+        for one in (sphere, perfect)
+    ]
+    assert np.abs(sines[0]).max() > 1e-4
+    assert np.abs(sines[1]).max() < 1e-9
+
+
+def test_scaling_a_lens_scales_its_polynomial() -> None:
+    one = replace(lens([1.0, -1.2], [0.2], [1.5, 1.0], 0.15), aspheric=((0.5, -3.0), (1.0, 2.0, -40.0)))
+    disk, across, down = exit_disk(one, 1.5, 0.05), *spread(100)
+    point, direction, weight, length = trace_path(one, disk, 0.03, 0.01, across, down, 1.5)
+    for factor in (1e-3, 40.0):
+        wide = Disk(disk.height * factor, disk.radius * factor)
+        scaled = trace_path(one.scaled(factor), wide, 0.03 * factor, 0.01 * factor, across, down, 1.5 * factor)
+        expected = (tuple(value * factor for value in point), direction, weight, length * factor)
+        same(scaled, expected, 1e-12 * max(factor, 1))
+
+
+def test_light_through_an_asphere_goes_the_same_way_back() -> None:
+    one = replace(lens([1.0, -1.2], [0.2], [1.5, 1.0], 0.15), aspheric=((0.5, -3.0), (1.0, 2.0, -40.0)))
+    across, down = spread(60)
+    depth = 1.5
+    (a, b), (u, v, w), weight = trace(path(one, Disk(0.0, 0.12)), 0.02, 0.05, across, down, depth)
+    back = path(turned_round(one), Disk(0.0, 1.0)).rows
+    (c, d), (p, q, r), passed = through(back, (a, b), (-u, -v, w), NUMPY, weight > 0)
+    kept = passed & (weight > 0)
+    assert np.mean(kept) > 0.5
+    np.testing.assert_allclose((c + depth * p / r)[kept], 0.02, atol=1e-12)
+    np.testing.assert_allclose((d + depth * q / r)[kept], 0.05, atol=1e-12)
+
+
+def test_rays_that_miss_an_asphere_are_blocked_and_leave_numbers() -> None:
+    one = replace(lens([0.2, -1.0], [0.3], [1.5, 1.0], 0.19, conic=[0.5, 0.0]), aspheric=((200.0,), (-3.0,)))
+    across, down = (number * 8 for number in spread(400))
+    with np.errstate(all="raise"):
+        (x, y), direction, weight, length = trace_path(one, Disk(0.1, 0.2), 0.2, 0.0, across, down, 0.4)
+    assert 0 < np.mean(weight > 0) < 0.2
+    assert np.all(np.isfinite([x, y, *direction, length]))
+    assert np.all(length[weight == 0] == 0)
+
+
+def gradient_error(one: Prescription, depth: float) -> float:
+    """Return the largest difference of direction cosines from the gradient of the path by the point in z = 0.
+
+    Along the disk's two axes d(path) = u dx + v dy; derivatives by central differences of sixth order.
+    """
+    disk = exit_disk(one, depth, 0.05)
+    across, down = (number * 0.9 for number in spread(40))
+    _, (u, v, _), weight, _ = trace_path(one, disk, 0.04, 0.02, across, down, depth)
+    worst = 0.0
+    for axis in (0, 1):
+        total = np.zeros((3, 40))
+        for count, share in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60)):
+            for sign in (-1, 1):
+                move = sign * count * 0.01
+                moved = across + move * (1 - axis), down + move * axis
+                point, _, _, length = trace_path(one, disk, 0.04, 0.02, *moved, depth)
+                total += sign * share / 0.01 * np.stack([*point, length])
+        dx, dy, dl = total
+        error = np.abs(dl - u * dx - v * dy) / disk.radius
+        worst = max(worst, float(error[weight > 0].max()))
+    assert np.mean(weight > 0) > 0.8
+    return worst
+
+
+def test_rays_are_perpendicular_to_surfaces_of_equal_path() -> None:
+    """Malus and Dupin, for spheres and for aspheres: to 1e-8."""
+    spheres = lens([1.0, -0.8, -1.6], [0.2, 0.1], [1.5, 1.7, 1.0], 0.15)
+    aspheres = replace(spheres, aspheric=((0.5, -3.0), (), (1.0, 2.0, -40.0)))
+    for one in (spheres, aspheres):
+        assert gradient_error(one, 1.1 * one.focal_length) < 1e-8
+
+
+def test_a_hyperbola_sends_out_light_of_equal_path() -> None:
+    """From the focus through the hyperbola, conic constant -n^2, and the plane: distance + n thickness + the gap."""
+    index, thickness = 1.6, 0.3
+    perfect = lens([inf, -1.0], [thickness], [index, 1.0], 0.4, conic=[0.0, -(index**2)], stop=1)
+    back = 1 / (index - 1)  # from the vertex to the focus
+    assert perfect.rear_principal + perfect.focal_length == pytest.approx(thickness + back)
+    disk = exit_disk(perfect, perfect.focal_length, 0.0)
+    _, (u, v, _), weight, length = trace_path(perfect, disk, 0.0, 0.0, *spread(300), perfect.focal_length)
+    lit = weight > 0
+    assert np.mean(lit) > 0.8
+    np.testing.assert_allclose((u[lit], v[lit]), 0, atol=1e-12)
+    np.testing.assert_allclose(length[lit], back + index * thickness - perfect.front_principal, atol=1e-12)
+
+
+def test_an_ellipsoid_sends_out_light_of_equal_path() -> None:
+    """From the focus, straight through the concentric sphere, then the ellipsoid, conic constant -1 / n^2.
+
+    The ellipsoid's focus lies n R / (n - 1) behind its vertex; the path is that along the axis.
+    """
+    index, rear = 1.5, 2.0  # rear: the sphere's radius
+    focus = index / (index - 1)
+    perfect = lens([1.0, rear], [focus - rear], [index, 1.0], 0.5, conic=[-1 / index**2, 0.0])
+    depth = focus - perfect.rear_principal
+    disk = exit_disk(perfect, depth, 0.0)
+    _, (u, _, _), weight, length = trace_path(perfect, disk, 0.0, 0.0, *spread(300), depth)
+    lit = weight > 0
+    assert np.mean(lit) > 0.8
+    np.testing.assert_allclose(u[lit], 0, atol=1e-12)
+    np.testing.assert_allclose(length[lit], rear + index * (focus - rear) - perfect.front_principal, atol=1e-12)
+    sphere = replace(perfect, conic=np.zeros(2))
+    assert np.ptp(trace_path(sphere, disk, 0.0, 0.0, 0.5 * spread(300)[0], 0.0, depth)[3]) > 1e-4
+
+
+def test_aspheric_terms_of_a_scene() -> None:
+    front = BICONVEX[0] | {"aspheric": [0.5, -3]}
+    camera = camera_with([front, BICONVEX[1]])
+    one = prescription_of(camera, camera.types[0])
+    spheres = camera_with(BICONVEX)
+    plain = prescription_of(spheres, spheres.types[0])
+    factor = one.radius[0]
+    assert plain.aspheric == ()
+    assert one.aspheric[0] == pytest.approx((0.5 / factor**3, -3 / factor**5))
+    with pytest.raises(InputError, match=r"surfaces.*a6 = 1e\+07 mm\^-5"):
+        camera_with([BICONVEX[0] | {"aspheric": [0.0, 1e7]}, BICONVEX[1]])
+    with pytest.raises(InputError, match="at most 7"):
+        camera_with([BICONVEX[0] | {"aspheric": [0.0] * 8}, BICONVEX[1]])

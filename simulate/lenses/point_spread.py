@@ -15,6 +15,7 @@ from math import ceil, pi
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -27,7 +28,6 @@ REACH = 40.0  # in units of `resolution`: the grid extends so far beyond the spo
 LEAST_INSIDE = 0.995
 WIDER = 1.25
 MOST_CELLS = 4096
-POINTS_AT_ONCE = 2**22
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +62,14 @@ class PointSpread:
 
 
 def density(wave: Wavefront, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the share of the light per area at points (x, y) from the wave's centre, (n,) each, by direct sums."""
+    """Return the share of the light per area at points (x, y) from the wave's centre: (n,)."""
+    import finufft  # pyright: ignore[reportMissingTypeStubs]
+
+    transform: Any = finufft.nufft2d3  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
     wavelength = _wavelength(wave)
-    found = np.empty(x.size)
-    rotation = wave.amplitude * np.exp(2j * pi / wavelength * wave.path)
-    step = max(1, POINTS_AT_ONCE // rotation.size)
-    for first in range(0, x.size, step):
-        part = slice(first, first + step)
-        phase = np.outer(x[part], wave.cosines[0]) + np.outer(y[part], wave.cosines[1])
-        found[part] = np.square(np.abs(np.exp(-2j * pi / wavelength * phase) @ rotation)) / wavelength**2
-    return found
+    u, v = 2 * pi / wavelength * (wave.cosines - wave.middle[:, None])
+    field = transform(u, v, _strength(wave), x, y, eps=PRECISION, isign=-1, nthreads=1)
+    return np.asarray(np.square(np.abs(field)) / wavelength**2, dtype=np.float64)
 
 
 def relative_intensity(wave: Wavefront, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -115,9 +113,8 @@ def _on_grid(wave: Wavefront, cell: float, count: int) -> FloatArray:
     wavelength = _wavelength(wave)
     # The middle of the cosines turns the phase of U alone; without it the nodes lie within the period of the grid.
     x, y = 2 * pi * cell / wavelength * (wave.cosines - wave.middle[:, None])
-    strength = wave.amplitude * np.exp(2j * pi / wavelength * wave.path)
-    transform: Any = finufft.nufft2d1  # pyright: ignore[reportUnknownMemberType]
-    field = transform(y, x, strength, (count, count), eps=PRECISION, isign=-1, nthreads=1)
+    transform: Any = finufft.nufft2d1  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    field = transform(y, x, _strength(wave), (count, count), eps=PRECISION, isign=-1, nthreads=1)
     return np.asarray(np.square(np.abs(field)) * (cell / wavelength) ** 2, dtype=np.float64)
 
 
@@ -151,6 +148,10 @@ def encircled_energy(wave: Wavefront, radius: float) -> float:
     x, y = np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))
     mean = density(wave, x.ravel(), y.ravel()).reshape(rings, turns).mean(axis=1)
     return float(2 * pi * (mean * distance) @ weights * radius / 2)
+
+
+def _strength(wave: Wavefront) -> NDArray[np.complex128]:
+    return np.asarray(wave.amplitude * np.exp(2j * pi / _wavelength(wave) * wave.path), dtype=np.complex128)
 
 
 def _wavelength(wave: Wavefront) -> float:

@@ -72,7 +72,7 @@ class Wavefront:
 
     @cached_property
     def half_width(self) -> float:
-        """Half of the largest range of direction cosines; |U|^2 holds frequencies up to twice that over the wavelength."""
+        """Half of the largest range of direction cosines; |U|^2 has frequencies up to twice that / wavelength."""
         return float(np.ptp(self.cosines, axis=1).max() / 2)
 
     @cached_property

@@ -44,7 +44,7 @@ def pupil(waves: Aberration, slope: float, reach: float = REACH) -> Wavefront:
 
 
 def defocused(waves: float) -> Wavefront:
-    return pupil(lambda radius, angle: waves * radius**2, 2 * waves)
+    return pupil(lambda radius, _: waves * radius**2, 2 * waves)
 
 
 def by_autocorrelation(waves: Callable[[np.ndarray], np.ndarray], frequency: float, count: int = 400) -> float:
@@ -64,7 +64,7 @@ def by_autocorrelation(waves: Callable[[np.ndarray], np.ndarray], frequency: flo
 
 
 def test_an_open_pupil_is_airys() -> None:
-    wave = pupil(lambda radius, angle: 0 * radius, 0)
+    wave = pupil(lambda radius, _: 0 * radius, 0)
     for radius in (0.5, 1.22, 3.0, 10.0, 30.0):
         v = np.pi * radius
         assert encircled_energy(wave, radius * UNIT) == pytest.approx(1 - j0(v) ** 2 - j1(v) ** 2, abs=1e-6)
@@ -99,7 +99,7 @@ def test_transfer_of_a_defocused_pupil(waves: float) -> None:
 @pytest.mark.parametrize("radial", [1.0, 3.0])
 def test_primary_spherical_aberration(radial: float) -> None:
     """Strehl ratio in the middle, MTF and encircled energy against integrals along the radius."""
-    wave = pupil(lambda radius, angle: radial * radius**4, 4 * radial)
+    wave = pupil(lambda radius, _: radial * radius**4, 4 * radial)
     middle = integrate.quad_vec(lambda square: np.exp(2j * np.pi * radial * square**2), 0, 1)[0]
     found = relative_intensity(wave, np.zeros(1), np.zeros(1))[0]
     assert found == pytest.approx(abs(middle) ** 2, abs=1e-6)

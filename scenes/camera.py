@@ -21,10 +21,11 @@ from ommatid.runtime.arrays import BoolArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
+from .constants import GREEN
 from .formats.picture import target_shape
 from .lens_type import LensOptics, LensType, SubImager
 from .scene import Scene
-from .tables.camera import LensTable, ToleranceTable
+from .tables.camera import RAYS, LensTable, ToleranceTable
 
 MOST_MEASUREMENTS = 2**30
 MOST_SUB_IMAGERS = 2**14
@@ -103,6 +104,11 @@ class Camera:
     def focus(self, lens_type: LensType) -> float:
         """Distance at which a type's lenses are in focus."""
         return self.distance if lens_type.optics.focus is None else lens_type.optics.focus
+
+    @property
+    def wavelengths(self) -> tuple[tuple[float, float], ...]:
+        """Wavelengths of the light with their shares of the detected light; none where light is rays."""
+        return () if self.wavelength is None else ((self.wavelength, 1.0),)
 
     @property
     def half_diagonal(self) -> float:
@@ -242,7 +248,7 @@ def derive(scene: Scene) -> Camera:
         pixel_pitch=scene.camera.pixel_pitch,
         lens_pitch=scene.camera.lens_pitch,
         types=tuple(replace(lens_type, left=left) for lens_type, left in zip(types, lefts, strict=False)),
-        wavelength=scene.camera.wavelength,
+        wavelength=_wavelength(scene),
         tolerance=scene.camera.tolerance,
         lens_columns=lefts[-1],
         detail=scene.target.detail,
@@ -261,6 +267,15 @@ def derive(scene: Scene) -> Camera:
         )
     _check_overlap(camera, scene)
     return camera
+
+
+def _wavelength(scene: Scene) -> float | None:
+    """Wavelength of the light, 550 nm for lenses with a width unless the scene says otherwise; None: rays alone."""
+    wavelength = scene.camera.wavelength
+    if wavelength is None:
+        wide = any(lens.aperture is not None or lens.surfaces is not None for lens in scene.camera.lens)
+        return GREEN if wide else None
+    return None if wavelength == RAYS else wavelength
 
 
 def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensType:

@@ -12,15 +12,6 @@ def skipped_effects(scene: Scene, camera: Camera) -> tuple[SkippedEffect, ...]:
     return (*_in_rendering(scene, camera), *_in_recording(scene, camera), *_in_estimation(scene))
 
 
-def reason_for_rays(camera: Camera, has_world: bool) -> str | None:
-    """Return why lenses with surfaces are traced by rays alone although the light has a wavelength; None: by waves."""
-    if has_world:
-        return "a lens with surfaces before a world is traced by rays: its diffraction depends on the distance"
-    if camera.tolerance is not None and (camera.tolerance.focal_length or camera.tolerance.tilt):
-        return "a lens with surfaces whose sensor is tilted or displaced along the axis is traced by rays"
-    return None
-
-
 def assumptions(scene: Scene, camera: Camera) -> tuple[str, ...]:
     """Return what the error bars take for granted and no measurement is asked about, a sentence each."""
     if camera.covers_whole_pixels or (camera.has_detail and scene.prior.kind != "independent"):
@@ -37,10 +28,6 @@ def _in_rendering(scene: Scene, camera: Camera) -> list[SkippedEffect]:
         skipped.append(SkippedEffect("samples of an aperture", "every lens is a pinhole in focus"))
     elif camera.wavelength is None:
         skipped.append(SkippedEffect("diffraction", "the scene has no camera.wavelength: light is rays"))
-    elif any(lens_type.optics.surfaces is not None for lens_type in camera.types):
-        reason = reason_for_rays(camera, scene.world is not None)
-        if reason is not None:
-            skipped.append(SkippedEffect("diffraction of lenses with surfaces", reason))
     if scene.world is None:
         why = "there is nothing but the luminous target: paths have one segment"
         skipped.append(SkippedEffect("interreflection", why))

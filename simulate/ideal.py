@@ -58,7 +58,7 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     elif blurred:
         from ommatid.scenes.optics import blur
 
-        return blur.matrix(camera, lens_type, blur.blur_of(camera, lens_type))
+        return blur.matrix(camera, lens_type, *blur.blurs_of(camera, lens_type))
     else:
         parts = [sub_matrix(camera, sub) for sub in subs]
     return sparse.csr_array(sparse.vstack(parts, format="csr"))

@@ -1,8 +1,8 @@
 """H of thin lenses: footprints blurred by defocus and by diffraction.
 
 Lengths are pixels of f. Every ray of a lens type is displaced on the target by a random vector: a point of the disk of
-defocus, or of the Airy pattern, or their sum (geometric blur and the diffraction of an open aperture taken as
-independent, the usual approximation). Its distribution is the same for all pixels and isotropic, so that
+defocus or, if the light has wavelengths, of the diffraction pattern of the defocused pupil (`diffraction`). Its
+distribution is the same for all pixels and isotropic, so that
 
     H_ij = T(y, x) = E[trapezoid(y - dy) trapezoid(x - dx)],   trapezoid(t) = |[0, m] and [t, t + 1]| / m,
 
@@ -12,7 +12,8 @@ for an isotropic displacement, P(x) = E (dx - x)+ and F(y, x) = E (dy - y)+ (dx 
 
     T = trapezoid trapezoid + trapezoid q(x) + q(y) trapezoid + D D F / m^2,
 
-which is the entry without blur where P and F vanish.
+which is the entry without blur where P and F vanish; the first term is times the light within the pattern's largest
+radius.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ from ommatid.runtime.memory import check_memory
 
 from ..camera import Camera
 from ..lens_type import LensType
-from .blur_moments import airy_end, moments, quantiles, slopes
+from .blur_moments import moments, slopes
+from .diffraction import MOST_WAVES, Pattern, end_of, pattern
+from .radial_density import RadialDensity, disk_density, disk_slant
 
 MOST_REACH = 1000  # pixels of f
-MOST_RINGS = 1000  # disk of defocus in units of the Airy pattern; larger ones take minutes
 TABLES = 6  # arrays of the size of the transfer function that `matrix` holds at once
 SIGNS = np.array([1, -1, -1, 1])  # of the terms of D
 
@@ -42,10 +44,10 @@ SIGNS = np.array([1, -1, -1, 1])  # of the terms of D
 class Blur:
     """Distribution of the displacement of a lens type's rays from a pinhole's, in pixels of f.
 
-    disk : diameter of the disk of defocus, 0 in focus
+    disk : diameter of the disk of rays out of focus, 0 in focus
     airy : radius on the target where the Airy pattern (2 J1(v) / v)^2 has v = 1, 0 without diffraction
-    weight : (aperture / 2 depth)^2: rays through the lens's rim have (1 + weight)^-2 of the weight of those through its
-        middle, the cos^4 law for a pixel on the lens's axis; 0 for a uniform disk
+    weight : (aperture / 2 depth)^2: light through the lens's rim has (1 + weight)^-2 of the weight of that through its
+        middle, the cos^4 law for a pixel on the lens's axis; 0 for a uniform pupil
     """
 
     disk: float = 0.0
@@ -58,63 +60,92 @@ class Blur:
         return self.disk == 0 and self.airy == 0
 
     @property
-    def reach(self) -> float:
-        """Largest displacement, which is added to a footprint on every side."""
-        return self.disk / 2 + self.airy * airy_end()
+    def waves(self) -> float:
+        """Defocus at the pupil's rim in wavelengths; ValueError without diffraction."""
+        if self.airy == 0:
+            raise ValueError("waves of defocus need a wavelength, got a blur of rays")
+        return self.disk / (8 * np.pi * self.airy)
 
     @property
-    def radii(self) -> FloatArray:
-        """Radii that encircle the shares (0, 1/n, ... 1)^2 of the truncated Airy pattern: (n + 1,), n = QUANTILES."""
-        return self.airy * quantiles()
+    def reach(self) -> float:
+        """Largest displacement, which is added to a footprint on every side."""
+        return self.airy * end_of(self.waves) if self.airy else self.disk / 2
+
+    @property
+    def pattern(self) -> Pattern:
+        """The diffraction pattern."""
+        return pattern(self.waves, self.weight)
+
+    @property
+    def spread_density(self) -> RadialDensity:
+        """Density of the displacements."""
+        return self.pattern.spread_density(self.airy) if self.airy else disk_density(self.disk, self.weight)
+
+    @property
+    def slant_density(self) -> RadialDensity:
+        """Density whose derivative along an axis is the change for a pupil that is brighter towards that axis."""
+        return self.pattern.slant_density(self.airy) if self.airy else disk_slant(self.disk, self.weight)
 
 
-def blur_of(camera: Camera, lens_type: LensType) -> Blur:
-    """The blur of a lens type: a disk of diameter aperture |1 - distance / focus|, and Airy's if there is a wavelength.
+Blurs = tuple[tuple[Blur, float], ...]  # of the wavelengths, with their shares of the light
 
-    Raises ValueError for a lens with surfaces, whose blur is not a disk, InputError for more blur than can be computed.
+
+def blur_of(camera: Camera, lens_type: LensType, wavelength: float | None = None) -> Blur:
+    """The blur of a lens type at a wavelength, absent: the camera's; without one the disk of the rays.
+
+    More than `MOST_WAVES` of defocus are a disk of rays too. Raises ValueError for a lens with surfaces, InputError for
+    more blur than can be computed.
     """
     if lens_type.optics.surfaces is not None:
         raise ValueError(f"lens type '{lens_type.name}' has surfaces; expected a pinhole or a thin lens")
     aperture = lens_type.optics.aperture
     if aperture is None:
         return Blur()
+    wavelength = wavelength or camera.wavelength or 0.0
     disk = aperture * abs(1 - camera.distance / camera.focus(lens_type)) / camera.target_pitch
-    scale = 0.0 if camera.wavelength is None else camera.wavelength * camera.distance / np.pi
-    weight = (aperture / (2 * camera.depth(lens_type))) ** 2 if disk else 0.0
-    blur = Blur(disk, scale / (aperture * camera.target_pitch), weight)
+    airy = wavelength * camera.distance / np.pi / (aperture * camera.target_pitch)
+    blur = Blur(disk, airy, (aperture / (2 * camera.depth(lens_type))) ** 2)
+    if airy and blur.waves > MOST_WAVES:
+        blur = replace(blur, airy=0.0)
+    if blur.is_zero:
+        return Blur()
     if blur.reach > MOST_REACH:
         raise InputError(
             f"camera.lens.{lens_type.name}: its blur reaches {blur.reach:.3g} pixels of f, expected at most"
             f" {MOST_REACH}; change its aperture or its focus"
         )
-    if blur.airy and disk > MOST_RINGS * blur.airy:
-        raise InputError(
-            f"camera.lens.{lens_type.name}: the disk of defocus is {disk / blur.airy:.3g} times as wide as the"
-            f" diffraction, expected at most {MOST_RINGS}; remove camera.wavelength, as diffraction is negligible"
-        )
     return blur
 
 
-def matrix(camera: Camera, lens_type: LensType, blur: Blur) -> sparse.csr_array:
+def blurs_of(camera: Camera, lens_type: LensType) -> Blurs:
+    """The blur of a lens type at each wavelength of the light, with its share of the light."""
+    shares = camera.wavelengths or ((None, 1.0),)
+    return tuple((blur_of(camera, lens_type, wavelength), share) for wavelength, share in shares)
+
+
+def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> sparse.csr_array:
     """H of all sub-imagers of a lens type as designed, without distortion: (its measurements, N).
 
-    Rays that miss the target bring no light: rows near its edges sum to less than 1. With a weight the disk of a pixel
-    off its lens's axis is asymmetric: rays through the near side of the lens have more weight. To first order in the
-    position s of the pixel's middle the weight w(a) of the lens point a becomes w(a) - s . grad w(a) inside the disk,
-    and that gradient is the weighted disk's minus that of a uniform one of the height of its rim. Neglected are the
-    second order, 12 weight (s / depth)^2 of an entry, and the variation of w within a sensor pixel.
+    blurs : each with its share of the light, as of `blurs_of`
+
+    Rays that miss the target bring no light: rows near its edges sum to less than 1. With a weight the blur of a pixel
+    off its lens's axis is asymmetric: light through the near side of the lens has more weight. It is right to first
+    order in the position s of the pixel's middle. Neglected are the second order, 12 weight (s / depth)^2 of an entry,
+    the variation within a sensor pixel, and the share `diffraction.TAIL` of the light, which lands further out.
     """
+    reach = max(blur.reach for blur, _ in blurs)
     unit = lcm(lens_type.ratio.denominator, lens_type.step.denominator)
-    down, across = (_axis(camera, lens_type, blur, axis, unit) for axis in (0, 1))
+    down, across = (_axis(camera, lens_type, reach, axis, unit) for axis in (0, 1))
     offsets = np.unique(np.abs(np.concatenate([down.offset.ravel(), across.offset.ravel()])))  # symmetric
     needed = TABLES * 8 * offsets.size**2
     check_memory(needed, f"camera.lens.{lens_type.name}: its blur", "take simpler ratios, or less blur")
     gap = np.maximum(offsets - unit - int(lens_type.ratio * unit), 0) / (2 * unit)
-    lit = np.hypot.outer(gap, gap) < max(blur.reach, np.finfo(float).tiny)
-    table = np.where(lit, transfer(float(lens_type.ratio), offsets, unit, blur), 0.0)
-    slope = (
-        np.where(lit, _asymmetry(camera, lens_type, blur, offsets, unit), 0.0) if blur.disk and blur.weight else None
-    )
+    lit = np.hypot.outer(gap, gap) < max(reach, np.finfo(float).tiny)
+    ratio = float(lens_type.ratio)
+    table = np.where(lit, sum(share * transfer(ratio, offsets, unit, blur) for blur, share in blurs), 0.0)
+    slanted = [(blur, share) for blur, share in blurs if blur.disk and blur.weight]
+    slope = sum(share * _asymmetry(camera, lens_type, blur, offsets, unit) for blur, share in slanted)
+    slope = np.where(lit, slope, 0.0) if slanted else None
     data: list[FloatArray] = []
     indices: list[IntArray] = []
     counts: list[IntArray] = []
@@ -130,9 +161,9 @@ def matrix(camera: Camera, lens_type: LensType, blur: Blur) -> sparse.csr_array:
     return sparse.csr_array((np.concatenate(data), np.concatenate(indices), pointers), shape=shape)
 
 
-def entries(camera: Camera, lens_type: LensType, blur: Blur) -> int:
-    """Upper bound of the number of entries of `matrix`, to check that it fits into memory."""
-    tall, wide = (_reached(lens_type, blur, size) for size in camera.shape)
+def entries(camera: Camera, lens_type: LensType, reach: float) -> int:
+    """Upper bound of the number of entries of `matrix` for blurs of a reach, to check that it fits into memory."""
+    tall, wide = (_reached(lens_type, reach, size) for size in camera.shape)
     return lens_type.measurements * tall * wide
 
 
@@ -146,18 +177,20 @@ def transfer(ratio: float, offsets: IntArray, unit: int, blur: Blur) -> FloatArr
     if blur.is_zero:
         return sharp
     kinks, even, _ = _differences(ratio, offsets, unit)
-    beyond, corner = moments(kinks, blur.disk, blur.airy, blur.weight)
+    density = blur.spread_density
+    beyond, corner = moments(kinks, density)
     widened = np.outer(trapezoid, even @ beyond)
-    return sharp + widened + widened.T + even @ corner @ even.T
+    return density.mass * sharp + widened + widened.T + even @ corner @ even.T
 
 
-def steepness(ratio: float, offsets: IntArray, unit: int, blur: Blur) -> FloatArray:
-    """The derivative of T by y, its first coordinate, for a blur that is not zero; parameters as of `transfer`."""
+def steepness(ratio: float, offsets: IntArray, unit: int, density: RadialDensity) -> FloatArray:
+    """The derivative by y, its first coordinate, of T of displacements with a density; offsets as of `transfer`."""
     trapezoid, steep = _trapezoid(ratio, offsets, unit)
     kinks, even, odd = _differences(ratio, offsets, unit)
-    beyond, _ = moments(kinks, blur.disk, blur.airy, blur.weight)
-    lower, corner = slopes(kinks, blur.disk, blur.airy, blur.weight)
-    return np.outer(steep, trapezoid + even @ beyond) + np.outer(odd @ lower, trapezoid) + odd @ corner @ even.T
+    beyond, _ = moments(kinks, density)
+    lower, corner = slopes(kinks, density)
+    steep = np.outer(steep, density.mass * trapezoid + even @ beyond)
+    return steep + np.outer(odd @ lower, trapezoid) + odd @ corner @ even.T
 
 
 def _kinks(ratio: float, offsets: IntArray, unit: int) -> IntArray:
@@ -185,12 +218,10 @@ def _differences(ratio: float, offsets: IntArray, unit: int) -> tuple[FloatArray
 
 def _asymmetry(camera: Camera, lens_type: LensType, blur: Blur, offsets: IntArray, unit: int) -> FloatArray:
     """Change of an entry of H per pixel of f between a lens and the footprint of its pixel, along y: (n, n)."""
-    uniform = replace(blur, weight=0.0)
-    ratio = float(lens_type.ratio)
-    inside = steepness(ratio, offsets, unit, blur) - steepness(ratio, offsets, unit, uniform) / (1 + blur.weight)
-    # |1 - distance / focus| depth / distance: shift of the middle of the weights on the target.
-    lever = blur.disk / 2 / np.sqrt(blur.weight) * camera.target_pitch / camera.distance
-    return np.sign(1 - camera.distance / camera.focus(lens_type)) * lever * inside
+    inside = steepness(float(lens_type.ratio), offsets, unit, blur.slant_density)
+    # A pixel at s sees the pupil's amplitude 2 s sqrt(weight) / depth brighter at the rim on its side.
+    lever = 2 * np.sqrt(blur.weight) * camera.target_pitch / camera.distance
+    return -np.sign(1 - camera.distance / camera.focus(lens_type)) * lever * inside
 
 
 @dataclass(frozen=True)
@@ -207,12 +238,12 @@ class _Axis:
     beside: FloatArray
 
 
-def _axis(camera: Camera, lens_type: LensType, blur: Blur, axis: int, unit: int) -> _Axis:
+def _axis(camera: Camera, lens_type: LensType, reach: float, axis: int, unit: int) -> _Axis:
     size, count, length = camera.shape[axis], lens_type.array[axis], int(lens_type.ratio * unit)
     begin = lens_type.origin[axis] * unit + int(lens_type.step * unit) * np.arange(count)
     starts = begin[:, None] + length * np.arange(lens_type.pixels[axis])
-    reached = _reached(lens_type, blur, size)
-    first = np.clip(np.floor(starts / unit - blur.reach).astype(np.int64), 0, size - reached)
+    reached = _reached(lens_type, reach, size)
+    first = np.clip(np.floor(starts / unit - reach).astype(np.int64), 0, size - reached)
     cells = first[..., None] + np.arange(reached)
     index = camera.types.index(lens_type)
     subs = [camera.sub_imager(index, *((number, 0) if axis == 0 else (0, number))) for number in range(count)]
@@ -235,6 +266,6 @@ def _block(
     return values + upward * slope[row, column] + sideways * slope[column, row]
 
 
-def _reached(lens_type: LensType, blur: Blur, size: int) -> int:
+def _reached(lens_type: LensType, reach: float, size: int) -> int:
     """Number of texels along an axis that a footprint reaches at most."""
-    return min(ceil(lens_type.ratio + Fraction(2 * blur.reach)) + 1, size)
+    return min(ceil(lens_type.ratio + Fraction(2 * reach)) + 1, size)

@@ -160,14 +160,14 @@ def _change(camera: Camera, lens_type: LensType, reduced: Blur) -> tuple[float, 
 
     Returns the largest change for values from 0 to 255, and the mean square for independent pixels of variance 1.
     """
-    from .blur import blur_of, matrix
+    from .blur import blurs_of, matrix
 
-    blur = blur_of(camera, lens_type)
-    margin = ceil(blur.reach) + 1
+    blurs = blurs_of(camera, lens_type)
+    margin = ceil(max(blur.reach for blur, _ in blurs)) + 1
     side = ceil(lens_type.ratio) + 1 + 2 * margin
     single = replace(lens_type, array=(1, 1), pixels=(1, 1), origin=(margin, margin), left=None)
     small = replace(camera, rows=side, columns=side, types=(single,), lens_columns=None)
-    row = sparse.csr_array(matrix(small, single, blur) - matrix(small, single, reduced)).data
+    row = sparse.csr_array(matrix(small, single, *blurs) - matrix(small, single, (reduced, 1.0))).data
     most = WHITE * max(float(row[row > 0].sum()), -float(row[row < 0].sum()))
     return most, float(np.square(row).sum())
 

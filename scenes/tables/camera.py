@@ -14,6 +14,7 @@ from .units import Angle, Length, Magnification, Pair, Radius, Step, file_name, 
 
 Distortion = Annotated[float, Field(ge=-1000, le=1000)]
 STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
+RAYS = "none"  # wavelength of light that does not diffract
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
 
@@ -128,9 +129,9 @@ class CameraTable(Table):
 
     pixel_pitch: Length = Field(description="side of one sensor pixel")
     lens_pitch: Length = Field(description="distance between the centres of neighbouring lenses")
-    wavelength: Length | None = Field(
+    wavelength: Literal["none"] | Length | None = Field(
         default=None,
-        description="wavelength of the light; absent: no diffraction, 550 nm for glasses and sensors",
+        description='wavelength of the light, 550 nm if absent; "none": light is rays, which do not diffract',
     )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]

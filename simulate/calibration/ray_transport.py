@@ -68,7 +68,8 @@ def one_pass(renderer: Renderer, group: str, block: slice, work: Plan, number: i
     counts, columns, sums = sums_by_texel(texels, weights)
     pixel = np.repeat(np.arange(counts.size), counts)
     total = weights.sum(axis=1)
-    return TracedEntries(pixel * renderer.camera.unknowns + columns, sums / total[pixel], total == 0)
+    values = sums * (renderer.captured(group) / total[pixel])
+    return TracedEntries(pixel * renderer.camera.unknowns + columns, values, total == 0)
 
 
 def _joined(passes: list[TracedEntries], shape: tuple[int, int]) -> Part:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import ceil
+from math import ceil, pi
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -18,7 +18,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
-from .point_spread import CELLS, REACH, grid_of, point_spread
+from .point_spread import REACH, grid_of, point_spread
 from .prescription import Prescription, prescribe, prescription_of
 from .ray_trace import Disk, exit_disk, reach
 from .wavefront import Wavefront, wavefront_of
@@ -75,6 +75,21 @@ class LensField:
         heights, waves = self._rays
         return np.interp(height, heights, [wave.brightness for wave in waves], right=0.0)
 
+    def lit_share(self, height: FloatArray) -> FloatArray:
+        """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
+        return self.brightness(height) / (pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2)
+
+    @property
+    def pupil_radius(self) -> float:
+        """Radius of the beam on its way to the target."""
+        return self._rays[1][0].half_width * self.distance
+
+    def waves_of(self, vergence: float) -> float:
+        """Return the defocus at the pupil's rim, in waves, that a change of the target's vergence makes."""
+        if self.wavelength is None:
+            raise ValueError("expected light with a wavelength, got rays alone")
+        return self.pupil_radius**2 * vergence / (2 * self.wavelength)
+
     @cached_property
     def rays_suffice(self) -> bool:
         """True if light counts as rays: it has no wavelength, or the spots are far wider than diffraction."""
@@ -89,13 +104,13 @@ class LensField:
         if self.rays_suffice:
             return self._rays
         last = float(self._rays[0][-1])
-        known = {height: self._computed(height) for height in (0.0, last)}
+        known = {height: self.lit_wave(height) for height in (0.0, last)}
         grid = self._common_grid(list(known.values()))
         heights, waiting = [0.0, last], [(0.0, last)]
         while waiting and len(heights) < MOST_NODES:
             low, high = waiting.pop()
             middle = (low + high) / 2
-            known[middle] = self._computed(middle)
+            known[middle] = self.lit_wave(middle)
             ends = [point_spread(known[height], grid).values for height in (low, middle, high)]
             if np.abs(ends[1] - (ends[0] + ends[2]) / 2).sum() > TOLERANCE:
                 heights.append(middle)
@@ -103,7 +118,8 @@ class LensField:
         heights.sort()
         return np.array(heights), [known[height] for height in heights]
 
-    def _computed(self, height: float) -> Wavefront:
+    def lit_wave(self, height: float) -> Wavefront:
+        """Return the wave of a sensor point that gets light."""
         wave = self.wave(height, self.wavelength)
         if wave is None:
             raise ValueError(f"no light at a height of {height:g} mm, expected a lit one")
@@ -138,36 +154,60 @@ class LensField:
         return [(waves[after - 1], 1 - share), (waves[after], share)]
 
     def spread(self, height: float, angle: float) -> FloatArray:
-        """Return the point-spread function of a sensor point on the grid, (n, n), whose cells add up to 1.
+        """Return the point-spread function of a sensor point on the grid: (n, n) shares of the light.
 
         angle : from the y axis to the sensor point, towards x
         """
         parts = [share * point_spread(wave.turned(-angle), self.grid).values for wave, share in self.between(height)]
-        total: FloatArray = np.sum(parts, axis=0)
-        return total / total.sum()
+        return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
 
 
-def sampling_tables(field: LensField, cells: int) -> tuple[FloatArray, float]:
-    """Return densities at the field's nodes for drawing offsets, (heights, n, n), and the width of all n points.
+@dataclass(frozen=True, eq=False)
+class SamplingTables:
+    """Densities of the slopes by which diffraction and aberrations turn rays from the mean one.
+
+    heights : of the sensor point, (h,);  vergences : 1 / distance of the target, rising, (v,)
+    densities : (h, v, n, n), rows along the direction of the sensor point;  width : of the slopes of all n points
+    captured : share of the light within that width
+    """
+
+    heights: FloatArray
+    vergences: FloatArray
+    densities: FloatArray
+    width: float
+    captured: float
+
+
+def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
+    """Return the densities of slopes of a lens at vergences other than 0.
 
     Offsets drawn from densities that are linear between the points are a convolution with a tent of two cells. It damps
     a frequency f along an axis by sinc(f cell)^2, which is divided out here, as the frequencies are limited.
-    cells : of the grid per wavelength times f-number
+    cells : of the grid per wavelength times f-number;  reach : of the grid beyond the spot, in the same unit
     """
-    cell, half = field.grid[0] * CELLS / cells, field.grid[1]
+    heights = field.nodes[0]
+    waves = [[replace(field, distance=1 / v).lit_wave(float(height)) for v in vergences] for height in heights]
+    all_waves = [(wave, abs(v)) for row in waves for wave, v in zip(row, vergences, strict=True)]
+    cell = min(wave.resolution * v for wave, v in all_waves) / cells
+    half = max((wave.spot_radius + reach * wave.resolution) * v for wave, v in all_waves)
     tables: list[FloatArray] = []
-    for wave in field.nodes[1]:
-        values = point_spread(wave, (cell, half)).values
-        damping = np.sinc(np.fft.fftfreq(len(values))) ** 2
-        limited = np.maximum(damping, np.sinc(1 / cells) ** 2)  # beyond these frequencies there is nothing
-        sharpened = np.fft.ifft2(np.fft.fft2(values) / np.outer(limited, limited)).real
-        tables.append(np.maximum(sharpened, 0.0) / values.sum())
-    return np.stack(tables), cell * (tables[0].shape[0] - 1)
+    captured: list[float] = []
+    for row in waves:
+        for wave, v in zip(row, vergences, strict=True):
+            spread = point_spread(wave, (cell / abs(v), half / abs(v)))
+            values = spread.values if v > 0 else spread.values[::-1, ::-1]
+            damping = np.maximum(np.sinc(np.fft.fftfreq(len(values))) ** 2, np.sinc(1 / cells) ** 2)
+            sharpened = np.fft.ifft2(np.fft.fft2(values) / np.outer(damping, damping)).real
+            tables.append(np.maximum(sharpened, 0.0) / spread.inside)
+            captured.append(spread.inside)
+    shape = (heights.size, vergences.size, *tables[0].shape)
+    densities = np.stack(tables).reshape(shape).astype(np.float64)
+    return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)))
 
 
 def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:
     """Return the wavelengths of the light and their weights; a single None for rays alone."""
-    return ((camera.wavelength, 1.0),)
+    return camera.wavelengths or ((None, 1.0),)
 
 
 def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> LensField:

@@ -50,9 +50,9 @@ class _Pixels:
 def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     """H of all sub-imagers of a lens type with surfaces, as designed: (its measurements, N).
 
-    A row holds the light of a pixel that comes from the target, as a share of the light within the grid of the
-    point-spread function; rows of pixels without light are empty. Neglected are the variation of the blur within a
-    pixel, and the 0.5 per cent of the light that diffraction takes beyond the grid.
+    A row holds the light of a pixel that comes from the target: less than 1, as diffraction takes up to 0.5 per cent
+    of the light beyond the grid of the point-spread function. Rows of pixels without light are empty. Neglected is the
+    variation of the blur within a pixel.
     Raises InputError if the surfaces form no image.
     """
     found: sparse.csr_array | None = None

@@ -126,6 +126,7 @@ def wavefront_of(
 ) -> Wavefront | None:
     """Trace the wave of the sensor point (0, height), `depth` behind the rear principal plane, to the target.
 
+    distance : of the target; negative for the virtual point behind the lens from which divergent light comes
     reach : in units of `resolution`, distance from the edge of the spot at which the field is still exact
     Returns None if no light passes.
     """
@@ -172,7 +173,7 @@ def _traced(
     light /= light.sum()
     centre = hits[:, 0] @ light
     beside = points - centre[:, None, None]
-    length = np.sqrt(np.square(beside).sum(axis=0) + distance**2)
+    length = np.copysign(np.sqrt(np.square(beside).sum(axis=0) + distance**2), distance)
     cosines = beside / length
     right, up = (cosines[:, 1] - cosines[:, 2]) / (2 * STEP), (cosines[:, 3] - cosines[:, 4]) / (2 * STEP)
     density = np.abs(right[0] * up[1] - right[1] * up[0]) * (area * edge**2).ravel()

@@ -1,15 +1,14 @@
 """Rays from the sensor through a pinhole or a thin lens into the world, on Mitsuba's fast backends.
 
-A lens type has one `LensModel`, composed of its properties: a pinhole, a thin lens with its distortion and diffraction,
-or (`real_lens`) the surfaces of a real one. Absent effects cost nothing.
+A lens type has one `LensModel`, composed of its properties: a pinhole, a thin lens with its distortion, one that
+diffracts (`diffracting_lens`), or the surfaces of a real one (`real_lens`). Absent effects cost nothing.
 """
 
 # pyright: basic
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from collections.abc import Callable
+from typing import Any
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
@@ -17,9 +16,8 @@ from ommatid.scenes.pose import poses
 
 from ..lenses import thin_lens
 
-if TYPE_CHECKING:
-    from ommatid.scenes.optics.blur import Blur
-
+Point = tuple[Any, Any]
+Distance = Callable[[Any, Any], Any]  # along z to the first surface that rays meet, by their origins and directions
 Emission = tuple[tuple[Any, Any, Any], tuple[Any, Any, Any], Any]
 
 
@@ -28,6 +26,7 @@ class LensModel:
 
     has_weights = False  # True if rays carry different amounts of light
     tail = 0.0  # pixels of f by which rare rays land outside the footprint of the others
+    captured = 1.0  # share of the light that the rays represent
 
     def __init__(self, camera: Camera, lens_type: LensType) -> None:
         """Create the model of a lens type."""
@@ -39,13 +38,17 @@ class LensModel:
             pairs = zip(camera.sub_imagers, poses(camera), strict=True)
             self._limit = max(field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
 
-    def emit(self, x: Any, y: Any, depth: Any, sampler: Any) -> Emission:
+    def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights.
 
         Directions are not normalised; the weights are None if all rays carry the same light.
+        lens : (x, y) of the lens in the camera
         """
-        del sampler
+        del sampler, lens
         return (0, 0, 0), (*self.chief(x, y, depth), 1), None
+
+    def follow(self, distance: Distance) -> None:
+        """Tell the lens how far the surfaces of a world are; only light that is waves depends on it."""
 
     def chief(self, x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
         """Return the slopes, behind the lens, of the ray through its centre."""
@@ -58,7 +61,7 @@ class LensModel:
 
 
 class ThinLens(LensModel):
-    """A thin lens with an aperture, in focus or not, that diffracts if the light has a wavelength."""
+    """A thin lens with an aperture, in focus or not, for light that is rays."""
 
     has_weights = True
 
@@ -70,46 +73,17 @@ class ThinLens(LensModel):
 
         self._radius = dr.opaque(mi.Float, aperture / 2)
         self._focal = dr.opaque(mi.Float, camera.focal_length(lens_type))
-        self._radii = None
-        if camera.wavelength is not None:
-            from ommatid.scenes.optics.blur import blur_of
 
-            blur = blur_of(camera, lens_type)
-            self.tail, self._radii = blur.reach, slope_table(blur, camera)
-
-    def emit(self, x: Any, y: Any, depth: Any, sampler: Any) -> Emission:
+    def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
         import mitsuba as mi
 
+        del lens
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * self._radius
         weight = thin_lens.falloff(x, y, on_disk.x, on_disk.y, depth)
         slopes = self.chief(x, y, depth)
-        if self._radii is not None:
-            shift = sample_displacement(self._radii, sampler.next_2d())
-            slopes = slopes[0] + shift[0], slopes[1] + shift[1]
         direction = [
             thin_lens.through_thin_lens(slope, position, depth, self._focal)
             for slope, position in zip(slopes, (on_disk.x, on_disk.y), strict=True)
         ]
         return (on_disk.x, on_disk.y, 0), (*direction, 1), weight
-
-
-def slope_table(blur: Blur, camera: Camera) -> Any:
-    """Return the radii of a blur as slopes of rays, in a table for `sample_displacement`."""
-    import mitsuba as mi
-
-    return mi.Float((blur.radii * camera.target_pitch / camera.distance).astype(np.float32))
-
-
-def sample_displacement(radii: Any, sample: Any) -> tuple[Any, Any]:
-    """Draw the slopes that diffraction adds to a ray: a radius from the table, at any angle."""
-    import drjit as dr
-    import mitsuba as mi
-
-    last = dr.width(radii) - 1
-    position = dr.sqrt(sample.x) * last
-    lower = dr.minimum(mi.UInt32(position), last - 1)
-    share = position - mi.Float(lower)
-    radius = dr.lerp(dr.gather(mi.Float, radii, lower), dr.gather(mi.Float, radii, lower + 1), share)
-    sine, cosine = dr.sincos(2 * dr.pi * sample.y)
-    return radius * cosine, radius * sine

@@ -2,7 +2,7 @@
 
 The samples of one pixel are adjacent lanes, so that a pixel's sum is the sum of a block, in float64 and the same on any
 number of threads. A random number is drawn for an effect only if the lenses have it: two for the position in the pixel,
-two more for an aperture, two more for diffraction. Lengths are millimetres.
+two more for an aperture, one more for several wavelengths. Lengths are millimetres.
 """
 
 # pyright: basic
@@ -46,18 +46,15 @@ class Rays:
 class RayGenerator:
     """Generates the rays of all sub-imagers of some lens types: one type, or several that are all pinholes."""
 
-    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: Sampler, flat: bool = True) -> None:
-        """Load the tables of the pixels into the renderer; a fast variant has to be active.
-
-        flat : False before a world with depth
-        """
+    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: Sampler) -> None:
+        """Load the tables of the pixels into the renderer; a fast variant has to be active."""
         import drjit as dr
         import mitsuba as mi
 
         self._sampler_name: Sampler = sampler
         self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": fitting(sampler, 16)})
         self.pixels = sum(lens_type.measurements for lens_type in types)
-        self.lens = lens_of(camera, types[0], flat)
+        self.lens = lens_of(camera, types[0])
         self._tables = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in _tables(camera, types)]
         dr.make_opaque(self._tables)
         self._pitch = float(camera.pixel_pitch)
@@ -94,7 +91,7 @@ class RayGenerator:
             z = corner_z + axes[4] * at.x + axes[5] * at.y
         else:
             x, y, z = corner_x + at.x, corner_y + at.y, corner_z
-        start, direction, weight = self.lens.emit(x, y, -z, self.sampler)
+        start, direction, weight = self.lens.emit(x, y, -z, self.sampler, (lens_x, lens_y))
         ray = dr.zeros(mi.RayDifferential3f, lanes)
         ray.o = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
         ray.d = dr.normalize(mi.Vector3f(*direction))
@@ -118,11 +115,17 @@ def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[FloatArray]:
     return list(np.concatenate(parts, axis=1))
 
 
-def lens_of(camera: Camera, lens_type: LensType, flat: bool = True) -> LensModel:
-    """Create the lens model of a lens type; `flat` is False before a world with depth."""
+def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
+    """Create the lens model of a lens type."""
     if lens_type.optics.surfaces is not None:
         from .real_lens import real_lens
 
-        return real_lens(camera, lens_type, flat)
+        return real_lens(camera, lens_type)
     aperture = lens_type.optics.aperture
-    return LensModel(camera, lens_type) if aperture is None else ThinLens(camera, lens_type, aperture)
+    if aperture is None:
+        return LensModel(camera, lens_type)
+    if camera.wavelengths:
+        from .diffracting_lens import DiffractingLens
+
+        return DiffractingLens(camera, lens_type, aperture)
+    return ThinLens(camera, lens_type, aperture)

@@ -1,8 +1,14 @@
-"""Rays from the sensor through the surfaces of a real lens into the world, on Mitsuba's fast backends."""
+"""Rays from the sensor through the surfaces of a real lens into the world, on Mitsuba's fast backends.
+
+Light that is waves leaves in directions drawn from the point-spread function of the sensor point at the distance of
+what it meets. Before a flat target this is the target's. In a world the ray of geometrical optics through a point of
+the pupil finds the distance. (Where a surface ends before another, the pattern on either is not exact.)
+"""
 
 # pyright: basic
 from __future__ import annotations
 
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -10,16 +16,22 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.skipped import reason_for_rays
 
 from ..lenses.field import LensField, bands, field_of, sampling_tables
+from ..lenses.point_spread import REACH
 from ..lenses.prescription import prescription_of
-from ..lenses.ray_trace import exit_disk_of, path, trace
+from ..lenses.ray_trace import exit_disk_of, path, reach, trace
 from ..lenses.surface_shapes import Functions
-from .lens import Emission, LensModel
+from .lens import Distance, Emission, LensModel, Point
 
-SAMPLED_CELLS = 8  # of the grid that offsets are drawn from, per wavelength times f-number
 HEIGHTS = 257  # off the axis, between which the middle and the amount of the light are interpolated linearly
+CELLS, FEW = 8, 4  # of the grid that slopes are drawn from, per wavelength times f-number; where defocus varies
+FEW_REACH = 20.0  # of that grid where defocus varies
+WAVES = 3.0  # of defocus, beyond which light is rays in a world
+NEAR = 20.0  # pupil radii: surfaces that are nearer get light as rays
+STEP = 0.125  # waves between tabulated defoci, between which the light of the two is mixed
+SAME = 1e-3  # waves by which defocus may vary without a table of several
+FARTHEST = 1e-9  # vergence of the farthest surface
 
 
 class RealLens(LensModel):
@@ -38,74 +50,128 @@ class RealLens(LensModel):
         self._numbers = numbers.converted(lambda number: dr.opaque(mi.Float, float(number)))
         self._functions = Functions(dr.sqrt, dr.select, dr.maximum)
 
-    def emit(self, x: Any, y: Any, depth: Any, sampler: Any) -> Emission:
+    def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
         import mitsuba as mi
 
+        del lens
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
         (at_x, at_y), direction, weight = trace(self._numbers, x, y, on_disk.x, on_disk.y, depth, self._functions)
         return (at_x, at_y, 0), direction, weight
 
 
-class WaveLens(LensModel):
-    """A lens of surfaces before a flat target, whose light is waves.
+class WaveLens(RealLens):
+    """A lens of surfaces, whose light is waves of one or several wavelengths."""
 
-    A ray goes from the middle of the lens to the point of the target that the light of the sensor point meets on
-    average, displaced by an offset that is drawn from the point-spread function of that sensor point.
-    """
-
-    has_weights = True
-
-    def __init__(self, camera: Camera, fields: list[tuple[LensField, float]]) -> None:
-        """Create the model of a lens type with its fields at the wavelengths of the light, and their weights."""
-        self._distance = camera.distance
-        total = sum(weight for _, weight in fields)
-        self._bands = [_Band(field, weight / total) for field, weight in fields]
+    def __init__(self, camera: Camera, lens_type: LensType, fields: list[tuple[LensField, float]]) -> None:
+        """Create the model of a lens type with its fields at the wavelengths of the light, and their shares."""
+        super().__init__(camera, lens_type)
+        self._fields, self._depth, self._vergence = fields, camera.depth(lens_type), 1 / camera.distance
+        self._focus = 1 / camera.focus(lens_type)
+        self._distance: Distance | None = None
+        _, least, largest = reach(camera, lens_type)
+        self._shifts = [1 / depth - 1 / self._depth for depth in (largest, least)]
         self.tail = max(field.grid[1] for field, _ in fields) / camera.target_pitch
+        self._tabulate([self._vergence + shift for shift in self._shifts], CELLS, REACH)
 
-    def emit(self, x: Any, y: Any, depth: Any, sampler: Any) -> Emission:
+    def follow(self, distance: Distance) -> None:
+        """Let rays have the pattern of the distance of the surface that they meet."""
+        self._distance = distance
+        field, least, largest = self._fields[0][0], *self._shifts
+        wave = 1 / field.waves_of(1.0)  # of defocus, as a vergence
+        low, high = self._focus - WAVES * wave, self._focus + WAVES * wave
+        self._tabulate(
+            [max(low, FARTHEST + least), min(high, 1 / (NEAR * field.pupil_radius) + largest)], FEW, FEW_REACH
+        )
+
+    def _tabulate(self, ends: list[float], cells: int, beyond: float) -> None:
+        self._bands = [_Band(field, share, ends, cells, beyond) for field, share in self._fields]
+        shares = [share for _, share in self._fields]
+        self.captured = float(np.average([band.captured for band in self._bands], weights=shares))
+
+    def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
         import drjit as dr
 
-        del depth  # that of the design: `real_lens` sees to it
-        sample, begin = sampler.next_2d(), 0.0
-        chosen = sampler.next_1d() if len(self._bands) > 1 else 0.0
-        at_x, at_y, weight = self._bands[0].emit(x, y, sample)
-        for before, band in zip(self._bands, self._bands[1:], strict=False):
-            begin += before.weight
-            after = chosen >= begin
-            values = zip(band.emit(x, y, sample), (at_x, at_y, weight), strict=True)
-            at_x, at_y, weight = (dr.select(after, new, old) for new, old in values)
-        return (0, 0, 0), (at_x / self._distance, at_y / self._distance, 1), weight
+        sample = sampler.next_2d()
+        band = self._bands[0] if len(self._bands) == 1 else None
+        drawn, vergence, ray = 0.0 if band else sampler.next_1d(), self._vergence, None
+        if self._distance is not None:
+            ray = super().emit(x, y, depth, sampler, lens)
+            vergence = self._met(ray, x, y, depth, lens)
+        vergence += 1 / depth - 1 / self._depth
+        across, up, weight = self._bands[0].emit(x, y, self._depth / depth, vergence, sample)
+        begin = self._bands[0].share
+        for band in self._bands[1:]:
+            after, found = drawn >= begin, band.emit(x, y, self._depth / depth, vergence, sample)
+            values = zip(found, (across, up, weight), strict=True)
+            across, up, weight = (dr.select(after, new, old) for new, old in values)
+            begin += band.share
+        if ray is None:
+            return (0, 0, 0), (across, up, 1), weight
+        # Nearer or further than the tables go, light is rays.
+        inside = (vergence >= self._bands[0].ends[0]) & (vergence <= self._bands[0].ends[1])
+        (at_x, at_y, _), (u, v, w), traced = ray
+        origin = dr.select(inside, 0.0, at_x), dr.select(inside, 0.0, at_y), 0
+        slopes = dr.select(inside, across, u / w), dr.select(inside, up, v / w), 1
+        return origin, slopes, dr.select(inside, weight, traced)
+
+    def _met(self, ray: Emission, x: Any, y: Any, depth: Any, lens: Point) -> Any:
+        """Return 1 over the distance that a ray goes, or the ray through the middle of the lens if it is blocked."""
+        import drjit as dr
+
+        (at_x, at_y, _), direction, weight = ray
+        passed = weight > 0
+        start = lens[0] + dr.select(passed, at_x, 0.0), lens[1] + dr.select(passed, at_y, 0.0), 0
+        chief = (*self._bands[0].chief(x, y, self._depth / depth), 1)
+        assert self._distance is not None
+        return 1 / self._distance(start, [dr.select(passed, *pair) for pair in zip(direction, chief, strict=True)])
 
 
 class _Band:
-    """The tables of a lens type at one wavelength, whose share of the light is `weight`."""
+    """The tables of a lens type at one wavelength, whose share of the light is `share`."""
 
-    def __init__(self, field: LensField, weight: float) -> None:
+    def __init__(self, field: LensField, share: float, ends: list[float], cells: int, beyond: float) -> None:
+        """Tabulate the slopes between two vergences of the target, or at one if these are the same."""
         import mitsuba as mi
 
-        self.weight = weight
-        self._last = field.field
+        self.share, self.ends, self._last = share, ends, field.field
         heights = np.linspace(0.0, field.field, HEIGHTS)
         # The ratio of heights on the target and on the sensor; that on the axis is the limit.
         near = np.maximum(heights, 1e-6 * field.field)
-        self._scale = _table(field.centre(near, np.zeros(HEIGHTS))[0] / near)
-        self._light = _table(field.brightness(heights) / field.brightness(np.zeros(1)))
-        tables, self._width = sampling_tables(field, SAMPLED_CELLS)
-        self._offsets: Any = mi.MarginalContinuous2D1(tables.astype(np.float32), [field.nodes[0].tolist()])
+        self._scale = _table(field.centre(near, np.zeros(HEIGHTS))[0] / near / field.distance)
+        self._light = _table(field.lit_share(heights))
+        waves = field.waves_of(ends[1] - ends[0])
+        vergences = np.linspace(ends[0], ends[1], ceil(waves / STEP) + 1) if waves > SAME else np.array([sum(ends) / 2])
+        tables = sampling_tables(field, vergences, cells, beyond)
+        self.captured, self._width, self._varies = tables.captured, tables.width, vergences.size > 1
+        densities = tables.densities.astype(np.float32)
+        nodes = [field.nodes[0].tolist()]
+        self._slopes: Any = (
+            mi.MarginalContinuous2D2(densities, [*nodes, vergences.tolist()])
+            if self._varies
+            else mi.MarginalContinuous2D1(densities[:, 0], nodes)
+        )
 
-    def emit(self, x: Any, y: Any, sample: Any) -> tuple[Any, Any, Any]:
-        """Return the point of the target that a ray meets, from the lens's axis, and its weight."""
+    def chief(self, x: Any, y: Any, nearer: Any) -> tuple[Any, Any]:
+        """Return the mean slopes of the light of a sensor point whose depth is the designed one over `nearer`."""
         import drjit as dr
 
-        height = dr.sqrt(x * x + y * y)
-        scale, weight = self._interpolated(self._scale, height), self._interpolated(self._light, height)
-        drawn, _ = self._offsets.sample(sample, [dr.minimum(height, self._last)])
+        scale = self._interpolated(self._scale, dr.sqrt(x * x + y * y)) * nearer
+        return x * scale, y * scale
+
+    def emit(self, x: Any, y: Any, nearer: Any, vergence: Any, sample: Any) -> tuple[Any, Any, Any]:
+        """Return the slopes of a ray and its weight."""
+        import drjit as dr
+
+        height, (across, up) = dr.sqrt(x * x + y * y), self.chief(x, y, nearer)
+        at = [dr.minimum(height, self._last)]
+        drawn, _ = self._slopes.sample(sample, [*at, dr.clip(vergence, *self.ends)] if self._varies else at)
         beside, along = (drawn.x - 0.5) * self._width, (drawn.y - 0.5) * self._width
         cosine = dr.select(height > 0, y / height, 1.0)
         sine = dr.select(height > 0, x / height, 0.0)
-        return x * scale + along * sine + beside * cosine, y * scale + along * cosine - beside * sine, weight
+        weight = self._interpolated(self._light, height)
+        return across + along * sine + beside * cosine, up + along * cosine - beside * sine, weight
 
     def _interpolated(self, table: Any, height: Any) -> Any:
         import drjit as dr
@@ -123,15 +189,12 @@ def _table(values: FloatArray) -> Any:
     return mi.Float(values.astype(np.float32))
 
 
-def real_lens(camera: Camera, lens_type: LensType, flat: bool = True) -> LensModel:
-    """Return the model of a lens type with surfaces: of waves if the light has a wavelength and the target is flat.
+def real_lens(camera: Camera, lens_type: LensType) -> LensModel:
+    """Return the model of a lens type with surfaces: of waves, unless light is rays or diffraction is negligible.
 
-    flat : False if there is a world, where the blur depends on what a ray meets
     Raises InputError if the surfaces form no image or pass no light.
     """
-    if camera.wavelength is None or reason_for_rays(camera, not flat) is not None:
-        return RealLens(camera, lens_type)
-    fields = [(field_of(camera, lens_type, wavelength), weight) for wavelength, weight in bands(camera)]
+    fields = [(field_of(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
     if any(field.rays_suffice for field, _ in fields):
         return RealLens(camera, lens_type)
-    return WaveLens(camera, fields)
+    return WaveLens(camera, lens_type, fields)

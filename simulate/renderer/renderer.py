@@ -76,9 +76,7 @@ class Renderer:
         if fast:
             from .rays import RayGenerator
 
-            self._generators = {
-                group: RayGenerator(camera, types, sampler, world is None) for group, types in self.groups.items()
-            }
+            self._generators = {group: RayGenerator(camera, types, sampler) for group, types in self.groups.items()}
         else:
             self._sensors = {group: self._stock_sensors(types, sampler) for group, types in self.groups.items()}
         self._unit = 1.0  # radiance of a value of 1
@@ -173,7 +171,8 @@ class Renderer:
         if rays.weight is None:
             return rays.sums(light)[0] / rays.samples / self._unit
         total, weight = rays.sums(light * rays.weight, rays.weight)
-        return np.divide(total, weight * self._unit, out=np.full(weight.size, np.nan), where=weight > 0)
+        share = self.captured(group) / self._unit
+        return np.divide(total * share, weight, out=np.full(weight.size, np.nan), where=weight > 0)
 
     def depths(self, pinhole: Camera, seed: int) -> FloatArray:
         """Return the distance along z that a pinhole camera's only sub-imager sees at a point per pixel, (pixels,).
@@ -216,6 +215,10 @@ class Renderer:
         """Return the pixels of f by which rare rays of a group may land further out than others."""
         return self._generators[group].lens.tail
 
+    def captured(self, group: str) -> float:
+        """Return the share of the light that the rays of a group represent; the rest lands far away."""
+        return self._generators[group].lens.captured
+
     def _build_world(self, world: Scene, variant: str) -> None:
         """Use a world as the scene, with the target in it if it has a picture."""
         import mitsuba as mi
@@ -227,6 +230,18 @@ class Renderer:
         staged = stage(world, variant, mi.load_dict(target_of(self.camera, self._black())) if has_target else None)
         self._scene, self._integrator, self.direct_only = staged.scene, staged.integrator, staged.direct_only
         self._texels = f"{TARGET}.{self._texels.partition('.')[2]}" if has_target else ""
+        for generator in self._generators.values():
+            generator.lens.follow(self._distance)
+
+    def _distance(self, origin: tuple[Any, Any, Any], direction: tuple[Any, Any, Any]) -> Any:
+        """Return the distance along z of the surface that rays meet first, a large one where they meet none."""
+        import drjit as dr
+        import mitsuba as mi
+
+        ray = mi.Ray3f(mi.Point3f(*origin), dr.normalize(mi.Vector3f(*direction)))
+        met = self._scene.ray_intersect_preliminary(ray, coherent=False)
+        far = FAR * self.camera.distance
+        return dr.minimum(dr.select(met.is_valid(), met.t * ray.d.z, far), far)
 
     def _stock_sensors(self, types: tuple[LensType, ...], sampler: Sampler) -> dict[int, Any]:
         import mitsuba as mi

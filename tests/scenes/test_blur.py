@@ -18,7 +18,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.optics.blur import Blur, blur_of, entries, matrix, steepness, transfer
-from ommatid.scenes.optics.blur_moments import QUANTILES, TAIL, airy_end, encircled
+from ommatid.scenes.optics.diffraction import TAIL
 from ommatid.scenes.tables.camera import Surface
 from ommatid.simulate.ideal import ideal_matrix
 
@@ -30,7 +30,11 @@ BLURS = [Blur(disk=1.3), Blur(disk=1.3, weight=0.04), Blur(airy=0.44), Blur(1.3,
 
 
 def whole(cam: Camera, blur: Blur) -> Numbers:
-    return np.concatenate([matrix(cam, lens_type, blur).toarray() for lens_type in cam.types])
+    return np.concatenate([of_type(cam, cam.types.index(lens_type), blur) for lens_type in cam.types])
+
+
+def of_type(cam: Camera, index: int, blur: Blur) -> Numbers:
+    return matrix(cam, cam.types[index], (blur, 1.0)).toarray()
 
 
 def with_lens_optics(optics: LensOptics, wavelength: float | None = None) -> Camera:
@@ -69,59 +73,18 @@ def test_pinholes_have_no_blur_and_surfaces_are_refused() -> None:
         blur_of(real, real.types[0])
 
 
-# ---- the Airy pattern
-
-
-def radius_of(blur: Blur, share: Numbers) -> Numbers:
-    """Radius of the truncated Airy pattern that encircles a share of its light, as renderers look it up."""
-    return np.interp(np.sqrt(share), np.linspace(0.0, 1.0, QUANTILES + 1), blur.radii)
-
-
-def test_the_first_dark_ring_encircles_84_percent() -> None:
-    zero = float(special.jn_zeros(1, 1)[0])
-    assert encircled(np.array(zero)) == pytest.approx(0.8378, abs=5e-5)
-    table_step = 1 / QUANTILES  # of the square root of the share, which is flat at the dark ring
-    assert encircled(radius_of(Blur(airy=2.0), np.array(0.83778 / (1 - TAIL))) / 2) == pytest.approx(
-        encircled(np.array(zero)), abs=2 * table_step
-    )
-    assert encircled(np.array(airy_end())) == pytest.approx(1 - TAIL, abs=1e-12)
-
-
-def test_a_table_in_float32_has_the_pattern_s_shares() -> None:
-    """Linear between points on the curve, so that no share has an error above a step of the table."""
-    blur = Blur(airy=0.44)
-    table = blur.radii.astype(np.float32)
-    share = np.concatenate([np.geomspace(1e-12, 1, 500), np.linspace(0, 1, 5000)]).astype(np.float32)
-    position = np.sqrt(share) * np.float32(table.size - 1)
-    cell = np.minimum(position.astype(np.int64), table.size - 2)
-    result = table[cell] + (position - cell.astype(np.float32)) * (table[cell + 1] - table[cell])
-    assert result.dtype == np.float32
-    np.testing.assert_allclose(encircled(result.astype(float) / 0.44), share * (1 - TAIL), atol=3 / table.size)
-    small = slice(0, 300)
-    np.testing.assert_allclose(result[small], 2 * 0.44 * np.sqrt(share[small] * (1 - TAIL)), rtol=1e-4)
-    assert blur.radii[-1] == pytest.approx(blur.reach)
-
-
-def test_displacements_have_the_modulation_transfer_of_a_round_aperture() -> None:
-    """The truncated tail changes it by at most TAIL times the largest |J0(2 q v)| there, 1 / sqrt(pi q v)."""
-    n = 400_000
-    v = radius_of(Blur(airy=1.0), (np.arange(n) + 0.5) / n)
-    for q in (0.05, 0.2, 0.5, 0.8, 1.0, 1.3):
-        result = special.j0(2 * q * v).mean() * (1 - TAIL)
-        assert result == pytest.approx(mtf(np.array(q)), abs=TAIL / np.sqrt(np.pi * q * airy_end()) + 1e-5)
-
-
 # ---- limits, sums and symmetries of H
 
 
 def test_without_blur_entries_are_overlaps_of_boxes() -> None:
     for cam in (camera(), camera((11, 12), (("3/10", [2, 1], [2, 3]), ("2/5", [2, 2], [3, 3])))):
         ideal = ideal_matrix(cam)
-        sharp = np.concatenate([matrix(cam, lens_type, Blur()).toarray() for lens_type in cam.types])
+        sharp = whole(cam, Blur())
         np.testing.assert_allclose(sharp, ideal.toarray(), rtol=0, atol=1e-15)
-        assert sum(matrix(cam, lens_type, Blur()).nnz for lens_type in cam.types) == ideal.nnz
+        assert np.count_nonzero(sharp) == ideal.nnz
         for blur in (Blur(disk=1e-6), Blur(airy=1e-6), Blur(1e-6, 1e-7)):
-            np.testing.assert_allclose(whole(cam, blur), ideal.toarray(), rtol=0, atol=blur.disk + 5 * blur.airy)
+            mass = blur.spread_density.mass
+            np.testing.assert_allclose(whole(cam, blur), mass * ideal.toarray(), rtol=0, atol=blur.disk + 5 * blur.airy)
 
 
 def test_a_disk_wider_than_everything_spreads_light_evenly() -> None:
@@ -131,7 +94,9 @@ def test_a_disk_wider_than_everything_spreads_light_evenly() -> None:
 @pytest.mark.parametrize("blur", BLURS)
 def test_light_is_conserved_and_lost_only_at_the_edges(blur: Blur) -> None:
     wide = camera((139, 139), (("1/3", [1, 1], [3, 3]), ("2/5", [1, 1], [2, 2])))
-    np.testing.assert_allclose(whole(wide, blur).sum(axis=1), 1.0, rtol=0, atol=1e-12)
+    mass = blur.spread_density.mass
+    assert mass == pytest.approx(1 - TAIL if blur.airy else 1, abs=3e-4)
+    np.testing.assert_allclose(whole(wide, blur).sum(axis=1), mass, rtol=0, atol=1e-12)
     result = whole(camera(), blur)
     assert result.min() >= 0
     assert result.sum(axis=1).max() <= 1 + 1e-12
@@ -143,7 +108,7 @@ def test_mirrored_and_transposed_cameras_are_the_same(blur: Blur) -> None:
     cam = with_lens_optics(
         LensOptics(aperture=0.4, focus=800.0)
     )  # weights make the disks of off-axis pixels asymmetric
-    h = matrix(cam, cam.types[0], blur).toarray().reshape(3, 3, 5, 5, 19, 19)
+    h = of_type(cam, 0, blur).reshape(3, 3, 5, 5, 19, 19)
     np.testing.assert_allclose(h, h.transpose(1, 0, 3, 2, 5, 4), rtol=0, atol=1e-15)
     np.testing.assert_allclose(h, np.flip(h, (0, 2, 4)), rtol=0, atol=1e-15)
     np.testing.assert_allclose(h, np.flip(h, (1, 3, 5)), rtol=0, atol=1e-15)
@@ -153,8 +118,8 @@ def test_zero_entries_are_not_stored() -> None:
     cam = camera()
     for lens_type in cam.types:
         for blur in BLURS[:2]:
-            result = matrix(cam, lens_type, blur)
-            assert result.nnz <= entries(cam, lens_type, blur) < result.nnz * 4
+            result = matrix(cam, lens_type, (blur, 1.0))
+            assert result.nnz <= entries(cam, lens_type, blur.reach) < result.nnz * 4
             assert result.data.min() > 0
             assert result.has_sorted_indices
 
@@ -194,7 +159,7 @@ def test_texels_share_all_light_of_any_footprint(
     offsets = 2 * (np.arange(-wide, wide + 1) * unit + start % unit) + unit - length
     result = transfer(float(ratio), offsets, unit, blur)
     assert result.min() > -1e-13
-    assert result.sum() == pytest.approx(1, abs=1e-11)
+    assert result.sum() == pytest.approx(blur.spread_density.mass, abs=1e-11)
     np.testing.assert_allclose(result, result.T, rtol=0, atol=1e-14)
 
 
@@ -225,23 +190,21 @@ def along_lines(y: float, x: float, ratio: float, disk: float) -> float:
     return total / (np.pi * radius**2)
 
 
-def mtf(q: Numbers) -> Numbers:
-    q = np.minimum(q, 1.0)
-    return 2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q**2))
-
-
 def spectrum(blur: Blur, rho: Numbers) -> Numbers:
-    """Hankel transform of the blur, the Airy pattern whole."""
-    nodes, weights = np.polynomial.legendre.leggauss(100)
-    u = (1 + nodes) / 2
-    shares = weights * u * (1 + blur.weight * u**2) ** -2
-    disk = special.j0(np.pi * blur.disk * rho[:, None] * u) @ shares / shares.sum()
-    if blur.weight == 0 and blur.disk:
-        np.testing.assert_allclose(disk, 2 * special.j1(np.pi * blur.disk * rho) / (np.pi * blur.disk * rho), atol=1e-9)
-    return disk * mtf(np.pi * blur.airy * rho)
+    """Transfer function of the whole pattern: the pupil's autocorrelation (Hopkins 1955), by quadrature over x and y."""
+    nodes, weights = np.polynomial.legendre.leggauss(120)
+    at, share = (1 + nodes) / 2, weights / 2
+    q = np.minimum(np.pi * blur.airy * rho, 1.0)[:, None, None]
+    x = (1 - q) * np.sin(np.pi / 2 * at)[:, None]  # the chord's end is a square root
+    dx = (1 - q) * np.pi / 2 * np.cos(np.pi / 2 * at)[:, None] * share[:, None]
+    chord = np.sqrt(np.maximum(1 - (x + q) ** 2, 0))
+    y = chord * at
+    amplitude = [1 / (1 + blur.weight * ((x + side) ** 2 + y**2)) for side in (q, -q)]
+    values = amplitude[0] * amplitude[1] * np.cos(8 * np.pi * blur.waves * q * x)
+    return (4 / np.pi) * (1 + blur.weight) * (values * dx * chord * share).sum(axis=(1, 2))
 
 
-def by_fourier(y: float, x: float, ratio: float, blur: Blur, count: int = 160) -> float:
+def by_fourier(y: float, x: float, ratio: float, blur: Blur, count: int = 100) -> float:
     """T without truncation: the integral of its spectrum, which ends with the aperture's, in polar coordinates."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     angle = np.pi / 2 * (1 + nodes)
@@ -280,10 +243,10 @@ def test_disk_against_an_integral_along_lines(ratio: float, offsets: list[int], 
 )
 @pytest.mark.parametrize(("ratio", "offsets", "unit"), RATIOS)
 def test_airy_against_fourier(ratio: float, offsets: list[int], unit: int, blur: Blur) -> None:
-    """So near to a footprint the truncated tail contributes nothing, so that T is that of the whole over 1 - TAIL."""
-    assert offsets[-1] / unit / 2 + ratio / 2 + 1 + blur.disk / 2 < blur.airy * airy_end() / np.sqrt(2)
+    """So near to a footprint the light that lands beyond the reach contributes nothing."""
+    assert offsets[-1] / unit / 2 + ratio / 2 + 1 < blur.reach / np.sqrt(2)
     result, expected = compare(ratio, offsets, unit, blur, lambda y, x: by_fourier(y, x, ratio, blur))
-    np.testing.assert_allclose(result * (1 - TAIL), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("blur", [Blur(1.3), Blur(0.7, 0.3), Blur(airy=0.3), Blur(2.0, 0.3, 0.05)])
@@ -291,7 +254,7 @@ def test_steepness_is_the_derivative_of_transfer(blur: Blur) -> None:
     unit, positions = 1000, np.array([0, 400, 2000, 2600, 3999, 5200])
     offsets = np.concatenate([positions, positions + 2, np.abs(positions - 2)])  # h = 1 / unit; T is symmetric
     after, before = np.split(transfer(3.0, offsets, unit, blur)[:, : positions.size], 3)[1:]
-    result = steepness(3.0, positions, unit, blur)
+    result = steepness(3.0, positions, unit, blur.spread_density)
     np.testing.assert_allclose(result, (after - before) * unit / 2, rtol=0, atol=1e-5)
 
 
@@ -300,8 +263,8 @@ def test_pixels_off_the_axis_follow_the_cos4_law(focus: float) -> None:
     """Rays from the middle of a sensor pixel through 200 x 200 points of the lens, weighted by their angles."""
     cam = with_lens_optics(LensOptics(aperture=0.4, focus=focus))
     lens_type, blur = cam.types[0], blur_of(cam, cam.types[0])
-    uniform = matrix(cam, lens_type, replace(blur, weight=0.0)).toarray()
-    result = (matrix(cam, lens_type, blur).toarray() - uniform).reshape(3, 3, 5, 5, 19, 19)
+    uniform = of_type(cam, 0, replace(blur, weight=0.0))
+    result = (of_type(cam, 0, blur) - uniform).reshape(3, 3, 5, 5, 19, 19)
     share, angle = (np.arange(200) + 0.5) / 200, 2 * np.pi * (np.arange(200) + 0.5) / 200
     lens = [0.2 * np.outer(np.sqrt(share), turn(angle)).ravel() for turn in (np.cos, np.sin)]
     largest = 0.0
@@ -323,24 +286,24 @@ def test_pixels_off_the_axis_follow_the_cos4_law(focus: float) -> None:
 
 
 def displaced(blur: Blur, count: int, rng: np.random.Generator) -> Numbers:
-    """Displacements, (2, count), drawn from the disk by rejection and from the Airy pattern's table."""
-    moved = np.zeros((2, count))
-    if blur.disk:
-        drawn = rng.uniform(-1, 1, (2, 2 * count))
-        radius = (drawn**2).sum(axis=0)
-        kept = (radius < 1) & (rng.random(2 * count) < (1 + blur.weight * radius) ** -2)
-        moved += drawn[:, kept][:, :count] * blur.disk / 2
+    """Displacements, (2, count), drawn from the disk by rejection or from the pattern's table of radii; inf if lost."""
     if blur.airy:
-        angle, radius = rng.uniform(0, 2 * np.pi, count), radius_of(blur, rng.random(count))
-        moved += radius * np.array([np.sin(angle), np.cos(angle)])
-    return moved
+        lost = rng.random(count) > blur.pattern.encircled
+        table = blur.pattern.quantiles()
+        radius = blur.airy * np.interp(np.sqrt(rng.random(count)), np.linspace(0, 1, table.size), table)
+        angle = rng.uniform(0, 2 * np.pi, count)
+        return np.where(lost, 1e6, radius * np.array([np.sin(angle), np.cos(angle)]))
+    drawn = rng.uniform(-1, 1, (2, 2 * count))
+    radius = (drawn**2).sum(axis=0)
+    kept = (radius < 1) & (rng.random(2 * count) < (1 + blur.weight * radius) ** -2)
+    return drawn[:, kept][:, :count] * blur.disk / 2
 
 
 @pytest.mark.parametrize("blur", [*BLURS, Blur(9.0, weight=0.2)])
 def test_counted_rays(blur: Blur) -> None:
     cam = camera((8, 9), (("2/5", [2, 1], [2, 3]),))
     lens_type, count, rng = cam.types[0], 60_000, np.random.default_rng(5)
-    expected = matrix(cam, lens_type, blur).toarray()
+    expected = of_type(cam, 0, blur)
     seen = np.zeros_like(expected)
     ratio, size = float(lens_type.ratio), np.array([[cam.rows], [cam.columns]])
     positions = [(sub.window, i, j) for sub in cam.sub_imagers for i in range(2) for j in range(3)]

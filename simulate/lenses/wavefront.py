@@ -1,9 +1,9 @@
 """The wave that a sensor point sends back through a lens to the target.
 
 By reciprocity, the response of a sensor point to the point t of the target is |U(t)|^2, U the field at t of a point
-source on the sensor. Rays carry that field to the plane of the lenses, z = 0: position x(a), optical path L(x) and
-weight w(a), a the point of the exit disk through which a ray leaves. About the point t0 of the target that the rays
-meet on average (Fraunhofer's approximation, exact in defocus and aberrations),
+source on the sensor. Rays carry that field to the entrance pupil, where the stop's rim is as the target sees it: a ray
+that leaves through the point a of the exit disk with the weight w(a) has there the position x(a) and the optical path
+L(a). About the point t0 that the rays meet on average (Fraunhofer's approximation, exact in defocus and aberrations),
 
     U(t) = integral over a of sqrt(w |dq/da|) exp(2 pi i / lambda (L + |x - t0| - q . (t - t0))),
 
@@ -49,6 +49,7 @@ class Wavefront:
     hits : (2, n) where the ray of each node meets the target, from `centre`
     centre : (x, y) of the target that the rays meet on average
     brightness : light of the sensor point, projected solid angle in sr
+    outermost : radius of the outermost nodes, 1 the edge of the pupil
     """
 
     wavelength: float | None
@@ -59,6 +60,7 @@ class Wavefront:
     hits: FloatArray
     centre: tuple[float, float]
     brightness: float
+    outermost: float
 
     @cached_property
     def amplitude(self) -> FloatArray:
@@ -73,7 +75,7 @@ class Wavefront:
     @cached_property
     def half_width(self) -> float:
         """Half of the largest range of direction cosines; |U|^2 has frequencies up to twice that / wavelength."""
-        return float(np.ptp(self.cosines, axis=1).max() / 2)
+        return float(np.ptp(self.cosines, axis=1).max() / 2 / self.outermost)
 
     @cached_property
     def spot_radius(self) -> float:
@@ -168,16 +170,18 @@ def _traced(
     steps = STEP * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[..., None]
     points, slopes, weights = _rays(numbers, height, at + steps, depth)
     hits = points + distance * slopes
+    before = _pupil_plane(prescription, distance)
     light = weights[0] * (area * edge**2).ravel()
     brightness = float(light.sum()) * (disk.radius / (depth + disk.height)) ** 2
     light /= light.sum()
     centre = hits[:, 0] @ light
-    beside = points - centre[:, None, None]
-    length = np.copysign(np.sqrt(np.square(beside).sum(axis=0) + distance**2), distance)
+    beside = points + before * slopes - centre[:, None, None]
+    length = np.copysign(np.sqrt(np.square(beside).sum(axis=0) + (distance - before) ** 2), distance)
     cosines = beside / length
     right, up = (cosines[:, 1] - cosines[:, 2]) / (2 * STEP), (cosines[:, 3] - cosines[:, 4]) / (2 * STEP)
     density = np.abs(right[0] * up[1] - right[1] * up[0]) * (area * edge**2).ravel()
-    optical = trace_path(open_lens, disk, 0.0, height, at[0], at[1], depth)[3] + length[0]
+    optical = trace_path(open_lens, disk, 0.0, height, at[0], at[1], depth)[3]
+    optical = optical + before * np.sqrt(1 + np.square(slopes[:, 0]).sum(axis=0)) + length[0]
     return Wavefront(
         wavelength=wavelength,
         cosines=cosines[:, 0],
@@ -187,7 +191,17 @@ def _traced(
         hits=hits[:, 0] - centre[:, None],
         centre=(float(centre[0]), float(centre[1])),
         brightness=brightness,
+        outermost=float(radius[-1, 0]),
     )
+
+
+def _pupil_plane(prescription: Prescription, distance: float) -> float:
+    """Return how far before the plane of the lenses the entrance pupil is, 0 if it is not near the lens.
+
+    From the plane of the lenses itself, the rim would be where aberrations displace it on the way back from the stop.
+    """
+    before = prescription.front_principal - prescription.entrance_pupil.position
+    return before if abs(before) < abs(distance) / 2 else 0.0
 
 
 def _rays(numbers: LensPath, height: float, at: FloatArray, depth: float) -> tuple[FloatArray, FloatArray, FloatArray]:

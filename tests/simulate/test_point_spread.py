@@ -40,7 +40,9 @@ def pupil(waves: Aberration, slope: float, reach: float = REACH) -> Wavefront:
     share = (np.ones_like(turn) * area).ravel()
     unit = (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)
     path = waves((radius + 0 * turn).ravel(), turn.ravel()) * WAVELENGTH
-    return Wavefront(WAVELENGTH, HALF * unit, path, share / np.pi, share * HALF**2, spot * unit, (0.0, 0.0), 1.0)
+    return Wavefront(
+        WAVELENGTH, HALF * unit, path, share / np.pi, share * HALF**2, spot * unit, (0.0, 0.0), 1.0, radius.max()
+    )
 
 
 def defocused(waves: float) -> Wavefront:

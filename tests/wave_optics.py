@@ -61,6 +61,7 @@ def aperture_of(lens: Prescription, depth: float, height: float, rings: int = 40
     wanted = rim * np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()])
     area = np.repeat(weights / 2, turns) * np.pi * rim**2 / turns
     slopes = (wanted - np.array([[0.0], [height]])) / sensor
+    grown = np.ones_like(area)
     for _ in range(8):
         found = _traced(lens, height, sensor, slopes)[0][:2]
         columns = [(_traced(lens, height, sensor, slopes + step)[0][:2] - found) / STEP for step in _STEPS]

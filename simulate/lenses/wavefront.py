@@ -29,7 +29,7 @@ from .prescription import Prescription
 from .ray_trace import Disk, LensPath, path, spread, trace, trace_path
 
 SCOUTS = 4096  # rays that find the middle of the clear part of the disk
-EDGE_STEPS = 48  # of the bisection
+EDGE_STEPS = 32  # of the bisection
 STEP = 1e-6  # of differences, relative to the disk
 BESIDE_RIM = 1.001  # rims are so much wider for rays that the differences trace
 RAY_NODES = (48, 96)  # along the radius and around, where no wave oscillates over the pupil

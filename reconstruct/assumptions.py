@@ -151,13 +151,20 @@ class _Observation:
         if isinstance(model, DetailedModel):
             recorded = recorded - model.offset
         return EstimationTask(
-            model, recorded, self.usable.used, expected_noise, self.prior, scene.estimator, scene.tiles
+            model,
+            recorded,
+            self.usable.used,
+            expected_noise,
+            self.prior,
+            scene.estimator,
+            scene.tiles,
+            scene.prior_ratio,
         )
 
 
 def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution: Execution) -> Assumptions:
     """Collect prior and noise as known or fitted, estimating the image beforehand only where they depend on it."""
-    prior = stack.scene.prior
+    prior = stack.scene.assumed_prior
     if prior.kind == "fit":
         prior = prior.model_copy(update={"kind": "independent"})
     first = _Observation(stack, model_of_f(model, stack.camera, prior), usable_pixels(stack, model), prior)

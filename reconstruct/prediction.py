@@ -101,6 +101,7 @@ def predict(
     estimator: EstimatorTable,
     shape: tuple[int, int],
     misalignment_variance: Callable[[Form, BoolArray], FloatArray] | None = None,
+    prior_ratio: float = 1.0,
 ) -> Prediction:
     """Predict the error of one dense problem with noise of variance `actual`.
 
@@ -108,6 +109,7 @@ def predict(
     error is the limit of Eq. 5: the prior's part in the null space of H.
 
     actual : one variance for all measurements, or (M,); NaN leaves a measurement out
+    prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
     misalignment_variance : from a form and the measurements used, (M,), to what misalignment adds, (N,); asked where
         the estimator expects noise
     Raises InputError where the noise is to be fitted to a stack, or where no form is right.
@@ -117,14 +119,15 @@ def predict(
     seen, added = observability(matrix), None
     if (expected_noise > 0).all():
         form, solver = factorise(Problem(matrix, prior, expected_noise), estimator.method, estimator.tolerance)
-        expected = expected_error(form, {"noise": noise})
-        method, variance, resolved = solver.method, expected.variance, expected.resolved
+        expected = expected_error(form, {"noise": noise / prior_ratio})
+        method, variance, resolved = solver.method, prior_ratio * expected.variance, expected.resolved
         if misalignment_variance is not None:
             added = misalignment_variance(form, used)
             variance = variance + added
     else:
         limit = svd(Problem(matrix, prior, np.ones(noise.size)))
-        method, variance, resolved = limit.name, _noiseless_limit(limit, noise), limit.resolved()
+        variance = prior_ratio * _noiseless_limit(limit, noise / prior_ratio)
+        method, resolved = limit.name, limit.resolved()
     return Prediction(
         noise.size,
         prior.mean.size,
@@ -138,7 +141,7 @@ def predict(
         median_width(resolved),
         method,
         None if added is None else float(added.mean()),
-        float(prior.variance.mean()),
+        prior_ratio * float(prior.variance.mean()),
     )
 
 
@@ -161,7 +164,16 @@ def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray
     detail = independent_detail(model, used)
     if detail and scene.estimator.noise_variance is None:
         expected_noise = expected_noise + detail[DETAIL]
-    task = EstimationTask(model, recorded, used, expected_noise, scene.prior, scene.estimator, scene.tiles)
+    task = EstimationTask(
+        model,
+        recorded,
+        used,
+        expected_noise,
+        scene.assumed_prior,
+        scene.estimator,
+        scene.tiles,
+        scene.prior_ratio,
+    )
     result = METHODS[choice.method](task, Execution()).result({"noise": noise, **detail}, None)
     seen = observability(model.matrix[used]) if choice.method in ("dense", "detail") else None
     return Prediction(

@@ -56,6 +56,10 @@ class Prior:
         """Return L^T f: (N,) to (K,), or (N, q) to (K, q)."""
         return _scale_rows(self.root, image) if self.independent else self.root.T @ image
 
+    def scaled(self, ratio: float) -> Prior:
+        """Return the prior with `ratio` times the covariance."""
+        return self if ratio == 1 else Prior(self.mean, ratio**0.5 * self.root, self.rounding)
+
     def restrict(self, pixels: NDArray[np.intp]) -> Prior:
         """Return the marginal prior of these pixels."""
         rows = self.root[pixels]

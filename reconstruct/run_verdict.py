@@ -76,7 +76,7 @@ def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResul
         used=assumed.usable.used,
         spread=_spread(stack, assumed, total),
         shared=_shared(model, assumed, total, result),
-        largest=max(1.0, float((total / expected_noise).max())),
+        largest=max(1.0, float((total / expected_noise).max()), assumed.method.task.prior_ratio),
     )
     return residual_parts(residual, stack.camera)
 

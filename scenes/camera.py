@@ -74,7 +74,7 @@ class Camera:
     @property
     def covers_whole_pixels(self) -> bool:
         """True if every sensor pixel averages whole pixels of f, so that detail finer than f changes no measurement."""
-        whole = all(lens.ratio.denominator == lens.step.denominator == 1 for lens in self.types)
+        whole = all(number.denominator == 1 for lens in self.types for number in (lens.ratio, *lens.step))
         sharp = all(lens.optics.surfaces is None for lens in self.types) and self.has_box_footprints
         return whole and sharp and self.tolerance is None
 
@@ -109,6 +109,11 @@ class Camera:
     def wavelengths(self) -> tuple[tuple[float, float], ...]:
         """Wavelengths of the light with their shares of the detected light; none where light is rays."""
         return () if self.wavelength is None else ((self.wavelength, 1.0),)
+
+    @property
+    def has_width(self) -> bool:
+        """True if a lens type has an aperture or surfaces: not all are pinholes."""
+        return any(lens.optics.aperture is not None or lens.optics.surfaces is not None for lens in self.types)
 
     @property
     def half_diagonal(self) -> float:
@@ -159,7 +164,7 @@ class Camera:
         left = sum(other.array[1] for other in self.types[:index]) if lens_type.left is None else lens_type.left
         lens_x = ((columns - 1) / 2 - (left + l)) * self.lens_pitch
         lens_y = ((lens_type.array[0] - 1) / 2 - k) * self.lens_pitch
-        window = lens_type.origin[0] + k * lens_type.step, lens_type.origin[1] + l * lens_type.step
+        window = lens_type.window(k, l)
         x, y = self.position(*lens_type.middle(window))
         depth = self.depth(lens_type)
         shrink = depth / self.distance
@@ -184,8 +189,7 @@ class Camera:
         for lens_type in self.types:
             axes = [np.zeros(size, dtype=np.int64) for size in self.shape]
             for axis, seen in enumerate(axes):
-                for number in range(lens_type.array[axis]):
-                    start = lens_type.origin[axis] + number * lens_type.step
+                for start in lens_type.starts(axis):
                     seen[ceil(start) : floor(start + lens_type.ratio * lens_type.pixels[axis])] = 1
             count += np.outer(*axes)
         return count
@@ -216,7 +220,7 @@ class Camera:
                 "magnification": str(1 / lens_type.ratio),
                 "array": list(lens_type.array),
                 "pixels": list(lens_type.pixels),
-                "step": str(lens_type.step),
+                "step": lens_type.described_step,
                 **lens_type.optics.describe(),
             }
         if not self.is_ideal_pinhole:  # sub-images of ideal pinholes do not depend on where the lenses are
@@ -281,7 +285,8 @@ def _wavelength(scene: Scene) -> float | None:
 def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensType:
     ratio = 1 / lens.magnification
     most = tuple(
-        floor((size - (count - 1) * lens.step) / ratio) for size, count in zip((rows, columns), lens.array, strict=True)
+        floor((size - (count - 1) * step) / ratio)
+        for size, count, step in zip((rows, columns), lens.array, lens.step, strict=True)
     )
     if min(most) < 1:
         raise InputError(
@@ -297,8 +302,7 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
     optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale)
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics)
-    origin = floor((rows - lens_type.span[0]) / 2), floor((columns - lens_type.span[1]) / 2)
-    return replace(lens_type, origin=origin)
+    return lens_type.centred(rows, columns)
 
 
 def _check_overlap(camera: Camera, scene: Scene) -> None:

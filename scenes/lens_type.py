@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,9 @@ class LensType:
     """An array of equal sub-imagers.
 
     ratio : m, pixels of f that a sensor pixel covers along one axis
-    origin : row and column of f where the view of sub-imager (0, 0) begins
+    step : pixels of f from one window to the next, down and across
+    origin : row and column of f where the view of sub-imager (0, 0) begins; whole ones, so that the array stands at
+        most half a pixel of f off the target's middle
     left : columns of sub-imagers of other types to its left; None: those of the types listed before it
     """
 
@@ -57,7 +60,7 @@ class LensType:
     ratio: Fraction
     array: tuple[int, int]
     pixels: tuple[int, int]
-    step: Fraction
+    step: tuple[Fraction, Fraction]
     origin: tuple[int, int]
     optics: LensOptics = LensOptics()
     left: int | None = None
@@ -75,7 +78,22 @@ class LensType:
     def finer(self, detail: int) -> LensType:
         """The same lens type on a grid of the target that is `detail` times finer along both axes."""
         origin = self.origin[0] * detail, self.origin[1] * detail
-        return replace(self, ratio=self.ratio * detail, step=self.step * detail, origin=origin)
+        step = self.step[0] * detail, self.step[1] * detail
+        return replace(self, ratio=self.ratio * detail, step=step, origin=origin)
+
+    def window(self, k: int, l: int) -> tuple[Fraction, Fraction]:  # noqa: E741
+        """Row and column of f where the view of sub-imager (k, l) begins."""
+        return self.origin[0] + k * self.step[0], self.origin[1] + l * self.step[1]
+
+    def starts(self, axis: int) -> tuple[Fraction, ...]:
+        """Row (axis 0) or column (1) of f where the view of each sub-imager along this axis begins."""
+        return tuple(self.origin[axis] + number * self.step[axis] for number in range(self.array[axis]))
+
+    @property
+    def described_step(self) -> str:
+        """The step as text: one number, or two if they differ."""
+        down, across = self.step
+        return str(down) if down == across else f"{down} down, {across} across"
 
     def middle(self, window: tuple[Fraction, Fraction]) -> tuple[float, float]:
         """Row and column of f in the middle of the view of a sub-imager whose view begins at `window`."""
@@ -86,9 +104,21 @@ class LensType:
     def span(self) -> tuple[Fraction, Fraction]:
         """Rows and columns of f that all sub-imagers together see."""
         rows, columns = (
-            self.ratio * pixels + (count - 1) * self.step for count, pixels in zip(self.array, self.pixels, strict=True)
+            self.ratio * pixels + (count - 1) * step
+            for count, pixels, step in zip(self.array, self.pixels, self.step, strict=True)
         )
         return rows, columns
+
+    def centred(self, rows: int, columns: int) -> LensType:
+        """The same lens type in the middle of a target, to the nearest whole pixel of f, the lower one of two."""
+        top, left = (ceil((size - span - 1) / 2) for size, span in zip((rows, columns), self.span, strict=True))
+        return replace(self, origin=(top, left))
+
+    def gaps(self, shape: tuple[int, int]) -> tuple[tuple[int, Fraction], ...]:
+        """Pixels of f before and after what all sub-imagers together see, along the rows and columns of `shape`."""
+        return tuple(
+            (start, size - span - start) for start, span, size in zip(self.origin, self.span, shape, strict=True)
+        )
 
 
 @dataclass(frozen=True)

@@ -149,6 +149,11 @@ class Scene(Table):
             raise ValueError("expected a picture, target.image, or a Mitsuba scene, world.file, got neither")
         if self.target.image is None and self.target.shape is None:
             raise ValueError("a target without a picture needs target.shape, the grid to reconstruct, got none")
+        if self.estimator.prior_variance is not None and (self.prior.kind == "fit" or self.target.detail > 1):
+            conflict = "prior.kind 'fit'" if self.prior.kind == "fit" else f"target.detail {self.target.detail}"
+            raise ValueError(
+                f"estimator.prior_variance takes a known prior of f, got {conflict}; remove one of the two"
+            )
         if self.sensor is not None:
             for lens in self.camera.lens:
                 if lens.aperture is None and lens.surfaces is None:
@@ -162,6 +167,17 @@ class Scene(Table):
     def source(self) -> Path:
         """The file that error messages name."""
         return self._source
+
+    @property
+    def assumed_prior(self) -> PriorTable:
+        """The prior that the estimator assumes: [prior], with estimator.prior_variance where it is set."""
+        variance = self.estimator.prior_variance
+        return self.prior if variance is None else self.prior.model_copy(update={"variance": variance})
+
+    @property
+    def prior_ratio(self) -> float:
+        """The actual variance of the prior over the one that the estimator assumes."""
+        return self.prior.variance / self.assumed_prior.variance
 
     def plain(self) -> dict[str, Any]:
         """The scene in types of TOML and JSON, without absent keys."""

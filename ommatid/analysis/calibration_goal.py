@@ -60,6 +60,8 @@ def for_prior(setup: Setup) -> StoppingRule:
         )
     prior = scene.prior.model_copy(update={"kind": "independent"}) if scene.prior.kind == "fit" else scene.prior
 
+    assumed_prior = scene.assumed_prior.model_copy(update={"kind": prior.kind})
+
     def added_error(model: Model) -> float:
         used = np.isfinite(noise) & (np.diff(model.matrix.indptr) > 0)
         model = model_of_f(model, camera, prior)
@@ -71,7 +73,16 @@ def for_prior(setup: Setup) -> StoppingRule:
 
         def expected(noise: Noise) -> ExpectedError:
             assumed = uniform(setting, int(used.sum())) if isinstance(setting, float) else total_variance(noise)
-            task = EstimationTask(model, recorded, used, assumed, prior, scene.estimator, scene.tiles)
+            task = EstimationTask(
+                model,
+                recorded,
+                used,
+                assumed,
+                assumed_prior,
+                scene.estimator,
+                scene.tiles,
+                scene.prior_ratio,
+            )
             return method(task, Execution()).result(noise, None).expected
 
         certain = {name: values for name, values in causes.items() if name != "calibration"}

@@ -16,7 +16,7 @@ from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Scene, parse
-from ommatid.scenes.skipped import assumptions
+from ommatid.scenes.skipped import ignores_detail
 
 from .prediction_table import json_of
 
@@ -96,7 +96,7 @@ def with_lens(scene: Scene, magnification: Fraction) -> Scene:
 
 def check_detail(scene: Scene) -> None:
     """Raise InputError where the error depends on detail finer than f, of which the scene says nothing."""
-    if assumptions(scene, derive(scene)):
+    if ignores_detail(scene, derive(scene)):
         raise InputError(
             "not ranked: its sensor pixels divide pixels of f, so its error depends on detail finer than f; set"
             " target.detail and a correlated prior"

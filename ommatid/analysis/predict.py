@@ -61,11 +61,12 @@ def predict_ideal(scene: Scene) -> Prediction:
     if choice.method != "dense" or camera.has_detail:
         model = model_of_f(ideal_model(scene, camera.with_grid_of_matrix), camera, scene.prior)
         return replace(predict_frame(choice, model, actual), assumes=_ideal_assumptions(setup))
-    prior = prior_of(scene.prior, camera.shape, camera.target_pitch, camera.detail)
+    prior = prior_of(scene.assumed_prior, camera.shape, camera.target_pitch, camera.detail)
     added = None
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":
-        added = partial(misalignment_variance, camera=camera, prior=prior)
-    prediction = predict(ideal_matrix(camera), prior, actual, scene.estimator, camera.shape, added)
+        added = partial(misalignment_variance, camera=camera, prior=prior.scaled(scene.prior_ratio))
+    matrix = ideal_matrix(camera)
+    prediction = predict(matrix, prior, actual, scene.estimator, camera.shape, added, scene.prior_ratio)
     return replace(prediction, assumes=_ideal_assumptions(setup))
 
 

@@ -26,9 +26,10 @@ VERDICT = "verdict"
 
 
 def rows(report: RunReport) -> list[Row]:
-    """Return names and values, in the order in which they are printed; the verdict is first."""
+    """Return names and values, in the order in which they are printed; the verdict and what it assumes are first."""
     return [
         *_verdict_rows(report),
+        *(("assumed", assumption) for assumption in report.assumes),
         *_stage_rows(report),
         *_error_rows(report.error),
         *(_region_row(region) for region in report.regions),
@@ -36,7 +37,6 @@ def rows(report: RunReport) -> list[Row]:
         *_solver_rows(report.solver),
         *_diagnostic_rows(report.diagnostics, report.unknowns),
         *_model_rows(report.model),
-        *(("assumed", assumption) for assumption in report.assumes),
         *((f"left out: {skipped.what}", skipped_words(skipped.why, skipped.bound)) for skipped in report.skipped),
         *_time_rows(report.spent, limits=is_trusted(report)),
     ]

@@ -46,6 +46,7 @@ def describe(
             "height": camera.rows * camera.target_pitch,
             "distance": camera.distance,
         },
+        "light_as": _light_words(camera),
         "lens_types": [_lens_type(camera, lens_type) for lens_type in camera.types],
         "measurements": camera.measurements,
         "unknowns": camera.unknowns,
@@ -60,15 +61,24 @@ def describe(
     }
 
 
+def _light_words(camera: Camera) -> str:
+    if not camera.has_width:
+        return "rays through pinholes"
+    if not camera.wavelengths:
+        return "rays, which do not diffract: camera.wavelength is 'none'"
+    return ", ".join(f"{wavelength * 1e6:.4g} nm" for wavelength, _ in camera.wavelengths)
+
+
 def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
     return {
         "name": lens_type.name,
         "magnification": str(1 / lens_type.ratio),
         "array": list(lens_type.array),
         "pixels": list(lens_type.pixels),
-        "step": str(lens_type.step),
+        "step": lens_type.described_step,
         "sees_rows": [lens_type.origin[0], float(lens_type.origin[0] + lens_type.span[0])],
         "sees_columns": [lens_type.origin[1], float(lens_type.origin[1] + lens_type.span[1])],
+        "off_centre": [float(before - after) / 2 for before, after in lens_type.gaps(camera.shape)],
         "sensor_depth": camera.depth(lens_type),
         "focal_length": camera.focal_length(lens_type),
         "sub_image_width": lens_type.pixels[1] * camera.pixel_pitch,
@@ -85,7 +95,12 @@ def _unseen_edges(camera: Camera) -> list[str]:
         edges = (("top", top), ("bottom", bottom), ("left", left), ("right", right))
         missed = [f"{float(width):g} at the {edge}" for edge, width in edges if width > 0]
         if missed:
-            sentences.append(f"type {lens_type.name} does not see the pixels {', '.join(missed)}")
+            sentence = f"type {lens_type.name} does not see the pixels {', '.join(missed)}"
+            rows, columns = (float(before - after) / 2 for before, after in lens_type.gaps(camera.shape))
+            offset = (
+                f": its middle is {rows:+g} rows and {columns:+g} columns from the target's" if rows or columns else ""
+            )
+            sentences.append(sentence + offset)
     return sentences
 
 
@@ -115,6 +130,7 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
     geometry = [
         ("target", f"{target['rows']} x {target['columns']} pixels, {target['height']:g} x {target['width']:g} mm"),
         ("distance", f"{target['distance']:g} mm"),
+        ("light", description["light_as"]),
         ("measurements", f"{description['measurements']} for {description['unknowns']} unknowns"),
     ]
     if description["pixels_seen_by_fewer_types"]:

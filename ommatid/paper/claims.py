@@ -1,4 +1,4 @@
-"""The claims of the paper (Wood, Rajan and Christensen) on expected errors and null spaces, checked by their numbers.
+"""The claims of the paper (Wood, Rajan and Christensen) on expected errors, and our formulas of null spaces, checked.
 
 Errors are expected squared errors per pixel (Eq. 5) in squared units of f; noise means its variance. Unless stated
 otherwise the estimator expects the actual noise.
@@ -30,6 +30,7 @@ from .tile_errors import (
 )
 
 YES, NO, QUALIFIED = "yes", "no", "with qualifications"
+PAPER, OWN = "paper", "ommatid"  # sources of claims
 SAME = 1.1  # ratio of curves that cannot be distinguished on axes of eight decades
 ABOUT_TEN = (8.0, 12.5)  # "about 10 times"
 ORDER_OF_TEN = 3.0  # the least ratio of the order of magnitude of ten
@@ -39,12 +40,16 @@ LOUD, QUIET = 1.0, 0.1  # noise variances that the claims name
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of the paper, the verdict (yes, no, with qualifications), its numbers, and the qualification."""
+    """A statement, the verdict (yes, no, with qualifications), its numbers, and the qualification.
+
+    source : of the statement: the paper, or this program, which generalises the paper's ranks of H to formulas
+    """
 
     claim: str
     holds: str
     numbers: dict[str, float]
     remark: str = ""
+    source: str = PAPER
 
 
 def verdict(holds: bool, qualified: bool = False) -> str:
@@ -227,6 +232,7 @@ def _one_rank() -> Claim:
         "one type leaves a null space of 2aN - a^2 dimensions, a = m - 1 plus unseen pixels, N the tile's side",
         verdict(holds),
         {f"{side} {lens} (a = {axes[side, lens]}): null space": count for (side, lens), count in nullities.items()},
+        source=OWN,
     )
 
 
@@ -241,4 +247,4 @@ def _two_ranks() -> Claim:
         for (side, pair), count in nullities.items()
     }
     numbers |= {f"{side} {'+'.join(THREE)}: null space": count for side, count in all_three.items()}
-    return Claim("two coprime types leave 2ab dimensions, three leave none", verdict(holds), numbers)
+    return Claim("two coprime types leave 2ab dimensions, three leave none", verdict(holds), numbers, source=OWN)

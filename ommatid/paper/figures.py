@@ -54,23 +54,36 @@ def draw_sweeps(path: Path, shown: list[PaperTile]) -> None:
 
 
 def draw_maps(path: Path, shown: list[PaperTile], noise: float) -> None:
-    """Draw Fig. 3: the error within the tile for each combination of lens types, with its maximum."""
-    figure = _figure(14.5, 4.6)
-    figure.get_layout_engine().set(wspace=0.08)
+    """Draw Fig. 3: the error within the tile for each combination of lens types, and below it without the border.
+
+    Every map has its own scale, from 0 to its maximum.
+    """
+    figure = _figure(14.5, 8.8)
+    figure.get_layout_engine().set(wspace=0.08, hspace=0.06)
     side = shown[0].side
-    for axes, tile in zip(figure.subplots(1, len(shown)), shown, strict=True):
-        error = tile.matched(noise)
-        drawn = axes.imshow(error.reshape(side, side), cmap="viridis", vmin=0.0, vmax=error.max())
-        where = "" if tile.camera.types_seeing().all() else " where no lens sees it"
-        title = f"{tile.name}\nmaximum {error.max():.4g}{where}, average {error.mean():.4g}"
-        _axes(axes, title, "column (target pixels)", "row (target pixels)")
-        axes.grid(visible=False)
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.get_major_locator().set_params(integer=True)
-        bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-        bar.set_label("expected squared error (squared units of f)")
+    for panels, trim in zip(figure.subplots(2, len(shown)), (0, TRIM), strict=True):
+        for axes, tile in zip(panels, shown, strict=True):
+            _error_map(figure, axes, tile, noise, trim)
     figure.suptitle(f"Error within the {side} x {side} tile; noise variance {_power(noise)}, as the estimator expects")
     _save(figure, path)
+
+
+def _error_map(figure: Any, axes: Any, tile: PaperTile, noise: float, trim: int) -> None:
+    """Draw the error within a tile without its border of `trim` pixels, on its own scale."""
+    first, last = trim, tile.side - trim
+    error = tile.matched(noise).reshape(tile.side, tile.side)[first:last, first:last]
+    edges = (first - 0.5, last - 0.5)
+    drawn = axes.imshow(error, cmap="viridis", vmin=0.0, vmax=error.max(), extent=(*edges, *reversed(edges)))
+    seen = tile.camera.types_seeing()[first:last, first:last]
+    where = "" if seen.all() else " where no lens sees it"
+    within = f", trimmed by {trim} pixels" if trim else ""
+    title = f"{tile.name}{within}\nmaximum {error.max():.4g}{where}, average {error.mean():.4g}"
+    _axes(axes, title, "column (target pixels)", "row (target pixels)")
+    axes.grid(visible=False)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.get_major_locator().set_params(integer=True)
+    bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
+    bar.set_label("expected squared error (squared units of f)")
 
 
 def draw_sides(path: Path, shown: list[PaperTile]) -> None:

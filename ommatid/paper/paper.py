@@ -14,9 +14,10 @@ from ommatid.runtime.files import check_output, make_folder, write_csv
 from ommatid.runtime.progress import Progress, no_progress
 
 from . import figures
-from .claims import Claim, error_claims, rank_claims
+from .claims import PAPER, Claim, error_claims, rank_claims
 from .photograph_claims import photograph_claims
 from .photographs import PHOTOGRAPH, Photograph, Trials, crop_tiles, load, seeds, simulate_trials
+from .tile_claims import tile_claims
 from .tile_errors import ACTUAL, COMBINATIONS, SIDES, THREE, PaperTile, Tiles, distortion, sweep, tiles
 
 SIDE = 35  # of the photograph's tiles
@@ -47,11 +48,11 @@ def write_paper(
     progress(0.4)
     photograph = simulate_trials(computed[SIDE, THREE], image, crops, seed)
     progress(0.5)
-    claims = [*error_claims(computed), *rank_claims(), *photograph_claims(photograph)]
+    claims = [*error_claims(computed), *tile_claims(computed), *photograph_claims(photograph), *rank_claims()]
     progress(0.8)
     diverse = [computed[DISTORTION_SIDE, THREE], *distortion()]
     _write_numbers(folder, computed, photograph, diverse)
-    write_csv(folder / CLAIMS, ("claim", "holds", "numbers", "remark"), map(_claim_row, claims))
+    write_csv(folder / CLAIMS, ("claim", "source", "holds", "numbers", "remark"), map(_claim_row, claims))
     _write_figures(folder, computed, photograph)
     figures.draw_distortion(folder / "distortion.png", diverse, DISTORTION_NOISE)
     progress(1.0)
@@ -69,7 +70,8 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     lines: list[tuple[str, str]] = []
     for claim in summary["claims"]:
         remark = f": {claim['remark']}" if claim["remark"] else ""
-        lines.append((claim["claim"], claim["holds"] + remark))
+        own = "" if claim["source"] == PAPER else "not in the paper, "
+        lines.append((claim["claim"], own + claim["holds"] + remark))
     return [
         *lines,
         ("figures and numbers", ", ".join(summary["files"])),
@@ -133,7 +135,7 @@ def _trial_rows(trials: Trials) -> Iterable[Row]:
 
 def _claim_row(claim: Claim) -> Row:
     numbers = "; ".join(f"{name}: {number:.9g}" for name, number in claim.numbers.items())
-    return claim.claim, claim.holds, numbers, claim.remark
+    return claim.claim, claim.source, claim.holds, numbers, claim.remark
 
 
 def _write_table(path: Path, columns: Sequence[str], lines: Iterable[Row]) -> None:

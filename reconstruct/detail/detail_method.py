@@ -62,7 +62,7 @@ class DetailMethod(Method):
             lambda values: whitened.gain(white.vector(values)), whitened.posterior, weigh, whitened.hidden
         )
 
-    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error; truth : (N,), or better (pixels of the world,), whose detail is known."""
         white, solved = self._solved
         unit = np.ones(self.task.expected_noise.size)

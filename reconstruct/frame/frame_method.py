@@ -87,7 +87,7 @@ class FrameMethod(Method):
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
         return posterior_operators(self.system, self.task)
 
-    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
         task, actual = self.task, total_variance(noise)
         solution = self.solution

@@ -248,7 +248,7 @@ def _factorised_strip(system: Preconditioner, prior: float, axis: int, part: sli
 def is_sliding(lens_type: LensType) -> bool:
     """Return True if the type's sensor pixels are all the averages over boxes inside its field (shift-invariant)."""
     ratio = lens_type.ratio
-    return lens_type.step == 1 and ratio.denominator == 1 and lens_type.array == (int(ratio), int(ratio))
+    return lens_type.step == (1, 1) and ratio.denominator == 1 and lens_type.array == (int(ratio), int(ratio))
 
 
 def preconditioner_for(camera: Camera, weights: tuple[float, ...], prior: float | FloatArray) -> Preconditioner:

@@ -38,7 +38,7 @@ class DenseMethod(Method):
         form, noise = self.estimate.form, self.task.expected_noise
         return operators_of(form, lambda values: values / noise) if form.problem.noisy else None
 
-    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
         solution, actual = self.estimate, total_variance(noise)
         expected = expected_error(solution.form, noise)

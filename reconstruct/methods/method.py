@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,6 +36,7 @@ class EstimationTask:
 
     recorded : (M,) g;  used : (M,) True for measurements that are used
     expected_noise : (measurements used,) the noise variance that the estimator assumes, 0 allowed
+    prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
     """
 
     model: Model
@@ -45,6 +46,7 @@ class EstimationTask:
     prior: estimation.PriorTable
     settings: estimation.EstimatorTable
     tiles: estimation.TilesTable
+    prior_ratio: float = 1.0
 
     @cached_property
     def complete(self) -> bool:
@@ -78,7 +80,7 @@ class EstimationTask:
         return float(np.sum(spectrum * np.square(waves)))
 
     def draw_deviation(self, rng: np.random.Generator) -> FloatArray:
-        """Draw an image from the prior, less its mean: (N,). Correlated pixels are reflected at the edges."""
+        """Draw an image from the assumed prior, less its mean: (N,). Correlated pixels are reflected at the edges."""
         spectrum = spectrum_of(self.prior, self.shape, *self._scale)
         noise = rng.normal(size=self.shape)
         if isinstance(spectrum, float):
@@ -153,9 +155,46 @@ class Method(ABC):
         """Return the operators of the estimate, None where this method cannot apply them, or not without noise."""
         return None
 
-    @abstractmethod
     def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
-        """Return the estimate and its error for the actual `noise`: (measurements used,) variances by cause."""
+        """Return the estimate and its error for the actual `noise`, (measurements used,) by cause, and actual prior.
+
+        With P0M = c P0, Eq. 5 is c times that of the noise Rvm / c for images of the assumed prior P0.
+        """
+        ratio = self.task.prior_ratio
+        if ratio == 1:
+            return self.result_for_assumed_prior(noise, truth)
+        scaled = {name: _divided(values, ratio) for name, values in noise.items()}
+        mean = self.task.prior.mean
+        closer = None if truth is None else mean + (truth - mean) / ratio**0.5
+        return _multiplied(self.result_for_assumed_prior(scaled, closer), ratio)
+
+    @abstractmethod
+    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+        """Return the estimate and its error for the actual `noise` and images of the prior that is assumed."""
+
+
+def _multiplied(result: MethodResult, ratio: float) -> MethodResult:
+    """Return a result whose expected squares are `ratio` times as large."""
+    expected, given, power, of_sum = result.expected, result.interval, result.residual_power, result.variance_of_sum
+    expected = replace(
+        expected,
+        variance=ratio * expected.variance,
+        missing=ratio * expected.missing,
+        parts={name: ratio * part for name, part in expected.parts.items()},
+    )
+    if given is not None:
+        given = Interval(ratio * given.mse, ratio * given.low, ratio * given.high, ratio**2 * given.variance)
+    if power is not None:
+        power = power.multiplied(ratio)
+
+    def variance_of_sum(weights: FloatArray) -> float:
+        return ratio * of_sum(weights)
+
+    return replace(result, expected=expected, interval=given, variance_of_sum=variance_of_sum, residual_power=power)
+
+
+def _divided(values: FloatArray, ratio: float) -> FloatArray:
+    return np.broadcast_to(values[0] / ratio, values.shape) if is_uniform(values) and values.size else values / ratio
 
 
 def total_variance(noise: dict[str, FloatArray]) -> FloatArray:

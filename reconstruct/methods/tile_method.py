@@ -51,7 +51,7 @@ class TileMethod(Method):
         """Return the operators of the whole frame, None where a measurement has no noise."""
         return iterative_operators(self.task) if (self.task.expected_noise > 0).all() else None
 
-    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
         task = self.task
         groups = self.groups(noise)

@@ -38,7 +38,7 @@ class RobustMethod(Method):
         """Return f^ alone: (N,)."""
         return self._solved[1].image
 
-    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error with the given noise and misalignment as its tolerance says.
 
         There is no interval for a given image: misalignment acts on it otherwise than on images of the prior.
@@ -76,9 +76,9 @@ class AlignedMethod(Method):
         """Return f^ alone: (N,)."""
         return self._dense.estimate_image()
 
-    def result(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
+    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error with the given noise; the remaining uncertainty of the fit adds to it."""
-        result, alignment = self._dense.result(noise, truth), self.alignment
+        result, alignment = self._dense.result_for_assumed_prior(noise, truth), self.alignment
         added = float(alignment.variance.mean())
         expected = result.expected
 

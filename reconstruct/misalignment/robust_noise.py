@@ -9,7 +9,8 @@ So the best linear estimator is Eq. 4 of Wood et al. with E[H] for H and one den
 sub-imager, and Eq. 5 with both holds on average over images and cameras. E[H] is slightly blurred.
 
 H is piecewise smooth: it has a kink wherever an edge of a sensor pixel coincides with one of a texel, and in the camera
-as designed all edges coincide. A derivative there is of little use, so moments are sums over points on either side.
+as designed all edges coincide. A derivative there is of little use, so moments are sums over points on either side
+(`parameter_grid`).
 """
 
 from __future__ import annotations
@@ -17,8 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import linalg, sparse, special, stats
+from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
@@ -31,10 +31,9 @@ from ..expected_error import CHUNK, ExpectedError
 from ..forms.form import Form
 from ..prior import Prior
 from ..problem import Problem
+from .parameter_grid import points_of
 
 PARAMETERS = 6  # position x and y, tilt about x and about y, rotation, focal length: the columns of every table here
-POINTS = 3  # on either side: exact for polynomials to degree 5 between zero and the next kink
-DRAWS = 32  # pairs of points where more than offsets is misaligned
 CAUSE = "misalignment"  # in the error budget
 
 
@@ -93,14 +92,14 @@ def robust_noise(camera: Camera, prior: Prior) -> MisalignmentNoise:
     slices = camera.slices()
     blocks = [np.zeros((rows.stop - rows.start,) * 2) for rows in slices]
     mean = start
-    for group in _quadrature(np.asarray(spread.any(axis=0))):
+    if spread.any():
         shift = sparse.csr_array(start.shape)
-        for weight, scores in group:
+        for weight, scores in zip(*points_of(np.asarray(spread.any(axis=0))), strict=True):
             change = sparse.csr_array(misaligned_matrix(camera, design + scores * spread) - start)
             shift = shift + weight * change
             _add_squares(blocks, slices, change, prior, weight)
         _add_squares(blocks, slices, shift, prior, -1.0)
-        mean = mean + shift
+        mean = start + shift
     return MisalignmentNoise(sparse.csr_array(mean), tuple(blocks))
 
 
@@ -195,38 +194,6 @@ def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray], cau
     parts = {name: float(weights @ values) for name, values in noise.items()}
     rest = max(from_measurements - sum(parts.values()), 0.0)
     return ExpectedError(variance, missing, {**parts, cause: rest}, resolved, leverage)
-
-
-def _quadrature(free: NDArray[np.bool_]) -> list[list[tuple[float, FloatArray]]]:
-    """Return groups of weights and points, (6,) in standard deviations, for the parameters that are `free`.
-
-    The contributions of groups add up. Offsets in x and in y move different edges of a pixel, so they can be taken one
-    after the other. All other parameters move the same edges, with a kink where their sum is zero: then points are
-    drawn evenly from all parameters at once.
-    """
-    numbers = np.flatnonzero(free)
-    if (numbers < 2).all():
-        sides = [(sign, node, weight) for node, weight in zip(*half_normal(POINTS), strict=True) for sign in (-1, 1)]
-        units = np.eye(PARAMETERS)
-        return [[(weight / 2, sign * node * units[number]) for sign, node, weight in sides] for number in numbers]
-    even = stats.qmc.Sobol(numbers.size, rng=np.random.default_rng(0)).random(DRAWS)
-    points = np.zeros((2 * DRAWS, PARAMETERS))
-    points[:, numbers] = np.concatenate([stats.norm.ppf(even), -stats.norm.ppf(even)])
-    return [[(0.5 / DRAWS, point) for point in points]]
-
-
-def half_normal(points: int) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss nodes and weights for |t| of a standard normal t: exact to degree 2 `points` - 1.
-
-    Gauss-Hermite nodes would treat a kink at zero as smooth: three of them get E|t| wrong by a tenth and more.
-    """
-    order = np.arange(2 * points)
-    moments: FloatArray = 2 ** (order / 2) * special.gamma((order + 1) / 2) / np.pi**0.5
-    square = np.array([moments[row : row + points] for row in range(points)])
-    monic = np.concatenate([np.linalg.solve(square, -moments[points:]), [1.0]])
-    nodes = np.sort(np.roots(monic[::-1]).real)
-    weights = np.linalg.solve(np.vander(nodes, increasing=True).T, moments[:points])
-    return np.asarray(nodes, dtype=np.float64), np.asarray(weights, dtype=np.float64)
 
 
 def _add_squares(

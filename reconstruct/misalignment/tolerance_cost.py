@@ -38,7 +38,9 @@ def mismatch_variance(
     """Return what the difference of the camera's H from the form's adds to Eq. 5, for images of the prior: (N,).
 
     moments : of H and of what it sees of such images, for all measurements;  slices : of their blocks
+    prior : the actual one, whose covariance is a multiple of the form's
     """
+    stretch = float(np.sqrt(prior.variance.sum() / form.problem.prior.variance.sum()))
     shift, parts = _shift(form, used, moments), _used_blocks(used, moments, slices)
     added = np.empty(form.problem.unknowns)
     for chunk, _, u, negative in solved_columns(form, np.arange(form.problem.unknowns)):
@@ -48,7 +50,7 @@ def mismatch_variance(
         for rows, block in parts:
             spread += np.sum(negative[rows] * (block @ negative[rows]), axis=0)
         added[chunk] = spread + np.square(in_prior).sum(axis=0) + np.square(prior.mean @ shifted)
-        added[chunk] += 2 * np.sum(u * in_prior, axis=0)
+        added[chunk] += 2 * stretch * np.sum(u * in_prior, axis=0)
     return added
 
 

@@ -161,7 +161,7 @@ def with_attenuation(
     noise = operators.gain(root * white)
     attenuation = Attenuation.of(method, operators, [white], [noise], root)
 
-    unseen = operators.hidden(task.draw_deviation(rng))
+    unseen = task.prior_ratio**0.5 * operators.hidden(task.draw_deviation(rng))
     if not attenuation.strength(noise + unseen) <= FIRST_ORDER:
         return result
     average = attenuation.effect(image + unseen, task.prior.mean)

@@ -35,6 +35,17 @@ class ResidualPower:
     draws: int
     samples: Float32Array | None = None
 
+    def multiplied(self, ratio: float) -> ResidualPower:
+        """Return the expected squares of residuals that are larger by the root of `ratio`."""
+        bias, noise, samples = self.bias, self.noise, self.samples
+        return ResidualPower(
+            ratio * self.prior,
+            None if bias is None else ratio * bias,
+            None if noise is None else ratio * noise,
+            self.draws,
+            None if samples is None else np.float32(ratio**0.5) * samples,
+        )
+
 
 @dataclass(frozen=True)
 class ResidualInputs:

@@ -91,7 +91,7 @@ class FootprintAssignment:
 
 def _interval(lens_type: LensType, axis: int) -> FootprintInterval:
     """The footprints of a lens type along rows (axis 0) or columns (1) of f."""
-    starts = [float(lens_type.origin[axis] + number * lens_type.step) for number in range(lens_type.array[axis])]
+    starts = [float(start) for start in lens_type.starts(axis)]
     ratio = float(lens_type.ratio)
     middles = np.array(starts)[:, None] + ratio * (np.arange(lens_type.pixels[axis], dtype=np.float64) + 0.5)
     return FootprintInterval(np.asarray(middles.ravel(), dtype=np.float64), ratio / 2)

@@ -134,7 +134,7 @@ def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> s
     the variation within a sensor pixel, and the share `diffraction.TAIL` of the light, which lands further out.
     """
     reach = max(blur.reach for blur, _ in blurs)
-    unit = lcm(lens_type.ratio.denominator, lens_type.step.denominator)
+    unit = lcm(*(number.denominator for number in (lens_type.ratio, *lens_type.step)))
     down, across = (_axis(camera, lens_type, reach, axis, unit) for axis in (0, 1))
     offsets = np.unique(np.abs(np.concatenate([down.offset.ravel(), across.offset.ravel()])))  # symmetric
     needed = TABLES * 8 * offsets.size**2
@@ -240,7 +240,7 @@ class _Axis:
 
 def _axis(camera: Camera, lens_type: LensType, reach: float, axis: int, unit: int) -> _Axis:
     size, count, length = camera.shape[axis], lens_type.array[axis], int(lens_type.ratio * unit)
-    begin = lens_type.origin[axis] * unit + int(lens_type.step * unit) * np.arange(count)
+    begin = lens_type.origin[axis] * unit + int(lens_type.step[axis] * unit) * np.arange(count)
     starts = begin[:, None] + length * np.arange(lens_type.pixels[axis])
     reached = _reached(lens_type, reach, size)
     first = np.clip(np.floor(starts / unit - reach).astype(np.int64), 0, size - reached)

@@ -172,8 +172,8 @@ class BoxFootprints:
 
 
 def _axis(camera: Camera, lens_type: LensType, axis: int) -> BoxAxis:
-    starts = [lens_type.origin[axis] + number * lens_type.step for number in range(lens_type.array[axis])]
-    parts = [overlap(lens_type.ratio, lens_type.pixels[axis], start, camera.shape[axis]) for start in starts]
+    ratio, pixels, size = lens_type.ratio, lens_type.pixels[axis], camera.shape[axis]
+    parts = [overlap(ratio, pixels, start, size) for start in lens_type.starts(axis)]
     return BoxAxis(sparse.csr_array(sparse.vstack(parts, format="csr")))
 
 

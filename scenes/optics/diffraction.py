@@ -110,4 +110,8 @@ def _fields(v: FloatArray, waves: float, weight: float) -> tuple[ComplexArray, C
     tilted = share * u / (1 + weight * u**2)
     size = max(1, AT_ONCE // u.size)
     parts = [np.outer(v[first : first + size], u) for first in range(0, v.size, size)]
-    return np.concatenate([j0(part) @ share for part in parts]), np.concatenate([j1(part) @ tilted for part in parts])
+    even, odd = (
+        np.concatenate([np.asarray(bessel(part) @ values, dtype=np.complex128) for part in parts])
+        for bessel, values in ((j0, share), (j1, tilted))
+    )
+    return even, odd

@@ -1,31 +1,34 @@
 """Optical and sensor effects that are negligible in a scene, found before anything is rendered.
 
 An effect is skipped if it is small in itself and small compared to the noise: if it would change images drawn from the
-prior, on average, by less than a tenth of the noise variance. Each skipped effect comes with a bound on the change for
+prior, on average, by less than 1/200 of the noise variance in any pixel, those at the target's corners included,
+whose rays may miss the target. The error that is expected without the effect is then at most 2 % below the one with
+it. Each skipped effect comes with a bound on the change for
 any target of values from 0 to 255. `render.complete` skips nothing.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import ceil, hypot
+from math import ceil, floor, hypot
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import sparse
 
 from ..camera import Camera
-from ..constants import AIRY_FIRST_ZERO, WHITE
+from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
 from ..lens_type import LensOptics, LensType
 from ..scene import Scene
+from ..tables.estimation import PriorTable
 
 if TYPE_CHECKING:
     from .blur import Blur
 
 MOST_DISK = 1 / 20  # pixels of f, diameter of a negligible disk of defocus
 MOST_AIRY = 1 / 5  # sensor pixels, diameter of a negligible Airy disk, to its first dark ring
-MOST_OF_NOISE = 0.1  # of the noise variance: change by a negligible effect
-MOST_SHOT = 0.1  # of the variance of read noise: negligible shot noise
+MOST_OF_NOISE = 1 / 200  # of the noise variance: change by a negligible effect
+MOST_SHOT = 0.02  # of the variance of read noise: negligible shot noise, at a value of 255
 BOUND_DEVIATIONS = 5.0  # standard deviations in a bound on noise
 
 
@@ -56,13 +59,13 @@ def without_negligible_effects(scene: Scene, camera: Camera) -> tuple[Camera, tu
     allowed = MOST_OF_NOISE * noise_variance(scene, camera)
     skipped: list[SkippedEffect] = []
     if camera.wavelength is not None:
-        diffraction = _negligible_diffraction(camera, camera.wavelength, scene.prior.variance, allowed)
+        diffraction = _negligible_diffraction(camera, camera.wavelength, scene.prior, allowed)
         if diffraction is not None:
             camera = replace(camera, wavelength=None)
             skipped.append(diffraction)
     types: list[LensType] = []
     for lens_type in camera.types:
-        aperture = _negligible_aperture(camera, lens_type, scene.prior.variance, allowed)
+        aperture = _negligible_aperture(camera, lens_type, scene.prior, allowed)
         if aperture is None:
             types.append(lens_type)
         else:
@@ -86,7 +89,7 @@ def noise_variance(scene: Scene, camera: Camera) -> float:
 
 
 def negligible_shot_noise(scene: Scene, camera: Camera) -> SkippedEffect | None:
-    """The skipped shot noise, or None if it exceeds a tenth of the read noise or if the light cannot be computed.
+    """The skipped shot noise, or None if it exceeds 2 % of the read noise, or if the light cannot be computed.
 
     The bound is five standard deviations of the shot noise at a value of 255.
     """
@@ -106,7 +109,7 @@ def negligible_shot_noise(scene: Scene, camera: Camera) -> SkippedEffect | None:
 
 
 def _negligible_diffraction(
-    camera: Camera, wavelength: float, prior_variance: float, allowed: float
+    camera: Camera, wavelength: float, prior: PriorTable, allowed: float
 ) -> SkippedEffect | None:
     """The skipped diffraction, or None if at least one lens type needs it."""
     from .blur import blur_of
@@ -121,8 +124,8 @@ def _negligible_diffraction(
         disk = disk / camera.pixel_pitch
         if disk >= MOST_AIRY:
             return None
-        change, mean_square = _change(camera, lens_type, replace(blur_of(camera, lens_type), airy=0.0))
-        if prior_variance * mean_square > allowed:
+        change, mean_square = _change(camera, lens_type, replace(blur_of(camera, lens_type), airy=0.0), prior)
+        if mean_square > allowed:
             return None
         widest, most = max(widest, disk), max(most, change)
     why = f"the Airy disk is {widest:.2g} sensor pixels wide, and its effect is far below the noise"
@@ -130,7 +133,7 @@ def _negligible_diffraction(
 
 
 def _negligible_aperture(
-    camera: Camera, lens_type: LensType, prior_variance: float, allowed: float
+    camera: Camera, lens_type: LensType, prior: PriorTable, allowed: float
 ) -> SkippedEffect | None:
     """The skipped aperture of a lens type, or None if it is needed or if there is none."""
     if lens_type.optics.aperture is None or camera.wavelength is not None:
@@ -143,33 +146,71 @@ def _negligible_aperture(
     what = f"samples of the aperture of lens type {lens_type.name}"
     falloff = _illumination_change(camera, lens_type)
     if blur.disk == 0:
-        if prior_variance * (falloff / float(lens_type.ratio)) ** 2 > allowed:  # m^2 entries of 1/m^2 change by falloff
+        if prior.variance * (falloff / float(lens_type.ratio)) ** 2 > allowed:  # m^2 entries of 1/m^2 change by falloff
             return None
         return SkippedEffect(what, "it is in focus: all rays of a sensor point meet on the target", WHITE / 2 * falloff)
     if blur.disk >= MOST_DISK:
         return None
-    change, mean_square = _change(camera, lens_type, Blur())
-    if prior_variance * mean_square > allowed:
+    change, mean_square = _change(camera, lens_type, Blur(), prior)
+    if mean_square > allowed:
         return None
     why = f"the disk of defocus is {blur.disk:.2g} pixels of f wide, and its effect is far below the noise"
     return SkippedEffect(what, why, change + WHITE / 2 * falloff)
 
 
-def _change(camera: Camera, lens_type: LensType, reduced: Blur) -> tuple[float, float]:
-    """Change of a measurement, far from the target's edges, if the blur is reduced to `reduced`.
+def _change(camera: Camera, lens_type: LensType, reduced: Blur, prior: PriorTable) -> tuple[float, float]:
+    """Change of a measurement, far from the target's edges and at its corner, if the blur is reduced to `reduced`.
 
-    Returns the largest change for values from 0 to 255, and the mean square for independent pixels of variance 1.
+    Returns the largest change for values from 0 to 255, and the larger mean square for images of the prior. At the
+    corner rays miss the target, so that a row of H changes its sum, and sees less of the prior's mean.
     """
     from .blur import blurs_of, matrix
 
     blurs = blurs_of(camera, lens_type)
     margin = ceil(max(blur.reach for blur, _ in blurs)) + 1
-    side = ceil(lens_type.ratio) + 1 + 2 * margin
-    single = replace(lens_type, array=(1, 1), pixels=(1, 1), origin=(margin, margin), left=None)
-    small = replace(camera, rows=side, columns=side, types=(single,), lens_columns=None)
-    row = sparse.csr_array(matrix(small, single, *blurs) - matrix(small, single, (reduced, 1.0))).data
-    most = WHITE * max(float(row[row > 0].sum()), -float(row[row < 0].sum()))
-    return most, float(np.square(row).sum())
+    nearest = (min(start, floor(end)) for start, end in lens_type.gaps(camera.shape))
+    largest = mean_square = 0.0
+    for origin in ((margin, margin), tuple(min(max(gap, 0), margin) for gap in nearest)):
+        rows, columns = (start + ceil(lens_type.ratio) + 1 + margin for start in origin)
+        single = replace(lens_type, array=(1, 1), pixels=(1, 1), origin=origin, left=None)
+        small = replace(camera, rows=rows, columns=columns, types=(single,), lens_columns=None)
+        row = sparse.csr_array(matrix(small, single, *blurs) - matrix(small, single, (reduced, 1.0))).data
+        lost, squares = float(row.sum()) ** 2, float(np.square(row).sum())
+        if prior.kind != "independent":
+            squares = max(squares, lost)  # of neighbours that are all alike
+        largest = max(largest, WHITE * float(row[row > 0].sum()), -WHITE * float(row[row < 0].sum()))
+        mean_square = max(mean_square, prior.mean**2 * lost + prior.variance * squares)
+    return largest, mean_square
+
+
+def light_kept_in_focus(side: float) -> float:
+    """Share of the light of a sensor pixel's square that stays in it behind a circular aperture in focus.
+
+    side : of the square, in wavelengths times the f-number
+    """
+    # By Parseval: the square's autocorrelation, transformed, times the transfer function, in polar coordinates.
+    nodes, weights = np.polynomial.legendre.leggauss(200 + ceil(4 * side))
+    q, turn = (1 + nodes[:, None]) / 2, np.pi / 8 * (1 + nodes)
+    transfer = 2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q**2))
+    square = np.sinc(side * q * np.cos(turn)) ** 2 * np.sinc(side * q * np.sin(turn)) ** 2
+    return float(side**2 * np.pi / 2 * (weights[:, None] * weights * q * transfer * square).sum())
+
+
+def change_by_diffraction(camera: Camera, lens_type: LensType, aperture: float, focus: float) -> float:
+    """Bound on the change of a measurement of values from 0 to 255 by 550 nm diffraction at an aperture.
+
+    The light that leaves a sensor pixel's footprint with diffraction, and without it by defocus. Both lengths in mm.
+    """
+    from .blur import MOST_WAVES, Blur, transfer
+
+    footprint = float(lens_type.ratio) * camera.target_pitch
+    disk = aperture * abs(1 - camera.distance / focus) / footprint
+    airy = GREEN * camera.distance / np.pi / (aperture * footprint)
+    waves, rays = Blur(disk, airy), Blur(disk)
+    if waves.waves > MOST_WAVES:
+        waves = rays
+    kept = [float(transfer(1.0, np.array([0]), 1, blur)[0, 0]) for blur in (waves, rays)]
+    return WHITE * min(1.0, sum(1 - share for share in kept))
 
 
 def _illumination_change(camera: Camera, lens_type: LensType) -> float:

@@ -31,7 +31,8 @@ METRES = 1e-3  # per millimetre
 
 def electrons_per_steradian(scene: Scene, sensor: SensorTable) -> float:
     """Electrons per unit of f and per steradian of projected solid angle in one pixel."""
-    wavelength = (scene.camera.wavelength or GREEN) * METRES
+    wavelength = scene.camera.wavelength
+    wavelength = (wavelength if isinstance(wavelength, float) else GREEN) * METRES
     radiance = sensor.illuminance / pi / WHITE / EFFICACY  # W / (m^2 sr) per unit of f
     photons = radiance * wavelength / (PLANCK * LIGHT_SPEED)
     area = (scene.camera.pixel_pitch * METRES) ** 2

@@ -76,8 +76,8 @@ class LensTable(Table):
     array: Pair = Field(description="rows and columns of sub-imagers")
     pixels: Literal["fit"] | Pair = Field(description='rows and columns of a sub-image, or "fit"')
     step: Step = Field(
-        default=Fraction(1),
-        description="pixels of the target between windows of neighbours",
+        default=(Fraction(1), Fraction(1)),
+        description="pixels of the target between windows of neighbours, or two numbers: down and across",
     )
     aperture: Length | None = Field(default=None, description="diameter of a thin lens; absent: a pinhole")
     focus: Length | None = Field(default=None, description="distance of sharp focus; absent: the target's")

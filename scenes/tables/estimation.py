@@ -44,6 +44,12 @@ class EstimatorTable(Table):
         default=None,
         description='assumed noise variance; "fit": fitted to the stack; absent: all known noise',
     )
+    prior_variance: float | None = Field(
+        default=None,
+        gt=0,
+        le=LARGEST**2,
+        description="assumed variance of every pixel, beside the actual prior.variance; absent: the same",
+    )
     method: Literal[
         "auto",
         "covariance",
@@ -67,6 +73,15 @@ class EstimatorTable(Table):
         description='camera.tolerance is "trust": ignored, "robust": treated as noise, "fit": fitted to the stack',
     )
     memory: Memory | None = Field(default=None, description='limit, such as "4 GB"; absent: half of the free memory')
+
+    @model_validator(mode="after")
+    def _check_prior_variance(self) -> EstimatorTable:
+        if self.prior_variance is not None and self.misalignment != "trust":
+            raise ValueError(
+                f"prior_variance takes misalignment 'trust', got '{self.misalignment}', which needs the actual prior;"
+                " remove one of the two keys"
+            )
+        return self
 
 
 class StudyTable(Table):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from fractions import Fraction
 from functools import cache, partial
 from math import isfinite
@@ -92,16 +93,25 @@ def _magnification(value: object) -> Fraction:
     return ratio
 
 
-def _step(value: object) -> Fraction:
-    ratio = _ratio(value)
-    if ratio < 0:
-        raise ValueError(f"expected a step of 0 or more pixels of the target, got {shortened_repr(value)}")
-    return ratio
+def _step(value: object) -> tuple[Fraction, Fraction]:
+    pair_given = isinstance(value, list | tuple)
+    numbers: tuple[object, ...] = tuple(cast(Sequence[object], value)) if pair_given else (value, value)
+    said = shortened_repr(numbers if pair_given else value)
+    if len(numbers) != 2:
+        raise ValueError(f"expected a step or two, down and across, such as [2, 1], got {said}")
+    down, across = _ratio(numbers[0]), _ratio(numbers[1])
+    if down < 0 or across < 0:
+        raise ValueError(f"expected a step of 0 or more pixels of the target, got {said}")
+    return down, across
 
 
 def pair(value: object) -> object:
     """Convert a list of TOML to the tuple that frozen tables hold; return anything else unchanged."""
     return tuple(value) if isinstance(value, list) else value  # type: ignore[arg-type]
+
+
+def _plain_step(step: tuple[Fraction, Fraction]) -> str | int | list[str | int]:
+    return _plain_ratio(step[0]) if step[0] == step[1] else [_plain_ratio(number) for number in step]
 
 
 def _plain_ratio(ratio: Fraction) -> str | int:
@@ -162,6 +172,16 @@ def _text_schema(description: str) -> WithJsonSchema:
 
 
 _RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
+_STEP = WithJsonSchema(
+    {
+        "anyOf": [
+            {"type": "string"},
+            {"type": "number"},
+            {"type": "array", "items": {"type": ["string", "number"]}, "minItems": 2, "maxItems": 2},
+        ],
+        "description": "a ratio, or two, down and across",
+    }
+)
 
 Length = Annotated[
     float,
@@ -194,7 +214,7 @@ Illuminance = Annotated[
     _text_schema('an illuminance, such as "500 lux"'),
 ]
 Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_plain_ratio), _RATIO]
-Step = Annotated[Fraction, BeforeValidator(_step), PlainSerializer(_plain_ratio), _RATIO]
+Step = Annotated[tuple[Fraction, Fraction], BeforeValidator(_step), PlainSerializer(_plain_step), _STEP]
 Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[tuple[Count, Count], BeforeValidator(pair)]
 Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(pair)]

@@ -25,7 +25,8 @@ from .wavefront import Wavefront, wavefront_of
 
 HEIGHTS = 17  # at which the middle and the amount of the light are traced, splines between
 TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors of its cells
-MOST_NODES = 33
+MOST_NODES = 9
+MOST_WIDER = 2.0  # ratio of the widths of a common grid and of the narrowest that a wave of its own would have
 MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by rays alone
 
 
@@ -127,9 +128,10 @@ class LensField:
 
     @staticmethod
     def _common_grid(waves: list[Wavefront]) -> tuple[float, float]:
-        """Return a grid that is fine and wide enough for all waves."""
+        """Return a grid that is fine and wide enough for all waves but those of slivers of the pupil."""
         grids = [grid_of(wave) for wave in waves]
-        return min(cell for cell, _ in grids), max(half for _, half in grids)
+        cell, widest = min(cell for cell, _ in grids), min(half for _, half in grids) * MOST_WIDER
+        return cell, min(max(half for _, half in grids), widest)
 
     @cached_property
     def grid(self) -> tuple[float, float]:

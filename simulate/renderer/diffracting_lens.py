@@ -27,10 +27,11 @@ from ..lenses import thin_lens
 from ..lenses.ray_trace import reach
 from .lens import Distance, Emission, LensModel, Point
 
-FEW_QUANTILES = 2**14  # where the defocus varies
+FEW_QUANTILES = 2**12  # where the defocus varies
 STEP, GROWTH, LINEAR = 0.05, 1.02, 3.0  # between tabulated defoci, in waves: up to LINEAR, and as a factor beyond
 SAME = 1e-3  # waves by which defocus may vary without a table of several
 BEYOND = 1 - 1e-5  # focus over distance beyond the focus: below 1, since a side that rounding decides is no random one
+TINY = 1e-6  # share of the light that lands within a million times the largest radius
 NEAR = 10.0  # apertures: surfaces that are nearer get the pattern of that distance
 
 
@@ -60,6 +61,7 @@ class DiffractingLens(LensModel):
         _, least, largest = reach(self._camera, self._type)
         shifts = [1 / depth - 1 / self._depth for depth in (least, largest)]
         self._tabulate([1 / (NEAR * self._aperture) + max(shifts), min(shifts)])
+        self.captured = 1.0  # rays go where the rest of the light lands, too
 
     def _waves(self, vergence: Any, wavelength: float) -> Any:
         return self._aperture**2 / (8 * wavelength) * (vergence - 1 / self._focus)
@@ -117,7 +119,7 @@ class DiffractingLens(LensModel):
         slant: Any = 1.0
         for (wavelength, _), table, mask in zip(self._bands, self._tables, band, strict=True):
             waves = dr.abs(self._waves(vergence, wavelength))
-            v, relative = table.at(waves, dr.sqrt(beam.share) * self._steps)
+            v, relative = table.at(waves, beam.share, all_light=self.distance is not None)
             along = dr.select(mask, v * (wavelength / (pi * self._aperture)), along)
             slant = dr.select(mask, 1 + beam.slant * relative, slant)
         along = dr.select(vergence * self._focus < BEYOND, -along, along)
@@ -150,11 +152,24 @@ class BandTable:
         self._radii, self._slants = (mi.Float(table.ravel().astype(np.float32)) for table in (radii, slants))
         self._waves = mi.Float(self._nodes.astype(np.float32))
 
-    def at(self, waves: Any, position: Any) -> tuple[Any, Any]:
-        """Return v and the relative slant; beyond the last defocus the radii grow as those of the disk of rays."""
+    def at(self, waves: Any, share: Any, all_light: bool) -> tuple[Any, Any]:
+        """Return v and the relative slant where a share of the light is nearer, of that in the table or of all light.
+
+        Beyond the last defocus the radii grow as those of the disk of rays, beyond the table's as those of its tail.
+        """
+        import drjit as dr
+
+        if not all_light:
+            return self._inside(waves, share)
+        v, slant = self._inside(waves, dr.minimum(share / self.captured, 1.0))
+        rest = (1 - self.captured) / dr.maximum(1 - share, TINY)
+        return v * dr.maximum(rest, 1.0), slant
+
+    def _inside(self, waves: Any, share: Any) -> tuple[Any, Any]:
         import drjit as dr
         import mitsuba as mi
 
+        position = dr.sqrt(share) * self._steps
         cell = dr.minimum(mi.UInt32(position), self._steps - 1)
         inside = position - mi.Float(cell)
         if self._nodes.size == 1:

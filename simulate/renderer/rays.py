@@ -19,8 +19,9 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.pose import corner_offset, poses
 from ommatid.scenes.scene import Sampler
 
-from ..sampling.samplers import fitting
+from ..sampling.samplers import RELATED_DRAWS, fitting
 from .lens import LensModel, ThinLens
+from .reseeded_sampler import ReseededSampler
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
 
@@ -46,12 +47,16 @@ class Rays:
 class RayGenerator:
     """Generates the rays of all sub-imagers of some lens types: one type, or several that are all pinholes."""
 
-    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: Sampler) -> None:
-        """Load the tables of the pixels into the renderer; a fast variant has to be active."""
+    def __init__(self, camera: Camera, types: tuple[LensType, ...], sampler: Sampler, has_world: bool = False) -> None:
+        """Load the tables of the pixels into the renderer; a fast variant has to be active.
+
+        has_world : True if the sampler is also used for what the rays meet
+        """
         import drjit as dr
         import mitsuba as mi
 
         self._sampler_name: Sampler = sampler
+        self._has_world = has_world
         self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": fitting(sampler, 16)})
         self.pixels = sum(lens_type.measurements for lens_type in types)
         self.lens = lens_of(camera, types[0])
@@ -91,7 +96,10 @@ class RayGenerator:
             z = corner_z + axes[4] * at.x + axes[5] * at.y
         else:
             x, y, z = corner_x + at.x, corner_y + at.y, corner_z
-        start, direction, weight = self.lens.emit(x, y, -z, self.sampler, (lens_x, lens_y))
+        draws = ReseededSampler(self.sampler, seed, lanes)
+        start, direction, weight = self.lens.emit(x, y, -z, draws, (lens_x, lens_y))
+        if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
+            draws.reseeded()
         ray = dr.zeros(mi.RayDifferential3f, lanes)
         ray.o = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
         ray.d = dr.normalize(mi.Vector3f(*direction))

@@ -8,7 +8,7 @@ the pupil finds the distance. (Where a surface ends before another, the pattern 
 # pyright: basic
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, pi
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ WAVES = 3.0  # of defocus, beyond which light is rays in a world
 NEAR = 20.0  # pupil radii: surfaces that are nearer get light as rays
 STEP = 0.125  # waves between tabulated defoci, between which the light of the two is mixed
 SAME = 1e-3  # waves by which defocus may vary without a table of several
+TINY = 1e-6  # share of the light that lands within a million times the largest slope
 FARTHEST = 1e-9  # vergence of the farthest surface
 
 
@@ -83,6 +84,7 @@ class WaveLens(RealLens):
         self._tabulate(
             [max(low, FARTHEST + least), min(high, 1 / (NEAR * field.pupil_radius) + largest)], FEW, FEW_REACH
         )
+        self.captured = 1.0  # rays go where the rest of the light lands, too
 
     def _tabulate(self, ends: list[float], cells: int, beyond: float) -> None:
         self._bands = [_Band(field, share, ends, cells, beyond) for field, share in self._fields]
@@ -100,10 +102,10 @@ class WaveLens(RealLens):
             ray = super().emit(x, y, depth, sampler, lens)
             vergence = self._met(ray, x, y, depth, lens)
         vergence += 1 / depth - 1 / self._depth
-        across, up, weight = self._bands[0].emit(x, y, self._depth / depth, vergence, sample)
+        across, up, weight = self._bands[0].emit(x, y, self._depth / depth, vergence, sample, ray is not None)
         begin = self._bands[0].share
         for band in self._bands[1:]:
-            after, found = drawn >= begin, band.emit(x, y, self._depth / depth, vergence, sample)
+            after, found = drawn >= begin, band.emit(x, y, self._depth / depth, vergence, sample, ray is not None)
             values = zip(found, (across, up, weight), strict=True)
             across, up, weight = (dr.select(after, new, old) for new, old in values)
             begin += band.share
@@ -160,14 +162,20 @@ class _Band:
         scale = self._interpolated(self._scale, dr.sqrt(x * x + y * y)) * nearer
         return x * scale, y * scale
 
-    def emit(self, x: Any, y: Any, nearer: Any, vergence: Any, sample: Any) -> tuple[Any, Any, Any]:
-        """Return the slopes of a ray and its weight."""
+    def emit(self, x: Any, y: Any, nearer: Any, vergence: Any, sample: Any, all_light: bool) -> tuple[Any, Any, Any]:
+        """Return the slopes of a ray and its weight; `all_light` is False for the light within the table alone."""
         import drjit as dr
 
         height, (across, up) = dr.sqrt(x * x + y * y), self.chief(x, y, nearer)
         at = [dr.minimum(height, self._last)]
-        drawn, _ = self._slopes.sample(sample, [*at, dr.clip(vergence, *self.ends)] if self._varies else at)
+        share = self.captured if all_light else 1.0
+        within = type(sample)(dr.minimum(sample.x / share, 1.0), sample.y)
+        drawn, _ = self._slopes.sample(within, [*at, dr.clip(vergence, *self.ends)] if self._varies else at)
         beside, along = (drawn.x - 0.5) * self._width, (drawn.y - 0.5) * self._width
+        if all_light:  # the light beyond radius r falls as 1 / r
+            beyond, (turn, other) = sample.x > share, dr.sincos(2 * pi * sample.y)
+            radius = self._width / 2 * (1 - share) / dr.maximum(1 - sample.x, TINY)
+            beside, along = dr.select(beyond, radius * turn, beside), dr.select(beyond, radius * other, along)
         cosine = dr.select(height > 0, y / height, 1.0)
         sine = dr.select(height > 0, x / height, 0.0)
         weight = self._interpolated(self._light, height)

@@ -76,7 +76,9 @@ class Renderer:
         if fast:
             from .rays import RayGenerator
 
-            self._generators = {group: RayGenerator(camera, types, sampler) for group, types in self.groups.items()}
+            self._generators = {
+                group: RayGenerator(camera, types, sampler, world is not None) for group, types in self.groups.items()
+            }
         else:
             self._sensors = {group: self._stock_sensors(types, sampler) for group, types in self.groups.items()}
         self._unit = 1.0  # radiance of a value of 1

@@ -33,6 +33,11 @@ def seed_of(seed: int, start: int) -> int:
     return seed if start == 0 else int(np.random.SeedSequence([seed, start]).generate_state(1)[0])
 
 
+def seed_of_draw(seed: int, draw: int) -> int:
+    """Return the seed of draw number `draw`, from 1, of rays that began with `seed`, unrelated to all others."""
+    return int(np.random.SeedSequence(seed, spawn_key=(draw,)).generate_state(1)[0])
+
+
 def noise_generator(seed: int, name: str, k: int, l: int) -> np.random.Generator:  # noqa: E741
     """Return the generator of sub-imager (k, l) of the lens type `name`, which no other sub-imager shares."""
     sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()), k, l))

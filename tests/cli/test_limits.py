@@ -142,13 +142,10 @@ def test_a_lens_radius_close_to_zero_is_refused(tmp_path: Path) -> None:
 
 def test_a_blur_that_cannot_be_computed_is_refused() -> None:
     lens = example().camera.lens[0]
-    for update, words in (
-        ({"aperture": 1e4, "focus": 1.0}, "its blur reaches"),
-        ({"aperture": 9.0, "focus": 1500.0}, "wavelength"),
-    ):
-        table = example().camera.model_copy(update={"wavelength": 1e-5, "lens": (lens.model_copy(update=update),)})
+    for update in ({"aperture": 1e4, "focus": 1.0}, {"aperture": 1e-3}):
+        table = example().camera.model_copy(update={"lens": (lens.model_copy(update=update),)})
         derived = camera.derive(example().model_copy(update={"camera": table}))
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(InputError, match="its blur reaches"):
             blur_of(derived, derived.types[0])
 
 

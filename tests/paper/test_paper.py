@@ -18,6 +18,7 @@ from ommatid.paper import figures as paper_figures
 from ommatid.paper.claims import NO, QUALIFIED, YES
 from ommatid.paper.photograph_claims import photograph_claims
 from ommatid.paper.photographs import Photograph, TileCrops, crop_tiles, load, measure, seeds, simulate_trials
+from ommatid.paper.tile_claims import tile_claims
 from ommatid.paper.tile_errors import THREE, TWICE, TWO, PaperTile, TileError, Tiles, tile, tiles
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -137,10 +138,14 @@ def test_maps_show_the_tile_upright(written: Written, computed: Tiles) -> None:
         for row in rows:
             if row["lenses"] == "+".join(lenses):
                 image[int(row["row"]), int(row["column"])] = float(row["expected_squared_error"])
-        axes = written.figures["fig3"].axes[number]
-        np.testing.assert_array_equal(axes.images[0].get_array(), image)
-        assert axes.images[0].origin == "upper"
-        assert f"maximum {image.max():.4g}" in axes.get_title()
+        for trim, axes in zip((0, 2), written.figures["fig3"].axes[number:6:3], strict=True):
+            part = image[trim : 19 - trim, trim : 19 - trim]
+            np.testing.assert_array_equal(axes.images[0].get_array(), part)
+            assert axes.images[0].origin == "upper"
+            assert axes.images[0].get_extent() == [trim - 0.5, 18.5 - trim, 18.5 - trim, trim - 0.5]
+            assert axes.images[0].get_clim() == (0, part.max())
+            assert f"maximum {part.max():.4g}" in axes.get_title()
+            assert f"average {part.mean():.4g}" in axes.get_title()
         assert image.mean() == pytest.approx(computed[19, lenses].mse(1e-4), rel=1e-12)
 
 
@@ -196,6 +201,11 @@ VERDICTS = {
     "type I alone": QUALIFIED,
     "three types: the 35 x 35": QUALIFIED,
     "41 x 41": QUALIFIED,
+    "three types: trimming the 19 x 19": YES,
+    "three types: trimming the 35 x 35": NO,
+    "the 35 x 35 tile helps most": YES,
+    "a second equal set": YES,
+    "joining tiles": YES,
     "one type leaves": YES,
     "two coprime types": YES,
     "quantisation": QUALIFIED,
@@ -210,6 +220,7 @@ def test_each_claim_has_the_verdict_measured_beforehand(written: Written, beginn
     assert bool(claim["remark"]) or claim["holds"] == YES, "a qualification is stated"
     (row,) = [row for row in written.rows("claims.csv") if row["claim"] == claim["claim"]]
     assert (row["holds"], row["remark"]) == (claim["holds"], claim["remark"])
+    assert row["source"] == ("ommatid" if beginning in ("one type leaves", "two coprime types") else "paper")
     assert all(name in row["numbers"] for name in claim["numbers"])
 
 
@@ -226,6 +237,17 @@ def test_there_are_no_other_claims(written: Written) -> None:
         ("type I alone", "19: trimmed by 1", 1213.35),
         ("41 x 41", "times less than 19", 4.5),
         ("41 x 41", "times less than 35", 8.1),
+        ("three types: trimming the 19 x 19", "I+II: share of the error that it removes", 0.43),
+        ("three types: trimming the 19 x 19", "I+II+III: share of the error that it removes", 0.34),
+        ("three types: trimming the 35 x 35", "I+II: share of the error that it removes", 0.173),
+        ("three types: trimming the 35 x 35", "I+II+III: share of the error that it removes", 0.178),
+        ("the 35 x 35 tile helps most", "I+I: error of 19 over error of 35", 3.4),
+        ("the 35 x 35 tile helps most", "I+II: error of 19 over error of 35", 5.4),
+        ("the 35 x 35 tile helps most", "I+II+III: error of 19 over error of 35", 1.8),
+        ("a second equal set", "19: null space of one set", 361 - 225),
+        ("a second equal set", "19: null space of two", 361 - 225),
+        ("joining tiles", "I+II+III: joined", 1.54401e-4),
+        ("joining tiles", "I+II: joined", 89.16378),
         ("one type leaves", "19 I (a = 4): null space", 361 - 225),
         ("one type leaves", "35 I (a = 2): null space", 1225 - 1089),
         ("two coprime", "19 I+II (a = 4, b = 4): null space", 361 - 329),
@@ -251,21 +273,37 @@ def test_whole_numbers_are_rounded_with_a_third_less_error(written: Written) -> 
 def test_the_printed_table_names_every_claim(written: Written) -> None:
     lines = dict(paper.rows(written.description))
     for claim in written.description["claims"]:
-        assert lines[claim["claim"]].startswith(claim["holds"])
+        own = "" if claim["source"] == "paper" else "not in the paper, "
+        assert lines[claim["claim"]].startswith(own + claim["holds"])
 
 
 def test_claims_fail_on_swapped_tiles(computed: Tiles) -> None:
     swapped = {**computed, (19, TWICE): computed[19, THREE], (19, THREE): computed[19, TWICE]}
-    verdicts = {claim.claim: claim.holds for claim in claims.error_claims(swapped)}
+    verdicts = {claim.claim: claim.holds for claim in (*claims.error_claims(swapped), *tile_claims(swapped))}
     broken = (
         "two sets of type I",
         "two types are better",
         "one type or two",
         "three types: the error falls",
         "41 x 41",
+        "the 35 x 35 tile helps most",
+        "a second equal set",
     )
     for beginning in broken:
         assert [holds for claim, holds in verdicts.items() if claim.startswith(beginning)] == [NO]
+
+
+def test_the_claim_on_trimming_fails_on_swapped_tiles(computed: Tiles) -> None:
+    swapped = {**computed, (19, TWO): computed[19, THREE], (19, THREE): computed[19, TWO]}
+    (claim,) = [claim for claim in tile_claims(swapped) if claim.claim.startswith("three types: trimming the 19")]
+    assert (claim.holds, claim.remark) == (NO, "does not hold: it removes 43.2% with three types and 33.7% with two")
+
+
+def test_the_claim_on_joined_tiles_fails_where_the_whole_is_another(computed: Tiles) -> None:
+    whole = computed[35, TWO]
+    other = replace(whole, form=replace(whole.form, values=whole.form.values * 1.01))
+    (claim,) = [claim for claim in tile_claims({**computed, (35, TWO): other}) if claim.claim.startswith("joining")]
+    assert claim.holds == NO
 
 
 def test_crossing_and_knee_of_lines() -> None:

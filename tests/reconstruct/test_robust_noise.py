@@ -10,11 +10,11 @@ import pytest
 from scipy import linalg, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
+from ommatid.reconstruct.misalignment.parameter_grid import points_of
 from ommatid.reconstruct.misalignment.robust_noise import (
     MisalignmentNoise,
     as_misalignments,
     as_table,
-    half_normal,
     misaligned_matrix,
     robust_error,
     robust_noise,
@@ -61,11 +61,26 @@ def drawn_matrix(camera: Camera, rng: np.random.Generator) -> Any:
     return misaligned_matrix(camera, spread * rng.standard_normal(spread.shape))
 
 
-def test_gauss_points_of_the_half_normal_give_its_moments() -> None:
-    nodes, weights = half_normal(3)
-    assert [weights @ nodes**power for power in range(6)] == pytest.approx(
-        [stats.halfnorm.moment(power) if power else 1.0 for power in range(6)], rel=1e-10
-    )
+def test_points_have_the_moments_of_independent_normal_parameters() -> None:
+    weights, points = points_of(np.ones(6, dtype=np.bool_))
+    assert weights.sum() == pytest.approx(1, rel=1e-14)
+    assert weights @ points == pytest.approx(np.zeros(6), abs=1e-14)
+    assert points.T @ (weights[:, None] * points) == pytest.approx(np.eye(6), abs=1e-13)
+    assert weights @ np.abs(points) ** 3 == pytest.approx(np.full(6, stats.halfnorm.moment(3)), rel=1e-13)
+    absolute = np.full((6, 6), stats.halfnorm.mean() ** 2)
+    np.fill_diagonal(absolute, 1)
+    assert np.abs(points).T @ (weights[:, None] * np.abs(points)) == pytest.approx(absolute, rel=1e-13)
+
+
+def test_a_parameter_has_the_same_distribution_whatever_others_there_are() -> None:
+    """So that vanishing tolerances beside others change nothing."""
+    weights, points = points_of(np.ones(6, dtype=np.bool_))
+    for free in (np.arange(6) == 4, np.arange(6) < 2):
+        fewer, of_fewer = points_of(free)
+        assert len(fewer) <= 36, "equal points are joined"
+        assert not of_fewer[:, ~free].any()
+        for weight, point in zip(fewer, of_fewer, strict=True):
+            assert weights[(points[:, free] == point[free]).all(axis=1)].sum() == pytest.approx(weight, rel=1e-14)
 
 
 def test_tables_hold_the_drawn_misalignments() -> None:

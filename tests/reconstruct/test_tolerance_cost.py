@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from ommatid.reconstruct.estimator.estimate import factorise
+from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix, tolerances
 from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
 from ommatid.reconstruct.prior import exponential, independent
 from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
@@ -60,6 +63,65 @@ def test_the_cost_falls_with_the_tolerance() -> None:
     assert costs[2] < 1e-6
 
 
+def tolerated(tolerance: dict[str, float | str]) -> Camera:
+    """A small camera with two lens types and a tolerance."""
+    return replace(drawn_to("1 nm"), tolerance=ToleranceTable.model_validate(tolerance))
+
+
+def cost_of(camera: Camera, variance: float = 1e-2) -> float:
+    prior, used = independent(127.5, 5461.25, camera.unknowns), np.ones(camera.measurements, dtype=np.bool_)
+    form, _ = factorise(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, variance)), "auto", 1e-8)
+    return float(misalignment_variance(form, used, camera, prior).mean())
+
+
+def mean_over(camera: Camera, tables: FloatArray, variance: float = 1e-2) -> tuple[float, float]:
+    """Mean over misalignments of what each adds to the expected squared error, and its standard error over groups.
+
+    tables : (groups, cameras, sub-imagers, 6);  with H' a camera's matrix, of P0 the share (I - A H') remains, and
+    the prior's mean is off by A (H - H') f0
+    """
+    prior, designed = independent(127.5, 5461.25, camera.unknowns), ideal_matrix(camera).toarray()
+    noise = variance * np.eye(camera.measurements)
+    gain = 5461.25 * designed.T @ np.linalg.inv(5461.25 * designed @ designed.T + noise)
+    expected = 5461.25 * np.square(np.eye(camera.unknowns) - gain @ designed).sum()
+    costs: list[float] = []
+    for table in tables.reshape(-1, *tables.shape[2:]):
+        seen = gain @ misaligned_matrix(camera, table).toarray()
+        off = gain @ (designed @ prior.mean) - seen @ prior.mean
+        error = 5461.25 * np.square(np.eye(camera.unknowns) - seen).sum() + np.square(off).sum()
+        costs.append(float(error - expected) / camera.unknowns)
+    means = np.mean(np.reshape(costs, tables.shape[:2]), axis=1)
+    return float(means.mean()), float(means.std(ddof=1)) / means.size**0.5
+
+
+def random_misalignments(camera: Camera, groups: int, cameras: int) -> FloatArray:
+    """Normal misalignments, in every group one of each sub-imager's in each of equally likely intervals."""
+    spread, rng = tolerances(camera), np.random.default_rng(3)
+    order = rng.permuted(np.broadcast_to(np.arange(cameras)[:, None, None], (groups, cameras, *spread.shape)), axis=1)
+    return spread * stats.norm.ppf((order + rng.random(order.shape)) / cameras)
+
+
+@pytest.mark.parametrize(
+    "tolerance",
+    [{"rotation": "0.1 deg"}, {"focal_length": 1e-3}, {"position": "20 nm"}],
+    ids=lambda each: next(iter(each)),
+)
+def test_the_cost_of_one_tolerance_is_that_of_random_cameras(tolerance: dict[str, float | str]) -> None:
+    """Points whose second moments are a quarter too large fail."""
+    camera = tolerated(tolerance)
+    mean, error = mean_over(camera, random_misalignments(camera, 10, 12))
+    assert cost_of(camera) == pytest.approx(mean, abs=3 * error)
+    assert error < 0.03 * mean, "too few cameras to tell"
+
+
+@pytest.mark.parametrize(
+    "tolerance", [{"rotation": "0.1 deg"}, {"position": "20 nm"}], ids=lambda each: next(iter(each))
+)
+def test_vanishing_tolerances_change_nothing(tolerance: dict[str, float | str]) -> None:
+    vanishing = {"position": "1e-9 nm", "tilt": "1e-9 deg", "rotation": "1e-9 deg", "focal_length": 1e-12}
+    assert cost_of(tolerated({**vanishing, **tolerance})) == pytest.approx(cost_of(tolerated(tolerance)), rel=1e-6)
+
+
 def test_predict_includes_the_cost(tmp_path: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     tile = (GALLERY / "tile19.toml", "--no-rays", "--set", "noise.variance=1e-2")
@@ -81,6 +143,7 @@ def test_predict_with_saturated_pixels_and_with_blurred_lenses(ommatid: Command)
     """Saturated pixels are left out of both; a cost without closed form is reported as missing."""
     loose = ("--set", 'camera.tolerance.position="10 nm"')
     aperture = [part for name in ["I", "II", "III"] for part in ("--set", f'camera.lens.{name}.aperture="0.4 mm"')]
+    aperture += ["--set", 'camera.wavelength="none"']
     sensor = ("--set", "noise=", "--set", 'sensor.illuminance="500 lux"', "--set", 'sensor.exposure="10 ms"')
     bright = document(ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
     assert bright["measurements"] < 706

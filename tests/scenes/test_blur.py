@@ -191,7 +191,7 @@ def along_lines(y: float, x: float, ratio: float, disk: float) -> float:
 
 
 def spectrum(blur: Blur, rho: Numbers) -> Numbers:
-    """Transfer function of the whole pattern: the pupil's autocorrelation (Hopkins 1955), by quadrature over x and y."""
+    """Transfer function of the whole pattern: the pupil's autocorrelation (Hopkins 1955), by quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(120)
     at, share = (1 + nodes) / 2, weights / 2
     q = np.minimum(np.pi * blur.airy * rho, 1.0)[:, None, None]
@@ -262,7 +262,7 @@ def test_steepness_is_the_derivative_of_transfer(blur: Blur) -> None:
 def test_pixels_off_the_axis_follow_the_cos4_law(focus: float) -> None:
     """Rays from the middle of a sensor pixel through 200 x 200 points of the lens, weighted by their angles."""
     cam = with_lens_optics(LensOptics(aperture=0.4, focus=focus))
-    lens_type, blur = cam.types[0], blur_of(cam, cam.types[0])
+    blur = blur_of(cam, cam.types[0])
     uniform = of_type(cam, 0, replace(blur, weight=0.0))
     result = (of_type(cam, 0, blur) - uniform).reshape(3, 3, 5, 5, 19, 19)
     share, angle = (np.arange(200) + 0.5) / 200, 2 * np.pi * (np.arange(200) + 0.5) / 200

@@ -12,10 +12,12 @@ import pytest
 from scipy import stats
 
 from ommatid.reconstruct.noise import depends_on_light
-from ommatid.scenes.camera import derive
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics.blur import Blur, transfer
 from ommatid.scenes.optics.negligible import (
     MOST_SHOT,
     SkippedEffect,
+    light_kept_in_focus,
     negligible_shot_noise,
     noise_variance,
     without_negligible_effects,
@@ -29,13 +31,14 @@ from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light
 from ommatid.simulate.sensor.emva1288 import record
 
-from ..examples import TWO, familywise, needs, scene, with_optics
+from ..examples import THREE, TWO, familywise, needs, scene, with_optics
 from ..modules import ROOT, existing
 
-NOISY: dict[str, Any] = {"noise": {"variance": 100.0}}
+RAYS = {"wavelength": "none"}
+NOISY: dict[str, Any] = {"noise": {"variance": 1e4}}
 RULES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "in focus": ({"aperture": "0.4 mm"}, {}),
-    "nearly in focus": ({"aperture": "0.4 mm", "focus": "970 mm"}, {}),
+    "in focus": ({"aperture": "0.4 mm"}, RAYS),
+    "nearly in focus": ({"aperture": "0.4 mm", "focus": "970 mm"}, RAYS),
     "hardly diffracting": ({"aperture": "2.6 mm"}, {"wavelength": "550 nm"}),
 }
 
@@ -56,6 +59,33 @@ def test_the_bound_holds_for_the_worst_target(rule: str) -> None:
     assert worst.max() <= sum(effect.bound for effect in skipped) + 1e-9
     if rule == "nearly in focus":
         assert worst.max() > 0.2 * sum(effect.bound for effect in skipped), "the bound is not far too wide"
+
+
+@pytest.mark.parametrize("rule", ["nearly in focus", "hardly diffracting"])
+def test_the_expected_error_without_the_effect_is_low_by_two_percent_at_most(rule: str) -> None:
+    """At the least noise at which the effect is skipped, by dense algebra; at the corners rays miss the target.
+
+    Thresholds that compare the change far from the edges with a tenth of the noise fail, by 3 to 14 %.
+    """
+
+    def reduced(noise: float) -> Camera | None:
+        without = without_negligible_effects(*with_optics(*RULES[rule], THREE, noise={"variance": noise}))[0]
+        skips = without.wavelength is None and all(each.optics.aperture is None for each in without.types)
+        return without if skips else None
+
+    noise = next(float(variance) for variance in np.geomspace(1e-3, 1e5, 100) if reduced(float(variance)) is not None)
+    camera, (mean, variance) = reduced(noise), (127.5, 5461.25)
+    assert camera is not None
+    designed = ideal_matrix(camera).toarray()
+    actual = ideal_matrix(with_optics(*RULES[rule], THREE)[1]).toarray()
+    gain = variance * designed.T @ np.linalg.inv(variance * designed @ designed.T + noise * np.eye(len(designed)))
+    errors: list[float] = []
+    for matrix in (designed, actual):
+        resolution = np.eye(camera.unknowns) - gain @ matrix
+        shift = gain @ (matrix - designed).sum(axis=1) * mean
+        errors.append(variance * float(np.square(resolution).sum()) + float(shift @ shift))
+    noisy = noise * float(np.square(gain).sum())
+    assert 1 < (errors[1] + noisy) / (errors[0] + noisy) < 1.02
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -90,7 +120,7 @@ def test_the_reduced_rendering_draws_fewer_random_numbers(rule: str) -> None:
             generator.rays(16, 0, generator.blocks(16)[0])
         counts.append(drawn[0] // len(renderer.groups))
     assert counts[0] == 1, "only the position in the pixel"
-    assert counts[1] == (3 if rule == "hardly diffracting" else 2)
+    assert counts[1] == 2
 
 
 class Counting:
@@ -110,11 +140,11 @@ class Counting:
 def test_effects_that_matter_are_kept() -> None:
     """Little noise, no noise, a wide disk of defocus, a wide Airy disk, and misalignment."""
     cases: tuple[tuple[dict[str, Any], dict[str, Any], dict[str, Any]], ...] = (
-        ({"aperture": "0.4 mm", "focus": "970 mm"}, {}, {"noise": {"variance": 1e-6}}),
-        ({"aperture": "0.4 mm", "focus": "970 mm"}, {}, {}),
-        ({"aperture": "0.4 mm", "focus": "800 mm"}, {}, NOISY),
+        ({"aperture": "0.4 mm", "focus": "970 mm"}, RAYS, {"noise": {"variance": 1e-6}}),
+        ({"aperture": "0.4 mm", "focus": "970 mm"}, RAYS, {}),
+        ({"aperture": "0.4 mm", "focus": "800 mm"}, RAYS, NOISY),
         ({"aperture": "0.4 mm"}, {"wavelength": "550 nm"}, NOISY),
-        ({"aperture": "0.4 mm"}, {"tolerance": {"focal_length": 0.01}}, NOISY),
+        ({"aperture": "0.4 mm"}, RAYS | {"tolerance": {"focal_length": 0.01}}, NOISY),
     )
     for lens, more, tables in cases:
         described, camera = with_optics(lens, more, **tables)
@@ -125,6 +155,7 @@ def test_the_aperture_of_a_single_type_is_skipped() -> None:
     data = scene(lenses=TWO, **NOISY).plain()
     data["camera"]["lens"][0] |= {"aperture": "0.4 mm", "focus": "990 mm"}
     data["camera"]["lens"][1] |= {"aperture": "0.4 mm", "focus": "500 mm"}
+    data["camera"] |= RAYS
     described = parse(data, Path("test.toml"))
     reduced, skipped = without_negligible_effects(described, derive(described))
     assert [lens_type.optics.is_pinhole for lens_type in reduced.types] == [True, False]
@@ -134,7 +165,7 @@ def test_the_aperture_of_a_single_type_is_skipped() -> None:
 def test_skipped_effects_have_a_reason_and_a_bound() -> None:
     described, camera = with_optics(*RULES["nearly in focus"], **NOISY)
     skipped = [effect.describe() for effect in skipped_effects(described, camera)]
-    apertures = [effect for effect in skipped if "aperture" in effect["what"]]
+    apertures = [effect for effect in skipped if "samples of the aperture" in effect["what"]]
     assert len(apertures) == 2
     assert all(0 < effect["bound"] < 1 for effect in apertures)
     assert "pixels of f wide" in apertures[0]["why"]
@@ -226,3 +257,28 @@ def test_without_shot_noise_no_photon_is_drawn_and_one_estimate_suffices(monkeyp
     assert not depends_on_light(stack_from_recording(described, camera, short, np.zeros(light.size), {}), model)
     bright, same = dim(sensor={**described.sensor.model_dump(mode="json"), "illuminance": "5000 lux"})
     assert depends_on_light(stack_from_recording(bright, same, short, np.zeros(light.size), {}), model)
+
+
+@pytest.mark.parametrize("side", [0.1, 1.0, 3.0, 10.0])
+def test_the_light_that_a_pixel_keeps_is_an_entry_of_h(side: float) -> None:
+    """By Parseval, against the entry of a footprint and a texel of one size, integrated over the Airy pattern."""
+    kept = transfer(1.0, np.array([0]), 1, Blur(airy=1 / (np.pi * side)))[0, 0]
+    assert light_kept_in_focus(side) == pytest.approx(kept, abs=1e-9)
+
+
+def test_pinholes_and_rays_say_what_diffraction_would_change() -> None:
+    """A white target of one footprint before a black world loses the light that leaves its pixel."""
+    described, camera = with_optics({}, {}, (("1/3", [1, 1], [5, 5]),))
+    first = skipped_effects(described, camera)[0]
+    assert first.what == "aperture and diffraction"
+    lens = {"aperture": f"{camera.lens_pitch} mm"}
+    for table in ({}, RAYS):
+        _, wide = with_optics(lens, table, (("1/3", [1, 1], [5, 5]),))
+        assert wide.wavelengths == (((550e-6, 1.0),) if not table else ())
+    _, waves = with_optics(lens, {}, (("1/3", [1, 1], [5, 5]),))
+    change = (ideal_matrix(waves) - ideal_matrix(camera)).toarray()
+    largest = 255 * np.maximum(np.maximum(change, 0).sum(axis=1), np.maximum(-change, 0).sum(axis=1)).max()
+    assert 0.5 * first.bound < largest <= first.bound
+    described, rays = with_optics(lens, RAYS, (("1/3", [1, 1], [5, 5]),))
+    left_out = {effect.what: effect for effect in skipped_effects(described, rays)}
+    assert largest <= left_out["diffraction"].bound < 1.01 * first.bound

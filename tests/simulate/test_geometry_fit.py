@@ -116,7 +116,7 @@ def test_the_model_of_a_disk_is_the_closed_form_to_less_than_noise(diameter: flo
     sub = pinholes.sub_imagers[0]
     numbers = designed(pinholes, sub)
     numbers[BLUR] = diameter
-    exact = blur.matrix(pinholes, sub.type, blur.Blur(disk=diameter))
+    exact = blur.matrix(pinholes, sub.type, (blur.Blur(disk=diameter), 1.0))
     difference = abs(entries(pinholes, sub, numbers) - exact).max()
     assert difference < 0.1 * (1 / 9 * 8 / 9 / 4096) ** 0.5
 
@@ -207,10 +207,11 @@ def test_defocus_is_recovered() -> None:
     """A disk of 0.17 pixels of f in a camera whose scene says 0.04."""
     needs("llvm_ad_mono")
     few, complete = (("1/3", [1, 2], [5, 5]),), {"complete": True}
+    rays = {"wavelength": "none"}
     described, blurred = with_optics(
-        {"aperture": "0.4 mm", "focus": "700 mm"}, {}, few, calibration={"samples": 2048}, render=complete
+        {"aperture": "0.4 mm", "focus": "700 mm"}, rays, few, calibration={"samples": 2048}, render=complete
     )
-    _, sharper = with_optics({"aperture": "0.4 mm", "focus": "900 mm"}, {}, few)
+    _, sharper = with_optics({"aperture": "0.4 mm", "focus": "900 mm"}, rays, few)
     fits = fit_all(responses_from_rays(Setup(described, blurred)), sharper)
     expected = [designed(blurred, sub) for sub in blurred.sub_imagers]
     assert expected[0][BLUR] == pytest.approx(0.4 * 3 / 7)

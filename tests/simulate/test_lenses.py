@@ -14,6 +14,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
+from ommatid.scenes.optics.diffraction import pattern
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
@@ -114,7 +115,8 @@ def test_lenses_without_a_closed_form_are_calibrated() -> None:
     described = built(lens, (("1/3", [2, 2], [3, 3]),), (12, 12), noise={"variance": 1e-2})
     model = calibrate(Setup.from_scene(described))
     assert "agreement" not in model.record
-    assert model.matrix.sum(axis=1).max() == pytest.approx(1)
+    # All light within the pattern's largest radius, but what misses the target, meets it.
+    assert 0.9 < model.matrix.sum(axis=1).max() < pattern(0.0).encircled
 
 
 def test_omitted_lens_types_do_not_move_the_others() -> None:

@@ -13,19 +13,25 @@ import pytest
 from scipy import sparse, stats
 
 from ommatid.scenes.formats.picture import load
+from ommatid.scenes.optics.blur import blur_of
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.calibration.ray_transport import responses_from_rays
+from ommatid.simulate.calibration.ray_transport import one_pass, responses_from_rays
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.render import light
+from ommatid.simulate.renderer.renderer import Renderer
+from ommatid.simulate.renderer.variant import choose
+from ommatid.simulate.sampling.passes import Plan
 
 from ..examples import OPTICS, TWO, assert_student, familywise, needs, with_optics
 
 SAMPLES = 2**14
 FEWEST = 25  # rays expected in an entry, above which their number is normal
+RAYS = {"wavelength": "none"}
+WAVES = {"0.1 waves": 266.67, "0.3 waves": 108.11, "1 wave": 35.088, "3 waves": 11.976}  # focus, mm, at 550 nm
 CLOSED = OPTICS | {
-    "a thin lens in focus": ({"aperture": "0.4 mm"}, {}),
-    "far out of focus": ({"aperture": "0.4 mm", "focus": "700 mm"}, {}),
-    "diffraction out of focus": ({"aperture": "0.8 mm", "focus": "900 mm"}, {"wavelength": "550 nm"}),
+    "a thin lens in focus": ({"aperture": "0.4 mm"}, RAYS),
+    "far out of focus": ({"aperture": "0.4 mm", "focus": "700 mm"}, RAYS),
+    **{name: ({"aperture": "0.4 mm", "focus": f"{focus} mm"}, {}) for name, focus in WAVES.items()},
     "distorted and misaligned": ({"distortion": [-0.04, 0.02]}, OPTICS["misaligned"][1]),
 }
 
@@ -50,6 +56,32 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     traced = responses_from_rays(Setup(described, camera))
     found = scores(traced.matrix, true_matrix(camera), traced.passes * traced.samples)
     assert found.size > 5000
+    assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
+    assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
+
+
+@pytest.mark.parametrize("kind", WAVES)
+def test_the_focus_has_these_waves(kind: str) -> None:
+    _, camera = with_optics(*CLOSED[kind])
+    assert blur_of(camera, camera.types[0]).waves == pytest.approx(float(kind.split()[0]), rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["in focus", "0.3 waves", "3 waves"])
+def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str) -> None:
+    """Rays from points of the pupil that find the flat target's distance by themselves."""
+    needs("llvm_ad_mono")
+    described, camera = with_optics(*CLOSED.get(kind, ({"aperture": "0.4 mm"}, {})), render={"complete": True})
+    renderer = Renderer(camera, choose("auto"), "independent", together=False)
+    group, work = next(iter(renderer.groups)), Plan(64, SAMPLES // 64)
+    for generator in renderer._generators.values():  # pyright: ignore[reportPrivateUsage]
+        generator.lens.follow(renderer._distance)  # pyright: ignore[reportPrivateUsage]
+    rows = renderer.rows(group)
+    total = sparse.csr_array((rows.stop - rows.start, camera.unknowns))
+    (block,) = renderer.blocks(group, work.samples)
+    for number in range(work.passes):
+        where, values, _ = one_pass(renderer, group, block, work, number, described.render.seed)
+        total = total + sparse.csr_array((values, np.divmod(where, camera.unknowns)), shape=total.shape)
+    found = scores(sparse.csr_array(total / work.passes), ideal_matrix(camera)[rows], SAMPLES)
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
 

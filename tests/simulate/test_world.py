@@ -206,6 +206,7 @@ def test_an_aperture_blurs_objects_out_of_focus(tmp_path: Path) -> None:
     described, camera = world(tmp_path, square, ((1, [1, 1], [12, 12]),), render={"samples": 16384})
     data = described.plain()
     data["camera"]["lens"][0]["aperture"] = "4 mm"
+    data["camera"]["wavelength"] = "none"
     blurred = parse(data, Path("test.toml"))
     seen = light(Setup.from_scene(blurred)).mean.reshape(12, 12)
     away = (np.arange(12) - 5.5) ** 2

@@ -123,7 +123,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
         resolution=median_width(expected.resolved),
         method=outcome.result.solver.method,
         misalignment=budget.get(CAUSE),
-        prior_variance=outcome.assumed.prior.variance,
+        prior_variance=setup.scene.prior_ratio * outcome.assumed.prior.variance,
         mse_for_picture=None if given is None else given.mse + (mismatch.of_picture or 0.0 if mismatch else 0.0),
         interval=None if given is None or mismatch is not None else (given.low, given.high),
         budget=budget,
@@ -146,7 +146,8 @@ def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) ->
     method = outcome.assumed.method
     if not isinstance(method, DenseMethod) or setup.camera.has_detail:
         return _mismatch_of_images(recording, outcome, _cause(setup.camera))
-    camera, prior, used = setup.camera, method.task.prior_on(setup.camera.shape), outcome.assumed.usable.used
+    camera, used = setup.camera, outcome.assumed.usable.used
+    prior = method.task.prior_on(camera.shape).scaled(setup.scene.prior_ratio)
     form, slices = method.estimate.form, setup.camera.slices()
     averaged = camera.tolerance is not None and camera.has_sharp_footprints
     of_picture = None

@@ -27,6 +27,7 @@ HEIGHTS = 17  # at which the middle and the amount of the light are traced, spli
 TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors of its cells
 MOST_NODES = 9
 MOST_WIDER = 2.0  # ratio of the widths of a common grid and of the narrowest that a wave of its own would have
+LEAST_VERGENCE = 1e-9  # of a far target; that of 0 has no plane
 MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by rays alone
 
 
@@ -181,13 +182,13 @@ class SamplingTables:
 
 
 def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
-    """Return the densities of slopes of a lens at vergences other than 0.
+    """Return the densities of slopes of a lens for targets at vergences, which rise.
 
     Offsets drawn from densities that are linear between the points are a convolution with a tent of two cells. It damps
     a frequency f along an axis by sinc(f cell)^2, which is divided out here, as the frequencies are limited.
     cells : of the grid per wavelength times f-number;  reach : of the grid beyond the spot, in the same unit
     """
-    heights = field.nodes[0]
+    heights, vergences = field.nodes[0], np.where(np.abs(vergences) < LEAST_VERGENCE, LEAST_VERGENCE, vergences)
     waves = [[replace(field, distance=1 / v).lit_wave(float(height)) for v in vergences] for height in heights]
     all_waves = [(wave, abs(v)) for row in waves for wave, v in zip(row, vergences, strict=True)]
     cell = min(wave.resolution * v for wave, v in all_waves) / cells

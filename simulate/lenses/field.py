@@ -18,10 +18,10 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
-from .point_spread import REACH, grid_of, point_spread
+from .point_spread import grid_of, point_spread
 from .prescription import Prescription, prescribe, prescription_of
 from .ray_trace import Disk, exit_disk, reach
-from .wavefront import Wavefront, wavefront_of
+from .wavefront import GRID_REACH, Wavefront, wavefront_of
 
 HEIGHTS = 17  # at which the middle and the amount of the light are traced, splines between
 TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors of its cells
@@ -48,7 +48,7 @@ class LensField:
 
     def wave(self, height: float, wavelength: float | None) -> Wavefront | None:
         """Return the wave of a sensor point (0, height), or None if it gets no light."""
-        return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, REACH)
+        return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, GRID_REACH)
 
     @cached_property
     def _rays(self) -> tuple[FloatArray, list[Wavefront]]:

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
-from .wavefront import Wavefront
+from .wavefront import GRID_REACH, Wavefront
 
 PRECISION = 1e-9  # of U, relative to its largest value
 CELLS = 4  # per wavelength times f-number; 2 would be enough for the frequencies of |U|^2
-REACH = 40.0  # in units of `resolution`: the grid extends so far beyond the spot of the rays
 LEAST_INSIDE = 0.995
 WIDER = 1.25
 MOST_CELLS = 4096
@@ -82,7 +81,7 @@ def grid_of(wave: Wavefront, cells: int = CELLS) -> tuple[float, float]:
 
     cells : per wavelength times f-number
     """
-    return wave.resolution / cells, wave.spot_radius + REACH * wave.resolution
+    return wave.resolution / cells, wave.spot_radius + GRID_REACH * wave.resolution
 
 
 def point_spread(wave: Wavefront, grid: tuple[float, float] | None = None) -> PointSpread:
@@ -90,8 +89,8 @@ def point_spread(wave: Wavefront, grid: tuple[float, float] | None = None) -> Po
 
     grid : from `grid_of`, of this wave or of a wider one; None: its own, and wider until it holds 99.5 per cent of the
         light
-    The wave's nodes must serve the whole grid, as those of `wavefront_of` with a `reach` of REACH do. Raises InputError
-    for a grid of more than MOST_CELLS cells along an axis.
+    The wave's nodes must serve the whole grid, as those of `wavefront_of` with a `reach` of GRID_REACH do.
+    Raises InputError for a grid of more than MOST_CELLS cells along an axis.
     """
     cell, half = grid or grid_of(wave)
     while True:

@@ -35,6 +35,7 @@ BESIDE_RIM = 1.001  # rims are so much wider for rays that the differences trace
 RAY_NODES = (48, 96)  # along the radius and around, where no wave oscillates over the pupil
 FEWEST = (16, 32)
 MOST_NODES = 2**22
+GRID_REACH = 40.0  # in units of `resolution`: a grid of a point-spread function extends so far beyond the spot of rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +116,32 @@ def polar_nodes(counts: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatA
     radius = (nodes[:, None] + 1) / 2
     angle = 2 * pi * np.arange(counts[1])[None, :] / counts[1]
     return radius, angle, weights[:, None] / 2 * radius * (2 * pi / counts[1])
+
+
+def thin_wavefront(aperture: float, depth: float, distance: float, focus: float, wavelength: float) -> Wavefront:
+    """Return the wave of the sensor's middle behind a thin lens that is focused at `focus`; all distances positive.
+
+    Its nodes serve a grid that reaches GRID_REACH beyond the spot.
+    """
+    half, slack = aperture / 2, abs(1 - distance / focus)
+    phase = pi * aperture / wavelength / distance * (aperture * slack + GRID_REACH * wavelength * distance / aperture)
+    radius, angle, area = polar_nodes(node_counts(phase))
+    x = half * (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)
+    share = np.broadcast_to(area, (radius.size, angle.size)).ravel() * half**2
+    square = np.square(x).sum(axis=0)
+    light = share / (1 + square / depth**2) ** 2
+    path = square / 2 * (1 / distance - 1 / focus)
+    return Wavefront(
+        wavelength=wavelength,
+        cosines=x / distance,
+        path=path - light @ path / light.sum(),
+        light=light / light.sum(),
+        density=share / distance**2,
+        hits=x * (1 - distance / focus),
+        centre=(0.0, 0.0),
+        brightness=float(light.sum()) / depth**2,
+        outermost=float(radius[-1, 0]),
+    )
 
 
 def wavefront_of(

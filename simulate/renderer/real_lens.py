@@ -18,10 +18,10 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
 from ..lenses.field import LensField, bands, field_of, sampling_tables
-from ..lenses.point_spread import REACH
 from ..lenses.prescription import prescription_of
 from ..lenses.ray_trace import exit_disk_of, path, reach, trace
 from ..lenses.surface_shapes import Functions
+from ..lenses.wavefront import GRID_REACH
 from .lens import Distance, Emission, LensModel, Point
 
 HEIGHTS = 257  # off the axis, between which the middle and the amount of the light are interpolated linearly
@@ -73,7 +73,7 @@ class WaveLens(RealLens):
         _, least, largest = reach(camera, lens_type)
         self._shifts = [1 / depth - 1 / self._depth for depth in (largest, least)]
         self.tail = max(field.grid[1] for field, _ in fields) / camera.target_pitch
-        self._tabulate([self._vergence + shift for shift in self._shifts], CELLS, REACH)
+        self._tabulate([self._vergence + shift for shift in self._shifts], CELLS, GRID_REACH)
 
     def follow(self, distance: Distance) -> None:
         """Let rays have the pattern of the distance of the surface that they meet."""

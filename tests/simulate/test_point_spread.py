@@ -14,13 +14,12 @@ from scipy.special import j0, j1
 
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.lenses.point_spread import (
-    REACH,
     encircled_energy,
     point_spread,
     relative_intensity,
     strehl_ratio,
 )
-from ommatid.simulate.lenses.wavefront import Wavefront, node_counts, polar_nodes
+from ommatid.simulate.lenses.wavefront import GRID_REACH, Wavefront, node_counts, polar_nodes, thin_wavefront
 
 WAVELENGTH = 5.5e-4
 HALF = 0.1  # sine of the half angle of the cone of light
@@ -29,7 +28,7 @@ FREQUENCIES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])  # of the cut-off
 Aberration = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def pupil(waves: Aberration, slope: float, reach: float = REACH) -> Wavefront:
+def pupil(waves: Aberration, slope: float, reach: float = GRID_REACH) -> Wavefront:
     """Return the wave of a round pupil with an aberration of these waves at (radius, angle).
 
     slope : the largest change of the aberration over the radius, waves per radius
@@ -142,3 +141,15 @@ def test_more_waves_than_can_be_computed_are_refused() -> None:
         defocused(1000.0)
     with pytest.raises(InputError, match="finest detail"):
         point_spread(defocused(0.1), (UNIT / 4, 1000 * UNIT))
+
+
+def test_the_wave_of_a_thin_lens() -> None:
+    """Focused beyond the target: W20 = D^2 / 8 (1 / Z - 1 / F) waves, and light falls with cos^4 to the rim."""
+    wave = thin_wavefront(0.4, 3.0, 1000.0, 1250.0, WAVELENGTH)
+    waves = 0.4**2 / 8 * (1 / 1000 - 1 / 1250) / WAVELENGTH
+    assert strehl_ratio(wave) == pytest.approx(np.sinc(waves) ** 2, abs=1e-4)
+    assert wave.resolution == pytest.approx(WAVELENGTH * 1000 / 0.4, rel=1e-6)
+    assert wave.brightness == pytest.approx(np.pi * np.sin(np.arctan(0.2 / 3)) ** 2, rel=1e-9)
+    found = point_spread(wave).transfer(np.stack([FREQUENCIES / wave.resolution, 0 * FREQUENCIES], axis=1))
+    expected = [by_autocorrelation(lambda radius: waves * radius**2, frequency) for frequency in FREQUENCIES]
+    np.testing.assert_allclose(found, expected, atol=1e-3)

@@ -105,11 +105,27 @@ def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> 
         low, high = np.maximum(middles - 1.5, texel), np.minimum(middles + 1.5, texel + 1)
         return np.maximum(high - low, 0) / 3
 
-    for texel in ((0, 0), (1, 2), (4, 4), (9, 3)):
+    assert row.max() > 50 * TOLERANCE / 9
+    for texel in ((0, 0), (1, 2), (4, 4), (9, 3), divmod(int(row.argmax()), camera.columns)):
         expected = overlap(rows, texel[0]) @ light @ overlap(columns, texel[1])
         # A texel is a ninth of the footprint: so much of the point-spread function's error at most is in an entry.
         assert row[texel] == pytest.approx(expected, abs=TOLERANCE / 9)
-        assert expected > 30 * TOLERANCE / 9
+
+
+def test_several_wavelengths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Traced H is the closed form, which is the mean of those of the wavelengths with their glass."""
+    needs("llvm_ad_mono")
+    glass = [{**FLAT[0], "index": None, "glass": "N-SF11"}, {**FLAT[1], "radius": "-1.6 mm"}]
+    glass[0] = {key: value for key, value in glass[0].items() if value is not None}
+    setup = setup_of(glass, "550 nm")
+    monkeypatch.setattr(Camera, "wavelengths", property(lambda _: ((4.5e-4, 0.3), (6.5e-4, 0.7))))
+    traced, expected = responses_from_rays(setup), ideal_matrix(setup.camera)
+    found = scores(traced.matrix, expected, traced.passes * traced.samples)
+    assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
+    assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
+    monkeypatch.setattr(Camera, "wavelengths", property(lambda _: ((4.5e-4, 1.0),)))
+    blue = scores(ideal_matrix(replace(setup.camera, detail=2)), expected, SAMPLES)
+    assert np.abs(blue).max() > 2 * stats.norm.isf(familywise(found.size) / 2)
 
 
 def test_rows_add_up_to_the_light_that_the_target_sends() -> None:

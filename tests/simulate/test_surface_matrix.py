@@ -113,6 +113,26 @@ def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> 
         assert row[texel] == pytest.approx(expected, abs=TOLERANCE / 9)
 
 
+@pytest.mark.parametrize("kind", ["waves out of focus", "waves with coma"])
+def test_rays_that_follow_the_distance_of_what_they_meet(kind: str) -> None:
+    """In a world as before a flat target: H of a flat target that lenses have to find."""
+    needs("llvm_ad_mono")
+    from ommatid.simulate.renderer.renderer import Renderer
+
+    surfaces, wavelength, more = CASES[kind]
+    camera = setup_of(surfaces, wavelength, **more).camera
+    renderer = Renderer(camera, "llvm_ad_mono", "independent", together=False)
+    scene: Any = renderer
+    scene._generators["A"].lens.follow(scene._distance)
+    texels, weights = renderer.hits("A", 4 * SAMPLES, lambda index: index + 7, slice(0, camera.measurements))
+    assert weights is not None
+    found = np.zeros((camera.measurements, camera.unknowns + 1))
+    np.add.at(found, (np.arange(camera.measurements)[:, None], texels), weights)
+    matrix = sparse.csr_array(found[:, :-1] / weights.sum(axis=1)[:, None])
+    found = scores(matrix, ideal_matrix(camera), 4 * SAMPLES)
+    assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
+
+
 def test_several_wavelengths(monkeypatch: pytest.MonkeyPatch) -> None:
     """Traced H is the closed form, which is the mean of those of the wavelengths with their glass."""
     needs("llvm_ad_mono")

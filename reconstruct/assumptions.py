@@ -2,7 +2,8 @@
 
 The assumed noise holds everything known: the sensor's, quantisation, the rendering's own variance, and the variance
 that the uncertainty of H adds at a first estimate of the image. The noise of a real sensor depends on the light, so it
-too is computed again at the first estimate. Dead and saturated pixels are left out.
+too is computed again at the first estimate. Dead pixels are left out; saturated ones count as censored, again at the
+first estimate.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from .methods.method import EstimationTask, Execution, Method, MethodResult, tot
 from .model_error.attenuation import can_be_corrected, with_attenuation
 from .model_error.contrast import Contrast, true_contrast
 from .noise import (
+    CERTAIN,
+    SATURATION,
     Noise,
     UsablePixels,
     check_noise_fit,
@@ -36,12 +39,12 @@ from .noise import (
     uniform,
     usable_pixels,
 )
+from .saturation import ROUNDS, censored, has_converged
 
 Result = TypeVar("Result")
 
 NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
 RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
-CERTAIN = ("rendering", "calibration", DETAIL)  # noise that stays known when the rest of it is to be fitted
 
 
 @dataclass(frozen=True)
@@ -142,8 +145,9 @@ class _Observation:
     def expected_noise(self, noise: Noise) -> FloatArray:
         """Return the variance that the estimator assumes, (pixels used,)."""
         setting = self.stack.scene.estimator.noise_variance
-        used = int(self.usable.used.sum())
-        return uniform(setting, used) if isinstance(setting, float) else total_variance(noise)
+        if not isinstance(setting, float):
+            return total_variance(noise)
+        return uniform(setting, int(self.usable.used.sum())) + noise.get(SATURATION, 0.0)
 
     def task(self, expected_noise: FloatArray) -> EstimationTask:
         """Return the task of an estimation method; the offset of detail's mean is taken off the measurements."""
@@ -163,11 +167,32 @@ class _Observation:
 
 
 def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution: Execution) -> Assumptions:
-    """Collect prior and noise as known or fitted, estimating the image beforehand only where they depend on it."""
+    """Collect prior and noise as known or fitted, estimating the image beforehand only where they depend on it.
+
+    Saturated pixels are left out at first, and then count as censored.
+    """
+    usable = usable_pixels(stack, model)
+    assumed = _assumptions(stack, model, usable, choice, execution)
+    if not usable.saturated:
+        return assumed
+    image = assumed.method.image
+    for _ in range(ROUNDS):
+        values, pixels = censored(stack, model, usable, image, assumed.fit)
+        assumed = _assumptions(values, model, pixels, choice, execution)
+        before, image = image, assumed.method.image
+        if has_converged(model.light(before), model.light(image), stack, usable):
+            break
+    return assumed
+
+
+def _assumptions(
+    stack: Stack, model: Model, usable: UsablePixels, choice: MethodChoice, execution: Execution
+) -> Assumptions:
+    """Collect prior and noise for the pixels that are usable."""
     prior = stack.scene.assumed_prior
     if prior.kind == "fit":
         prior = prior.model_copy(update={"kind": "independent"})
-    first = _Observation(stack, model_of_f(model, stack.camera, prior), usable_pixels(stack, model), prior)
+    first = _Observation(stack, model_of_f(model, stack.camera, prior), usable, prior)
 
     def method_with(observation: _Observation, noise: Noise) -> Method:
         return METHODS[choice.method](observation.task(observation.expected_noise(noise)), execution)

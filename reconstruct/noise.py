@@ -17,18 +17,30 @@ from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
+from .detail.detailed_model import CAUSE as DETAIL
 from .methods.method import is_uniform
 
 Noise = dict[str, FloatArray]  # variances by cause
+SATURATION = "saturation"  # in the error budget
+CERTAIN = ("rendering", "calibration", DETAIL, SATURATION)  # noise that stays known when the rest of it is to be fitted
 
 
 @dataclass(frozen=True)
 class UsablePixels:
-    """The sensor pixels that are used, (M,), and the numbers of those that are not, by reason."""
+    """The sensor pixels that are used, (M,), the number of dead ones, and the saturated ones, (M,).
+
+    censoring : (M,) variance that a saturated pixel's value has in addition to its noise; None: none is used
+    """
 
     used: BoolArray
     dead: int
-    saturated: int
+    full: BoolArray
+    censoring: FloatArray | None = None
+
+    @property
+    def saturated(self) -> int:
+        """Number of saturated pixels."""
+        return int(np.sum(self.full))
 
 
 def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
@@ -45,7 +57,7 @@ def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
         full = alive & stack.recording.saturated
     elif noise is not None and noise.saturation is not None:
         full = alive & (stack.values >= np.float32(noise.saturation))  # the stack holds float32
-    return UsablePixels(alive & ~full, int(np.sum(~alive)), int(np.sum(full)))
+    return UsablePixels(alive & ~full, int(np.sum(~alive)), full)
 
 
 def known_noise(stack: Stack) -> Noise:
@@ -67,6 +79,8 @@ def initial_noise(stack: Stack, model: Model, usable: UsablePixels, prior: Prior
     if model.variance.any():
         from_prior = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
         noise["calibration"] = from_prior[usable.used]
+    if usable.censoring is not None:
+        noise[SATURATION] = usable.censoring[usable.used]
     return noise
 
 

@@ -8,10 +8,9 @@ types as listed, sub-imagers (k, l) by rows, then pixels by rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from math import ceil, floor, hypot
 from typing import Any
 
@@ -21,14 +20,13 @@ from ommatid.runtime.arrays import BoolArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
-from .constants import GREEN
 from .formats.picture import target_shape
-from .lens_type import LensOptics, LensType, SubImager
+from .lens_type import LensOptics, LensType, SubImager, adjacent_slices
+from .optics.spectrum import wavelengths_of
 from .scene import Scene
-from .tables.camera import RAYS, LensTable, ToleranceTable
+from .tables.camera import LensTable, ToleranceTable
 
 MOST_MEASUREMENTS = 2**30
-MOST_SUB_IMAGERS = 2**14
 PLANES = 4  # arrays of the target's or the sensor's size that every stage holds at once
 
 
@@ -38,6 +36,8 @@ class Camera:
 
     lens_columns : columns of sub-imagers on the sensor, those of types left out by `restrict` included
     detail : the world's grid is so many times finer than f
+    wavelength : the mean, if there are several;  bands : each wavelength and the share of electrons that it frees
+    walls : False if light of every lens reaches every patch
     """
 
     rows: int
@@ -51,6 +51,13 @@ class Camera:
     tolerance: ToleranceTable | None = None
     lens_columns: int | None = None
     detail: int = 1
+    bands: tuple[tuple[float, float], ...] = ()
+    walls: bool = True
+
+    @property
+    def wavelengths(self) -> tuple[tuple[float, float], ...]:
+        """Wavelengths over which diffraction and dispersion are averaged, with weights of sum 1; none: rays alone."""
+        return () if self.wavelength is None else self.bands or ((self.wavelength, 1.0),)
 
     @property
     def world(self) -> Camera:
@@ -106,11 +113,6 @@ class Camera:
         return self.distance if lens_type.optics.focus is None else lens_type.optics.focus
 
     @property
-    def wavelengths(self) -> tuple[tuple[float, float], ...]:
-        """Wavelengths of the light with their shares of the detected light; none where light is rays."""
-        return () if self.wavelength is None else ((self.wavelength, 1.0),)
-
-    @property
     def has_width(self) -> bool:
         """True if a lens type has an aperture or surfaces: not all are pinholes."""
         return any(lens.optics.aperture is not None or lens.optics.surfaces is not None for lens in self.types)
@@ -127,8 +129,9 @@ class Camera:
 
     @property
     def has_box_footprints(self) -> bool:
-        """True if the designed H averages f over boxes: no distortion, and no blur."""
-        return all(lens_type.optics.distortion is None and not self.is_blurred(lens_type) for lens_type in self.types)
+        """True if the designed H averages f over boxes: no distortion, no blur, and walls."""
+        sharp = (lens_type.optics.distortion is None and not self.is_blurred(lens_type) for lens_type in self.types)
+        return self.walls and all(sharp)
 
     def is_blurred(self, lens_type: LensType) -> bool:
         """True if a point of the target is imaged as more than a point: by surfaces, defocus or diffraction."""
@@ -140,7 +143,7 @@ class Camera:
     def has_sharp_footprints(self) -> bool:
         """True if footprints have a closed form even when misaligned: no surfaces, and no blur."""
         defocused = self.tolerance is not None and (self.tolerance.focal_length or self.tolerance.tilt)
-        return not any(
+        return self.walls and not any(
             lens_type.optics.surfaces is not None
             or self.is_blurred(lens_type)
             or (lens_type.optics.aperture is not None and defocused)
@@ -166,8 +169,7 @@ class Camera:
         lens_y = ((lens_type.array[0] - 1) / 2 - k) * self.lens_pitch
         window = lens_type.window(k, l)
         x, y = self.position(*lens_type.middle(window))
-        depth = self.depth(lens_type)
-        shrink = depth / self.distance
+        depth, shrink = self.depth(lens_type), self.depth(lens_type) / self.distance
         patch = lens_x + (lens_x - x) * shrink, lens_y + (lens_y - y) * shrink
         return SubImager(lens_type, k, l, window, (lens_x, lens_y), patch, depth)
 
@@ -177,11 +179,11 @@ class Camera:
 
     def slices(self) -> list[slice]:
         """The measurements of each sub-imager."""
-        return _slices(sub.type.pixels[0] * sub.type.pixels[1] for sub in self.sub_imagers)
+        return adjacent_slices(sub.type.pixels[0] * sub.type.pixels[1] for sub in self.sub_imagers)
 
     def type_slices(self) -> list[slice]:
         """The measurements of each lens type."""
-        return _slices(lens_type.measurements for lens_type in self.types)
+        return adjacent_slices(lens_type.measurements for lens_type in self.types)
 
     def types_seeing(self) -> IntArray:
         """Number of lens types that see each pixel of f as a whole: (rows, columns)."""
@@ -225,23 +227,18 @@ class Camera:
             }
         if not self.is_ideal_pinhole:  # sub-images of ideal pinholes do not depend on where the lenses are
             description["camera.places"] = [self.lens_columns, *(lens_type.left for lens_type in self.types)]
-        if self.detail != 1:
-            description["target.detail"] = self.detail
-        if self.wavelength is not None:
-            description["camera.wavelength"] = self.wavelength
+        bands = [list(band) for band in self.bands] or None
+        optional = ("target.detail", self.detail, 1), ("camera.wavelength", self.wavelength, None)
+        optional += ("camera.bands", bands, None), ("camera.walls", self.walls, True)
+        description |= {key: value for key, value, default in optional if value != default}
         if self.tolerance is not None:
             description["camera.tolerance"] = self.tolerance.model_dump(mode="json")
         return description
 
 
-def _slices(sizes: Iterable[int]) -> list[slice]:
-    """Adjacent slices of the given sizes, from 0."""
-    return [slice(first, last) for first, last in pairwise(accumulate(sizes, initial=0))]
-
-
 def derive(scene: Scene) -> Camera:
     """Derive the camera of a scene. Raises InputError if arrays do not fit the target, or sub-images the sensor."""
-    rows, columns = target_shape(scene)
+    (rows, columns), (wavelength, bands) = target_shape(scene), wavelengths_of(scene)
     types = tuple(_lens_type(lens, rows, columns, scene) for lens in scene.camera.lens)
     lefts = list(accumulate((lens_type.array[1] for lens_type in types), initial=0))
     camera = Camera(
@@ -252,17 +249,15 @@ def derive(scene: Scene) -> Camera:
         pixel_pitch=scene.camera.pixel_pitch,
         lens_pitch=scene.camera.lens_pitch,
         types=tuple(replace(lens_type, left=left) for lens_type, left in zip(types, lefts, strict=False)),
-        wavelength=_wavelength(scene),
+        wavelength=wavelength,
         tolerance=scene.camera.tolerance,
         lens_columns=lefts[-1],
         detail=scene.target.detail,
+        bands=bands,
+        walls=scene.camera.walls,
     )
     for lens_type in types:
-        if lens_type.count > MOST_SUB_IMAGERS:
-            raise InputError(
-                f"{scene.source}: camera.lens.{lens_type.name}.array has {lens_type.count} sub-imagers, expected at"
-                f" most {MOST_SUB_IMAGERS} per lens type; use fewer"
-            )
+        lens_type.check_count(scene.source)
     needed = PLANES * 8 * (camera.world.unknowns + camera.measurements)
     check_memory(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
     if camera.measurements > MOST_MEASUREMENTS:
@@ -271,15 +266,6 @@ def derive(scene: Scene) -> Camera:
         )
     _check_overlap(camera, scene)
     return camera
-
-
-def _wavelength(scene: Scene) -> float | None:
-    """Wavelength of the light, 550 nm for lenses with a width unless the scene says otherwise; None: rays alone."""
-    wavelength = scene.camera.wavelength
-    if wavelength is None:
-        wide = any(lens.aperture is not None or lens.surfaces is not None for lens in scene.camera.lens)
-        return GREEN if wide else None
-    return None if wavelength == RAYS else wavelength
 
 
 def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensType:
@@ -300,7 +286,7 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
             f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}"
         )
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
-    optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale)
+    optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating)
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics)
     return lens_type.centred(rows, columns)
 

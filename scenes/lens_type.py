@@ -5,8 +5,10 @@ Lengths are millimetres; positions on the target are in pixels of f, from its to
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import accumulate, pairwise
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from typing import Any
 from ommatid.runtime.errors import InputError
 
 from .tables.camera import Surface
+
+MOST_SUB_IMAGERS = 2**14
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,7 @@ class LensOptics:
     aperture : diameter of a thin lens;  focus : distance in focus, absent: the target's
     distortion : k1, k2 of the magnification factor 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner
     surfaces : of a real lens, from the target to the sensor;  scale : factor on the surfaces, or "fit"
+    coating : reflectance of each surface to air;  absent: Fresnel's
     """
 
     aperture: float | None = None
@@ -30,6 +35,7 @@ class LensOptics:
     distortion: tuple[float, float] | None = None
     surfaces: tuple[Surface, ...] | None = None
     scale: float | str | None = None
+    coating: float | None = None
 
     @property
     def is_pinhole(self) -> bool:
@@ -41,8 +47,13 @@ class LensOptics:
         surfaces = None if self.surfaces is None else [surface.model_dump(mode="json") for surface in self.surfaces]
         effects: dict[str, Any] = {"aperture": self.aperture, "focus": self.focus, "scale": self.scale}
         effects["distortion"] = None if self.distortion is None else list(self.distortion)
-        effects["surfaces"] = surfaces
+        effects |= {"surfaces": surfaces, "coating": self.coating}
         return {name: value for name, value in effects.items() if value is not None}
+
+
+def adjacent_slices(sizes: Iterable[int]) -> list[slice]:
+    """Adjacent slices of the given sizes, from 0."""
+    return [slice(first, last) for first, last in pairwise(accumulate(sizes, initial=0))]
 
 
 @dataclass(frozen=True)
@@ -74,6 +85,14 @@ class LensType:
     def measurements(self) -> int:
         """Number of sensor pixels of all sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
+
+    def check_count(self, source: Path) -> None:
+        """Raise InputError, which names the scene file, for too many sub-imagers."""
+        if self.count > MOST_SUB_IMAGERS:
+            raise InputError(
+                f"{source}: camera.lens.{self.name}.array has {self.count} sub-imagers, expected at most"
+                f" {MOST_SUB_IMAGERS} per lens type; use fewer"
+            )
 
     def finer(self, detail: int) -> LensType:
         """The same lens type on a grid of the target that is `detail` times finer along both axes."""

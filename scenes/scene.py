@@ -22,7 +22,7 @@ from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTabl
 from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.overrides import apply_overrides, keep_lenses
-from .tables.sensor import NoiseTable, SensorTable
+from .tables.sensor import LightTable, NoiseTable, SensorTable
 from .tables.table import Table
 from .tables.units import Corner, FileName, Length, Pair, Samples, Time
 
@@ -130,6 +130,7 @@ class Scene(Table):
     target: TargetTable
     camera: CameraTable
     world: WorldTable | None = None
+    light: LightTable | None = None
     noise: NoiseTable | None = None
     sensor: SensorTable | None = None
     prior: PriorTable = PriorTable()
@@ -145,6 +146,13 @@ class Scene(Table):
     def _check_combination(self) -> Scene:
         if self.noise is not None and self.sensor is not None:
             raise ValueError("expected [noise] for an ideal sensor or [sensor] for a real one, got both; remove one")
+        if not self.camera.walls and (self.calibration.method != "transport" or self.calibration.fit is not None):
+            raise ValueError(
+                "camera.walls = false leaves H without a closed form: expected calibration.method 'transport', no fit,"
+                f" got '{self.calibration.method}'"
+            )
+        if self.light is not None and self.camera.wavelength is not None:
+            raise ValueError("expected camera.wavelength or light.spectrum, got both; remove one")
         if self.target.image is None and self.world is None:
             raise ValueError("expected a picture, target.image, or a Mitsuba scene, world.file, got neither")
         if self.target.image is None and self.target.shape is None:
@@ -249,6 +257,7 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
         from .tables.lens_file import with_surfaces
 
         update["camera"] = with_surfaces(scene.camera, source)
+    update |= _with_curves(scene)
     image, world = scene.target.image, scene.world
     if image is not None and not image.startswith("photo:"):
         update["target"] = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
@@ -257,9 +266,23 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     return with_tables(scene, **update)
 
 
+def _with_curves(scene: Scene) -> dict[str, Any]:
+    """Tables whose files of a curve, relative to the scene file, are replaced by its points. Raises InputError."""
+    from .formats.curve import read_curve
+
+    update: dict[str, Any] = {}
+    if scene.light is not None and scene.light.file is not None:
+        points = read_curve((scene.source.parent / scene.light.file).resolve())
+        update["light"] = scene.light.model_copy(update={"spectrum": points})
+    if scene.sensor is not None and isinstance(scene.sensor.quantum_efficiency, str):
+        points = read_curve((scene.source.parent / scene.sensor.quantum_efficiency).resolve(), 1.0)
+        update["sensor"] = scene.sensor.model_copy(update={"quantum_efficiency": points})
+    return update
+
+
 def write(path: Path, scene: Scene) -> None:
     """Write a scene as TOML, defaults included. Raises InputError or MachineError."""
     import tomli_w
 
-    pair = re.compile(r"\[\s+(\d+),\s+(\d+),\s+\]")  # tomli_w spreads pairs over four lines
+    pair = re.compile(r"\[\s+([-+.\de]+),\s+([-+.\de]+),\s+\]")  # tomli_w spreads pairs over four lines
     write_text(path, pair.sub(r"[\1, \2]", tomli_w.dumps(scene.plain())))

@@ -84,6 +84,8 @@ class Setup:
     def has_closed_form(self) -> bool:
         """True if H of the simulated camera with its misalignments has a closed form."""
         camera = self.simulated
+        if not camera.walls:
+            return False
         for lens_type in camera.types:
             if lens_type.optics.distortion is not None and camera.is_blurred(lens_type):
                 return False

@@ -50,9 +50,14 @@ class Truth:
 def ideal_camera(camera: Camera, finer: int = 1) -> Camera:
     """Return a pinhole in the array's centre with `finer` x `finer` sensor pixels per pixel of f."""
     lens_type = LensType(
-        "truth", Fraction(1, finer), (1, 1), (camera.rows * finer, camera.columns * finer), Fraction(1), (0, 0)
+        "truth",
+        Fraction(1, finer),
+        (1, 1),
+        (camera.rows * finer, camera.columns * finer),
+        (Fraction(1), Fraction(1)),
+        (0, 0),
     )
-    return replace(camera, types=(lens_type,), wavelength=None, tolerance=None, lens_columns=None)
+    return replace(camera, types=(lens_type,), wavelength=None, tolerance=None, lens_columns=None, walls=True)
 
 
 def truth(setup: Setup) -> Truth:

@@ -33,9 +33,14 @@ def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
 def ideal_matrix(camera: Camera) -> sparse.csr_array:
     """Return H of all sub-imagers as designed: (M, N).
 
-    Raises InputError for a lens type that is both distorted and blurred, which has no closed form, and for surfaces
-    that form no image.
+    Raises InputError for a lens type that is both distorted and blurred, and for a camera without walls, which have no
+    closed form, and for surfaces that form no image.
     """
+    if not camera.walls:
+        raise InputError(
+            "camera.walls = false: light through several lenses has no closed form; run with calibration.method"
+            " 'transport', or keep the walls"
+        )
     return sparse.csr_array(sparse.vstack([_type_matrix(camera, lens) for lens in camera.types], format="csr"))
 
 

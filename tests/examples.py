@@ -101,7 +101,7 @@ def tile_problem(lens_types: int, noise: float) -> Problem:
 OPTICS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # for `with_optics`
     "pinhole": ({}, {}),
     "out of focus": ({"aperture": "0.4 mm", "focus": "900 mm"}, {"wavelength": "none"}),
-    "diffraction": ({"aperture": "0.8 mm"}, {"wavelength": "550 nm"}),
+    "diffraction": ({"aperture": "0.8 mm"}, {"wavelength": "550 nm", "lens_pitch": "1 mm"}),
     "distortion": ({"distortion": [0.05, 0.02]}, {}),
     "misaligned": ({}, {"tolerance": {"position": "1 um", "rotation": "1 deg", "tilt": "1 deg"}}),
 }

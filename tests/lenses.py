@@ -62,9 +62,10 @@ def ball(radius: float = 1.0, index: float = 1.5) -> Prescription:
 
 
 def camera_with(surfaces: Any, **more: Any) -> Camera:
-    """Return the camera of the paper's tile with these lenses of type I."""
+    """Return the camera of the paper's tile with these lenses of type I, and room for them."""
     data = read(GALLERY / "tile19.toml", (), ["I"]).plain()
     data["camera"]["lens"][0] |= {"surfaces": surfaces, **more}
+    data["camera"]["lens_pitch"] = "1 mm"
     return derive(parse(data, Path("test.toml")))
 
 

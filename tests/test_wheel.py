@@ -23,7 +23,7 @@ sys.path.insert(0, "WHEEL")
 import ommatid
 assert ommatid.__file__.startswith("WHEEL"), ommatid.__file__
 """
-DATA = ("*.toml", "worlds/*", "lenses/*")  # of the gallery, beside its modules
+DATA = ("*.toml", "worlds/*", "lenses/*", "spectra/*")  # of the gallery, beside its modules
 QUICK = ("render.samples=16", "calibration.method=ideal", "render.variant=scalar_rgb", "target.shape=[19, 19]")
 
 

@@ -90,4 +90,9 @@ def electrons(setup: Setup) -> dict[str, Any] | None:
     from ommatid.scenes.optics.radiometry import summary
     from ommatid.simulate.sensor.response import response
 
-    return summary(setup.scene, setup.camera, response(setup))
+    light = summary(setup.scene, setup.camera, response(setup))
+    if all(lens_type.optics.surfaces is None for lens_type in setup.camera.types):
+        return light
+    from ommatid.simulate.lenses.etendue import transmissions
+
+    return {**light, "transmitted": transmissions(setup.camera)}

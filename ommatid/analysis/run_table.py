@@ -125,9 +125,10 @@ def _solver_rows(solver: SolverReport) -> list[Row]:
 
 def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]:
     lines: list[Row] = []
-    if diagnostics.pixels_dead or diagnostics.pixels_saturated:
-        counts = f"{diagnostics.pixels_dead} dead, {diagnostics.pixels_saturated} saturated"
-        lines.append(("sensor pixels left out", counts))
+    if diagnostics.pixels_dead:
+        lines.append(("sensor pixels left out", f"{diagnostics.pixels_dead} dead"))
+    if diagnostics.pixels_saturated:
+        lines.append(("saturated sensor pixels", f"{diagnostics.pixels_saturated}, known to reach the limit"))
     width = "nothing is resolved" if diagnostics.resolution is None else f"{diagnostics.resolution:.3g} pixels of f"
     lines += [
         ("degrees of freedom", f"{diagnostics.degrees_of_freedom:.1f} of {unknowns}"),

@@ -80,10 +80,11 @@ def cautions(report: RunReport) -> list[str]:
     """Return warnings that a reader needs before the numbers, one sentence each."""
     warnings: list[str] = []
     diagnostics = report.diagnostics
-    if diagnostics.pixels_dead or diagnostics.pixels_saturated:
+    if diagnostics.pixels_dead:
+        warnings.append(f"{diagnostics.pixels_dead} dead sensor pixels are excluded from the estimate.")
+    if diagnostics.pixels_saturated:
         warnings.append(
-            f"{diagnostics.pixels_dead} dead and {diagnostics.pixels_saturated} saturated sensor pixels are excluded"
-            " from the estimate."
+            f"{diagnostics.pixels_saturated} saturated sensor pixels count as readings of at least the limit."
         )
     return warnings + [f"Assumed: {assumption}." for assumption in report.assumes]
 

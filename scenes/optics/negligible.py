@@ -53,6 +53,7 @@ def without_negligible_effects(scene: Scene, camera: Camera) -> tuple[Camera, tu
     if (
         scene.render.complete
         or scene.world is not None
+        or not camera.walls
         or all(lens_type.optics.aperture is None for lens_type in camera.types)
     ):
         return camera, ()

@@ -1,14 +1,14 @@
 """Electrons that the target's light frees in a sensor pixel, by photometry, radiometry and the lens's geometry.
 
 A pixel of the target of value f reflects f / 255 of the illuminance E equally into all directions (Lambert), so that
-its luminance is E / pi f / 255. The light is monochromatic and is converted at the peak of the eye's sensitivity, 683
-lm/W, whatever its wavelength. (Lux of a colour to which the eye is less sensitive corresponds to more photons.) Lengths
-are millimetres.
+its luminance is E / pi f / 255. Lux are converted to photons by the eye's sensitivity V(lambda), integrated over the
+spectrum of the light (`spectrum`). Lengths are millimetres.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import pi
 from typing import Any
 
@@ -18,25 +18,22 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
-from ..constants import GREEN, WHITE
+from ..constants import WHITE
 from ..lens_type import LensType, SubImager
 from ..pose import Pose, corner_offset, poses
 from ..recording import clips_dark_noise, dark_electrons, expected_recording, saturation_electrons
 from ..scene import Scene
 from ..tables.sensor import SensorTable
+from .spectrum import efficacy, electrons_per_lumen
 
-PLANCK, LIGHT_SPEED, EFFICACY = 6.62607015e-34, 299792458.0, 683.0  # J s, m/s, lm/W: exact in the SI
 METRES = 1e-3  # per millimetre
 
 
 def electrons_per_steradian(scene: Scene, sensor: SensorTable) -> float:
     """Electrons per unit of f and per steradian of projected solid angle in one pixel."""
-    wavelength = scene.camera.wavelength
-    wavelength = (wavelength if isinstance(wavelength, float) else GREEN) * METRES
-    radiance = sensor.illuminance / pi / WHITE / EFFICACY  # W / (m^2 sr) per unit of f
-    photons = radiance * wavelength / (PLANCK * LIGHT_SPEED)
+    luminance = sensor.illuminance / pi / WHITE  # lm / (m^2 sr) per unit of f
     area = (scene.camera.pixel_pitch * METRES) ** 2
-    return photons * area * sensor.exposure * sensor.quantum_efficiency
+    return luminance * area * sensor.exposure * electrons_per_lumen(scene)
 
 
 def solid_angle(aperture: float, depth: float) -> float:
@@ -68,7 +65,8 @@ def electrons(
 ) -> FloatArray:
     """Electrons per unit of f in every pixel during the exposure: (M,).
 
-    solid_angles : sr by the name of the lens type, projected and on the axis, for lens types with surfaces
+    solid_angles : sr by the name of the lens type, projected and on the axis, times the share of light transmitted, for
+        lens types with surfaces; thin lenses lose nothing
     illumination : (M,) relative to the axis, for pixels behind surfaces, absent: 1; thin lenses follow cos^4
     Raises ValueError without a sensor, or if a solid angle of a lens with surfaces is missing.
     """
@@ -77,12 +75,27 @@ def electrons(
     unit = electrons_per_steradian(scene, scene.sensor)
     response = np.empty(camera.measurements)
     for sub, pixels, pose in zip(camera.sub_imagers, camera.slices(), poses(camera), strict=True):
+        if not camera.walls:
+            response[pixels] = unit * _through_all_lenses(camera, sub, pose)
+            continue
         angle = _solid_angle(sub.type, sub.depth, solid_angles or {})
         if sub.type.optics.surfaces is None:
             response[pixels] = unit * angle * relative_illumination(camera, sub, pose)
         else:
             response[pixels] = unit * angle * (1.0 if illumination is None else illumination[pixels])
     return response
+
+
+def _through_all_lenses(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
+    """Projected solid angle, sr, of all lenses together at each pixel of a sub-imager: (its pixels,)."""
+    total = np.zeros(sub.type.pixels[0] * sub.type.pixels[1])
+    for other, place in zip(camera.sub_imagers, poses(camera), strict=True):
+        if other.type.optics.aperture is None:
+            raise ValueError(f"lens type '{other.type.name}' has no aperture; light without walls needs one")
+        shift = np.array([pose.lens[0] - place.lens[0], pose.lens[1] - place.lens[1], 0.0])
+        seen = replace(pose, middle=pose.middle + shift)
+        total += solid_angle(other.type.optics.aperture, sub.depth) * relative_illumination(camera, sub, seen)
+    return total
 
 
 def _solid_angle(lens_type: LensType, depth: float, known: Mapping[str, float]) -> float:
@@ -126,6 +139,7 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
     white : electrons at 255, averaged over the type's pixels;  mean : electrons at the prior's mean
     saturation : value that saturates the brightest pixel;  saturates : True if that is below 255
     noise : standard deviation of a value for a target at the prior's mean, in units of f, rms over the pixels
+    efficacy : of the light, lm/W;  wavelengths : in mm, which stand for a spectrum, and the share of each
     cut_off : True if noise of the dark reaches below a digital number of 0 (EMVA 1288 asks for a higher black level)
     """
     if scene.sensor is None:
@@ -146,4 +160,10 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
                 "noise": float(np.sqrt(alive.mean())) if alive.size else None,
             }
         )
-    return {"lens_types": lens_types, "dark": dark_electrons(sensor), "cut_off": clips_dark_noise(sensor)}
+    return {
+        "efficacy": efficacy(scene),
+        "wavelengths": [list(band) for band in camera.bands],
+        "lens_types": lens_types,
+        "dark": dark_electrons(sensor),
+        "cut_off": clips_dark_noise(sensor),
+    }

@@ -9,12 +9,13 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from ommatid.runtime.errors import shortened_repr
 
+from ..zemax.dispersion import Dispersion
 from .table import Table
-from .units import Angle, Length, Magnification, Pair, Radius, Step, file_name, pair
+from .units import Angle, FileName, Length, Magnification, Pair, Radius, Step, file_name, pair
 
 Distortion = Annotated[float, Field(ge=-1000, le=1000)]
-STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
 RAYS = "none"  # wavelength of light that does not diffract
+STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
 
 
@@ -27,6 +28,11 @@ class Surface(Table):
     thickness: Length | None = Field(default=None, description="distance to the next surface; absent for the last one")
     glass: str | None = Field(default=None, description="glass behind the surface, such as N-BK7; absent: air")
     index: float | None = Field(default=None, ge=1, le=5, description="refractive index, in place of a glass")
+    dispersion: Dispersion | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="index of refraction of the glass as a function of the wavelength; absent: of a built-in glass",
+    )
     semi_diameter: Length = Field(description="half the diameter of its clear aperture")
     conic: float = Field(default=0.0, ge=-100, le=100, description="0: a sphere, -1: a paraboloid")
     aspheric: Annotated[tuple[float, ...], BeforeValidator(pair), Field(min_length=1, max_length=7)] | None = Field(
@@ -40,6 +46,8 @@ class Surface(Table):
     def _check_medium(self) -> Surface:
         if self.glass is not None and self.index is not None:
             raise ValueError("expected a glass or an index of refraction, got both")
+        if self.dispersion is not None and self.index is not None:
+            raise ValueError("expected a dispersion or an index of refraction, got both")
         return self
 
     @model_validator(mode="after")
@@ -93,6 +101,13 @@ class LensTable(Table):
         description='scale of the surfaces; "fit": to the focal length that the magnification requires',
     )
 
+    coating: float | None = Field(
+        default=None,
+        ge=0,
+        lt=1,
+        description="reflectance of each surface to air; absent: uncoated, by Fresnel's equations",
+    )
+
     @field_validator("pixels", mode="before")
     @classmethod
     def _check_pixels(cls, value: object) -> object:
@@ -117,8 +132,10 @@ class LensTable(Table):
                     raise ValueError(f"{name} belongs to a thin lens, and surfaces imply it; remove one, got both")
             if self.focus is not None and isinstance(self.scale, float | int):
                 raise ValueError('a number as scale fixes the focus; take scale "fit", got focus too')
-        elif self.scale is not None:
-            raise ValueError("scale belongs to surfaces, got none")
+        else:
+            for name in ("scale", "coating"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} belongs to surfaces, got none")
         if self.focus is not None and self.aperture is None and self.surfaces is None:
             raise ValueError("focus belongs to a lens with an aperture or surfaces, got a pinhole")
         return self
@@ -133,6 +150,14 @@ class CameraTable(Table):
         default=None,
         description='wavelength of the light, 550 nm if absent; "none": light is rays, which do not diffract',
     )
+    walls: bool = Field(
+        default=True, description="light of a lens reaches its own patch of the sensor only; false: those of all lenses"
+    )
+    glass_catalogue: FileName | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="glass catalogue (AGF) with glasses of surfaces beside the built-in ones",
+    )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]
 
@@ -142,4 +167,26 @@ class CameraTable(Table):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"expected a different name for every lens type, got {name!r} twice")
+        return self
+
+    @model_validator(mode="after")
+    def _check_walls(self) -> CameraTable:
+        for lens in self.lens:
+            if not self.walls and (lens.aperture is None or lens.distortion is not None):
+                raise ValueError(
+                    f"walls = false needs thin lenses with an aperture and without distortion, which weigh their light,"
+                    f" got lens type '{lens.name}'; add an aperture or keep the walls"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_apertures(self) -> CameraTable:
+        if sum(lens.array[0] * lens.array[1] for lens in self.lens) == 1:
+            return self  # a single lens has no neighbour
+        for lens in self.lens:
+            if lens.aperture is not None and lens.aperture > self.lens_pitch * (1 + 1e-9):
+                raise ValueError(
+                    f"expected lens.{lens.name}.aperture of at most lens_pitch, {self.lens_pitch:g} mm, got"
+                    f" {lens.aperture:g} mm; make the aperture smaller or lens_pitch larger"
+                )
         return self

@@ -1,12 +1,12 @@
 """Lens files: the surfaces of a lens, from the target to the sensor.
 
-Two formats are read. A TOML file holds the key of a scene file, `surfaces = [{radius = "1 mm", thickness = "0.5 mm",
-glass = "N-BK7", semi_diameter = "0.2 mm"}, ...]`, and optionally a `title`. Any other file is read as the text of
-PBRT's realistic camera: rows of radius, thickness, index of refraction and diameter, in millimetres, with comments
-after a #; a single number in the first row is the focal length. PBRT's radii have the sign used here, positive if the
-centre of curvature lies towards the film. Its index 0 is air; its last thickness, to the film, is ignored, because the
-magnification determines the distance of the sensor; a radius of 0 is a plane, and the aperture stop if there is air on
-both sides of it or its index is 0.
+Three formats are read. A TOML file holds the key of a scene file, `surfaces = [{radius = "1 mm", thickness = "0.5 mm",
+glass = "N-BK7", semi_diameter = "0.2 mm"}, ...]`, and optionally a `title`. A file .zmx is a sequential lens of Zemax
+(`ommatid.scenes.zemax.zmx`). Any other file is read as the text of PBRT's realistic camera: rows of radius, thickness,
+index of refraction and diameter, in millimetres, with comments after a #; a single number in the first row is the focal
+length. PBRT's radii have the sign used here, positive if the centre of curvature lies towards the film. Its index 0 is
+air; its last thickness, to the film, is ignored, because the magnification determines the distance of the sensor; a
+radius of 0 is a plane, and the aperture stop if there is air on both sides of it or its index is 0.
 
 Source: M. Pharr, W. Jakob, G. Humphreys, Physically Based Rendering, section 6.4 (third edition).
 """
@@ -20,6 +20,8 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
 
+from ..zemax.agf import Catalogue, read_catalogue
+from ..zemax.zmx import read_zmx
 from . import glass, toml
 from .camera import CameraTable, Surface
 from .messages import explain
@@ -37,17 +39,22 @@ class LensFile(Table):
 
 
 def read_lens(path: Path) -> tuple[Surface, ...]:
-    """Read the surfaces of a lens from a file in TOML (.toml) or in PBRT's text format (any other suffix).
+    """Read the surfaces of a lens from a file in TOML (.toml), of Zemax (.zmx) or in PBRT's text format (any other).
 
     Raises InputError that names the file, the row or the key, what was expected and what came.
     """
+    if path.suffix.lower() == ".zmx":
+        return _with_one_stop(read_zmx(path), path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such lens file; expected one beside the scene file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: could not be read as a lens file ({error})") from error
-    surfaces = _from_toml(text, path) if path.suffix == ".toml" else _from_rows(text, path)
+    return _with_one_stop(_from_toml(text, path) if path.suffix == ".toml" else _from_rows(text, path), path)
+
+
+def _with_one_stop(surfaces: tuple[Surface, ...], path: Path) -> tuple[Surface, ...]:
     stops = sum(surface.stop for surface in surfaces)
     if stops > 1:
         raise InputError(f"{path}: expected one aperture stop at most, got {stops}; mark only the smallest")
@@ -57,7 +64,8 @@ def read_lens(path: Path) -> tuple[Surface, ...]:
 def with_surfaces(camera: CameraTable, source: Path) -> CameraTable:
     """The camera's table with every name of a lens file, relative to the scene file `source`, replaced by its surfaces.
 
-    Raises InputError for a damaged file and for an unknown glass.
+    Glasses of the catalogue are replaced by their dispersion, so that the result needs no other file. The catalogue
+    comes before the built-in glasses. Raises InputError for a damaged file and for an unknown glass.
     """
     lenses = [
         lens.model_copy(update={"surfaces": read_lens((source.parent / lens.surfaces).resolve())})
@@ -65,13 +73,36 @@ def with_surfaces(camera: CameraTable, source: Path) -> CameraTable:
         else lens
         for lens in camera.lens
     ]
-    for lens in lenses:
-        for number, surface in enumerate(() if isinstance(lens.surfaces, str) else lens.surfaces or ()):
-            try:
-                glass.check(surface.glass or glass.AIR)
-            except InputError as error:
-                raise InputError(f"{source}: camera.lens.{lens.name}.surfaces[{number}].glass: {error}") from error
-    return camera.model_copy(update={"lens": tuple(lenses)})
+    catalogue = None
+    if camera.glass_catalogue is not None:
+        catalogue = read_catalogue((source.parent / camera.glass_catalogue).resolve())
+    for place, lens in enumerate(lenses):
+        if lens.surfaces and not isinstance(lens.surfaces, str):
+            where = f"{source}: camera.lens.{lens.name}.surfaces"
+            surfaces = tuple(
+                _with_glass(surface, catalogue, f"{where}[{number}].glass")
+                for number, surface in enumerate(lens.surfaces)
+            )
+            lenses[place] = lens.model_copy(update={"surfaces": surfaces})
+    return camera.model_copy(update={"lens": tuple(lenses), "glass_catalogue": None})
+
+
+def _with_glass(surface: Surface, catalogue: Catalogue | None, where: str) -> Surface:
+    """The surface with the dispersion of its glass, if that is from the catalogue. Raises InputError if unknown."""
+    if surface.glass is None or surface.dispersion is not None:
+        return surface
+    name = glass.ALIASES.get(surface.glass, surface.glass)
+    if catalogue is not None:
+        found = catalogue.find(surface.glass)
+        if found is not None:
+            return surface.model_copy(update={"glass": found, "dispersion": catalogue.dispersion(found)})
+    try:
+        glass.check(name)
+    except InputError as error:
+        nearest = catalogue and catalogue.nearest(surface.glass)
+        advice = f"; the catalogue's nearest glass is '{shortened(nearest)}'" if nearest else ""
+        raise InputError(f"{where}: {error}{advice}") from error
+    return surface.model_copy(update={"glass": name})
 
 
 def _from_toml(text: str, path: Path) -> tuple[Surface, ...]:

@@ -1,13 +1,92 @@
-"""The tables of the sensor in the scene file: [noise] of an ideal one, or [sensor] in the terms of EMVA 1288."""
+"""The tables of light and sensor in the scene file.
+
+[light], and [noise] of an ideal sensor, or [sensor] in the terms of EMVA 1288.
+"""
 
 from __future__ import annotations
 
-from pydantic import Field, model_validator
+import re
+from typing import Annotated, cast
 
+from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
+
+from ommatid.runtime.errors import shortened_repr
+
+from ..formats import curve
 from .table import LARGEST, Table
-from .units import Illuminance, Time
+from .units import Illuminance, Time, file_name, length
 
 FULL_SCALE = 256.0
+MILLIMETRE = 1e6  # nm
+ILLUMINANTS = ("D65", "LED-B3")
+INTERVAL = re.compile(r"\s*([0-9.]+)(?:\s*-\s*([0-9.]+))?\s*([^\W\d]+)\s*")
+FILE = re.compile(r".+\.[A-Za-z]+\s*")
+_POINTS = {"type": "array", "items": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}}
+_CURVE = [{"type": "string"}, {**_POINTS, "minItems": 2}]
+
+
+def _interval(text: str) -> tuple[float, float] | None:
+    """Shortest and longest wavelength, mm, of a text such as "555 nm" or "450-650 nm"; None for another text."""
+    match = INTERVAL.fullmatch(text)
+    if match is None:
+        return None
+    first, last, unit = match.groups()
+    shortest = length(f"{first} {unit}")
+    longest = shortest if last is None else length(f"{last} {unit}")
+    if last is not None and longest <= shortest:
+        raise ValueError(f'expected the shorter wavelength first, as in "450-650 nm", got {shortened_repr(text)}')
+    for end in (shortest, longest):
+        if not curve.SHORTEST <= end * MILLIMETRE <= curve.LONGEST:
+            raise ValueError(
+                f"expected wavelengths from {curve.SHORTEST:g} to {curve.LONGEST:g} nm, got {shortened_repr(text)}"
+            )
+    return shortest, longest
+
+
+def _spectrum(value: object) -> object:
+    if not isinstance(value, str):
+        if not isinstance(value, list | tuple):
+            raise ValueError(f'expected a text such as "555 nm" or a curve, got {shortened_repr(value)}')
+        return curve.checked(cast(object, value))
+    if value in ILLUMINANTS or _interval(value) is not None:
+        return value
+    if FILE.fullmatch(value) is None:
+        raise ValueError(
+            f'expected "555 nm", "450-650 nm", {", ".join(f"{name!r}" for name in ILLUMINANTS)} or the name of a file,'
+            f" got {shortened_repr(value)}"
+        )
+    return file_name(value)
+
+
+def _efficiency(value: object) -> object:
+    if isinstance(value, str):
+        return file_name(value)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if not 0 < value <= 1:
+            raise ValueError(f"expected a quantum efficiency above 0 and at most 1, got {value:g}")
+        return float(value)
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"expected a number, the name of a file or a curve, got {shortened_repr(value)}")
+    return curve.checked(cast(object, value), 1.0)
+
+
+class LightTable(Table):
+    """The light that falls onto the target."""
+
+    spectrum: Annotated[str | curve.Curve, BeforeValidator(_spectrum), WithJsonSchema({"anyOf": _CURVE})] = Field(
+        description='"555 nm", "450-650 nm" (flat radiant power), "D65", "LED-B3", or a curve of wavelength and power'
+    )
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Shortest and longest wavelength, mm, of a flat spectrum, equal for one wavelength; None for a curve."""
+        return _interval(self.spectrum) if isinstance(self.spectrum, str) else None
+
+    @property
+    def file(self) -> str | None:
+        """Name of the file that holds the spectrum, until it is read."""
+        text = self.spectrum
+        return text if isinstance(text, str) and text not in ILLUMINANTS and self.interval is None else None
 
 
 class NoiseTable(Table):
@@ -24,7 +103,7 @@ class NoiseTable(Table):
         default=None,
         ge=-LARGEST,
         le=LARGEST,
-        description="largest recorded value; saturated pixels are excluded; absent: no limit",
+        description="largest recorded value; a saturated pixel counts as at least that; absent: no limit",
     )
 
     @property
@@ -45,7 +124,11 @@ class SensorTable(Table):
         description="of the target, whose pixels of value 255 reflect all light (Lambertian)"
     )
     exposure: Time = Field(description="exposure time")
-    quantum_efficiency: float = Field(default=1.0, gt=0, le=1, description="electrons per photon")
+    quantum_efficiency: Annotated[
+        float | str | curve.Curve,
+        BeforeValidator(_efficiency),
+        WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0, "maximum": 1}, *_CURVE]}),
+    ] = Field(default=1.0, description="electrons per photon: a number, or a curve of wavelength and value")
     full_well: float = Field(default=10000.0, gt=0, le=1e9, description="largest number of electrons in a pixel")
     dark_current: float = Field(default=0.0, ge=0, le=1e9, description="electrons per second without light")
     read_noise: float = Field(default=0.0, ge=0, le=1e6, description="standard deviation of a reading, in electrons")

@@ -71,6 +71,11 @@ def duration(text: str) -> float:
     return _in_units(text, unit="s", what="a time", examples=("30 s", "2 min"))
 
 
+def length(text: str) -> float:
+    """Convert a text such as "555 nm" to millimetres. Raises ValueError that says what was expected."""
+    return _in_units(text, unit="mm", what="a length", examples=("1 mm", "6 um"))
+
+
 def _ratio(value: object) -> Fraction:
     try:
         if isinstance(value, bool) or not isinstance(value, str | int | float | Fraction):

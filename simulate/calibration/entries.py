@@ -61,7 +61,7 @@ def rendered_model(
 
 def _compared(responses: Responses, variance: FloatArray, camera: Camera) -> dict[str, Any]:
     """Compare H with the ideal one, if that has a closed form."""
-    if any(lens.optics.distortion is not None and camera.is_blurred(lens) for lens in camera.types):
+    if not camera.walls or any(lens.optics.distortion is not None and camera.is_blurred(lens) for lens in camera.types):
         return {}
     return {"agreement": agreement(responses.matrix, variance, camera, responses.passes)}
 

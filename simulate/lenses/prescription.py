@@ -170,7 +170,7 @@ def prescribe(surfaces: Sequence[Surface], wavelength: float | None = None) -> P
     marked = [index for index, surface in enumerate(surfaces) if surface.stop]
     if len(marked) > 1:
         raise InputError(f"expected one aperture stop at most, got {len(marked)}; mark the smallest alone")
-    index = [surface.index or glass.index(surface.glass or glass.AIR, wavelength or GREEN) for surface in surfaces]
+    index = [glass.index_behind(surface, wavelength or GREEN) for surface in surfaces]
     if index[-1] != 1:
         raise InputError(
             f"expected air behind the last surface, got an index of {index[-1]:g}; end the list with the surface"
@@ -221,4 +221,15 @@ def prescription_of(camera: Camera, lens_type: LensType) -> Prescription:
             f"{key}: the sensor would lie {-room:.4g} mm inside the lens, {camera.depth(lens_type):.4g} mm behind its"
             " rear principal plane; turn the lens round, make it thinner or scale it"
         )
+    _check_width(camera, lens_type, scaled)
     return scaled
+
+
+def _check_width(camera: Camera, lens_type: LensType, scaled: Prescription) -> None:
+    """Raise InputError if lenses would reach into their neighbours."""
+    widest, room = 2 * float(scaled.semi_diameter.max()), camera.lens_pitch
+    if widest > room * (1 + 1e-9) and len(camera.sub_imagers) > 1:
+        raise InputError(
+            f"camera.lens.{lens_type.name}.surfaces: expected openings of at most camera.lens_pitch, {room:.4g} mm, got"
+            f" a diameter of {widest:.4g} mm after scaling; reduce semi_diameter or widen the pitch"
+        )

@@ -20,6 +20,7 @@ Direction = tuple[Any, Any, Any]
 
 STEPS = 8  # of Newton's method; the error is squared by each
 CONVERGED = 1e-5  # largest last step, in semi-diameters, above which a ray is blocked
+LONGEST = 2.0  # step in semi-diameters, beyond which the method has failed
 BEYOND = 4.0  # r^2 over that of the rim, where the polynomial ends; rays out there are blocked anyway
 STEEPEST = 1e-3  # least cosine times length of the normal, with which Newton's method divides
 
@@ -77,15 +78,16 @@ def meet_asphere(
     curvature, shape, opening, *terms = surface
     u, v, w = direction
     total, (x, y, z), *_ = meet_conic(curvature, shape, x, y, direction, functions, passed)
-    run = total
+    step = total
     for _ in range(STEPS):
         sag, slope, _ = _sag(curvature, shape, opening, terms, x * x + y * y, functions)
         toward = w - 2 * slope * (x * u + y * v)
-        run = (sag - z) / functions.where(toward > STEEPEST, toward, 1.0)
+        step = (sag - z) / functions.where(toward > STEEPEST, toward, 1.0)
+        run = functions.where(step * step < LONGEST**2 * opening, step, 0.0)
         total, x, y, z = total + run, x + run * u, y + run * v, z + run * w
     _, slope, exists = _sag(curvature, shape, opening, terms, x * x + y * y, functions)
     cosine = w - 2 * slope * (x * u + y * v)
-    passed = passed & exists & (cosine > 0) & (run * run <= CONVERGED**2 * opening)
+    passed = passed & exists & (cosine > 0) & (step * step <= CONVERGED**2 * opening)
     return Meeting(total, (x, y, z), (-2 * slope * x, -2 * slope * y, 1.0), cosine, passed)
 
 

@@ -2,7 +2,8 @@
 
 The samples of one pixel are adjacent lanes, so that a pixel's sum is the sum of a block, in float64 and the same on any
 number of threads. A random number is drawn for an effect only if the lenses have it: two for the position in the pixel,
-two more for an aperture, one more for several wavelengths. Lengths are millimetres.
+two more for an aperture, one more for several wavelengths, and without walls one for the lens. Lengths are
+millimetres.
 """
 
 # pyright: basic
@@ -20,7 +21,7 @@ from ommatid.scenes.pose import corner_offset, poses
 from ommatid.scenes.scene import Sampler
 
 from ..sampling.samplers import RELATED_DRAWS, fitting
-from .lens import LensModel, ThinLens
+from .lens import Distance, LensModel, ThinLens
 from .reseeded_sampler import ReseededSampler
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
@@ -63,6 +64,19 @@ class RayGenerator:
         self._tables = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in _tables(camera, types)]
         dr.make_opaque(self._tables)
         self._pitch = float(camera.pixel_pitch)
+        self._crossing, self._own = None, None
+        if not camera.walls:
+            from .crosstalk import Crosstalk
+
+            models = {lens_type.name: lens_of(camera, lens_type) for lens_type in camera.types}
+            self._crossing = Crosstalk(camera, models)
+            self._own = mi.UInt32(own_lenses(camera, types).astype(np.uint32))
+            self.lens.tail = self._crossing.tail
+
+    def follow(self, distance: Distance) -> None:
+        """Tell all lenses how far the surfaces of a world are."""
+        (self._crossing or self.lens).follow(distance)
+        self.lens.captured = 1.0 if self._crossing is not None else self.lens.captured
 
     def blocks(self, samples: int, pixels: int | None = None) -> list[slice]:
         """Divide all pixels, or `pixels` of them, into blocks whose rays start together and fit into memory."""
@@ -97,7 +111,11 @@ class RayGenerator:
         else:
             x, y, z = corner_x + at.x, corner_y + at.y, corner_z
         draws = ReseededSampler(self.sampler, seed, lanes)
-        start, direction, weight = self.lens.emit(x, y, -z, draws, (lens_x, lens_y))
+        if self._crossing is None:
+            start, direction, weight = self.lens.emit(x, y, -z, draws, (lens_x, lens_y))
+        else:
+            own = dr.gather(mi.UInt32, self._own, index)
+            start, direction, weight = self._crossing.emit(own, (x, y, -z), draws, (lens_x, lens_y))
         if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
             draws.reseeded()
         ray = dr.zeros(mi.RayDifferential3f, lanes)
@@ -121,6 +139,13 @@ def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[FloatArray]:
         constants = np.repeat(np.array(constant)[:, None], row.size, axis=1)
         parts.append(np.concatenate([pose.middle[:, None] + pose.axes @ corner, constants]))
     return list(np.concatenate(parts, axis=1))
+
+
+def own_lenses(camera: Camera, types: tuple[LensType, ...]) -> IntArray:
+    """Return the number of each pixel's sub-imager in the camera, (pixels,)."""
+    numbers = [np.full(rows.stop - rows.start, number) for number, rows in enumerate(camera.slices())]
+    chosen = zip(camera.sub_imagers, numbers, strict=True)
+    return np.concatenate([number for sub, number in chosen if sub.type in types])
 
 
 def lens_of(camera: Camera, lens_type: LensType) -> LensModel:

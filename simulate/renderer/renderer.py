@@ -233,7 +233,7 @@ class Renderer:
         self._scene, self._integrator, self.direct_only = staged.scene, staged.integrator, staged.direct_only
         self._texels = f"{TARGET}.{self._texels.partition('.')[2]}" if has_target else ""
         for generator in self._generators.values():
-            generator.lens.follow(self._distance)
+            generator.follow(self._distance)
 
     def _distance(self, origin: tuple[Any, Any, Any], direction: tuple[Any, Any, Any]) -> Any:
         """Return the distance along z of the surface that rays meet first, a large one where they meet none."""

@@ -15,6 +15,8 @@ def response(setup: Setup) -> FloatArray:
     scene, camera = setup.scene, setup.camera
     if all(lens_type.optics.surfaces is None for lens_type in camera.types):
         return electrons(scene, camera)
-    from ..lenses.etendue import relative_illumination, solid_angles
+    from ..lenses.etendue import relative_illumination, solid_angles, transmissions
 
-    return electrons(scene, camera, solid_angles(camera), relative_illumination(camera))
+    passed = transmissions(camera)
+    transmitted = {name: angle * passed[name] for name, angle in solid_angles(camera).items()}
+    return electrons(scene, camera, transmitted, relative_illumination(camera))

@@ -35,7 +35,7 @@ from ..runs import document
 TILE = GALLERY / "tile19.toml"
 FEW = ("noise.variance=1e-2", "render.samples=1024", "calibration.samples=1024", "calibration.method=transport")
 BLUR = tuple(f'camera.lens.{name}.aperture="0.8 mm"' for name in ("I", "II", "III"))
-DIFFRACTION = (*BLUR, 'camera.wavelength="550 nm"')
+DIFFRACTION = (*BLUR, 'camera.wavelength="550 nm"', 'camera.lens_pitch="1 mm"')
 DISTORTION = tuple(f"camera.lens.{name}.distortion=[0.05,0.02]" for name in ("I", "II", "III"))
 
 

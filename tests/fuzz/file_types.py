@@ -15,9 +15,10 @@ import numpy as np
 
 from ommatid.runtime.files import digest
 from ommatid.scenes import camera, model_file, scene, stack
-from ommatid.scenes.formats import picture
+from ommatid.scenes.formats import curve, picture
 from ommatid.scenes.hardware import frames, source_positions
 from ommatid.scenes.tables import lens_file
+from ommatid.scenes.zemax.agf import read_catalogue
 
 from ..conftest import TINY
 from ..examples import GALLERY
@@ -143,6 +144,16 @@ def read_lens(path: Path) -> str:
     return fingerprint(lens_file.read_lens(path))
 
 
+def read_glasses(path: Path) -> str:
+    catalogue = read_catalogue(path)
+    dispersions = [catalogue.dispersion(name) for name in catalogue.entries]
+    return fingerprint([(each.model_dump(mode="json"), each.index(550e-6)) for each in dispersions])
+
+
+def read_curve(path: Path) -> str:
+    return fingerprint([list(point) for point in curve.read_curve(path)])
+
+
 # Stacks and models
 
 
@@ -221,7 +232,42 @@ def read_world(path: Path) -> str:
 
 SHOW = ("show", "{file}", "--json")
 LENS = ("show", SCENE, "--json", "--set", "camera.lens.I.surfaces={file}")
+LIGHT = ("show", SCENE, "--json", "--set", "light.spectrum={file}")
 STACK = ("reconstruct", "{file}", "sound.npz", "-o", "new.exr", "--json")
+ZMX = b"""UNIT MM X W X CM
+SURF 0
+  DISZ INFINITY
+SURF 1
+  STOP
+  TYPE EVENASPH
+  CURV 0.05 0 0 0
+  CONI -0.5
+  PARM 2 1e-5
+  PARM 8 1e-20
+  DISZ 3
+  GLAS N-BK7 0 0 1.5 60
+  DIAM 4 1
+SURF 2
+  CURV -0.04
+  DISZ 20
+  CLAP 0 3 0
+  GLAS ___BLANK 1 0 1.6 36
+SURF 3
+  TYPE STANDARD
+  DIAM 2
+SURF 4
+"""
+AGF = b"""CC some glasses
+NM N-BK7 2 517642 1.5168 64.17 0 1
+CD 1.03961212 6.00069867E-3 0.231792344 2.00179144E-2 1.01046945 103.560653 0 0
+LD 0.3 2.5
+NM KRS 13 0 2.3 20 0
+CD 2.2 0.03 0 0 2e-4 3e-6 1e-7
+LD 0.4 20
+NM C 5 0
+CD 1.5 0.01 0.002
+LD 0.3 1
+"""
 MODEL = ("reconstruct", "sound.exr", "{file}", "-o", "new.exr", "--json")
 PICTURE = ("show", SCENE, "--json", "--set", "target.image={file}", "--set", "target.origin=", "--set", "target.shape=")
 IMPORT = ("import", SCENE, "{file}", "-o", "new.exr", "--origin", "0,0", "--json")
@@ -242,6 +288,9 @@ FILE_TYPES = {
         FileType("lens, TOML", "lens.toml", LENSES_TOML, damaged, read_lens, LENS),
         FileType("lens, keys and values", "lens.toml", LENSES_TOML, scene_mutated, read_lens, LENS),
         FileType("lens, rows", "lens.dat", LENSES_DAT, rows_damaged, read_lens, LENS),
+        FileType("lens, ZMX", "lens.zmx", lambda _: [ZMX], rows_damaged, read_lens, LENS),
+        FileType("glasses, AGF", "glass.agf", lambda _: [AGF], rows_damaged, read_glasses, ()),
+        FileType("curve, CSV", "curve.csv", gallery_files("spectra/*5.csv"), damaged, read_curve, LIGHT),
         FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
         FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
         FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),

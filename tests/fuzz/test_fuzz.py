@@ -16,7 +16,12 @@ from .file_types import FILE_TYPES
 SEED = 0
 INPUTS = 100  # of each type, but of those in containers written anew, many of which are valid and reconstructed:
 RESEALED_INPUTS = 40
-FAMILIES = (("scene", "settings"), ("lens", "places", "world"), ("stack", "model"), ("picture", "frames"))
+FAMILIES = (
+    ("scene", "settings"),
+    ("lens", "glasses", "places", "world", "curve"),
+    ("stack", "model"),
+    ("picture", "frames"),
+)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids="-".join)

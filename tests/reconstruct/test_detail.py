@@ -33,7 +33,7 @@ EXPONENTIAL = {"kind": "exponential", "correlation_length": "6 mm", "variance": 
 CAMERAS = {
     "distorted": ({"distortion": [0.3, 0]}, {"lens_pitch": "3 mm"}),
     "misaligned": ({}, {"tolerance": {"position": "0.5 um"}}),
-    "out of focus": ({"aperture": "0.8 mm", "focus": "800 mm"}, {}),
+    "out of focus": ({"aperture": "0.8 mm", "focus": "800 mm"}, {"lens_pitch": "1 mm"}),
 }
 SMALL = (("1/3", [3, 3], [3, 3]), ("1/2", [2, 2], [5, 5]))
 

@@ -213,7 +213,7 @@ def test_calibration_accounts_for_dark_flat_and_rounding(imaging_camera: Camera,
 
 def test_with_a_sensor_one_sweep_has_photon_noise(imaging_camera: Camera, ommatid: Command) -> None:
     """Saturated readings are ignored: one frame exceeds the sensor's range."""
-    text = SCENE.replace("pixels =", 'aperture = "0.1 mm"\npixels =') + SENSOR + "gain = 0.1\n"
+    text = SCENE.replace("pixels =", 'aperture = "0.06 mm"\npixels =') + SENSOR + "gain = 0.1\n"
     Path("scene.toml").write_text(text, encoding="utf-8")
     truth, rng = ideal_matrix(imaging_camera), np.random.default_rng(9)
     frames: list[Array] = []

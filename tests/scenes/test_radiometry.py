@@ -45,11 +45,9 @@ def test_electrons_are_the_light_from_the_target_to_the_lens() -> None:
     result = float(electrons(described, camera)[4]) * 255
     patch, lens, distance = 5e-3**2, pi * 0.05e-3**2, 1.0  # m^2, m^2, m
     lumens = 500 / pi * patch * lens / distance**2
-    energy = constants.h * constants.c / 550e-9
-    assert result == pytest.approx(
-        lumens * 10e-3 / 683 / energy, rel=2e-3
-    )  # neglecting sin^2 against tan^2, of 0.05 / 1.2
-    assert result == pytest.approx(lumens * 10e-3 / 683 / energy / (1 + (0.05 / 1.2) ** 2), rel=2e-4)
+    photons = lumens * 10e-3 / (683.002 * 0.9949501) / (constants.h * constants.c / 550e-9)
+    assert result == pytest.approx(photons, rel=2e-3)  # neglecting sin^2 against tan^2, of 0.05 / 1.2
+    assert result == pytest.approx(photons / (1 + (0.05 / 1.2) ** 2), rel=2e-4)
 
 
 def test_electrons_are_proportional_to_light_and_time() -> None:
@@ -65,7 +63,7 @@ def test_electrons_are_proportional_to_light_and_time() -> None:
         changed = described.model_copy(update={"sensor": described.sensor.model_copy(update={key: value})})
         np.testing.assert_allclose(electrons(changed, camera), factor * before, rtol=1e-12)
     red = described.model_copy(update={"camera": described.camera.model_copy(update={"wavelength": 660e-6})})
-    np.testing.assert_allclose(electrons(red, camera), 660 / 550 * before, rtol=1e-12)
+    np.testing.assert_allclose(electrons(red, camera), 660 / 550 * 0.9949501 / 0.061 * before, rtol=1e-6)
 
 
 def test_a_smaller_magnification_collects_more_light() -> None:
@@ -158,7 +156,8 @@ def test_the_summary_has_the_light_of_each_type() -> None:
             (lens_type["mean"] + 4 + 1 / 12) ** 0.5 / lens_type["mean"] * 127.5
         )  # at half of 255; frames add less than 1/64
         assert shot < lens_type["noise"] < 1.03 * shot
-    assert [line[0] for line in rows(result)] == ["lens type A", "lens type B", "lens type C"]
+    assert rows(result)[0] == ("light", "679.6 lm/W")
+    assert [line[0] for line in rows(result)[1:]] == ["lens type A", "lens type B", "lens type C"]
     assert described.sensor is not None
     changes = {"exposure": 1.0, "black_level": 0.0, "dark_current": 1.0}
     long = described.model_copy(update={"sensor": described.sensor.model_copy(update=changes)})
@@ -167,7 +166,7 @@ def test_the_summary_has_the_light_of_each_type() -> None:
     assert result["cut_off"]
     assert {"without light", "warning"} <= {line[0] for line in rows(result)}
     dark = summary(described, camera, np.zeros_like(response))
-    assert "too little light" in rows(dark)[0][1]
+    assert "too little light" in rows(dark)[1][1]
 
 
 def test_a_prediction_with_unequal_noise() -> None:

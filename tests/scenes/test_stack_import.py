@@ -162,7 +162,7 @@ def test_pixels_with_a_flat_not_above_the_dark_are_dead(imaging_camera: Camera, 
 
 
 def test_with_a_sensor_the_stack_holds_digital_numbers(imaging_camera: Camera, ommatid: Command) -> None:
-    lensed = SCENE.replace("pixels =", 'aperture = "0.1 mm"\npixels =')
+    lensed = SCENE.replace("pixels =", 'aperture = "0.06 mm"\npixels =')
     Path("scene.toml").write_text(lensed + SENSOR, encoding="utf-8")
     _, values = recorded_image(imaging_camera)
     digital = np.clip(np.rint(100 + 7 * values), 0, 4094)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.lenses.prescription import Prescription, prescription_of
 from ommatid.simulate.lenses.ray_trace import Disk, exit_disk, path, spread, through, trace, trace_path
-from ommatid.simulate.lenses.surface_shapes import NUMPY
+from ommatid.simulate.lenses.surface_shapes import NUMPY, meet_asphere
 
 from ..lenses import BICONVEX, camera_with, lens, turned_round
 
@@ -77,6 +77,41 @@ def test_rays_meet_the_surface_of_the_formula() -> None:
     before, behind = np.stack([u, v, w]).T, np.stack(out).T
     np.testing.assert_allclose(np.cross(before, normal), 1.6 * np.cross(behind, normal), atol=1e-12)
     assert np.abs(slope).max() > 0.5
+
+
+def height(surface: tuple[float, ...], square: Array) -> Array:
+    """Return the sag of (curvature, 1 + conic, a4, a6, ...)."""
+    curvature, shape, *terms = surface
+    root = np.sqrt(np.maximum(1 - shape * curvature**2 * square, 0))
+    return curvature * square / (1 + root) + sum(term * square ** (2 + n) for n, term in enumerate(terms))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_strong_aspheres_are_met_where_bisection_finds_them(seed: int) -> None:
+    """Waves of a third of the semi-diameter, such as telephones' lenses have; rays that meet them once; no warning."""
+    rng = np.random.default_rng(seed)
+    surface = (rng.uniform(-0.6, 0.6), rng.uniform(-2, 2), *(rng.normal(size=7) * 0.15 * np.exp(-0.3 * np.arange(7))))
+    x, y, p, q = rng.uniform(-1, 1, (4, 300)) * [[0.9], [0.9], [0.45], [0.45]]
+
+    def above(z: Array) -> Array:
+        return z - height(surface, (x + p * z) ** 2 + (y + q * z) ** 2)
+
+    grid = np.linspace(-0.8, 0.8, 801)
+    sides = above(np.repeat(grid[:, None], 300, axis=1)) > 0
+    once = np.sum(sides[1:] != sides[:-1], axis=0) == 1
+    low, high = (grid[np.argmax(sides, axis=0) + step] for step in (-1, 0))
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = np.where(above(middle) > 0, low, middle), np.where(above(middle) > 0, middle, high)
+    square = (x + p * high) ** 2 + (y + q * high) ** 2
+    once &= ~sides[0] & (square < 0.99) & (1 - surface[1] * surface[0] ** 2 * square > 0.02)
+    w = 1 / np.sqrt(1 + p * p + q * q)
+    row = (*surface[:2], 1.0, *surface[2:])
+    with np.errstate(all="raise"):
+        meeting = meet_asphere(row, x, y, (p * w, q * w, w), NUMPY, np.full(300, True))
+    assert np.mean(once) > 0.3
+    assert np.all(meeting.passed[once])
+    np.testing.assert_allclose(meeting.point[2][once], high[once], atol=1e-12)
 
 
 def test_an_asphere_corrects_a_sphere() -> None:

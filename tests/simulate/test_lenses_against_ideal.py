@@ -25,6 +25,7 @@ from ommatid.simulate.sampling.passes import Plan
 from ..examples import OPTICS, TWO, assert_student, familywise, needs, with_optics
 
 SAMPLES = 2**14
+DIFFRACTS = {"wavelength": "550 nm", "lens_pitch": "1 mm"}
 FEWEST = 25  # rays expected in an entry, above which their number is normal
 RAYS = {"wavelength": "none"}
 WAVES = {"0.1 waves": 266.67, "0.3 waves": 108.11, "1 wave": 35.088, "3 waves": 11.976}  # focus, mm, at 550 nm
@@ -60,6 +61,23 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
 
 
+def test_traced_h_of_several_wavelengths_is_the_closed_form() -> None:
+    """Every ray has one of the wavelengths, with its share of the light; H of one wavelength is another."""
+    needs("llvm_ad_mono")
+    lens = {"aperture": "0.4 mm", "focus": "108.11 mm"}
+    render = {"sampler": "independent", "complete": True}
+    tables: dict[str, Any] = {"calibration": {"samples": SAMPLES}, "render": render, "light": {"spectrum": "LED-B3"}}
+    described, camera = with_optics(lens, {}, **tables)
+    assert len(camera.wavelengths) > 2
+    traced = responses_from_rays(Setup(described, camera))
+    found = scores(traced.matrix, ideal_matrix(camera), SAMPLES)
+    assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
+    assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
+    _, blue = with_optics(lens, {"wavelength": "450 nm"})
+    other = scores(traced.matrix, ideal_matrix(blue), SAMPLES)
+    assert np.abs(other).max() > 2 * stats.norm.isf(familywise(other.size) / 2)
+
+
 @pytest.mark.parametrize("kind", WAVES)
 def test_the_focus_has_these_waves(kind: str) -> None:
     _, camera = with_optics(*CLOSED[kind])
@@ -74,7 +92,7 @@ def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str)
     renderer = Renderer(camera, choose("auto"), "independent", together=False)
     group, work = next(iter(renderer.groups)), Plan(64, SAMPLES // 64)
     for generator in renderer._generators.values():  # pyright: ignore[reportPrivateUsage]
-        generator.lens.follow(renderer._distance)  # pyright: ignore[reportPrivateUsage]
+        generator.follow(renderer._distance)  # pyright: ignore[reportPrivateUsage]
     rows = renderer.rows(group)
     total = sparse.csr_array((rows.stop - rows.start, camera.unknowns))
     (block,) = renderer.blocks(group, work.samples)

@@ -175,12 +175,16 @@ def test_the_disk_holds_every_ray_that_passes(tmp_path: Any) -> None:
     gauss = double_gauss(tmp_path)
     shaded = lens([inf, 10.0, -10.0], [5.0, 1.0], [1.0, 1.5, 1.0], [3.0, 0.5, 0.5])  # its stop stops nothing
     remote = lens([inf, 10.0, -10.0], [9.0, 1.0], [1.0, 1.5, 1.0], [0.5, 3.0, 3.0])  # telecentric, but for the glass
+    # the sag of its last surface is largest inside its edge
+    bent = replace(lens([1.0, 3.0], [0.3], [1.5, 1.0], [0.2, 0.4], stop=0), aspheric=((), (-1.0, -8.0)))
+    assert bent.last_extent()[1] > max(0.0, bent.sag(inf)[1]) + 1e-3
     for one, depth, field in (
         (gauss, 52.0, 12.0),
         (remote, 11.0, 2.0),
         (shaded, 11.0, 2.0),
         (ball(), 1.55, 0.1),
         (turned_round(gauss), 60.0, 0.0),
+        (bent, 2.0, 0.4),
     ):
         disk = exit_disk(one, depth, field)
         wide = Disk(disk.height, disk.radius * 1.6)

@@ -39,7 +39,11 @@ def _size(pixels: int) -> str:
 
 def _apertures(diameter: str) -> tuple[str, ...]:
     """Return apertures that diffract, of all three lens types."""
-    return ("camera.wavelength=550 nm", *(f"camera.lens.{name}.aperture={diameter}" for name in ("I", "II", "III")))
+    return (
+        "camera.wavelength=550 nm",
+        "camera.lens_pitch=1 mm",
+        *(f"camera.lens.{name}.aperture={diameter}" for name in ("I", "II", "III")),
+    )
 
 
 def _tiles() -> Iterable[Cell]:

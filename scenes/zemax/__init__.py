@@ -1,0 +1,1 @@
+"""Files of Zemax: lenses, glass catalogues, and the formulas of these."""

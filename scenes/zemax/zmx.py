@@ -1,0 +1,212 @@
+"""Sequential lens files of Zemax (.zmx), from the object to the image, which is the order of a scene file, too.
+
+Spheres, conics and even aspheres are read (STANDARD, EVENASPH), with curvature, thickness, semi-diameter, conic and
+glass. Curvatures have the sign used here, positive if the centre lies towards the image. The object, the image and flat
+surfaces without glass on either side are left out, unless they are the stop. The distance to the image is ignored,
+because the magnification determines it. So are wavelengths, fields, the system aperture (the stop is as wide as its
+semi-diameter) and everything else that is no surface.
+
+A glass without a name, by its index nd and Abbe number vd (a "model" glass), has the index A + B / w^2 with that nd and
+vd, from 400 to 700 nm; it differs from real glasses of the same nd and vd by some 1e-4 at 550 nm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from ommatid.runtime.errors import InputError, shortened
+
+from ..tables.camera import Surface
+from ..tables.messages import explain
+from .text import number, read_text
+
+MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0, "METER": 1000.0}
+MOST_SURFACES = 1000
+ASPHERE = "EVENASPH"
+KINDS = ("STANDARD", ASPHERE)
+TERMS = 8  # of an even asphere, from r^2 on
+REFUSED = {
+    "SQAP": "a rectangular aperture",
+    "ELAP": "an elliptical aperture",
+    "OBSC": "an obscuration",
+    "SPID": "a spider",
+    "UDAD": "a drawn aperture",
+    "OBDC": "a decentred aperture",
+}
+LEAST_ABBE, LARGEST_ABBE = 5, 200
+FRAUNHOFER = {"F": 0.4861327, "d": 0.5875618, "C": 0.6562725}  # wavelengths in micrometres
+
+
+@dataclass
+class Lines:
+    """The lines of one surface: the number of the first, and the words behind each keyword (PARM n counts as one)."""
+
+    line: int
+    words: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+
+    def value(self, keyword: str, where: str, default: float = 0.0) -> float:
+        """Return the first number behind a keyword; `inf` for INFINITY."""
+        words = self.words.get(keyword)
+        if not words:
+            return default
+        return inf if words[0].upper() == "INFINITY" else number(words[0], where, keyword)
+
+
+def read_zmx(path: Path) -> tuple[Surface, ...]:
+    """Read the surfaces of a lens. Raises InputError that names the file, the surface and what is not supported."""
+    unit, surfaces = _surfaces(read_text(path, "lens file"), path)
+    if len(surfaces) < 3:
+        raise InputError(f"{path}: expected surfaces between the object and the image (SURF), got none")
+    read: list[dict[str, Any]] = []
+    before: object = None
+    for place, lines in enumerate(surfaces[1:-1], start=1):
+        where = f"{path}, line {lines.line}, surface {place}"
+        table = _table(lines, where, unit)
+        thickness = lines.value("DISZ", where) * unit
+        behind = _medium(table)
+        if _is_dummy(table, before, behind):
+            if read:
+                read[-1]["thickness"] += thickness
+        else:
+            read.append(table | {"thickness": thickness, "where": where})
+        before = behind
+    if not read:
+        raise InputError(f"{path}: expected a lens, got flat surfaces without glass alone")
+    read[-1]["thickness"] = 0.0
+    return tuple(_surface(table) for table in read)
+
+
+def _surfaces(text: str, path: Path) -> tuple[float, list[Lines]]:
+    """Return the unit of lengths in mm, and the lines of all surfaces."""
+    unit, surfaces = 1.0, list[Lines]()
+    for line, keyword, words in _keywords(text):
+        if keyword == "SURF":
+            if len(surfaces) == MOST_SURFACES:
+                raise InputError(f"{path}, line {line}: expected at most {MOST_SURFACES} surfaces, got more")
+            surfaces.append(Lines(line))
+        elif keyword == "UNIT" and words:
+            if words[0].upper() not in MILLIMETRES:
+                expected = ", ".join(MILLIMETRES)
+                raise InputError(f"{path}, line {line}: expected a unit among {expected}, got '{shortened(words[0])}'")
+            unit = MILLIMETRES[words[0].upper()]
+        elif keyword == "MODE" and words and words[0].upper() != "SEQ":
+            raise InputError(f"{path}, line {line}: expected a sequential lens (MODE SEQ), got '{shortened(words[0])}'")
+        elif surfaces and keyword == "PARM" and len(words) > 1:
+            surfaces[-1].words.setdefault(f"PARM {words[0]}", words[1:])
+        elif surfaces:
+            surfaces[-1].words.setdefault(keyword, words)
+    return unit, surfaces
+
+
+def _keywords(text: str) -> Iterator[tuple[int, str, list[str]]]:
+    for line, row in enumerate(text.splitlines(), start=1):
+        words = row.split()
+        if words:
+            yield line, words[0].upper(), words[1:]
+
+
+def _table(lines: Lines, where: str, unit: float) -> dict[str, Any]:
+    """Return the keys of a surface of a scene file, its lengths as numbers of mm; raise InputError if unsupported."""
+    for keyword, meaning in REFUSED.items():
+        if keyword in lines.words:
+            raise InputError(f"{where}: expected a circular opening, got {meaning} ({keyword}); remove it")
+    kind = (lines.words.get("TYPE") or ["STANDARD"])[0].upper()
+    if kind not in KINDS:
+        what = "a coordinate break" if kind == "COORDBRK" else f"the type {shortened(kind)}"
+        raise InputError(f"{where}: expected a surface of type {' or '.join(KINDS)} on one axis, got {what}")
+    curvature = lines.value("CURV", where) / unit
+    table: dict[str, Any] = {"conic": lines.value("CONI", where), "stop": "STOP" in lines.words}
+    table["semi_diameter"] = _opening(lines, where) * unit
+    if kind == ASPHERE:
+        terms = [lines.value(f"PARM {n}", where) / unit ** (2 * n - 1) for n in range(1, TERMS + 1)]
+        if terms[0]:
+            curvature, table["conic"] = _with_square(curvature, table["conic"], terms[0], where)
+        if any(terms[1:]):
+            table["aspheric"] = terms[1:]
+    if curvature:
+        table["radius"] = 1 / curvature
+    return table | _glass(lines, where)
+
+
+def _with_square(curvature: float, conic: float, term: float, where: str) -> tuple[float, float]:
+    """Return curvature and conic constant of a surface to which `term` r^2 is added: a paraboloid stays one."""
+    if curvature and conic != -1:
+        raise InputError(
+            f"{where}: expected PARM 1, the coefficient of r^2, of 0, got {term:g}; add it to the curvature instead"
+        )
+    return curvature + 2 * term, -1.0
+
+
+def _opening(lines: Lines, where: str) -> float:
+    """Return the semi-diameter: that of an aperture, or else the one that DIAM holds."""
+    openings = [lines.value("DIAM", where)]
+    for keyword in ("CLAP", "FLAP"):
+        words = lines.words.get(keyword, [])
+        if len(words) > 1:
+            if number(words[0], where, keyword) > 0:
+                raise InputError(
+                    f"{where}: expected an opening without an obscuration, got an inner radius ({keyword})"
+                )
+            openings.append(number(words[1], where, keyword))
+    return next((opening for opening in reversed(openings) if opening), 0.0)
+
+
+def _glass(lines: Lines, where: str) -> dict[str, Any]:
+    """Return the keys of the medium behind a surface; none for air."""
+    words = lines.words.get("GLAS", [])
+    if not words or words[0].upper() == "AIR":
+        return {}
+    if words[0].upper() == "MIRROR":
+        raise InputError(f"{where}: expected a lens of refracting surfaces, got a mirror")
+    if words[0] != "___BLANK":
+        return {"glass": words[0]}
+    return _model_glass(words[3:5], where)
+
+
+def _model_glass(words: list[str], where: str) -> dict[str, Any]:
+    """Return the keys of a glass without a name, of which nd and vd are given; a vd of 0 is no dispersion."""
+    index, abbe = (number(word, where, "nd and vd of a glass") for word in (*words, "", "")[:2])
+    if not 1 <= index <= 5:
+        raise InputError(f"{where}: expected a glass of nd from 1 to 5, got {index:g}")
+    if abbe and not LEAST_ABBE <= abbe <= LARGEST_ABBE:
+        raise InputError(
+            f"{where}: expected a glass of vd 0 or from {LEAST_ABBE} to {LARGEST_ABBE}, got {abbe:g}; give its name"
+        )
+    if not abbe:
+        return {"index": index}
+    inverse = {line: wavelength**-2 for line, wavelength in FRAUNHOFER.items()}
+    slope = (index - 1) / abbe / (inverse["F"] - inverse["C"])
+    level = index - slope * inverse["d"]
+    # (A + B / w^2)^2 as Schott's formula
+    coefficients = [level**2, 0.0, 2 * level * slope, slope**2]
+    return {"dispersion": {"formula": 1, "coefficients": coefficients, "shortest": "400 nm", "longest": "700 nm"}}
+
+
+def _medium(table: dict[str, Any]) -> object:
+    """Return what stands for the medium behind a surface; None for air."""
+    return table.get("glass") or table.get("dispersion") or table.get("index")
+
+
+def _is_dummy(table: dict[str, Any], before: object, behind: object) -> bool:
+    """True for a surface that does nothing."""
+    return before is None and behind is None and not table["stop"] and not {"radius", "aspheric"} & {*table}
+
+
+def _surface(table: dict[str, Any]) -> Surface:
+    where, thickness = table.pop("where"), table.pop("thickness")
+    if not 0 <= thickness < inf:
+        raise InputError(f"{where}: expected a finite thickness (DISZ) of 0 or more, got {thickness:g} mm")
+    if table["semi_diameter"] <= 0:
+        raise InputError(f"{where}: expected a semi-diameter (DIAM) above 0, got {table['semi_diameter']:g} mm")
+    lengths = {"thickness": thickness, "semi_diameter": table["semi_diameter"], "radius": table.get("radius", 0.0)}
+    data = table | {name: f"{value!r} mm" for name, value in lengths.items() if value}
+    try:
+        return Surface.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{where}: {explain(error, data, Surface)}") from error

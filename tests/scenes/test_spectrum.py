@@ -1,0 +1,226 @@
+"""Electrons from lux by hand, CIE's tables against another copy, and the few wavelengths that stand for a spectrum."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import constants
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics import spectrum
+from ommatid.scenes.optics.radiometry import electrons
+from ommatid.scenes.scene import Scene, parse, read, with_changes, write
+
+from ..examples import scene
+
+# By hand: 500 lux on a white target, a lens 0.1 mm wide 1.2 mm before a pixel of 6 um x 6 um, 10 ms.
+# E / pi x pi sin^2 x area x time, sin^2 = 0.05^2 / (0.05^2 + 1.2^2) = 1.73310e-3:
+# 500 x 1.73310e-3 x 36e-12 x 0.01 = 3.11958e-13 lm s. Times 0.6 electrons per photon, below.
+LUMEN_SECONDS = 3.11958e-13
+# V (CIE, 1924) at 450, 550 and 650 nm is 0.0380, 0.99495 and 0.1070, so that a lumen second is
+# 1 / (683.002 x 0.0380) = 0.0385295 J, 1 / 679.553 = 1.471556e-3 J and 1 / 73.0812 = 0.0136834 J,
+# and a photon has 1.986446e-25 J m / wavelength = 4.41432e-19 J, 3.61172e-19 J and 3.05607e-19 J.
+BY_HAND = {"450 nm": 16337.2, "550 nm": 762.63, "650 nm": 8380.7}
+
+# CIE's tables every 10 nm from 380 to 780 nm.
+SENSITIVITY = """
+0.000039 0.00012 0.000396 0.00121 0.0040 0.0116 0.023 0.038 0.060 0.09098 0.13902 0.20802 0.323 0.503 0.710 0.862 0.954
+0.99495 0.995 0.952 0.870 0.757 0.631 0.503 0.381 0.265 0.175 0.107 0.061 0.032 0.017 0.00821 0.004102 0.002091
+0.001047 0.00052 0.000249 0.00012 0.00006 0.00003 0.000015"""
+DAYLIGHT = """
+49.9755 54.6482 82.7549 91.4860 93.4318 86.6823 104.865 117.008 117.812 114.861 115.923 108.811 109.354 107.802 104.790
+107.689 104.405 104.046 100.000 96.3342 95.7880 88.6856 90.0062 89.5991 87.6987 83.2886 83.6992 80.0268 80.2146 82.2778
+78.2842 69.7213 71.6091 74.3490 61.6040 69.8856 75.0870 63.5927 46.4182 66.8054 63.3828"""
+TENS = np.arange(380.0, 781.0, 10.0)
+
+
+def lit(light: Any = None, efficiency: Any = 0.6, **more: Any) -> tuple[Scene, Camera]:
+    """A scene of one thin lens on the axis of its pixels, lit by a spectrum, and its camera."""
+    sensor = {"illuminance": "500 lux", "exposure": "10 ms", "quantum_efficiency": efficiency, "black_level": 20.0}
+    data = scene(lenses=(("1/5", [1, 1], [3, 3]),)).plain() | {"sensor": sensor}
+    data["camera"] |= more
+    data["camera"]["lens"][0]["aperture"] = "0.1 mm"
+    if light is not None:
+        data["light"] = {"spectrum": light}
+    described = parse(data, Path("test.toml"))
+    return described, derive(described)
+
+
+def white(described: tuple[Scene, Camera]) -> float:
+    """Electrons in the middle pixel at 255."""
+    return float(electrons(*described)[4]) * 255
+
+
+@pytest.mark.parametrize("light", BY_HAND)
+def test_electrons_of_one_wavelength_are_those_by_hand(light: str) -> None:
+    """The pixel is wide enough that cos^4 takes 1e-5 of its light."""
+    assert white(lit(light)) == pytest.approx(BY_HAND[light], rel=3e-5)
+    assert white(lit(wavelength=light)) == pytest.approx(BY_HAND[light], rel=3e-5)
+
+
+def test_electrons_of_daylight_are_those_by_hand() -> None:
+    """Photons and lumens of D65, summed every 10 nm."""
+    sensitivity, power = (np.array(text.split(), dtype=float) for text in (SENSITIVITY, DAYLIGHT))
+    photons = np.trapezoid(power * TENS * 1e-9, TENS) / 1.986446e-25
+    lumens = 683.002 * np.trapezoid(power * sensitivity, TENS)
+    assert white(lit("D65")) == pytest.approx(0.6 * LUMEN_SECONDS * photons / lumens, rel=2e-3)
+    assert 204 < lumens / np.trapezoid(power, TENS) < 206, "lm/W, of D65 from 380 to 780 nm"
+
+
+def test_the_tables_are_those_of_another_library() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    standard = colour.colorimetry.SDS_LEFS["CIE 1924 Photopic Standard Observer"]
+    for name, other in (
+        ("photopic", standard),
+        *((name, colour.SDS_ILLUMINANTS[name]) for name in ("D65", "LED-B3")),
+    ):
+        table = np.array(spectrum.table(name))
+        np.testing.assert_allclose(table[:, 1], [float(other[wavelength]) for wavelength in table[:, 0]], rtol=1e-12)
+    lamp, grid = colour.SDS_ILLUMINANTS["LED-B3"], np.arange(380.0, 781.0)
+    power = np.interp(grid, lamp.wavelengths, lamp.values)
+    lumens = 683.002 * np.trapezoid(power * [float(standard[wavelength]) for wavelength in grid])
+    photons = np.trapezoid(power * grid * 1e-9) / (constants.h * constants.c)
+    assert white(lit("LED-B3")) == pytest.approx(0.6 * LUMEN_SECONDS * photons / lumens, rel=1e-4)
+
+
+def test_a_curve_of_quantum_efficiency_weights_the_photons() -> None:
+    """Flat power from 500 to 600 nm, efficiency rising from 0 to 1: the mean of (x + 500 nm) x over that of 500 + x."""
+    ramp = [[500, 0.0], [600, 1.0]]
+    mean = (500 * 100 / 2 + 100**2 / 3) / (500 + 100 / 2) / 100  # of the efficiency, weighted by the photons
+    assert white(lit("500-600 nm", ramp)) == pytest.approx(mean * white(lit("500-600 nm", 1.0)), rel=1e-5)
+    half = white(lit("500-600 nm", [[400, 0.5], [700, 0.5]]))
+    assert half == pytest.approx(0.5 * white(lit("500-600 nm", 1.0)), rel=1e-12)
+    # sum of (500 + x)^2 x over sum of (500 + x) x: the mean wavelength of the electrons
+    mean = (500**2 / 2 + 1000 * 100 / 3 + 100**2 / 4) / (500 / 2 + 100 / 3)
+    camera = lit("500-600 nm", ramp)[1]
+    assert camera.wavelength == pytest.approx(mean * 1e-6, rel=1e-5)
+
+
+def transfer(frequency: np.ndarray) -> np.ndarray:
+    """Contrast of a circular pupil by the area that two displaced circles share, summed over chords."""
+    height = (np.arange(1000) + 0.5) / 1000
+    chord = np.maximum(np.sqrt(1 - height**2) - frequency[..., None], 0)
+    return 4 / np.pi * chord.mean(axis=-1)
+
+
+@pytest.mark.parametrize(("light", "count"), [("D65", 5), ("LED-B3", 5), ("450-650 nm", 4), ("545-555 nm", 1)])
+def test_a_few_wavelengths_diffract_as_the_whole_spectrum(light: str, count: int) -> None:
+    """Contrast at every frequency within 1e-3, by hundreds of wavelengths; with one node less it is beyond."""
+    described, camera = lit(light)
+    wavelengths = camera.wavelengths
+    assert len(wavelengths) == count
+    assert sum(share for _, share in wavelengths) == pytest.approx(1, rel=1e-12)
+    assert sum(at * share for at, share in wavelengths) == pytest.approx(camera.wavelength, rel=1e-12)
+    assert camera.bands == (wavelengths if count > 1 else ())
+    at, weight = spectrum.spectrum_of(described).wavelength, spectrum.detected(described)
+    frequency = np.linspace(0, 1 / at[0], 40)[:, None]
+    exact = transfer(frequency * at[::2]) @ weight[::2] / weight[::2].sum()
+    few = transfer(frequency * [1e6 * at for at, _ in wavelengths]) @ [share for _, share in wavelengths]
+    assert np.abs(few - exact).max() < 1.1e-3
+    if count > 1:
+        at, share = spectrum.gauss(at[weight > 0], weight[weight > 0] / weight.sum(), count - 1)
+        assert np.abs(transfer(frequency * at) @ share - exact).max() > 1e-3
+
+
+def test_gauss_s_rule_is_legendre_s_for_a_flat_weight() -> None:
+    points = np.linspace(-1, 1, 20001)
+    weight = np.full(points.size, 1 / points.size)
+    for count in (1, 3, 6):
+        expected = np.polynomial.legendre.leggauss(count)
+        found = spectrum.gauss(points, weight, count)
+        np.testing.assert_allclose(found[0], expected[0], atol=2e-4)
+        np.testing.assert_allclose(found[1], expected[1] / 2, atol=2e-4)
+
+
+def test_one_wavelength_is_the_same_in_either_table() -> None:
+    by_light, by_camera = lit("550 nm")[1], lit(wavelength="550 nm")[1]
+    assert by_light == by_camera
+    assert by_light.wavelengths == ((by_camera.wavelength, 1.0),)
+    assert lit()[1].wavelengths == ()
+    assert white(lit()) == white(lit("550 nm"))
+
+
+def test_files_hold_curves(tmp_path: Path) -> None:
+    """Beside the scene file; a written scene holds their points."""
+    (tmp_path / "lamp.csv").write_text("nm, power\n500, 1\n600, 1  # flat\n", encoding="utf-8")
+    (tmp_path / "chip.txt").write_text("400 0.5\n700 0.5\n", encoding="utf-8")
+    data = lit()[0].plain()
+    data |= {"light": {"spectrum": "lamp.csv"}}
+    data["sensor"]["quantum_efficiency"] = "chip.txt"
+    described = with_changes(data, tmp_path / "mine.toml", (), ())
+    assert white((described, derive(described))) == pytest.approx(white(lit("500-600 nm", 0.5)), rel=1e-12)
+    write(tmp_path / "elsewhere.toml", described)
+    text = (tmp_path / "elsewhere.toml").read_text(encoding="utf-8")
+    assert "[500.0, 1.0]" in text
+    (tmp_path / "lamp.csv").unlink()
+    assert read(tmp_path / "elsewhere.toml").light == described.light
+
+
+@pytest.mark.parametrize(
+    ("light", "words"),
+    [
+        ("D56", "'D65', 'LED-B3' or the name of a file, got 'D56'"),
+        ("650-450 nm", "expected the shorter wavelength first"),
+        ("5-6 mm", "expected wavelengths from 100 to 20000 nm"),
+        ("0 nm", "above zero"),
+        ([[500, 1]], "expected 2 to 10000 points of a wavelength in nm and a value, got 1"),
+        ([[500, 1], [500, 1]], "ascending order, got 500 after 500 nm"),
+        ([[500, 1], [600, -1]], "expected values from 0 to 1e"),
+        ([[500, 0], [600, 0]], "at least one value above 0"),
+        ([[500, 1], [600]], "pairs of a wavelength in nm and a value, got"),
+        (550, "a text such as"),
+    ],
+)
+def test_spectra_that_are_none_are_refused(light: Any, words: str) -> None:
+    with pytest.raises(InputError, match=r"^test\.toml: light\.spectrum: ") as refused:
+        lit(light)
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("efficiency", "words"),
+    [(0.0, "above 0 and at most 1, got 0"), ([[500, 1], [600, 1.2]], "from 0 to 1, got 1.2"), (True, "expected")],
+)
+def test_efficiencies_that_are_none_are_refused(efficiency: Any, words: str) -> None:
+    with pytest.raises(InputError, match=r"sensor\.quantum_efficiency: ") as refused:
+        lit("D65", efficiency)
+    assert words in str(refused.value)
+
+
+def test_light_that_is_not_seen_or_not_detected_is_refused() -> None:
+    with pytest.raises(InputError, match="lux, which measure light from 360 to 830 nm"):
+        white(lit("900 nm"))
+    with pytest.raises(InputError, match=r"camera\.wavelength: .*lux"):
+        white(lit(wavelength="900 nm"))
+    with pytest.raises(InputError, match="above 0 within the light's 450 to 650 nm"):
+        lit("450-650 nm", [[700, 1.0], [800, 1.0]])
+    with pytest.raises(InputError, match=r"camera\.wavelength or light\.spectrum, got both"):
+        lit("D65", wavelength="550 nm")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("500, 1\n600\n", "line 2: expected a wavelength in nm and a value, got '600'"),
+        ("500, 1\n600, nan\n", "line 2: expected a wavelength"),
+        ("500, 1\n400, 1\n", "ascending"),
+        ("", "got 0"),
+        ("# " + "x" * 2_000_000, "at most 1000000 bytes"),
+    ],
+)
+def test_damaged_curves_are_refused(content: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "lamp.csv").write_text(content, encoding="utf-8")
+    data = lit()[0].plain() | {"light": {"spectrum": "lamp.csv"}}
+    with pytest.raises(InputError, match=r"lamp\.csv") as refused:
+        with_changes(data, tmp_path / "mine.toml", (), ())
+    assert words in str(refused.value)
+    (tmp_path / "lamp.csv").unlink()
+    with pytest.raises(InputError, match="no such file"):
+        with_changes(data, tmp_path / "mine.toml", (), ())

@@ -1,0 +1,135 @@
+"""Light lost by reflection against Fresnel's equations for every ray; openings that would overlap are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import asin, atan2, cos, sin, sqrt
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.scene import read
+from ommatid.scenes.setup import Setup
+from ommatid.simulate.lenses.etendue import transmission, transmissions
+from ommatid.simulate.lenses.prescription import Prescription, prescription_of
+from ommatid.simulate.sensor.response import response
+
+from ..conftest import Command
+from ..examples import GALLERY
+
+SENSOR = 'sensor={illuminance="500 lux", exposure="10 ms"}'
+
+
+CROWN, FLINT = 1.51872, 1.79190  # N-BK7 and N-SF11 at the green line of mercury, by SCHOTT's data sheets
+CEMENT = ((FLINT - CROWN) / (FLINT + CROWN)) ** 2
+
+
+def gallery(name: str) -> Camera:
+    return derive(read(GALLERY / f"{name}.toml", ["camera.wavelength=546.074 nm"]))
+
+
+def first_lens(name: str) -> Prescription:
+    camera = gallery(name)
+    return prescription_of(camera, camera.types[0])
+
+
+def unpolarised(before: float, behind: float, incidence: float) -> float:
+    """Mean reflectance of both polarisations at an angle of incidence, in the form with angles of Fresnel."""
+    if before == behind:
+        return 0.0
+    if incidence < 1e-6:
+        return ((before - behind) / (before + behind)) ** 2
+    refracted = asin(before * sin(incidence) / behind)
+    difference, total = incidence - refracted, incidence + refracted
+    return (sin(difference) / sin(total)) ** 2 / 2 * (1 + (cos(total) / cos(difference)) ** 2)
+
+
+def transmitted(lens: Prescription, height: float, slope: float) -> float | None:
+    """Trace a meridional ray from in front of a lens of spheres by angles; None where a rim stops it."""
+    angle, passed, position = atan2(slope, 1.0), 1.0, 0.0
+    for number, radius in enumerate(lens.radius):
+        before, behind = lens.index_before[number], lens.index[number]
+        vertex = lens.vertices[number]
+        height += (vertex - position) * np.tan(angle)
+        position = vertex
+        normal = 0.0
+        if np.isfinite(radius):
+            along, up = cos(angle), sin(angle)
+            half = along * radius - up * height
+            run = (height**2) / (half + np.copysign(sqrt(half**2 - height**2), radius))
+            position, height = position + run * along, height + run * up
+            normal = asin(-height / radius)
+        if abs(height) > lens.semi_diameter[number]:
+            return None
+        incidence = angle - normal
+        passed *= 1 - unpolarised(before, behind, abs(incidence))
+        angle = normal + asin(before * sin(incidence) / behind)
+    return passed
+
+
+@pytest.mark.parametrize("name", ["doublet", "planoconvex"])
+@pytest.mark.parametrize("field", [0.0, 0.03])
+def test_rays_at_every_height_lose_what_the_axis_loses(name: str, field: float) -> None:
+    """The mean over the meridional rays of a bundle from afar, by polarisation and incidence, to 1e-4."""
+    lens = first_lens(name)
+    widest = float(lens.entrance_pupil.radius)
+    middle = -field * float(lens.entrance_pupil.position)
+    heights = np.linspace(-widest, widest, 41)
+    shares = [(transmitted(lens, middle + height, field), abs(height)) for height in heights]  # rings of the pupil
+    seen = [(share, weight) for share, weight in shares if share is not None]
+    assert len(seen) > 36
+    mean = float(np.average([share for share, _ in seen], weights=[weight for _, weight in seen]))
+    assert transmission(lens) == pytest.approx(mean, abs=1e-4)
+
+
+def test_the_gallery_s_lenses_lose_what_fresnel_s_equations_say() -> None:
+    silica = (0.4599 / 2.4599) ** 2  # 3.495 %
+    assert transmissions(gallery("planoconvex"))["I"] == pytest.approx((1 - silica) ** 2, rel=1e-9)
+    crown, flint = (0.51872 / 2.51872) ** 2, (0.79190 / 2.79190) ** 2  # 4.241 and 8.045 %
+    lost = 1 - transmissions(gallery("doublet"))["II"]
+    assert lost == pytest.approx(1 - (1 - crown) * (1 - CEMENT) * (1 - flint), abs=2e-5)
+    assert lost == pytest.approx(0.125, abs=5e-4)
+
+
+def test_a_coating_takes_the_place_of_surfaces_to_air() -> None:
+    lens = first_lens("doublet")
+    assert transmission(lens, 0.005) == pytest.approx(0.995**2 * (1 - CEMENT), abs=2e-6)
+    assert transmission(lens, 0.0) == pytest.approx(1 - CEMENT, abs=2e-6)
+    in_air = replace(first_lens("planoconvex"), index=np.ones(3))
+    assert transmission(in_air, 0.5) == 1, "a stop in air reflects nothing"
+
+
+def test_electrons_are_those_that_pass() -> None:
+    changes = [SENSOR, "noise="]
+    bare, coated = (
+        response(Setup.from_scene(read(GALLERY / "doublet.toml", [*changes, *more])))
+        for more in ([], [f"camera.lens.{name}.coating=0.0" for name in ("I", "II", "III")])
+    )
+    np.testing.assert_allclose(bare / coated, 0.8747 / (1 - CEMENT), rtol=1e-3)
+
+
+def test_openings_wider_than_the_pitch_are_refused(ommatid: Command) -> None:
+    """A thin lens when the scene is read; glass, which is scaled, before anything is rendered or computed."""
+    with pytest.raises(
+        InputError, match=r"camera: expected lens\.II\.aperture of at most lens_pitch, 0\.5 mm, got 3 mm"
+    ):
+        read(GALLERY / "tile19.toml", ['camera.lens.II.aperture="3 mm"'])
+    read(GALLERY / "tile19.toml", ['camera.lens.II.aperture="0.5 mm"'])
+    with pytest.raises(InputError, match="coating belongs to surfaces"):
+        read(GALLERY / "tile19.toml", ["camera.lens.II.coating=0.1"])
+    narrow = ["--set", "camera.lens_pitch=0.4 mm"]
+    for command in (["show", "planoconvex"], ["predict", "planoconvex"], ["render", "planoconvex", "-o", "g.exr"]):
+        ended = ommatid(*command, *narrow)
+        assert ended.code == 2
+        assert "camera.lens.I.surfaces: expected openings of at most camera.lens_pitch, 0.4 mm, got" in ended.err
+        assert not Path("g.exr").exists()
+
+
+def test_a_single_lens_may_be_wider_than_the_pitch() -> None:
+    alone = ["camera.lens.I.array=[1, 1]", "camera.lens_pitch=0.4 mm"]
+    camera = derive(read(GALLERY / "planoconvex.toml", alone, ["I"]))
+    prescription_of(camera, camera.types[0])
+    derive(read(GALLERY / "tile19.toml", [*alone, 'camera.lens.I.aperture="3 mm"'], ["I"]))

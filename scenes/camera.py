@@ -137,9 +137,9 @@ class Camera:
         return self.walls and not any(bent)
 
     def is_blurred(self, lens_type: LensType) -> bool:
-        """True if a thin lens images a point of the target as a disk, by defocus or diffraction."""
+        """True if a point of the target is imaged as more than a point: by surfaces, defocus or diffraction."""
         if lens_type.optics.aperture is None:
-            return False
+            return lens_type.optics.surfaces is not None
         return self.wavelength is not None or self.focus(lens_type) != self.distance
 
     @property

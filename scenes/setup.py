@@ -87,8 +87,6 @@ class Setup:
         if not camera.walls:
             return False
         for lens_type in camera.types:
-            if lens_type.optics.surfaces is not None:
-                return False
             if (lens_type.optics.distortion is not None or lens_type.is_rotated) and camera.is_blurred(lens_type):
                 return False
         return camera.tolerance is None or camera.has_sharp_footprints

@@ -2,7 +2,8 @@
 
 Through a pinhole a footprint is a rectangle of m x m pixels of f, so H is a Kronecker product of two overlaps along one
 axis for every sub-imager (Wood et al., section 2). Distorted and misaligned footprints follow by exact area overlap,
-those blurred by defocus and diffraction from the blur's own transform.
+those blurred by defocus and diffraction from the blur's own transform, those of lenses with surfaces from the waves
+that are traced through them.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
 def ideal_matrix(camera: Camera) -> sparse.csr_array:
     """Return H of all sub-imagers as designed: (M, N).
 
-    Lenses of surfaces count as perfect ones in focus. Raises InputError for a lens type that is blurred and distorted
-    or rotated, and for a camera without walls, which have no closed form.
+    Raises InputError for a lens type that is blurred and distorted or rotated, and for a camera without walls, which
+    have no closed form, and for surfaces that form no image.
     """
     if not camera.walls:
         raise InputError(
@@ -49,6 +50,10 @@ def ideal_matrix(camera: Camera) -> sparse.csr_array:
 def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
     blurred = camera.is_blurred(lens_type)
+    if lens_type.optics.surfaces is not None and not lens_type.is_rotated:
+        from .lenses import surface_matrix
+
+        return surface_matrix.matrix(camera, lens_type)
     if lens_type.optics.distortion is not None or lens_type.is_rotated:
         from ommatid.scenes.optics import footprints
 

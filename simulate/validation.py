@@ -53,11 +53,23 @@ def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
 def _visible_pixels(camera: Camera, lens_type: LensType) -> int:
     """Approximate number of pixels of f that a sensor pixel may see."""
     side = ceil(lens_type.ratio) + BESIDE
-    if lens_type.optics.surfaces is None and camera.is_blurred(lens_type):
+    if lens_type.optics.surfaces is not None:
+        side += 2 * ceil(_diffraction_reach(camera, lens_type))
+    elif camera.is_blurred(lens_type):
         from ommatid.scenes.optics.blur import blur_of
 
         side += 2 * ceil(blur_of(camera, lens_type).reach)
     return side**2
+
+
+def _diffraction_reach(camera: Camera, lens_type: LensType) -> float:
+    """How far, in pixels of f, the point-spread function of surfaces is computed in focus."""
+    from .lenses.prescription import prescription_of
+    from .lenses.wavefront import GRID_REACH
+
+    depth = camera.depth(lens_type)
+    working = prescription_of(camera, lens_type).working_f_number(depth)
+    return GRID_REACH * (camera.wavelength or 0.0) * working * camera.distance / depth / camera.target_pitch
 
 
 def check_lenses(camera: Camera) -> None:

@@ -24,7 +24,6 @@ from .prediction.run_prediction import predict_run
 from .prediction.sensor_noise import expected_noise
 
 LEFT_OUT = "a perfect H and a perfect rendering: their uncertainty is left out"
-PERFECT_LENSES = "lenses of surfaces are perfect and in focus"
 PRIOR_LIGHT = "light of the prior's mean, and no pixel saturated"
 
 
@@ -72,8 +71,7 @@ def predict_ideal(scene: Scene) -> Prediction:
 
 
 def _ideal_assumptions(setup: Setup) -> tuple[str, ...]:
-    surfaces = any(lens_type.optics.surfaces is not None for lens_type in setup.camera.types)
-    return (LEFT_OUT, *([PERFECT_LENSES] if surfaces else []), PRIOR_LIGHT, *assumptions(setup.scene, setup.camera))
+    return (LEFT_OUT, PRIOR_LIGHT, *assumptions(setup.scene, setup.camera))
 
 
 def optics(camera: Camera) -> list[dict[str, Any]]:

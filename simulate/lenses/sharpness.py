@@ -21,8 +21,11 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.lens_type import LensType
 
+from .field import field_of
+from .point_spread import point_spread, strehl_ratio
 from .prescription import Prescription, prescription_of
 from .ray_trace import exit_disk_of, path, reach, spread, trace
+from .wavefront import Wavefront, thin_wavefront
 
 RAYS = 4096
 
@@ -36,6 +39,9 @@ def describe(camera: Camera) -> list[dict[str, Any]]:
     spot_axis, spot_corner : root mean square radius on the sensor, on the axis and at the farthest sensor point, None
         where no light arrives
     focus, sharpest : the distance in paraxial focus, and the one with the smallest spot on the axis
+    strehl_axis, strehl_corner : Strehl ratio at the target's distance
+    contrast_axis, contrast_corner : modulation transfer of the lens at half the sensor's Nyquist frequency, of the
+        worse direction; these four None without a wavelength, or without light
     """
     lenses: list[dict[str, Any]] = []
     for lens_type in camera.types:
@@ -55,6 +61,9 @@ def words(lens: dict[str, Any]) -> str:
     def um(value: float | None) -> str:
         return "no light" if value is None else f"{value * 1e3:.3g} um"
 
+    def share(value: float | None) -> str:
+        return "unknown" if value is None else f"{value:.3f}"
+
     sharp = f"sharp from {mm(lens['near'])} to {mm(lens['far'])}"
     if lens["near"] is None:
         sharp = "nowhere sharp to a pixel"
@@ -65,6 +74,8 @@ def words(lens: dict[str, Any]) -> str:
             f"  Airy disk {um(lens['airy_diameter'])}, {lens['airy_pixels']:.3g} pixels; {sharp}",
             f"  spot (rms radius) {um(lens['spot_axis'])} on the axis, {um(lens['spot_corner'])} at the corner;"
             f" sharpest at {mm(lens['sharpest'])}, by paraxial rays at {mm(lens['focus'])}",
+            f"  Strehl ratio {share(lens['strehl_axis'])} on the axis, {share(lens['strehl_corner'])} at the corner;"
+            f" contrast at half of Nyquist {share(lens['contrast_axis'])} and {share(lens['contrast_corner'])}",
         ]
     )
 
@@ -87,6 +98,8 @@ def _thin(camera: Camera, lens_type: LensType, diameter: float) -> dict[str, Any
     # A uniform disk's root mean square radius is its diameter over sqrt(8).
     spot = diameter * abs(1 - camera.distance / focus) * depth / camera.distance / sqrt(8)
     near, far = depth_of_field(depth, 1 / focus, diameter, camera.pixel_pitch)
+    wavelength = camera.wavelength
+    wave = None if wavelength is None else thin_wavefront(diameter, depth, camera.distance, focus, wavelength)
     return {
         "lens": lens_type.name,
         "focal_length": camera.focal_length(lens_type),
@@ -98,6 +111,7 @@ def _thin(camera: Camera, lens_type: LensType, diameter: float) -> dict[str, Any
         "spot_corner": spot,
         "focus": focus,
         "sharpest": focus,
+        **_contrasts(camera, depth, wave, wave),
     }
 
 
@@ -121,7 +135,28 @@ def _real(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "spot_corner": spot_corner,
         "focus": 1 / vergence if vergence > 0 else None,
         "sharpest": _sharpest(*axis),
+        **_contrasts(camera, depth, *_waves(camera, lens_type)),
     }
+
+
+def _waves(camera: Camera, lens_type: LensType) -> tuple[Wavefront | None, Wavefront | None]:
+    """Return the waves on the axis and at the corner; None for rays alone, and without light."""
+    wavelength = camera.wavelength
+    field = field_of(camera, lens_type, wavelength)
+    if wavelength is None or field.rays_suffice:
+        return None, None
+    return field.wave(0.0, wavelength), field.wave(field.field, wavelength)
+
+
+def _contrasts(camera: Camera, depth: float, axis: Wavefront | None, corner: Wavefront | None) -> dict[str, Any]:
+    """Return Strehl ratios and contrasts by their keys."""
+    frequency = depth / camera.distance / (4 * camera.pixel_pitch)  # half of Nyquist, on the target
+    along = np.array([[frequency, 0.0], [0.0, frequency]])
+    found: dict[str, Any] = {}
+    for place, wave in (("axis", axis), ("corner", corner)):
+        found[f"strehl_{place}"] = None if wave is None else strehl_ratio(wave)
+        found[f"contrast_{place}"] = None if wave is None else float(point_spread(wave).transfer(along).min())
+    return found
 
 
 def _diffraction(camera: Camera, working: float) -> dict[str, float]:

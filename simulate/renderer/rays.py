@@ -152,9 +152,9 @@ def own_lenses(camera: Camera, types: tuple[LensType, ...]) -> IntArray:
 def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
     """Create the lens model of a lens type."""
     if lens_type.optics.surfaces is not None:
-        from .real_lens import RealLens
+        from .real_lens import real_lens
 
-        return RealLens(camera, lens_type)
+        return real_lens(camera, lens_type)
     aperture = lens_type.optics.aperture
     if aperture is None:
         return LensModel(camera, lens_type)

@@ -35,10 +35,13 @@ BIPLANE = [
 SENSOR = {"illuminance": "300 lux", "exposure": "10 ms", "read_noise": 3, "gain": 0.5, "black_level": 40, "prnu": 0.01}
 
 
-def built(lens: dict[str, Any], lenses: Lenses = THREE, shape: tuple[int, int] = (19, 19), **tables: Any) -> Scene:
+def built(
+    lens: dict[str, Any], lenses: Lenses = THREE, shape: tuple[int, int] = (19, 19), wavelength: str = "", **tables: Any
+) -> Scene:
     """Return a scene whose lens types all have these keys, calibrated by transport."""
     calibration = {"method": "transport", "samples": 1024}
     data = scene(shape, lenses, render={"samples": 1024}, calibration=calibration).plain()
+    data["camera"] |= {"wavelength": wavelength} if wavelength else {}
     for described in data["camera"]["lens"]:
         described.update(lens)
     return parse({**data, **tables}, Path("test.toml"))
@@ -70,7 +73,7 @@ def test_the_measured_error_is_the_expected_one(lens: dict[str, Any], tables: di
 def test_pixels_that_no_light_can_reach_are_dead() -> None:
     """A baffle vignettes the corners of the field: NaN in the stack, empty rows of H, unused by the estimate."""
     needs("llvm_ad_mono")
-    described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
+    described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), "none", noise={"variance": 1.0})
     camera, truth = derive(described), load(described)
     stack, model = render(Setup(described, camera, truth)), calibrate(Setup(described, camera))
     dark = np.isnan(stack.values)
@@ -84,7 +87,7 @@ def test_pixels_that_no_light_can_reach_are_dead() -> None:
     assert sums[0] == sums[-1] == 0
     assert usable_pixels(stack).dead == dark.sum() > 40
     assert usable_pixels(stack, model).dead >= dark.sum()
-    with_sensor = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), sensor=SENSOR)
+    with_sensor = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), "none", sensor=SENSOR)
     # Dark is where one of 16 passes of 64 rays brought nothing: a fifth of the light makes that a chance of 1e-5.
     assert (response(Setup(with_sensor, camera))[dark] < 0.2 * response(Setup(with_sensor, camera)).max()).all()
     counted = render(Setup(with_sensor, camera, truth))

@@ -1,0 +1,229 @@
+"""What one lens type with surfaces does over its field: where rays go, how much light passes, and how points blur.
+
+Lengths are millimetres, in the coordinates of the lens. The lens is round, so that everything depends on the height of
+the sensor point above the axis; point-spread functions turn with its direction. They are computed at nodes of height,
+as many as linear interpolation between them needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil, pi
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
+
+from .point_spread import grid_of, point_spread
+from .prescription import Prescription, prescribe, prescription_of
+from .ray_trace import Disk, exit_disk, reach
+from .wavefront import GRID_REACH, Wavefront, wavefront_of
+
+HEIGHTS = 17  # at which the middle and the amount of the light are traced, splines between
+TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors of its cells
+MOST_NODES = 9
+MOST_WIDER = 2.0  # ratio of the widths of a common grid and of the narrowest that a wave of its own would have
+LEAST_VERGENCE = 1e-9  # of a far target; that of 0 has no plane
+MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by rays alone
+
+
+@dataclass(frozen=True, eq=False)
+class LensField:
+    """One lens type at one wavelength.
+
+    distance : of the target from the front principal plane;  depth : of the sensor behind the rear one
+    field : the largest height of a sensor point
+    """
+
+    prescription: Prescription
+    disk: Disk
+    depth: float
+    distance: float
+    field: float
+    wavelength: float | None
+
+    def wave(self, height: float, wavelength: float | None) -> Wavefront | None:
+        """Return the wave of a sensor point (0, height), or None if it gets no light."""
+        return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, GRID_REACH)
+
+    @cached_property
+    def _rays(self) -> tuple[FloatArray, list[Wavefront]]:
+        """Heights that get light, the least of them 0, and their rays."""
+        heights = np.linspace(0.0, self.field, HEIGHTS)
+        found = [(height, self.wave(float(height), None)) for height in heights]
+        lit = [(height, wave) for height, wave in found if wave is not None]
+        return np.array([height for height, _ in lit]), [wave for _, wave in lit]
+
+    @cached_property
+    def _centres(self) -> CubicSpline:
+        heights, waves = self._rays
+        middles = np.array([wave.centre[1] for wave in waves])
+        # The height on the target is an odd function of the height on the sensor.
+        return CubicSpline(np.append(-heights[:0:-1], heights), np.append(-middles[:0:-1], middles))
+
+    def centre(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the middle of the light of sensor points on the target, from the lens's axis."""
+        height = np.hypot(x, y)
+        limited = np.clip(height, 1e-9 * self.field, self._rays[0][-1])
+        scale = self._centres(limited) / limited
+        return x * scale, y * scale
+
+    def brightness(self, height: FloatArray) -> FloatArray:
+        """Return the light at sensor points as a projected solid angle, sr; 0 where none arrives."""
+        heights, waves = self._rays
+        return np.interp(height, heights, [wave.brightness for wave in waves], right=0.0)
+
+    def lit_share(self, height: FloatArray) -> FloatArray:
+        """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
+        return self.brightness(height) / (pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2)
+
+    @property
+    def pupil_radius(self) -> float:
+        """Radius of the beam on its way to the target."""
+        return self._rays[1][0].half_width * self.distance
+
+    def waves_of(self, vergence: float) -> float:
+        """Return the defocus at the pupil's rim, in waves, that a change of the target's vergence makes."""
+        if self.wavelength is None:
+            raise ValueError("expected light with a wavelength, got rays alone")
+        return self.pupil_radius**2 * vergence / (2 * self.wavelength)
+
+    @cached_property
+    def rays_suffice(self) -> bool:
+        """True if light counts as rays: it has no wavelength, or the spots are far wider than diffraction."""
+        if self.wavelength is None:
+            return True
+        _, waves = self._rays
+        return any(wave.spot_radius * 2 * wave.half_width > MOST_RINGS * self.wavelength for wave in waves)
+
+    @cached_property
+    def nodes(self) -> tuple[FloatArray, list[Wavefront]]:
+        """Heights of the nodes and their waves; a single node serves a field over which nothing changes."""
+        if self.rays_suffice:
+            return self._rays
+        last = float(self._rays[0][-1])
+        known = {height: self.lit_wave(height) for height in (0.0, last)}
+        grid = self._common_grid(list(known.values()))
+        heights, waiting = [0.0, last], [(0.0, last)]
+        while waiting and len(heights) < MOST_NODES:
+            low, high = waiting.pop()
+            middle = (low + high) / 2
+            known[middle] = self.lit_wave(middle)
+            ends = [point_spread(known[height], grid).values for height in (low, middle, high)]
+            if np.abs(ends[1] - (ends[0] + ends[2]) / 2).sum() > TOLERANCE:
+                heights.append(middle)
+                waiting += [(low, middle), (middle, high)]
+        heights.sort()
+        return np.array(heights), [known[height] for height in heights]
+
+    def lit_wave(self, height: float) -> Wavefront:
+        """Return the wave of a sensor point that gets light."""
+        wave = self.wave(height, self.wavelength)
+        if wave is None:
+            raise ValueError(f"no light at a height of {height:g} mm, expected a lit one")
+        return wave
+
+    @staticmethod
+    def _common_grid(waves: list[Wavefront]) -> tuple[float, float]:
+        """Return a grid that is fine and wide enough for all waves but those of slivers of the pupil."""
+        grids = [grid_of(wave) for wave in waves]
+        cell, widest = min(cell for cell, _ in grids), min(half for _, half in grids) * MOST_WIDER
+        return cell, min(max(half for _, half in grids), widest)
+
+    @cached_property
+    def grid(self) -> tuple[float, float]:
+        """The grid of all point-spread functions of this lens."""
+        return self._common_grid(self.nodes[1])
+
+    @cached_property
+    def steps(self) -> tuple[int, int]:
+        """Steps of height over the field, and of direction over a right angle, that change less than the tolerance."""
+        _, waves = self.nodes
+        axis, rim = (point_spread(wave, self.grid).values for wave in (waves[0], waves[-1]))
+        variation = np.abs(rim - axis).sum(), np.abs(rim - rim.T).sum()
+        return ceil(variation[0] / TOLERANCE), ceil(variation[1] / TOLERANCE)
+
+    def between(self, height: float) -> list[tuple[Wavefront, float]]:
+        """Return the waves of the nodes beside a height, and their weights."""
+        heights, waves = self.nodes
+        if heights.size == 1 or height >= heights[-1]:
+            return [(waves[-1], 1.0)]
+        after = int(np.searchsorted(heights, height, side="right"))
+        share = float((height - heights[after - 1]) / (heights[after] - heights[after - 1]))
+        return [(waves[after - 1], 1 - share), (waves[after], share)]
+
+    def spread(self, height: float, angle: float) -> FloatArray:
+        """Return the point-spread function of a sensor point on the grid: (n, n) shares of the light.
+
+        angle : from the y axis to the sensor point, towards x
+        """
+        parts = [share * point_spread(wave.turned(-angle), self.grid).values for wave, share in self.between(height)]
+        return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingTables:
+    """Densities of the slopes by which diffraction and aberrations turn rays from the mean one.
+
+    heights : of the sensor point, (h,);  vergences : 1 / distance of the target, rising, (v,)
+    densities : (h, v, n, n), rows along the direction of the sensor point;  width : of the slopes of all n points
+    captured : share of the light within that width
+    """
+
+    heights: FloatArray
+    vergences: FloatArray
+    densities: FloatArray
+    width: float
+    captured: float
+
+
+def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
+    """Return the densities of slopes of a lens for targets at vergences, which rise.
+
+    Offsets drawn from densities that are linear between the points are a convolution with a tent of two cells. It damps
+    a frequency f along an axis by sinc(f cell)^2, which is divided out here, as the frequencies are limited.
+    cells : of the grid per wavelength times f-number;  reach : of the grid beyond the spot, in the same unit
+    """
+    heights, vergences = field.nodes[0], np.where(np.abs(vergences) < LEAST_VERGENCE, LEAST_VERGENCE, vergences)
+    waves = [[replace(field, distance=1 / v).lit_wave(float(height)) for v in vergences] for height in heights]
+    all_waves = [(wave, abs(v)) for row in waves for wave, v in zip(row, vergences, strict=True)]
+    cell = min(wave.resolution * v for wave, v in all_waves) / cells
+    half = max((wave.spot_radius + reach * wave.resolution) * v for wave, v in all_waves)
+    tables: list[FloatArray] = []
+    captured: list[float] = []
+    for row in waves:
+        for wave, v in zip(row, vergences, strict=True):
+            spread = point_spread(wave, (cell / abs(v), half / abs(v)))
+            values = spread.values if v > 0 else spread.values[::-1, ::-1]
+            damping = np.maximum(np.sinc(np.fft.fftfreq(len(values))) ** 2, np.sinc(1 / cells) ** 2)
+            sharpened = np.fft.ifft2(np.fft.fft2(values) / np.outer(damping, damping)).real
+            tables.append(np.maximum(sharpened, 0.0) / spread.inside)
+            captured.append(spread.inside)
+    shape = (heights.size, vergences.size, *tables[0].shape)
+    densities = np.stack(tables).reshape(shape).astype(np.float64)
+    return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)))
+
+
+def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:
+    """Return the wavelengths of the light and their weights; a single None for rays alone."""
+    return camera.wavelengths or ((None, 1.0),)
+
+
+def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> LensField:
+    """Return a lens type of the camera at a wavelength.
+
+    The lens is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that principal
+    planes move and the distances from them with them. Raises InputError if the surfaces form no image.
+    """
+    lens, depth, distance = prescription_of(camera, lens_type), camera.depth(lens_type), camera.distance
+    if wavelength is not None and wavelength != camera.wavelength and lens_type.optics.surfaces is not None:
+        other = replace(lens, index=prescribe(lens_type.optics.surfaces, wavelength).index)
+        depth += lens.rear_principal - other.rear_principal
+        distance += other.front_principal - lens.front_principal
+        lens = other
+    far, _, _ = reach(camera, lens_type)
+    return LensField(lens, exit_disk(lens, depth, far), depth, distance, far, wavelength)

@@ -1,0 +1,157 @@
+"""H of lenses with surfaces: the point-spread functions of traced waves, integrated over sensor pixels and pixels of f.
+
+Lengths are pixels of f. An entry is the mean of overlap(y, dy) overlap(x, dx) over the displacements (dx, dy) of the
+point-spread function, where overlap is the share of the footprint [a, b] + d along an axis that lies in the texel. The
+footprint is the box between the middles of the light of the pixel's edges, so that distortion is part of it. An
+overlap is the second difference B(b - c) - B(b - d) + B(a - d) - B(a - c) of B(t) = |t| / 2. On a grid of cells D wide
+the point-spread function holds no frequency above 1 / 2D; the sum over the grid is exact where B is freed of these too,
+
+    B(t) = (t Si(W t) + cos(W t) / W) / pi,   W = pi / D,   Si the sine integral (Shannon's sampling theorem).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import groupby
+from math import pi
+
+import numpy as np
+from scipy import sparse
+from scipy.special import sici
+
+from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.memory import check_memory
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.pose import corner_offset, pose_of
+
+from .field import LensField, bands, field_of
+
+LEAST = 1e-12  # entries below are left out
+ENTRY = 16  # bytes
+
+
+@dataclass(frozen=True, eq=False)
+class _Pixels:
+    """Sensor pixels of a lens type, in the order of measurements.
+
+    x, y : (M,) middle, mm from the lens's axis;  rows, columns : (M, 2) edges of the footprint
+    """
+
+    x: FloatArray
+    y: FloatArray
+    rows: FloatArray
+    columns: FloatArray
+
+
+@lru_cache(maxsize=4)
+def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
+    """H of all sub-imagers of a lens type with surfaces, as designed: (its measurements, N).
+
+    A row holds the light of a pixel that comes from the target: less than 1, as diffraction takes up to 0.5 per cent
+    of the light beyond the grid of the point-spread function. Rows of pixels without light are empty. Neglected is the
+    variation of the blur within a pixel.
+    Raises InputError if the surfaces form no image.
+    """
+    found: sparse.csr_array | None = None
+    total = np.zeros(lens_type.measurements)
+    for wavelength, weight in bands(camera):
+        field = field_of(camera, lens_type, wavelength)
+        pixels = _pixels(camera, lens_type, field)
+        light = weight * field.brightness(np.hypot(pixels.x, pixels.y))
+        part = sparse.csr_array(sparse.diags_array(light) @ _rows(camera, field, pixels))
+        found, total = part if found is None else sparse.csr_array(found + part), total + light
+    assert found is not None
+    scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
+    return sparse.csr_array(sparse.diags_array(scale) @ found)
+
+
+def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _Pixels:
+    parts: list[FloatArray] = []
+    half = camera.pixel_pitch / 2
+    for sub in camera.sub_imagers:
+        if sub.type != lens_type:
+            continue
+        pose = pose_of(sub)
+        row, column = (index.ravel() + 0.5 for index in np.indices(lens_type.pixels))
+        u, v = corner_offset(camera, sub)
+        points = pose.axes @ np.stack([u + column * camera.pixel_pitch, v + row * camera.pixel_pitch])
+        x, y, _ = pose.middle[:, None] + points
+        left, right = (sub.lens[0] + field.centre(x + step, y)[0] for step in (-half, half))
+        upper, lower = (sub.lens[1] + field.centre(x, y + step)[1] for step in (-half, half))
+        columns = [camera.columns / 2 - edge / camera.target_pitch for edge in (left, right)]
+        rows = [camera.rows / 2 - edge / camera.target_pitch for edge in (upper, lower)]
+        parts.append(np.stack([x, y, *rows, *columns]))
+    x, y, *edges = np.concatenate(parts, axis=1)
+    return _Pixels(x, y, np.stack(edges[:2], axis=1), np.stack(edges[2:], axis=1))
+
+
+def _rows(camera: Camera, field: LensField, pixels: _Pixels) -> sparse.csr_array:
+    count = pixels.x.size
+    wide = max(field.grid[1] if not field.rays_suffice else 0.0, max(wave.spot_radius for wave in field.nodes[1]))
+    side = [min(size, float(np.ptp(pixels.rows[0])) + 2 * wide / camera.target_pitch + 2) for size in camera.shape]
+    needed = int(count * side[0] * side[1]) * ENTRY
+    check_memory(needed, "H of a lens with surfaces", "crop the target or use fewer sub-imagers")
+    rows: list[sparse.csr_array] = [sparse.csr_array((1, camera.unknowns))] * count
+    lit = np.flatnonzero(field.brightness(np.hypot(pixels.x, pixels.y)) > 0)
+    by_points = _by_rays if field.rays_suffice else _by_waves
+    for pixel, values in by_points(camera, field, pixels, lit):
+        values[values < LEAST] = 0.0
+        rows[pixel] = sparse.csr_array(values.reshape(1, -1))
+    return sparse.csr_array(sparse.vstack(rows, format="csr"))
+
+
+def _by_rays(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray) -> Iterator[tuple[int, FloatArray]]:
+    """Compute the entries, (rows, columns) of f, of each lit pixel from the rays of the nodes beside its height."""
+    for pixel in lit.tolist():
+        x, y = float(pixels.x[pixel]), float(pixels.y[pixel])
+        values = np.zeros(camera.shape)
+        for wave, share in field.between(float(np.hypot(x, y))):
+            across, up = wave.turned(float(np.arctan2(-x, y))).hits / camera.target_pitch
+            down = _overlaps(pixels.rows[pixel], -up, camera.rows, 0.0)
+            beside = _overlaps(pixels.columns[pixel], -across, camera.columns, 0.0)
+            values += (down * (share * wave.light)[:, None]).T @ beside
+        yield pixel, values
+
+
+def _by_waves(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray) -> Iterator[tuple[int, FloatArray]]:
+    """Compute the entries, (rows, columns) of f, of each lit pixel; pixels with one point-spread function in turn."""
+    cell, levels = field.grid[0] / camera.target_pitch, [max(steps, 1) for steps in field.steps]
+    keys = {int(pixel): _key(field, float(pixels.x[pixel]), float(pixels.y[pixel])) for pixel in lit}
+    for (level, turn), members in groupby(sorted(keys, key=keys.__getitem__), key=keys.__getitem__):
+        spread = field.spread(field.field * level / levels[0], pi / 2 * turn / levels[1])
+        offsets: FloatArray = cell * (np.arange(len(spread), dtype=np.float64) - len(spread) // 2)
+        for pixel in members:
+            x, y = pixels.x[pixel], pixels.y[pixel]
+            turned = spread.T if abs(x) > abs(y) else spread
+            turned = turned[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1]
+            down = _overlaps(pixels.rows[pixel], -offsets, camera.rows, cell)
+            beside = _overlaps(pixels.columns[pixel], -offsets, camera.columns, cell)
+            yield pixel, np.asarray(down.T @ turned @ beside, dtype=np.float64)
+
+
+def _key(field: LensField, x: float, y: float) -> tuple[int, int]:
+    """Return the level of height and of direction, folded into the half quadrant beside the y axis, of a pixel."""
+    levels, turns = field.steps
+    angle = float(np.arctan2(min(abs(x), abs(y)), max(abs(x), abs(y))))
+    return round(float(np.hypot(x, y)) / field.field * levels), round(angle / (pi / 2) * turns)
+
+
+def _overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float) -> FloatArray:
+    """Return the share of the interval between two edges, moved by each offset, in each texel: (n, size).
+
+    cell : spacing of the offsets, whose frequencies are left out; 0: none
+    """
+    low, high = edges.min(), edges.max()
+    texels = np.arange(size + 1)
+    upper, lower = (_integral(edge + offsets[:, None] - texels, cell) for edge in (high, low))
+    return (upper[:, :-1] - upper[:, 1:] + lower[:, 1:] - lower[:, :-1]) / (high - low)
+
+
+def _integral(t: FloatArray, cell: float) -> FloatArray:
+    if cell == 0:
+        return np.abs(t) / 2
+    rate = pi / cell
+    return (t * sici(rate * t)[0] + np.cos(rate * t) / rate) / pi

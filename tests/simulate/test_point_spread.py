@@ -1,0 +1,155 @@
+"""Point-spread functions of pupils that the test makes up, against closed forms and one-dimensional integrals.
+
+Radii are in units of the wavelength times the f-number on the target's side, aberrations in waves over the unit disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy import integrate
+from scipy.special import j0, j1
+
+from ommatid.runtime.errors import InputError
+from ommatid.simulate.lenses.point_spread import (
+    encircled_energy,
+    point_spread,
+    relative_intensity,
+    strehl_ratio,
+)
+from ommatid.simulate.lenses.wavefront import GRID_REACH, Wavefront, node_counts, polar_nodes, thin_wavefront
+
+WAVELENGTH = 5.5e-4
+HALF = 0.1  # sine of the half angle of the cone of light
+UNIT = WAVELENGTH / (2 * HALF)
+FREQUENCIES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])  # of the cut-off
+Aberration = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def pupil(waves: Aberration, slope: float, reach: float = GRID_REACH) -> Wavefront:
+    """Return the wave of a round pupil with an aberration of these waves at (radius, angle).
+
+    slope : the largest change of the aberration over the radius, waves per radius
+    """
+    spot = 2 * slope * UNIT
+    radius, angle, area = polar_nodes(node_counts(2 * np.pi * HALF / WAVELENGTH * (2 * spot + reach * UNIT)))
+    turn = np.ones_like(radius) * angle
+    share = (np.ones_like(turn) * area).ravel()
+    unit = (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)
+    path = waves((radius + 0 * turn).ravel(), turn.ravel()) * WAVELENGTH
+    return Wavefront(
+        WAVELENGTH, HALF * unit, path, share / np.pi, share * HALF**2, spot * unit, (0.0, 0.0), 1.0, radius.max()
+    )
+
+
+def defocused(waves: float) -> Wavefront:
+    return pupil(lambda radius, _: waves * radius**2, 2 * waves)
+
+
+def by_autocorrelation(waves: Callable[[np.ndarray], np.ndarray], frequency: float, count: int = 400) -> float:
+    """Return the MTF of a round pupil with waves(radius), at a frequency in units of the cut-off.
+
+    The overlap of two unit disks, 2 `frequency` apart, row by row of y, by Gauss's quadrature along both.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    top = np.sqrt(1 - frequency**2)
+    turn = np.arcsin(top) * nodes  # y = sin(turn) takes the square root at the ends out of the integrand
+    y = np.sin(turn)
+    half = np.sqrt(1 - y**2) - frequency
+    x = half[:, None] * nodes
+    phase = waves(np.hypot(x + frequency, y[:, None])) - waves(np.hypot(x - frequency, y[:, None]))
+    rows = half * (np.exp(2j * np.pi * phase) @ weights)
+    return float(abs(np.sum(rows * np.cos(turn) * weights) * np.arcsin(top)) / np.pi)
+
+
+def test_an_open_pupil_is_airys() -> None:
+    wave = pupil(lambda radius, _: 0 * radius, 0)
+    for radius in (0.5, 1.22, 3.0, 10.0, 30.0):
+        v = np.pi * radius
+        assert encircled_energy(wave, radius * UNIT) == pytest.approx(1 - j0(v) ** 2 - j1(v) ** 2, abs=1e-6)
+    spread = point_spread(wave)
+    assert 0.995 <= spread.inside < 1
+    mtf = 2 / np.pi * (np.arccos(FREQUENCIES) - FREQUENCIES * np.sqrt(1 - FREQUENCIES**2))
+    for turn in (0.0, 0.7):
+        at = FREQUENCIES[:, None] / UNIT * [np.cos(turn), np.sin(turn)]
+        np.testing.assert_allclose(spread.transfer(at), mtf, atol=1e-3)
+
+
+@pytest.mark.parametrize("waves", [0.1, 0.21, 0.5])
+def test_strehl_ratio_of_defocus(waves: float) -> None:
+    assert strehl_ratio(defocused(waves)) == pytest.approx(np.sinc(waves) ** 2, abs=1e-9)
+
+
+@pytest.mark.parametrize("waves", [1.0, 1.5, 2.7])
+def test_the_middle_of_a_defocused_point(waves: float) -> None:
+    """From one wave on the middle is no longer the brightest point."""
+    middle = relative_intensity(defocused(waves), np.zeros(1), np.zeros(1))
+    assert middle[0] == pytest.approx(np.sinc(waves) ** 2, abs=1e-9)
+
+
+@pytest.mark.parametrize("waves", [0.1, 0.3, 1.0, 3.0])
+def test_transfer_of_a_defocused_pupil(waves: float) -> None:
+    """Hopkins (1955), by direct autocorrelation."""
+    found = point_spread(defocused(waves)).transfer(np.stack([FREQUENCIES / UNIT, 0 * FREQUENCIES], axis=1))
+    expected = [by_autocorrelation(lambda radius: waves * radius**2, frequency) for frequency in FREQUENCIES]
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("radial", [1.0, 3.0])
+def test_primary_spherical_aberration(radial: float) -> None:
+    """Strehl ratio in the middle, MTF and encircled energy against integrals along the radius."""
+    wave = pupil(lambda radius, _: radial * radius**4, 4 * radial)
+    middle = integrate.quad_vec(lambda square: np.exp(2j * np.pi * radial * square**2), 0, 1)[0]
+    found = relative_intensity(wave, np.zeros(1), np.zeros(1))[0]
+    assert found == pytest.approx(abs(middle) ** 2, abs=1e-6)
+    at = np.stack([0 * FREQUENCIES, FREQUENCIES / UNIT], axis=1)
+    expected = [by_autocorrelation(lambda radius: radial * radius**4, frequency) for frequency in FREQUENCIES]
+    np.testing.assert_allclose(point_spread(wave).transfer(at), expected, atol=1e-3)
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    rho = (nodes + 1) / 2
+    radii = rho * 3.0  # as far as the encircled energy goes
+    bessel = j0(np.pi * np.outer(radii, rho))
+    field = bessel @ (weights / 2 * rho * np.exp(2j * np.pi * radial * rho**4))
+    # Over the whole plane |2 integral|^2 pi / 4 integrates to 1 in these units (Airy's middle is pi / 4 per unit^2).
+    encircled = np.sum(np.abs(2 * field) ** 2 * np.pi / 4 * 2 * np.pi * radii * weights / 2) * 3.0
+    assert encircled_energy(wave, 3.0 * UNIT) == pytest.approx(encircled, abs=1e-3)
+
+
+def test_small_aberrations_follow_marechal() -> None:
+    def waves(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        coma = 0.03 * np.sqrt(8) * (3 * radius**3 - 2 * radius) * np.sin(angle)
+        spherical = 0.03 * np.sqrt(5) * (6 * radius**4 - 6 * radius**2 + 1)
+        astigmatism = 0.02 * np.sqrt(6) * radius**2 * np.cos(2 * angle)
+        return coma + spherical + astigmatism
+
+    variance = 0.03**2 + 0.03**2 + 0.02**2
+    assert strehl_ratio(pupil(waves, 2.0)) == pytest.approx(np.exp(-((2 * np.pi) ** 2) * variance), abs=1e-2)
+    assert strehl_ratio(pupil(waves, 2.0)) < 0.94
+
+
+def test_many_waves_of_defocus_are_the_disk_of_rays() -> None:
+    """The encircled energy of a uniform disk, away from the rings at its edge."""
+    wave = defocused(30.0)
+    for share in (0.3, 0.5, 0.7):
+        assert encircled_energy(wave, share * wave.spot_radius) == pytest.approx(share**2, abs=1e-3)
+
+
+def test_more_waves_than_can_be_computed_are_refused() -> None:
+    with pytest.raises(InputError, match="oscillates"):
+        defocused(1000.0)
+    with pytest.raises(InputError, match="finest detail"):
+        point_spread(defocused(0.1), (UNIT / 4, 1000 * UNIT))
+
+
+def test_the_wave_of_a_thin_lens() -> None:
+    """Focused beyond the target: W20 = D^2 / 8 (1 / Z - 1 / F) waves, and light falls with cos^4 to the rim."""
+    wave = thin_wavefront(0.4, 3.0, 1000.0, 1250.0, WAVELENGTH)
+    waves = 0.4**2 / 8 * (1 / 1000 - 1 / 1250) / WAVELENGTH
+    assert strehl_ratio(wave) == pytest.approx(np.sinc(waves) ** 2, abs=1e-4)
+    assert wave.resolution == pytest.approx(WAVELENGTH * 1000 / 0.4, rel=1e-6)
+    assert wave.brightness == pytest.approx(np.pi * np.sin(np.arctan(0.2 / 3)) ** 2, rel=1e-9)
+    found = point_spread(wave).transfer(np.stack([FREQUENCIES / wave.resolution, 0 * FREQUENCIES], axis=1))
+    expected = [by_autocorrelation(lambda radius: waves * radius**2, frequency) for frequency in FREQUENCIES]
+    np.testing.assert_allclose(found, expected, atol=1e-3)

@@ -74,9 +74,11 @@ def electrons(
         raise ValueError("numbers of electrons need a scene with a [sensor], got one without")
     unit = electrons_per_steradian(scene, scene.sensor)
     response = np.empty(camera.measurements)
+    places = zip(camera.sub_imagers, poses(camera), strict=True)
+    lenses = np.array([(*pose.lens, sub.type.optics.aperture or 0.0) for sub, pose in places])
     for sub, pixels, pose in zip(camera.sub_imagers, camera.slices(), poses(camera), strict=True):
         if not camera.walls:
-            response[pixels] = unit * _through_all_lenses(camera, sub, pose)
+            response[pixels] = unit * _through_all_lenses(camera, sub, pose, lenses)
             continue
         angle = _solid_angle(sub.type, sub.depth, solid_angles or {})
         if sub.type.optics.surfaces is None:
@@ -86,16 +88,15 @@ def electrons(
     return response
 
 
-def _through_all_lenses(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
-    """Projected solid angle, sr, of all lenses together at each pixel of a sub-imager: (its pixels,)."""
-    total = np.zeros(sub.type.pixels[0] * sub.type.pixels[1])
-    for other, place in zip(camera.sub_imagers, poses(camera), strict=True):
-        if other.type.optics.aperture is None:
-            raise ValueError(f"lens type '{other.type.name}' has no aperture; light without walls needs one")
-        shift = np.array([pose.lens[0] - place.lens[0], pose.lens[1] - place.lens[1], 0.0])
-        seen = replace(pose, middle=pose.middle + shift)
-        total += solid_angle(other.type.optics.aperture, sub.depth) * relative_illumination(camera, sub, seen)
-    return total
+def _through_all_lenses(camera: Camera, sub: SubImager, pose: Pose, lenses: FloatArray) -> FloatArray:
+    """Projected solid angle, sr, of all lenses together at each pixel of a sub-imager: (its pixels,).
+
+    lenses : (lenses, 3), x, y and aperture of each
+    """
+    shift = np.column_stack([np.array(pose.lens) - lenses[:, :2], np.zeros(len(lenses))])
+    seen = relative_illumination(camera, sub, replace(pose, middle=(pose.middle + shift)[:, None, None]))
+    angles = np.array([solid_angle(float(aperture), sub.depth) for aperture in lenses[:, 2]])
+    return angles @ seen.reshape(len(lenses), -1)
 
 
 def _solid_angle(lens_type: LensType, depth: float, known: Mapping[str, float]) -> float:

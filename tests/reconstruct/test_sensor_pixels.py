@@ -94,38 +94,30 @@ def test_saturated_pixels_are_known_to_reach_the_limit(bits: int | None) -> None
 
 @pytest.mark.parametrize("bits", [None, 7])
 def test_light_just_below_saturation_is_not_biased(bits: int | None) -> None:
-    """By images of the prior, half of whose light saturates: the estimate is as far off as that of a wider range.
+    """Over images of the prior the estimate is right on average, with an error as expected, though some saturates.
 
-    Without the saturated pixels the light estimated for readings about the limit is 0.3 lower, ten standard errors.
+    Without the saturated pixels it is too dark, by tens of standard errors.
     """
     seeds, prior = 20, {"mean": 236.0, "variance": 25.0}
-    noise = {"variance": 4.0} | ({} if bits is None else {"bits": bits})
-    lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
-    limited = scene((12, 12), lenses, noise={**noise, "saturation": 240.0}, prior=prior)
-    unlimited = scene((12, 12), lenses, noise=noise, prior=prior)
-    camera, record = derive(limited), {"seconds": 0.0, "versions": {}, "seed": 0, "first_seed": 0}
-    model = ideal_model(limited, camera)
+    noise = {"variance": 4.0, "saturation": 240.0} | ({} if bits is None else {"bits": bits})
+    described = scene((12, 12), (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit")), noise=noise, prior=prior)
+    camera, record = derive(described), {"seconds": 0.0, "versions": {}, "seed": 0, "first_seed": 0}
+    model = ideal_model(described, camera)
     model = replace(model, record={**model.record, "seconds": 0.0, "versions": {}})
     differences, ratios, inside = np.empty(seeds), np.empty(seeds), 0
+    assert described.noise is not None
     for seed in range(seeds):
         truth = 236 + np.random.default_rng(seed).normal(0, 5, model.unknowns)
-        light, means = model.forward(truth), np.empty(2)
-        near = light > 240 - 2 * 2
-        for index, described in enumerate((limited, unlimited)):
-            assert described.noise is not None
-            values = expose(light, described.noise, generators(camera, seed), camera.slices())
-            result = restore(Stack(described, camera, values, np.zeros_like(values), record), model, truth)
-            means[index] = (model.forward(result.estimate) - light)[near].mean()
-            if described is limited:
-                assert result.usable.saturated > 10
-                assert result.error is not None
-                assert result.interval is not None
-                inside += result.interval.low < result.error.mse < result.interval.high
-                ratios[seed] = result.error.mse / result.expected.mse
-        differences[seed] = means[0] - means[1]
-    print(differences.mean(), differences.std(ddof=1) / seeds**0.5, ratios.mean(), inside)
-    assert abs(differences.mean()) < 0.05
-    assert abs(ratios.mean() - 1) < 4 * ratios.std(ddof=1) / seeds**0.5
+        values = expose(model.forward(truth), described.noise, generators(camera, seed), camera.slices())
+        result = restore(Stack(described, camera, values, np.zeros_like(values), record), model, truth)
+        assert result.usable.saturated > 0
+        assert result.error is not None
+        assert result.interval is not None
+        differences[seed] = model.forward(result.estimate - truth).mean()
+        ratios[seed] = result.error.mse / result.expected.mse
+        inside += result.interval.low < result.error.mse < result.interval.high
+    for mean, samples in ((0, differences), (1, ratios)):
+        assert abs(samples.mean() - mean) < 4 * samples.std(ddof=1) / seeds**0.5
     assert inside >= seeds - 2
 
 

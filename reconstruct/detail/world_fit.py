@@ -127,7 +127,7 @@ def world_evidence(task: EstimationTask) -> WorldEvidence:
         raise InputError(
             f"a fit of the prior or the noise takes {MIN_MEASUREMENTS} measurements or more, got {inside.size}"
         )
-    kept = task.used[model.fine.measurements_inside(rows, columns)]
+    kept = np.isin(model.fine.measurements_inside(rows, columns), inside)
     matrix = sparse.csr_array(model.fine.submatrix(rows, columns)[kept])
     residual = task.recorded[inside] + model.offset[inside] - model.fine.matrix[inside] @ _mean(model, task)
     deviation = np.sqrt(task.on_all_measurements(task.expected_noise, 1.0)[inside])
@@ -142,8 +142,11 @@ def _mean(model: DetailedModel, task: EstimationTask) -> FloatArray:
 
 
 def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slice, IntArray]:
-    """Return the largest window in the middle with at most MOST used measurements inside, and these."""
-    most = max(task.shape)
+    """Return the largest window in the middle with at most MOST used measurements inside, and these.
+
+    Where blur reaches so far that a smaller window holds too few, the larger one with MOST of its measurements.
+    """
+    most, wider = max(task.shape), None
     for side in range(most, 0, -1):
         rows, columns = (
             slice((size - min(side, size)) // 2 * detail, ((size - min(side, size)) // 2 + min(side, size)) * detail)
@@ -151,8 +154,12 @@ def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slic
         )
         inside = fine.measurements_inside(rows, columns)
         inside = inside[task.used[inside]]
+        if inside.size < MIN_MEASUREMENTS and wider is not None:
+            rows, columns, inside = wider
+            return rows, columns, inside[np.linspace(0, inside.size - 1, MOST).round().astype(np.int64)]
         if inside.size <= MOST:
             return rows, columns, inside
+        wider = rows, columns, inside
     raise InputError(f"a fit of the prior takes {MIN_MEASUREMENTS} measurements or more in a window, got none")
 
 

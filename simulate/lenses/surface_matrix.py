@@ -34,7 +34,7 @@ ENTRY = 16  # bytes
 
 
 @dataclass(frozen=True, eq=False)
-class _Pixels:
+class _PixelFootprints:
     """Sensor pixels of a lens type, in the order of measurements.
 
     x, y : (M,) middle, mm from the lens's axis;  rows, columns : (M, 2) edges of the footprint
@@ -68,7 +68,7 @@ def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     return sparse.csr_array(sparse.diags_array(scale) @ found)
 
 
-def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _Pixels:
+def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFootprints:
     parts: list[FloatArray] = []
     half = camera.pixel_pitch / 2
     for sub in camera.sub_imagers:
@@ -85,10 +85,10 @@ def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _Pixels:
         rows = [camera.rows / 2 - edge / camera.target_pitch for edge in (upper, lower)]
         parts.append(np.stack([x, y, *rows, *columns]))
     x, y, *edges = np.concatenate(parts, axis=1)
-    return _Pixels(x, y, np.stack(edges[:2], axis=1), np.stack(edges[2:], axis=1))
+    return _PixelFootprints(x, y, np.stack(edges[:2], axis=1), np.stack(edges[2:], axis=1))
 
 
-def _rows(camera: Camera, field: LensField, pixels: _Pixels) -> sparse.csr_array:
+def _rows(camera: Camera, field: LensField, pixels: _PixelFootprints) -> sparse.csr_array:
     count = pixels.x.size
     wide = max(field.grid[1] if not field.rays_suffice else 0.0, max(wave.spot_radius for wave in field.nodes[1]))
     side = [min(size, float(np.ptp(pixels.rows[0])) + 2 * wide / camera.target_pitch + 2) for size in camera.shape]
@@ -103,7 +103,9 @@ def _rows(camera: Camera, field: LensField, pixels: _Pixels) -> sparse.csr_array
     return sparse.csr_array(sparse.vstack(rows, format="csr"))
 
 
-def _by_rays(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray) -> Iterator[tuple[int, FloatArray]]:
+def _by_rays(
+    camera: Camera, field: LensField, pixels: _PixelFootprints, lit: IntArray
+) -> Iterator[tuple[int, FloatArray]]:
     """Compute the entries, (rows, columns) of f, of each lit pixel from the rays of the nodes beside its height."""
     for pixel in lit.tolist():
         x, y = float(pixels.x[pixel]), float(pixels.y[pixel])
@@ -116,7 +118,9 @@ def _by_rays(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray) -
         yield pixel, values
 
 
-def _by_waves(camera: Camera, field: LensField, pixels: _Pixels, lit: IntArray) -> Iterator[tuple[int, FloatArray]]:
+def _by_waves(
+    camera: Camera, field: LensField, pixels: _PixelFootprints, lit: IntArray
+) -> Iterator[tuple[int, FloatArray]]:
     """Compute the entries, (rows, columns) of f, of each lit pixel; pixels with one point-spread function in turn."""
     cell, levels = field.grid[0] / camera.target_pitch, [max(steps, 1) for steps in field.steps]
     keys = {int(pixel): _key(field, float(pixels.x[pixel]), float(pixels.y[pixel])) for pixel in lit}

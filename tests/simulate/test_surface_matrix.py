@@ -25,7 +25,7 @@ ONE = (("1/3", [1, 2], [3, 3]),)
 # Far from the best shape, wide open and off the axis: coma, astigmatism and a few waves of spherical aberration.
 BENT = [
     {"radius": "-1.5 mm", "thickness": "0.3 mm", "index": 1.5, "semi_diameter": "0.1 mm", "stop": True},
-    {"radius": "-0.5 mm", "semi_diameter": "0.2 mm"},
+    {"radius": "-0.5 mm", "semi_diameter": "0.165 mm"},
 ]
 FLAT = [
     {"thickness": "0.3 mm", "index": 1.5, "semi_diameter": "0.12 mm", "stop": True},

@@ -163,14 +163,14 @@ def test_rendered_against_the_closed_form(variant: str, optics: str, rotation: s
 def test_calibrated_against_the_closed_form(method: str, rotation: str | None) -> None:
     """Entry by entry, by the variance that the calibration states from its batches."""
     needs("llvm_ad_mono")
-    tables: dict[str, Any] = {"render": {"variant": "llvm_ad_mono"}, "calibration": {"samples": 4096, "method": method}}
+    tables: dict[str, Any] = {"render": {"variant": "llvm_ad_mono"}, "calibration": {"samples": 1024, "method": method}}
     named: dict[tuple[int, int], dict[str, Any]] = {(0, 2): {"window": [2, 8]}, (1, 1): {"window": [8, "17/4"]}}
     if rotation is not None:
         named[1, 1]["rotation"] = rotation
     setup = Setup.from_scene(steered(named, **tables))
     model = calibrate(setup)
     difference = np.asarray((model.matrix - ideal_matrix(setup.camera)).toarray())
-    assert np.abs(difference).max() < 5 * np.sqrt(model.variance.max()) < 0.02, "entries are 1/9 and 1/4"
+    assert np.abs(difference).max() < 5 * np.sqrt(model.variance.max()) < 0.03, "entries are 1/9 and 1/4"
 
 
 @pytest.mark.parametrize("rotation", [None, "5 deg"])

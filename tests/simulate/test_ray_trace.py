@@ -304,8 +304,8 @@ def test_the_renderer_s_rays_are_the_traced_ones() -> None:
     square = np.array([[0.5, 0.75, 0.5, 1.0], [0.5, 0.5, 0.25, 0.5]])
     x, y = np.array([0.01, 0.0, -0.01, 0.0]), np.array([0.0, 0.01, 0.0, 0.0])
     renderer = RealLens(camera, kind)
-    at = (mi.Float(np.float32(axis)) for axis in (x, y))
-    start, way, weight = renderer.emit(*at, mi.Float(depth), Fixed(square), (0.0, 0.0))
+    at_x, at_y = (mi.Float(np.float32(axis)) for axis in (x, y))
+    start, way, weight = renderer.emit(at_x, at_y, mi.Float(depth), Fixed(square), (0.0, 0.0))
     place, direction, light = trace(
         path(one, exit_disk_of(camera, kind, one)), x, y, 2 * square[0] - 1, 2 * square[1] - 1, depth
     )

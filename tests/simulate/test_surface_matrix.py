@@ -95,7 +95,7 @@ def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> 
     wave = lens.lit_wave(height).turned(float(np.arctan2(-x, y)))
     step = pitch / 16
     offsets = (np.arange(-40 * 16, 40 * 16) + 0.5) * step
-    across, up = np.meshgrid(offsets, offsets)
+    across, up = (np.asarray(axis, dtype=np.float64) for axis in np.meshgrid(offsets, offsets))
     light = density(wave, across.ravel(), up.ravel()).reshape(across.shape) * step**2
     half = np.array([-camera.pixel_pitch, camera.pixel_pitch]) / 2
     edges_x, edges_y = lens.centre(x + half, np.array([y, y]))[0], lens.centre(np.array([x, x]), y + half)[1]

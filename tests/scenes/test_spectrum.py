@@ -143,7 +143,10 @@ def test_one_wavelength_is_the_same_in_either_table() -> None:
     by_light, by_camera = lit("550 nm")[1], lit(wavelength="550 nm")[1]
     assert by_light == by_camera
     assert by_light.wavelengths == ((by_camera.wavelength, 1.0),)
-    assert lit()[1].wavelengths == ()
+    ((wavelength, share),) = lit()[1].wavelengths
+    assert (wavelength, share) == (pytest.approx(by_camera.wavelength, rel=1e-12), 1.0)
+    assert lit(wavelength="none")[1].wavelengths == ()
+    assert white(lit(wavelength="none")) == white(lit())
     assert white(lit()) == white(lit("550 nm"))
 
 

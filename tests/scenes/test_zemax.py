@@ -271,7 +271,7 @@ def test_a_scene_takes_glasses_from_a_catalogue(tmp_path: Path) -> None:
     (tmp_path / "lens.zmx").write_text(LENS.format(unit="MM").replace("PMMA", "e-lak9"), encoding="utf-8")
     data = read(GALLERY / "tile19.toml", (), ["I"]).plain()
     data["camera"]["lens"][0]["surfaces"] = "lens.zmx"
-    data["camera"]["glass_catalogue"] = "glass.agf"
+    data["camera"] |= {"glass_catalogue": "glass.agf", "lens_pitch": "2 mm"}
     scene = with_changes(data, tmp_path / "scene.toml", (), ())
     write(tmp_path / "other.toml", scene)
     (tmp_path / "glass.agf").unlink()

@@ -24,7 +24,7 @@ from ..examples import GALLERY, familywise, mean_weights, needs, scene, with_opt
 
 FAST = "llvm_ad_mono"
 SMALL = (("1/3", [2, 2], [2, 2]), ("1/5", [2, 2], [1, 1]))
-OPEN = {"walls": False, "lens_pitch": "0.02 mm"}  # so narrow that neighbours look at the target, too
+OPEN = {"walls": False, "wavelength": "none", "lens_pitch": "0.02 mm"}  # so narrow that neighbours look at the target, too
 TRANSPORT = {"method": "transport", "samples": 16384}
 BATCHES = 16
 
@@ -113,7 +113,7 @@ def test_electrons_and_weights_of_rays_count_every_lens(pitch: str) -> None:
 def test_far_neighbours_of_a_small_target_dim_it() -> None:
     """At a pitch of 0.5 mm they look past 31 pixels: H is the walled one times the own lens's share of the light."""
     needs(FAST)
-    wide = {"walls": False, "lens_pitch": "0.5 mm"}
+    wide = {"walls": False, "wavelength": "none", "lens_pitch": "0.5 mm"}
     described, camera = with_optics({"aperture": "0.02 mm"}, wide, SMALL, (31, 31), calibration=TRANSPORT)
     model = rendered_model(Setup(described, camera))
     share = np.asarray(model.matrix.sum(axis=1)).ravel()

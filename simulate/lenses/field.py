@@ -15,6 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
@@ -28,6 +29,7 @@ TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors o
 MOST_NODES = 9
 MOST_WIDER = 2.0  # ratio of the widths of a common grid and of the narrowest that a wave of its own would have
 LEAST_VERGENCE = 1e-9  # of a far target; that of 0 has no plane
+MOST_ABERRATED = 2.0  # spot of rays in disks of defocus, up to which it is that of defocus
 MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by rays alone
 
 
@@ -99,6 +101,18 @@ class LensField:
             return True
         _, waves = self._rays
         return any(wave.spot_radius * 2 * wave.half_width > MOST_RINGS * self.wavelength for wave in waves)
+
+    @property
+    def aberrated_rays(self) -> float:
+        """The widest spot in finest details of the light where rays stand for aberrated waves, 0 elsewhere.
+
+        Rays describe defocus. The caustics of aberrations are sharper by rays than by waves at any width of the spot.
+        """
+        if self.wavelength is None or not self.rays_suffice:
+            return 0.0
+        spot = max(wave.spot_radius for wave in self._rays[1])
+        defocus = self.pupil_radius * abs(1 - self.distance * (1 / self.prescription.focal_length - 1 / self.depth))
+        return spot * 2 * self._rays[1][0].half_width / self.wavelength if spot > MOST_ABERRATED * defocus else 0.0
 
     @cached_property
     def nodes(self) -> tuple[FloatArray, list[Wavefront]]:
@@ -206,6 +220,16 @@ def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: 
     shape = (heights.size, vergences.size, *tables[0].shape)
     densities = np.stack(tables).reshape(shape).astype(np.float64)
     return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)))
+
+
+def check_waves(lens_type: LensType, field: LensField) -> None:
+    """Raise InputError for aberrations of so many waves that the light can be computed neither as waves nor as rays."""
+    if field.aberrated_rays:
+        raise InputError(
+            f"camera.lens.{lens_type.name}.surfaces: expected a spot of at most {MOST_RINGS:g} times the finest detail"
+            f" of the light, got aberrations that spread it over {field.aberrated_rays:.3g}; reduce semi_diameter, or"
+            " take camera.wavelength = 'none' for rays, which promise more than such a lens can do"
+        )
 
 
 def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:

@@ -27,7 +27,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.pose import corner_offset, pose_of
 
-from .field import LensField, bands, field_of
+from .field import LensField, bands, check_waves, field_of
 
 LEAST = 1e-12  # entries below are left out
 ENTRY = 16  # bytes
@@ -53,12 +53,13 @@ def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     A row holds the light of a pixel that comes from the target: less than 1, as diffraction takes up to 0.5 per cent
     of the light beyond the grid of the point-spread function. Rows of pixels without light are empty. Neglected is the
     variation of the blur within a pixel.
-    Raises InputError if the surfaces form no image.
+    Raises InputError if the surfaces form no image, or aberrations of too many waves.
     """
     found: sparse.csr_array | None = None
     total = np.zeros(lens_type.measurements)
     for wavelength, weight in bands(camera):
         field = field_of(camera, lens_type, wavelength)
+        check_waves(lens_type, field)
         pixels = _pixels(camera, lens_type, field)
         light = weight * field.brightness(np.hypot(pixels.x, pixels.y))
         part = sparse.csr_array(sparse.diags_array(light) @ _rows(camera, field, pixels))

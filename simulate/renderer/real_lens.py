@@ -17,7 +17,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
-from ..lenses.field import LensField, bands, field_of, sampling_tables
+from ..lenses.field import LensField, bands, check_waves, field_of, sampling_tables
 from ..lenses.prescription import prescription_of
 from ..lenses.ray_trace import exit_disk_of, path, reach, trace
 from ..lenses.surface_shapes import Functions
@@ -203,6 +203,8 @@ def real_lens(camera: Camera, lens_type: LensType) -> LensModel:
     Raises InputError if the surfaces form no image or pass no light.
     """
     fields = [(field_of(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
+    for field, _ in fields:
+        check_waves(lens_type, field)
     if any(field.rays_suffice for field, _ in fields):
         return RealLens(camera, lens_type)
     return WaveLens(camera, lens_type, fields)

@@ -24,6 +24,7 @@ F_NUMBERS = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 NOISE = 1e-3
 PITCH = 12e-3  # mm, of sensor pixels
 WIDEST = "3 mm"  # lens pitch
+WIDEST_STOP = {"perfect": 1.4, "doublet": 2.0, "planoconvex": 2.8}  # f-numbers; the light of wider ones is not waves
 COLOURS = {"perfect": "black", "doublet": "tab:blue", "planoconvex": "tab:orange"}
 
 
@@ -38,12 +39,12 @@ class FNumberRow:
 
 
 def rows(lenses: Sequence[str] = tuple(COLOURS), f_numbers: Sequence[float] = F_NUMBERS) -> list[FNumberRow]:
-    """Return the rows of all lenses and f-numbers; lenses without an image at an f-number are left out."""
+    """Return the rows of all lenses and f-numbers down to the widest stop of each."""
     return [
         FNumberRow(lens, number, *(error(camera_of(lens, number, wavelength)) for wavelength in ("550 nm", "none")))
         for lens in lenses
         for number in f_numbers
-        if lens == "perfect" or number >= 2
+        if number >= WIDEST_STOP[lens]
     ]
 
 
@@ -55,8 +56,7 @@ def camera_of(lens: str, f_number: float, wavelength: str) -> Camera:
     data["camera"] |= {"pixel_pitch": f"{PITCH} mm", "lens_pitch": WIDEST, "wavelength": wavelength}
     for lens_type in data["camera"]["lens"]:
         if lens == "perfect":
-            ratio = 1 / (1000 * PITCH * _number(lens_type["magnification"]))
-            lens_type["aperture"] = f"{1 / ratio / f_number} mm"
+            lens_type["aperture"] = f"{1000 * PITCH * _number(lens_type['magnification']) / f_number} mm"
         else:
             lens_type["surfaces"] = [_opened(surface, 2.0 / f_number) for surface in lens_type["surfaces"]]
     return derive(parse(data, Path("benchmark")))

@@ -24,7 +24,11 @@ from ..examples import GALLERY, familywise, mean_weights, needs, scene, with_opt
 
 FAST = "llvm_ad_mono"
 SMALL = (("1/3", [2, 2], [2, 2]), ("1/5", [2, 2], [1, 1]))
-OPEN = {"walls": False, "wavelength": "none", "lens_pitch": "0.02 mm"}  # so narrow that neighbours look at the target, too
+OPEN = {
+    "walls": False,
+    "wavelength": "none",
+    "lens_pitch": "0.02 mm",
+}  # neighbours look at the target, too
 TRANSPORT = {"method": "transport", "samples": 16384}
 BATCHES = 16
 

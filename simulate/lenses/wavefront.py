@@ -10,8 +10,8 @@ L(a). About the point t0 that the rays meet on average (Fraunhofer's approximati
     q = (x - t0) / |x - t0|.
 
 The nodes of the integral are polar: by direction from the middle of the clear part of the exit disk, whose edge is
-found by repeated division along each direction, and by Gauss-Legendre along the radius, so that a vignetted pupil has a sharp
-edge. Lengths are millimetres, in the coordinates of the lens: sensor points lie on the y axis.
+found by dividing intervals along each direction, and by Gauss-Legendre along the radius, so that a vignetted pupil has
+a sharp edge. Lengths are millimetres, in the coordinates of the lens: sensor points lie on the y axis.
 """
 
 from __future__ import annotations

@@ -56,11 +56,15 @@ TESTED_ELSEWHERE = {
     "doctor": ("cli/test_commands.py", '"doctor"'),
 }
 
-# Options that shorten the commands of the pages: fewer samples and pixels, no correlation, no diffraction.
+# Options that shorten the commands of the pages: fewer samples and pixels, no correlation.
 QUICK = ["--set", "render.samples=16", "--set", "calibration.samples=16"]
 SCALAR = ["--set", "render.variant=scalar_rgb"]  # needs no compilation
 STARTER_SHAPE, SMALL_SHAPE = "shape = [59, 59]", "shape = [19, 19]"
 INDEPENDENT = ["--set", "prior.kind=independent", "--set", "prior.correlation_length="]
+TILE = [
+    *("--set", "target.shape=[19, 19]", "--set", "camera.lens.I.pixels=[5, 5]"),
+    *("--set", "camera.lens.II.pixels=[3, 3]", "--set", "camera.lens.III.pixels=[4, 4]"),
+]
 SHORTER = {
     "run misaligned": [*QUICK, *INDEPENDENT, "--set", 'study.models=["ideal","true"]'],
     "run corridor": [*QUICK, *SCALAR, "--set", "target.shape=[19, 19]"],
@@ -68,7 +72,7 @@ SHORTER = {
     "run tile19 -o sweep": [*QUICK, *SCALAR, "--set", "calibration.method=ideal", "--workers", "1"],
     "run tile19 -o auto": SCALAR,
     "run tile19 -o within": [*SCALAR, "--within", "5 s"],
-    "predict sensor": ["--set", "camera.wavelength="],
+    "predict sensor": TILE,
     "run": [*QUICK, *SCALAR],
     "render": [*QUICK, *SCALAR],
     "calibrate": [*QUICK, *SCALAR],

@@ -26,6 +26,7 @@ from .world_prior import WorldPrior
 
 LENGTHS = (0.5, 1.5, 4.0, 10.0, 25.0, 60.0)  # pixels of f, from which the search starts
 MOST = 700  # measurements whose covariance is diagonalised
+SPARSE = 0.1  # share of entries of H, from which products with it as a dense matrix are faster
 STEP = 0.2  # of the logarithm of the length, for the curvature
 TOLERANCE = 0.02  # of the logarithm of the length, far below what the evidence can distinguish
 
@@ -46,9 +47,10 @@ class WorldEvidence:
         """Return the eigenvalues of Hf K Hf^T and the squared residuals along its eigenvectors; of log(length in f)."""
         table = PriorTable.model_construct(kind="exponential", variance=1.0, correlation_length=exp(logarithm))
         prior = WorldPrior.of(table, self.shape, 1.0, self.detail)
-        spread = prior.apply(np.asarray(self.matrix.T.toarray(), dtype=np.float64))
-        covariance: FloatArray = self.matrix @ spread
-        values, vectors = linalg.eigh((covariance + covariance.T) / 2, check_finite=False)
+        dense = np.asarray(self.matrix.toarray(), dtype=np.float64)
+        spread = prior.apply(dense.T)
+        covariance = np.asarray((self.matrix if self.matrix.nnz < SPARSE * dense.size else dense) @ spread)
+        values, vectors = linalg.eigh((covariance + covariance.T) / 2, check_finite=False, driver="evd")
         return np.maximum(values, 0.0), np.square(vectors.T @ self.residual)
 
     def best_variance(

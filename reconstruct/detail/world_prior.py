@@ -58,8 +58,12 @@ class WorldPrior:
         product = np.empty(images.shape)
         for start in range(0, images.shape[1], COLUMNS):
             part = np.ascontiguousarray(images[:, start : start + COLUMNS].T).reshape(-1, rows, columns)
-            waves = fft.rfft2(part, s=self.lags.shape, workers=processors()) * self._spectrum
-            spread = fft.irfft2(waves, s=self.lags.shape, workers=processors())[:, :rows, :columns]
+            # Rows of zeros are not transformed, nor rows transformed back that lie outside the world.
+            waves = fft.rfft(part, n=self.lags.shape[1], workers=processors())
+            waves = fft.fft(waves, n=self.lags.shape[0], axis=1, workers=processors(), overwrite_x=True)
+            waves *= self._spectrum
+            waves = fft.ifft(waves, axis=1, workers=processors(), overwrite_x=True)[:, :rows]
+            spread = fft.irfft(waves, n=self.lags.shape[1], workers=processors())[:, :, :columns]
             product[:, start : start + COLUMNS] = spread.reshape(len(part), -1).T
         return product
 

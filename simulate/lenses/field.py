@@ -7,8 +7,9 @@ as many as linear interpolation between them needs.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, lru_cache
 from math import ceil, pi
 
 import numpy as np
@@ -161,22 +162,34 @@ class LensField:
         variation = np.abs(rim - axis).sum(), np.abs(rim - rim.T).sum()
         return ceil(variation[0] / TOLERANCE), ceil(variation[1] / TOLERANCE)
 
-    def between(self, height: float) -> list[tuple[Wavefront, float]]:
-        """Return the waves of the nodes beside a height, and their weights."""
-        heights, waves = self.nodes
+    def _beside(self, height: float) -> list[tuple[int, float]]:
+        """Return the numbers of the nodes beside a height, and their weights."""
+        heights = self.nodes[0]
         if heights.size == 1 or height >= heights[-1]:
-            return [(waves[-1], 1.0)]
+            return [(heights.size - 1, 1.0)]
         after = int(np.searchsorted(heights, height, side="right"))
         share = float((height - heights[after - 1]) / (heights[after] - heights[after - 1]))
-        return [(waves[after - 1], 1 - share), (waves[after], share)]
+        return [(after - 1, 1 - share), (after, share)]
 
-    def spread(self, height: float, angle: float) -> FloatArray:
-        """Return the point-spread function of a sensor point on the grid: (n, n) shares of the light.
+    def between(self, height: float) -> list[tuple[Wavefront, float]]:
+        """Return the waves of the nodes beside a height, and their weights."""
+        return [(self.nodes[1][node], share) for node, share in self._beside(height)]
 
-        angle : from the y axis to the sensor point, towards x
+    def spreads(self, angle: float) -> Callable[[float], FloatArray]:
+        """Return the point-spread function by the height of a sensor point, on the grid: (n, n) shares of the light.
+
+        angle : from the y axis to the sensor point, towards x; one function for all heights computes each node once
         """
-        parts = [share * point_spread(wave.turned(-angle), self.grid).values for wave, share in self.between(height)]
-        return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
+
+        @cache
+        def of_node(node: int) -> FloatArray:
+            return point_spread(self.nodes[1][node].turned(-angle), self.grid).values
+
+        def spread(height: float) -> FloatArray:
+            parts = [share * of_node(node) for node, share in self._beside(height)]
+            return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
+
+        return spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +250,7 @@ def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:
     return camera.wavelengths or ((None, 1.0),)
 
 
+@lru_cache(maxsize=16)
 def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> LensField:
     """Return a lens type of the camera at a wavelength.
 

@@ -125,8 +125,11 @@ def _by_waves(
     """Compute the entries, (rows, columns) of f, of each lit pixel; pixels with one point-spread function in turn."""
     cell, levels = field.grid[0] / camera.target_pitch, [max(steps, 1) for steps in field.steps]
     keys = {int(pixel): _key(field, float(pixels.x[pixel]), float(pixels.y[pixel])) for pixel in lit}
-    for (level, turn), members in groupby(sorted(keys, key=keys.__getitem__), key=keys.__getitem__):
-        spread = field.spread(field.field * level / levels[0], pi / 2 * turn / levels[1])
+    spread_at, before = field.spreads(0.0), 0
+    for (turn, level), members in groupby(sorted(keys, key=keys.__getitem__), key=keys.__getitem__):
+        if turn != before:
+            spread_at, before = field.spreads(pi / 2 * turn / levels[1]), turn
+        spread = spread_at(field.field * level / levels[0])
         offsets: FloatArray = cell * (np.arange(len(spread), dtype=np.float64) - len(spread) // 2)
         for pixel in members:
             x, y = pixels.x[pixel], pixels.y[pixel]
@@ -138,10 +141,10 @@ def _by_waves(
 
 
 def _key(field: LensField, x: float, y: float) -> tuple[int, int]:
-    """Return the level of height and of direction, folded into the half quadrant beside the y axis, of a pixel."""
+    """Return the level of direction, folded into the half quadrant beside the y axis, and of height, of a pixel."""
     levels, turns = field.steps
     angle = float(np.arctan2(min(abs(x), abs(y)), max(abs(x), abs(y))))
-    return round(float(np.hypot(x, y)) / field.field * levels), round(angle / (pi / 2) * turns)
+    return round(angle / (pi / 2) * turns), round(float(np.hypot(x, y)) / field.field * levels)
 
 
 def _overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float) -> FloatArray:

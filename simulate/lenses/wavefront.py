@@ -10,8 +10,8 @@ L(a). About the point t0 that the rays meet on average (Fraunhofer's approximati
     q = (x - t0) / |x - t0|.
 
 The nodes of the integral are polar: by direction from the middle of the clear part of the exit disk, whose edge is
-found by bisection along each direction, and by Gauss-Legendre along the radius, so that a vignetted pupil has a sharp
-edge. Lengths are millimetres, in the coordinates of the lens: sensor points lie on the y axis.
+found by dividing intervals along each direction, and by Gauss-Legendre along the radius, so that a vignetted pupil has
+a sharp edge. Lengths are millimetres, in the coordinates of the lens: sensor points lie on the y axis.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .prescription import Prescription
 from .ray_trace import Disk, LensPath, path, spread, trace, trace_path
 
 SCOUTS = 4096  # rays that find the middle of the clear part of the disk
-EDGE_STEPS = 32  # of the bisection
+EDGE_STEPS, PARTS = 8, 16  # of the search for the edge, each of which divides an interval into so many parts
 STEP = 1e-6  # of differences, relative to the disk
 BESIDE_RIM = 1.001  # rims are so much wider for rays that the differences trace
 RAY_NODES = (48, 96)  # along the radius and around, where no wave oscillates over the pupil
@@ -46,7 +46,7 @@ class Wavefront:
     cosines : (2, n) direction cosines of the lines from `centre` on the target to the nodes
     path : (n,) optical path from the sensor point through the node to `centre`, relative to the mean path
     light : (n,) share of the light that each node carries; the sum is `solid_angle`'s share 1
-    density : (n,) |dq/da| times the node's area, so that a field's amplitude is sqrt(light * density)
+    density : (n,) |dq/da| times the node's area, so that a field's amplitude is sqrt(light * density); (0,) for rays
     hits : (2, n) where the ray of each node meets the target, from `centre`
     centre : (x, y) of the target that the rays meet on average
     brightness : light of the sensor point, projected solid angle in sr
@@ -162,10 +162,10 @@ def wavefront_of(
     middle = _middle(prescription, disk, depth, height)
     if middle is None:
         return None
-    rough = _traced(prescription, disk, depth, height, distance, wavelength, middle, RAY_NODES)
+    rays = _traced(prescription, disk, depth, height, distance, None, middle, RAY_NODES)
     if wavelength is None:
-        return rough
-    phase = 2 * pi / wavelength * rough.half_width * (2 * rough.spot_radius + reach * rough.resolution)
+        return rays
+    phase = 2 * pi / wavelength * rays.half_width * 2 * rays.spot_radius + pi * reach
     return _traced(prescription, disk, depth, height, distance, wavelength, middle, node_counts(phase))
 
 
@@ -193,29 +193,36 @@ def _traced(
     at = (middle[:, None, None] + radius * edge * direction).reshape(2, -1)
     # All nodes are known to pass the rims; the differences may step over these.
     open_lens = replace(prescription, semi_diameter=BESIDE_RIM * prescription.semi_diameter)
-    numbers = path(open_lens, disk)
-    steps = STEP * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[..., None]
-    points, slopes, weights = _rays(numbers, height, at + steps, depth)
-    hits = points + distance * slopes
+    points, (u, v, w), weights, optical = trace_path(open_lens, disk, 0.0, height, at[0], at[1], depth)
+    slopes = np.stack([u / w, v / w])
+    hits = np.stack(points) + distance * slopes
     before = _pupil_plane(prescription, distance)
-    light = weights[0] * (area * edge**2).ravel()
+    light = weights * (area * edge**2).ravel()
     brightness = float(light.sum()) * (disk.radius / (depth + disk.height)) ** 2
     light /= light.sum()
-    centre = hits[:, 0] @ light
-    beside = points + before * slopes - centre[:, None, None]
-    length = np.copysign(np.sqrt(np.square(beside).sum(axis=0) + (distance - before) ** 2), distance)
-    cosines = beside / length
-    right, up = (cosines[:, 1] - cosines[:, 2]) / (2 * STEP), (cosines[:, 3] - cosines[:, 4]) / (2 * STEP)
-    density = np.abs(right[0] * up[1] - right[1] * up[0]) * (area * edge**2).ravel()
-    optical = trace_path(open_lens, disk, 0.0, height, at[0], at[1], depth)[3]
-    optical = optical + before * np.sqrt(1 + np.square(slopes[:, 0]).sum(axis=0)) + length[0]
+    centre = hits @ light
+
+    def lines(points: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return direction cosines and lengths of the lines from the centre to the pupil."""
+        beside = points + before * slopes - centre.reshape(2, *[1] * (points.ndim - 1))
+        length = np.copysign(np.sqrt(np.square(beside).sum(axis=0) + (distance - before) ** 2), distance)
+        return beside / length, length
+
+    cosines, length = lines(np.stack(points), slopes)
+    density = np.zeros(0)
+    if wavelength is not None:
+        steps = STEP * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[..., None]
+        moved = lines(*_rays(path(open_lens, disk), height, at + steps, depth))[0]
+        right, up = (moved[:, 0] - moved[:, 1]) / (2 * STEP), (moved[:, 2] - moved[:, 3]) / (2 * STEP)
+        density = np.abs(right[0] * up[1] - right[1] * up[0]) * (area * edge**2).ravel()
+    optical = optical + before * np.sqrt(1 + np.square(slopes).sum(axis=0)) + length
     return Wavefront(
         wavelength=wavelength,
-        cosines=cosines[:, 0],
+        cosines=cosines,
         path=optical - light @ optical,
         light=light,
         density=density,
-        hits=hits[:, 0] - centre[:, None],
+        hits=hits - centre[:, None],
         centre=(float(centre[0]), float(centre[1])),
         brightness=brightness,
         outermost=float(radius[-1, 0]),
@@ -231,10 +238,10 @@ def _pupil_plane(prescription: Prescription, distance: float) -> float:
     return before if abs(before) < abs(distance) / 2 else 0.0
 
 
-def _rays(numbers: LensPath, height: float, at: FloatArray, depth: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Trace rays through points of the disk, (5, 2, n): points and slopes, (2, 5, n), and weights, (5, n)."""
-    (x, y), (u, v, w), weight = trace(numbers, 0.0, height, at[:, 0], at[:, 1], depth)
-    return np.stack([x, y]), np.stack([u / w, v / w]), weight
+def _rays(numbers: LensPath, height: float, at: FloatArray, depth: float) -> tuple[FloatArray, FloatArray]:
+    """Trace rays through points of the disk, (k, 2, n): points and slopes, (2, k, n)."""
+    (x, y), (u, v, w), _ = trace(numbers, 0.0, height, at[:, 0], at[:, 1], depth)
+    return np.stack([x, y]), np.stack([u / w, v / w])
 
 
 def _edge(
@@ -242,11 +249,11 @@ def _edge(
 ) -> FloatArray:
     """Return the distance from the middle to the edge of the light along directions, (2, n): (1, n)."""
     numbers = path(prescription, disk)
-    low = np.zeros(direction.shape[1])
-    high = np.full(direction.shape[1], 2.0)  # across the unit disk, wherever the middle lies
+    low, width = np.zeros(direction.shape[1]), 2.0  # across the unit disk, wherever the middle lies
     for _ in range(EDGE_STEPS):
-        tried = (low + high) / 2
-        at = middle[:, None] + tried * direction
+        width /= PARTS
+        tried = low + width * np.arange(1, PARTS)[:, None]
+        at = middle[:, None, None] + tried * direction[:, None]
         lit = trace(numbers, 0.0, height, at[0], at[1], depth)[2] > 0
-        low, high = np.where(lit, tried, low), np.where(lit, high, tried)
+        low = low + width * np.logical_and.accumulate(lit).sum(axis=0)
     return low[None, :]

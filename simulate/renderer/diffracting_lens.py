@@ -12,12 +12,13 @@ either is not exact.)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil, pi
 from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.blur import blurs_of
@@ -145,11 +146,9 @@ class BandTable:
 
         low, high = (0.0, np.abs(ends).max()) if ends.min() < 0 < ends.max() else np.sort(np.abs(ends))
         self._nodes = _nodes(low, min(high, MOST_WAVES)) if high - low >= SAME else np.array([(low + high) / 2])
-        self._steps, patterns = steps, [pattern(waves, weight) for waves in self._nodes]
-        radii = np.array([each.quantiles(steps) for each in patterns])
-        slants = np.array([each.relative_slant(v) for each, v in zip(patterns, radii, strict=True)])
-        self.captured = float(np.mean([each.encircled for each in patterns]))
-        self._radii, self._slants = (mi.Float(table.ravel().astype(np.float32)) for table in (radii, slants))
+        self._steps = steps
+        tables, self.captured = _radii_and_slants(tuple(self._nodes.tolist()), weight, steps)
+        self._radii, self._slants = (mi.Float(table) for table in tables)
         self._waves = mi.Float(self._nodes.astype(np.float32))
 
     def at(self, waves: Any, share: Any, all_light: bool) -> tuple[Any, Any]:
@@ -191,6 +190,16 @@ class BandTable:
         import mitsuba as mi
 
         return dr.lerp(dr.gather(mi.Float, table, row), dr.gather(mi.Float, table, row + 1), share)
+
+
+@lru_cache(maxsize=16)
+def _radii_and_slants(nodes: tuple[float, ...], weight: float, steps: int) -> tuple[list[Float32Array], float]:
+    """Return the tables of radii and of slants, (defoci times (steps + 1),) each, and the share of light inside."""
+    patterns = [pattern(waves, weight) for waves in nodes]
+    radii = [each.quantiles(steps) for each in patterns]
+    slants = [each.relative_slant(v) for each, v in zip(patterns, radii, strict=True)]
+    tables = [np.concatenate(table).astype(np.float32) for table in (radii, slants)]
+    return tables, float(np.mean([each.encircled for each in patterns]))
 
 
 def _nodes(low: float, high: float) -> FloatArray:

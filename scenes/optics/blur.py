@@ -36,6 +36,7 @@ from .diffraction import MOST_WAVES, Pattern, end_of, pattern
 from .radial_density import RadialDensity, disk_density, disk_slant
 
 MOST_REACH = 1000  # pixels of f
+MOST_WEIGHT = 1.0  # of f/0.5; beyond, the first order in the height of a pixel does not describe the cos^4 law
 TABLES = 6  # arrays of the size of the transfer function that `matrix` holds at once
 SIGNS = np.array([1, -1, -1, 1])  # of the terms of D
 
@@ -109,6 +110,12 @@ def blur_of(camera: Camera, lens_type: LensType, wavelength: float | None = None
         blur = replace(blur, airy=0.0)
     if blur.is_zero:
         return Blur()
+    if blur.weight > MOST_WEIGHT:
+        number = camera.depth(lens_type) / aperture
+        raise InputError(
+            f"camera.lens.{lens_type.name}.aperture: expected a cone of light of f/0.5 at the sensor or narrower, the"
+            f" limit of lenses in air, got f/{number:.2g}; make the aperture smaller"
+        )
     if blur.reach > MOST_REACH:
         raise InputError(
             f"camera.lens.{lens_type.name}: its blur reaches {blur.reach:.3g} pixels of f, expected at most"

@@ -22,7 +22,7 @@ from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.blur import blurs_of
-from ommatid.scenes.optics.diffraction import MOST_WAVES, QUANTILES, pattern
+from ommatid.scenes.optics.diffraction import QUANTILES, pattern
 
 from ..lenses import thin_lens
 from ..lenses.ray_trace import reach
@@ -30,6 +30,7 @@ from .lens import Distance, Emission, LensModel, Point
 
 FEW_QUANTILES = 2**12  # where the defocus varies
 STEP, GROWTH, LINEAR = 0.05, 1.02, 3.0  # between tabulated defoci, in waves: up to LINEAR, and as a factor beyond
+MOST_TABULATED = 20.0  # waves, beyond which the radii grow with the defocus
 SAME = 1e-3  # waves by which defocus may vary without a table of several
 BEYOND = 1 - 1e-5  # focus over distance beyond the focus: below 1, since a side that rounding decides is no random one
 TINY = 1e-6  # share of the light that lands within a million times the largest radius
@@ -145,7 +146,7 @@ class BandTable:
         import mitsuba as mi
 
         low, high = (0.0, np.abs(ends).max()) if ends.min() < 0 < ends.max() else np.sort(np.abs(ends))
-        self._nodes = _nodes(low, min(high, MOST_WAVES)) if high - low >= SAME else np.array([(low + high) / 2])
+        self._nodes = _nodes(low, min(high, MOST_TABULATED)) if high - low >= SAME else np.array([(low + high) / 2])
         self._steps = steps
         tables, self.captured = _radii_and_slants(tuple(self._nodes.tolist()), weight, steps)
         self._radii, self._slants = (mi.Float(table) for table in tables)

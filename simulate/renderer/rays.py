@@ -159,7 +159,10 @@ def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
     if aperture is None:
         return LensModel(camera, lens_type)
     if camera.wavelengths:
-        from .diffracting_lens import DiffractingLens
+        from ommatid.scenes.optics.blur import blurs_of
 
-        return DiffractingLens(camera, lens_type, aperture)
+        if any(blur.airy for blur, _ in blurs_of(camera, lens_type)):  # not so far out of focus that light is rays
+            from .diffracting_lens import DiffractingLens
+
+            return DiffractingLens(camera, lens_type, aperture)
     return ThinLens(camera, lens_type, aperture)

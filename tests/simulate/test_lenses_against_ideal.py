@@ -33,6 +33,10 @@ CLOSED = OPTICS | {
     "a thin lens in focus": ({"aperture": "0.4 mm"}, RAYS),
     "far out of focus": ({"aperture": "0.4 mm", "focus": "700 mm"}, RAYS),
     **{name: ({"aperture": "0.4 mm", "focus": f"{focus} mm"}, {}) for name, focus in WAVES.items()},
+    "250 waves": (
+        {"aperture": "2 mm", "focus": "333.33 mm"},
+        {"wavelength": "4 nm", "lens_pitch": "3 mm", "pixel_pitch": "20 um"},
+    ),
     "distorted and misaligned": ({"distortion": [-0.04, 0.02]}, OPTICS["misaligned"][1]),
 }
 

@@ -39,7 +39,7 @@ NOISY: dict[str, Any] = {"noise": {"variance": 1e4}}
 RULES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "in focus": ({"aperture": "0.4 mm"}, RAYS),
     "nearly in focus": ({"aperture": "0.4 mm", "focus": "970 mm"}, RAYS),
-    "hardly diffracting": ({"aperture": "2.6 mm"}, {"wavelength": "550 nm", "lens_pitch": "3 mm"}),
+    "hardly diffracting": ({"aperture": "2.35 mm"}, {"wavelength": "550 nm", "lens_pitch": "3 mm"}),
 }
 
 

@@ -1,13 +1,13 @@
 """The observation model g = H f + v: a sparse H with the variance of its every entry (Wood et al., Eq. 1).
 
-H is (M, N): a row per sensor pixel in the order of measurements, a column per pixel of f, row by row. The ideal H of a
-large frame is not stored but applied from the scene's geometry.
+H is (M, N): a row per sensor pixel in the order of measurements, a column per pixel of f, row by row. The H of a large
+frame with box footprints, ideal or calibrated, is not stored but applied from the geometry.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from math import ceil
@@ -21,6 +21,7 @@ from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
 from .camera import Camera
+from .fitted.fitted_matrix import FittedMatrix, gradient
 from .optics.boxes import BoxFootprints
 from .scene import Scene
 from .shrinkage import shrink_variances
@@ -35,11 +36,12 @@ EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside
 
 @dataclass(frozen=True)
 class Model:
-    """H as `stored` (CSR, float64), or None where it follows from the camera; `variance` of each stored entry.
+    """H as `stored` (CSR, float64), or None where `boxes` applies it; `variance` of each stored entry.
 
     batches : (B, nnz) deviations of B independent estimates of the entries from their mean `stored`; B is 0 without
         uncertainty
     record : how H was determined: method, samples, seconds, agreement with the ideal model, fingerprint
+    fitted : the few numbers from which entries of variance 0 follow, with their errors; None: every entry by itself
     """
 
     scene: Scene
@@ -48,6 +50,7 @@ class Model:
     variance: FloatArray
     batches: Float32Array
     record: dict[str, Any]
+    fitted: FittedMatrix | None = field(default=None, kw_only=True)
 
     @property
     def matrix(self) -> sparse.csr_array:
@@ -66,12 +69,32 @@ class Model:
     @property
     def is_exact(self) -> bool:
         """True if H is that of an ideal camera with box footprints, so that `boxes` applies it."""
-        return self.record["method"] == "ideal" and self.camera.has_box_footprints
+        designed = self.record["method"] == "ideal" if self.fitted is None else self.fitted.is_as_designed
+        return designed and self.camera.has_box_footprints
+
+    @property
+    def has_boxes(self) -> bool:
+        """True if `boxes` applies H: it is ideal, or calibrated with box footprints."""
+        return self.stored is None or self.is_exact or (self.fitted is not None and self.fitted.is_boxes)
+
+    @property
+    def is_nearly_designed(self) -> bool:
+        """True if H is the ideal one with box footprints, or differs from it too little to change an error map."""
+        return self.is_exact or (self.fitted is not None and self.fitted.is_nearly_designed)
 
     @cached_property
     def boxes(self) -> BoxFootprints:
-        """The designed H with box footprints, for any camera."""
+        """H with box footprints: as calibrated, or else as designed, for any camera."""
+        if self.fitted is not None and self.fitted.is_boxes:
+            return self.fitted.boxes
         return BoxFootprints(self.camera)
+
+    @property
+    def without_entries(self) -> Model:
+        """The same H, applied by `boxes` alone where that serves: averages over boxes are faster than a matrix."""
+        if not self.has_boxes or self.stored is None:
+            return self
+        return replace(self, stored=None, variance=np.zeros(0), batches=np.zeros((0, 0), np.float32))
 
     @property
     def measurements(self) -> int:
@@ -112,7 +135,7 @@ class Model:
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Indices of the measurements that see nothing outside a window of f: (m,)."""
-        if self.is_exact:
+        if self.has_boxes:
             return self.boxes.measurements_inside(rows, columns)
         top, bottom, left, right = self._extents
         inside = (top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop)
@@ -120,7 +143,7 @@ class Model:
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """H from a window of f to the measurements that see nothing outside it: (m, pixels of the window)."""
-        if self.is_exact:
+        if self.has_boxes:
             return self.boxes.submatrix(rows, columns)
         inside = self.matrix[self.measurements_inside(rows, columns)]
         row, column = np.divmod(inside.indices, self.camera.columns)
@@ -130,13 +153,13 @@ class Model:
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """A key that is equal for two windows only if their submatrices are equal."""
-        return self.boxes.signature(rows, columns) if self.is_exact else (rows.start, columns.start)
+        return self.boxes.signature(rows, columns) if self.has_boxes else (rows.start, columns.start)
 
     @property
     def reach(self) -> int:
         """Largest number of rows or of columns of f that a measurement spans."""
         if self.stored is None:
-            return max(ceil(lens_type.ratio) + 1 for lens_type in self.camera.types)
+            return max(ceil(lens_type.ratio) + (1 if self.is_exact else 2) for lens_type in self.camera.types)
         top, bottom, left, right = self._extents
         return int(max((bottom - top).max(), (right - left).max())) + 1
 
@@ -155,8 +178,9 @@ class Model:
     def restrict(self, names: tuple[str, ...]) -> Model:
         """The model of only the named lens types, in its own order. Raises InputError for an unknown name."""
         camera, mask = self.camera.restrict(names)
+        fitted = None if self.fitted is None else self.fitted.restrict(camera)
         if self.stored is None:
-            return replace(self, camera=camera)
+            return replace(self, camera=camera, fitted=fitted)
         stored = np.repeat(mask, np.diff(self.matrix.indptr))
         return replace(
             self,
@@ -164,8 +188,32 @@ class Model:
             stored=self.matrix[mask],
             variance=self.variance[stored],
             batches=self.batches[:, stored],
+            fitted=fitted,
             record={key: value for key, value in self.record.items() if key != "agreement"},  # of all lens types
         )
+
+    @property
+    def without_uncertainty(self) -> Model:
+        """The same H, taken for exact."""
+        fitted = None if self.fitted is None else self.fitted.without_errors
+        return replace(self, variance=np.zeros_like(self.variance), batches=self.batches[:0], fitted=fitted)
+
+    def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
+        """L, (M, q), such that the error of H f by that of few numbers is L xi with independent xi of variance 1."""
+        return None if self.fitted is None else self.fitted.directions(self._gradients(image))
+
+    def error_variance(self, image: FloatArray) -> FloatArray | None:
+        """Variance of each measurement by the errors of few numbers, (M,): the diagonal of L L^T."""
+        return None if self.fitted is None else self.fitted.error_variance(self._gradients(image))
+
+    def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
+        """A random error of H f by those of few numbers, L xi: (M,)."""
+        return None if self.fitted is None else self.fitted.error_draw(self._gradients(image), rng)
+
+    def _gradients(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """H applied to the gradient of f, (N,), down and across: (M,) each."""
+        down, across = gradient(image, self.camera.shape)
+        return self.forward(down), self.forward(across)
 
     def variance_from_model(self, image: FloatArray, noise: Sequence[FloatArray] = ()) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement of `image`: (M,).

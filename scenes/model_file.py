@@ -1,8 +1,8 @@
-"""The file of a model: a matrix for `scipy.sparse.load_npz`, with its variances and a description.
+"""The file of a model: a matrix for `scipy.sparse.load_npz`, with its variances and a description, or few numbers.
 
 `variance` is in the order of `data`; a JSON text `ommatid` holds the scene, the record of how H was determined, and a
-SHA-256. The ideal H of a large frame is not stored, as it follows from the scene: such a file has the format "boxes"
-and no entries.
+SHA-256. The format says which kind a file is: "csr" has entries; "boxes" has none, since the ideal H of a large frame
+follows from the scene; "views 1" has the few numbers of a fitted H, and entries of what they do not explain alone.
 """
 
 from __future__ import annotations
@@ -20,26 +20,35 @@ from scipy import sparse
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import digest, write_whole
 
-from .camera import derive
+from .camera import Camera, derive
+from .fitted.fitted_matrix import FittedMatrix, Views
+from .fitted.fitted_model import MeasuredRows, fitted_model, measured_rows
 from .formats import npz
 from .formats.provenance import checked
 from .model import Model
 from .scene import parse
+from .setup import Setup
 from .tables.table import LARGEST
 
 ENTRIES = ("indices", "indptr", "data")
+CSR, BOXES, VIEWS = b"csr", b"boxes", b"views 1"
+PREFIX = "views."
 
 
 def write(path: Path, model: Model) -> None:
     """Write a model, completely or not at all. Raises InputError or MachineError."""
-    arrays: dict[str, NDArray[Any]] = {
-        "shape": np.array([model.measurements, model.unknowns], dtype=np.int64),
-        "variance": model.variance,
-        "batches": model.batches,
-    }
-    if model.stored is not None:
-        arrays |= {name: getattr(model.stored, name) for name in ENTRIES}
-    layout = b"boxes" if model.stored is None else b"csr"
+    shape = np.array([model.measurements, model.unknowns], dtype=np.int64)
+    arrays: dict[str, NDArray[Any]] = {"shape": shape, "variance": model.variance, "batches": model.batches}
+    stored, layout = model.stored, BOXES if model.stored is None else CSR
+    if model.fitted is not None:
+        rest, layout = measured_rows(model), VIEWS
+        stored = None if rest is None else rest.matrix
+        none = np.zeros(0), np.zeros((0, 0), np.float32)
+        arrays["variance"], arrays["batches"] = none if rest is None else (rest.variance, rest.batches)
+        for name, views in model.fitted.views.items():
+            arrays |= views.arrays(f"{PREFIX}{name}")
+    if stored is not None:
+        arrays |= {name: getattr(stored, name) for name in ENTRIES}
     description = json.dumps({"scene": model.scene.plain(), "record": model.record})
     record = json.dumps({"description": description, "sha256": _seal(arrays, description)})
 
@@ -67,7 +76,8 @@ def read(path: Path) -> Model:
         matrix, shape = None, tuple(arrays["shape"].tolist())
         if "data" in arrays:
             matrix = _matrix(arrays, shape)
-        elif not (method == "ideal" and camera.has_box_footprints):
+        fitted = _fitted(arrays, Setup(scene, camera).simulated)
+        if matrix is None and fitted is None and not (method == "ideal" and camera.has_box_footprints):
             raise ValueError("it has no entries")
     except InputError:
         raise
@@ -79,7 +89,21 @@ def read(path: Path) -> Model:
     entries = np.shape(arrays.get("data", ()))
     if shape != expected or not arrays["variance"].shape == entries == arrays["batches"].shape[1:]:
         raise InputError(f"{path}: its matrix is {shape}, its scene needs {expected}; calibrate again")
-    return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
+    if fitted is None:
+        return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
+    rest = None if matrix is None else MeasuredRows(matrix, arrays["variance"], arrays["batches"])
+    return fitted_model(scene, camera, fitted, rest, record)
+
+
+def _fitted(arrays: dict[str, NDArray[Any]], camera: Camera) -> FittedMatrix | None:
+    """The few numbers of a file, None where it has none. Raises ValueError or KeyError if they are not the camera's."""
+    if not any(name.startswith(PREFIX) for name in arrays):
+        return None
+    views = {lens.name: Views.from_arrays(arrays, f"{PREFIX}{lens.name}") for lens in camera.types}
+    for lens in camera.types:
+        if len(views[lens.name].numbers) != lens.count:
+            raise ValueError(f"lens type {lens.name} has {len(views[lens.name].numbers)} views, expected {lens.count}")
+    return FittedMatrix(camera, views)
 
 
 def _matrix(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
@@ -102,7 +126,13 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         raise InputError(f"{path}: no such file")
     try:
         content = npz.read(path)
-        names = ["shape", "variance", "batches", *(ENTRIES if content["format"][()] != b"boxes" else ())]
+        layout = content["format"][()]
+        if layout not in (CSR, BOXES, VIEWS):
+            raise ValueError(f"its format is {layout!r}")
+        names = ["shape", "variance", "batches"]
+        if layout == CSR or (layout == VIEWS and "data" in content):
+            names += ENTRIES
+        names += [name for name in content if name.startswith(PREFIX)] if layout == VIEWS else []
         arrays = {name: content[name] for name in names}
         record = json.loads(str(content["ommatid"][()]))
         description, seal = record["description"], record["sha256"]

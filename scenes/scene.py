@@ -99,8 +99,9 @@ class CalibrationTable(Table):
         default=256,
         description='rays per sensor pixel, in 16 passes or more; "auto": until H adds less than 10 % to the error',
     )
-    fit: Literal["geometry"] | None = Field(
-        default=None, description='"geometry": fit a few parameters per sub-imager in place of noisy entries'
+    fit: Literal["auto", "geometry", "none"] | None = Field(
+        default=None,
+        description='"auto" (default): H by few numbers where they explain it; "geometry": views alone; "none": entries',
     )
 
     @property
@@ -112,7 +113,7 @@ class CalibrationTable(Table):
 
     @model_validator(mode="after")
     def _check_fit(self) -> CalibrationTable:
-        if self.fit is not None and self.method == "ideal":
+        if self.fit in ("auto", "geometry") and self.method == "ideal":
             raise ValueError("fit belongs to a calibrated H, got method 'ideal'; take 'points' or 'transport'")
         return self
 
@@ -146,7 +147,7 @@ class Scene(Table):
     def _check_combination(self) -> Scene:
         if self.noise is not None and self.sensor is not None:
             raise ValueError("expected [noise] for an ideal sensor or [sensor] for a real one, got both; remove one")
-        if not self.camera.walls and (self.calibration.method != "transport" or self.calibration.fit is not None):
+        if not self.camera.walls and (self.calibration.method != "transport" or self.calibration.fit in ("auto", "geometry")):
             raise ValueError(
                 "camera.walls = false leaves H without a closed form: expected calibration.method 'transport', no fit,"
                 f" got '{self.calibration.method}'"

@@ -18,11 +18,9 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.boxes import BoxFootprints, overlap
+from ommatid.scenes.optics.boxes import MOST_STORED, BoxFootprints, overlap
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
-
-MOST_STORED = 2**24  # entries of H; more are computed from the scene each time
 
 
 def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -37,7 +36,7 @@ def for_stack(stack: Stack) -> StoppingRule:
         if bound is not None:
             return bound
         restoration = restore(stack, model)
-        certain = replace(model, variance=np.zeros_like(model.variance), batches=model.batches[:0])
+        certain = model.without_uncertainty
         return _added(restoration.noise, restoration.expected, lambda: restore(stack, certain).expected.mse)
 
     made_from = ["stack", digest(stack.values, stack.variance), _tables(stack.scene)]

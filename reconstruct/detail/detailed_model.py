@@ -96,6 +96,18 @@ class DetailedModel(Model):
         world = repetition(self.camera.shape, self.camera.detail) @ prior_variance
         return self.fine.prior_variance_from_model(world, prior_mean)
 
+    def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
+        """Return L, (M, q), such that the error of H by that of few numbers adds L xi to the measurements of f."""
+        return self.fine.error_directions(self.world_given(image))
+
+    def error_variance(self, image: FloatArray) -> FloatArray | None:
+        """Return the variance of each measurement by the errors of few numbers, (M,)."""
+        return self.fine.error_variance(self.world_given(image))
+
+    def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
+        """Return a random error of the measurements of f by those of few numbers, (M,)."""
+        return self.fine.error_draw(self.world_given(image), rng)
+
     @property
     def has_error_halves(self) -> bool:
         """True if each half of the batches of H has a variance of its own."""

@@ -121,8 +121,8 @@ class ErrorMap:
 
     @cached_property
     def is_even(self) -> bool:
-        """True if H is exact and both expected and actual noise are even over each lens type."""
-        if not (self.task.model.is_exact and self.task.complete):
+        """True if H is as designed, or nearly so, and both expected and actual noise are even over each lens type."""
+        if not (self.task.model.is_nearly_designed and self.task.complete):
             return False
         slices = self.task.model.camera.type_slices()
         return all(_even(values[part]) for values in (self.task.expected_noise, self.actual) for part in slices)
@@ -159,10 +159,10 @@ class ErrorMap:
         model = self.task.model
         widths = [ceil(lens_type.ratio) for lens_type in model.camera.types]
         halo = self.halo * max(widths)
-        reach = max(widths) - 1 if model.is_exact else model.reach - 1
+        reach = max(widths) - 1 if model.is_nearly_designed else model.reach - 1
 
         def source(rows: slice, columns: slice) -> Stencil:
-            if model.is_exact:
+            if model.is_nearly_designed:
                 return box_stencil(model.camera, weights, prior, rows, columns)
             pixels = pixel_numbers(model.camera.shape, rows, columns)
             return stored_stencil(self._by_pixel, weights, prior, pixels, reach)

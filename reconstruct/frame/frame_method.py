@@ -12,7 +12,6 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.model import Model
 
 from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval, interval
@@ -65,7 +64,7 @@ class FrameMethod(Method):
             weights = np.broadcast_to(1 / task.expected_noise[:1], task.expected_noise.shape)
         else:
             weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
-        camera, prior, observation = task.model.camera, task.precision_on(task.shape), _without_matrix(task.model)
+        camera, prior, observation = task.model.camera, task.precision_on(task.shape), task.model.without_entries
         if self._banded:
             return BandedSystem(camera, observation, weights, prior, task.model.matrix)
         return FrameSystem(camera, observation, weights, prior)
@@ -189,11 +188,3 @@ class FrameMethod(Method):
         noisy = count * sum(expected.parts.values())
         variance = 4 * along + 2 * float(back @ back) + (map_error * noisy) ** 2
         return interval(float(bias @ bias) + noisy, variance, count)
-
-
-def _without_matrix(model: Model) -> Model:
-    """Return the model without its matrix if H is exact: averages over boxes are faster."""
-    if not model.is_exact:
-        return model
-    no_entries = np.zeros(0)
-    return Model(model.scene, model.camera, None, no_entries, np.zeros((0, 0), np.float32), {"method": "ideal"})

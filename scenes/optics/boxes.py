@@ -20,8 +20,9 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.processors import processors
 
 from ..camera import Camera
-from ..lens_type import LensType
+from ..lens_type import LensType, adjacent_slices
 
+MOST_STORED = 2**24  # entries of H; more are computed from the geometry each time
 ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 
 
@@ -131,14 +132,12 @@ class BoxFootprints:
     @cached_property
     def boxes(self) -> tuple[Box, ...]:
         """H of each lens type, or of each sub-imager of a type with steered ones."""
-        camera = self._grids
-        return tuple(
-            Box(lens_type, _axis(camera, lens_type, 0), _axis(camera, lens_type, 1)) for lens_type in camera.types
-        )
+        return tuple(designed_box(self.camera.shape, lens_type) for lens_type in self.camera.on_grids.types)
 
-    @property
-    def _grids(self) -> Camera:
-        return self.camera.on_grids
+    @cached_property
+    def slices(self) -> list[slice]:
+        """The measurements of each of the boxes."""
+        return adjacent_slices(box.lens_type.measurements for box in self.boxes)
 
     @property
     def entries(self) -> int:
@@ -149,7 +148,7 @@ class BoxFootprints:
         """H f: (N,) or (rows, columns) to (M,)."""
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.camera.shape)
         out = np.empty(self.camera.measurements)
-        for box, pixels in zip(self.boxes, self._grids.type_slices(), strict=True):
+        for box, pixels in zip(self.boxes, self.slices, strict=True):
             box.forward(grid, out[pixels])
         return out
 
@@ -157,7 +156,7 @@ class BoxFootprints:
         """H^T g: (M,) to (N,)."""
         out = np.zeros(self.camera.shape)
         readings = np.ascontiguousarray(measurements, dtype=np.float64)
-        for box, pixels in zip(self.boxes, self._grids.type_slices(), strict=True):
+        for box, pixels in zip(self.boxes, self.slices, strict=True):
             box.adjoint(readings[pixels], out)
         return out.ravel()
 
@@ -167,7 +166,7 @@ class BoxFootprints:
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Indices of the measurements that see nothing outside a window of f: (m,)."""
-        pairs = zip(self._grids.type_slices(), self.boxes, strict=True)
+        pairs = zip(self.slices, self.boxes, strict=True)
         return np.concatenate([pixels.start + box.measurements_inside(rows, columns) for pixels, box in pairs])
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
@@ -175,8 +174,13 @@ class BoxFootprints:
         return sparse.csr_array(sparse.vstack([box.submatrix(rows, columns) for box in self.boxes], format="csr"))
 
 
-def _axis(camera: Camera, lens_type: LensType, axis: int) -> BoxAxis:
-    ratio, pixels, size = lens_type.ratio, lens_type.pixels[axis], camera.shape[axis]
+def designed_box(shape: tuple[int, int], lens_type: LensType) -> Box:
+    """H of a lens type as designed, on a target of this shape."""
+    return Box(lens_type, _axis(shape[0], lens_type, 0), _axis(shape[1], lens_type, 1))
+
+
+def _axis(size: int, lens_type: LensType, axis: int) -> BoxAxis:
+    ratio, pixels = lens_type.ratio, lens_type.pixels[axis]
     parts = [overlap(ratio, pixels, start, size) for start in lens_type.starts(axis)]
     return BoxAxis(sparse.csr_array(sparse.vstack(parts, format="csr")))
 

@@ -13,14 +13,15 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.fitted_model import fitted_model
 from ommatid.scenes.model import Model
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
 from ..ideal import ideal_matrix
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import rounding_variance
-from .point_sources import Plans, Responses, responses_from_points
+from ..sampling.passes import plan, rounding_variance
+from .point_sources import Plans, Responses, Subsets, responses_from_points
 
 
 def rendered_model(
@@ -36,35 +37,61 @@ def rendered_model(
     """
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     record = dict[str, Any](method=scene.calibration.method)
-    if scene.calibration.method == "transport":
-        from .ray_transport import responses_from_rays
 
-        responses = responses_from_rays(setup, progress, plans)
+    def measure(subsets: Subsets | None) -> Responses:
+        if scene.calibration.method == "transport":
+            from .ray_transport import responses_from_rays
+
+            responses = responses_from_rays(setup, progress, plans, subsets)
+        else:
+            responses = responses_from_points(setup, progress, checkpoint, plans, subsets)
+        return replace(responses, float32_samples=1) if float64 else responses
+
+    if fits(setup):
+        from .fit.fit import calibrate_by_fit
+
+        one = plan(scene.calibration.sample_count, scene.render.sampler) if plans is None else None
+        rays = {lens.name: (one or plans[lens.name]).total for lens in camera.types}
+        fit = calibrate_by_fit(setup.simulated, measure, lambda responses: entry_variances(responses, camera), rays)
+        record |= {"fit": fit.record, **fit.responses.record()}
+        model = fitted_model(setup.resolved, camera, fit.matrix, fit.rest, record)
     else:
-        responses = responses_from_points(setup, progress, checkpoint, plans)
-    if float64:
-        responses = replace(responses, float32_samples=1)
-    variance = entry_variances(responses, camera)
-    if scene.calibration.fit == "geometry":
-        from .geometry_fit import fit_geometry
-
-        responses, variance, record["fit"] = fit_geometry(responses, variance, setup.simulated)
-    record |= {
-        "seconds": perf_counter() - start,
+        responses = measure(None)
+        variance = entry_variances(responses, camera)
+        record |= responses.record()
+        model = Model(setup.resolved, camera, responses.matrix, variance, responses.batches, record)
+    seconds = perf_counter() - start
+    record = model.record | {
+        "seconds": seconds,
         "seed": scene.render.seed,
-        **responses.record(),
-        **_compared(responses, variance, camera),
+        **_compared(model, camera, model.record["passes"]),
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
-    return Model(setup.resolved, camera, responses.matrix, variance, responses.batches, record)
+    return replace(model, record=record)
 
 
-def _compared(responses: Responses, variance: FloatArray, camera: Camera) -> dict[str, Any]:
+def fits(setup: Setup) -> bool:
+    """Return True if the scene's H is to follow from few numbers where these explain it."""
+    return setup.scene.calibration.fit != "none" and setup.simulated.walls
+
+
+def _compared(model: Model, camera: Camera, passes: int) -> dict[str, Any]:
     """Compare H with the ideal one, if that has a closed form."""
     bent = (lens for lens in camera.types if lens.optics.distortion is not None or lens.is_rotated)
     if not camera.walls or any(camera.is_blurred(lens) for lens in bent):
         return {}
-    return {"agreement": agreement(responses.matrix, variance, camera, responses.passes)}
+    if model.fitted is None:
+        return {"agreement": agreement(model.matrix, model.variance, camera, passes)}
+    largest, count = model.fitted.largest_deviation
+    chance = -np.expm1(count * np.log1p(-2 * stats.norm.sf(largest))) if largest else 1.0
+    compared = {"max_z": largest, "p_value": float(chance)}
+    if model.is_exact:
+        return {"agreement": {"rms_difference_from_ideal": 0.0, **compared}}
+    if model.stored is None:
+        return {}
+    difference = sparse.csr_array(model.matrix - ideal_matrix(camera))
+    rms = float(np.sqrt(np.square(difference.data).sum() / max(int(difference.nnz), 1)))
+    return {"agreement": {"rms_difference_from_ideal": rms, **compared}}
 
 
 def entry_variances(responses: Responses, camera: Camera) -> FloatArray:

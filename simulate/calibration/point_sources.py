@@ -39,6 +39,7 @@ STRAYS = 2  # rays of a sensor pixel that float32 may have rounded over the edge
 # Rows of H of one group, the variances of their entries, (nnz,), and their batches, (batches, nnz).
 Part = tuple[sparse.csr_array, FloatArray, Float32Array]
 Plans = dict[str, Plan]  # by the name of a group
+Subsets = dict[str, IntArray | None]  # pixels of a group, None: all, by its name
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,12 @@ def responses_from_points(
     progress: Progress = no_progress,
     checkpoint: Checkpoint | None = None,
     plans: Plans | None = None,
+    subsets: Subsets | None = None,
 ) -> Responses:
     """Measure H by sweeping grids of point sources over the target.
 
     plans : of each group; None: all as the scene says
+    subsets : groups, and their pixels, that are measured; rows of H of all others are empty; None: all
     """
     from ..renderer.renderer import Renderer
 
@@ -79,9 +82,10 @@ def responses_from_points(
     renderer = Renderer(camera, variant, scene.render.sampler, together=False)  # each type has its own spacing
     if plans is None:
         plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
-    sweeps = {group: SourceSweep(renderer, group) for group in renderer.groups}
+    chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets
+    sweeps = {group: SourceSweep(renderer, group, chosen[group]) for group in renderer.groups if group in chosen}
     shares = {group: sweep.visible.spacing**2 for group, sweep in sweeps.items()}
-    parts: list[Part] = []
+    parts: dict[str, list[Part]] = {group: [] for group in renderer.groups}
     done, finished = 0, State()
     state = State() if checkpoint is None else checkpoint.state()
     for group, sweep in sweeps.items():
@@ -96,9 +100,28 @@ def responses_from_points(
             if checkpoint is not None:
                 checkpoint.offer(lambda sweep=sweep, finished=finished: {**finished, **sweep.state()})
         finished = {**finished, **sweep.state()} if checkpoint is not None else finished
-        parts.append(sweep.part(work))
+        parts[group].append(sweep.part(work))
         done += shares[group]
-    return joined_parts(parts, plans, variant, scene.render.seed)
+    whole = [on_all_rows(each, renderer.rows(group), chosen.get(group), camera.unknowns) for group, each in parts.items()]
+    return joined_parts(whole, plans, variant, scene.render.seed)
+
+
+def on_all_rows(parts: list[Part], rows: slice, subset: IntArray | None, unknowns: int) -> Part:
+    """Return the rows of H of a group from parts of them, those that were not measured empty.
+
+    rows : of the group in H;  subset : pixels of the group that the parts have, one after the other; None: all
+    """
+    size = rows.stop - rows.start
+    if not parts:
+        return sparse.csr_array((size, unknowns)), np.zeros(0), np.zeros((BATCHES, 0), dtype=np.float32)
+    matrices, variances, batches = zip(*parts, strict=True)
+    matrix = sparse.csr_array(sparse.vstack(matrices, format="csr"))
+    if subset is not None:
+        counts = np.zeros(size, dtype=np.int64)
+        counts[subset] = np.diff(matrix.indptr)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        matrix = sparse.csr_array((matrix.data, matrix.indices, starts), shape=(size, unknowns))
+    return matrix, np.concatenate(variances), np.concatenate(batches, axis=1)
 
 
 def joined_parts(parts: list[Part], plans: Plans, variant: str, seed: int) -> Responses:
@@ -123,9 +146,10 @@ class SourceSweep:
     uniform : (pixels,), of a uniform target;  dark : (pixels,), True if no ray of some pass reaches the target
     """
 
-    def __init__(self, renderer: Renderer, group: str) -> None:
-        """Create an empty sweep."""
-        self._renderer, self._group, self.visible = renderer, group, visible_pixels(renderer, group)
+    def __init__(self, renderer: Renderer, group: str, subset: IntArray | None = None) -> None:
+        """Create an empty sweep of the pixels of a group, or of a subset of them."""
+        self._renderer, self._group, self._subset = renderer, group, subset
+        self.visible = visible_pixels(renderer, group, subset)
         shape = self.visible.row.size, self.visible.spacing**2
         self.tally, self.uniform = Tally(*shape), Tally(shape[0])
         self.dark = np.zeros(shape[0], dtype=np.bool_)
@@ -165,7 +189,7 @@ class SourceSweep:
         self.tally.add(values)
 
     def _read(self, samples: int, seeds: Callable[[int], int]) -> FloatArray:
-        readings = self._renderer.expose(self._group, samples, seeds)
+        readings = self._renderer.expose(self._group, samples, seeds, self._subset)
         self.dark |= np.isnan(readings[0])
         return np.nan_to_num(readings)
 

@@ -20,7 +20,7 @@ from ommatid.scenes.setup import Setup
 from ..renderer.variant import check_transport_variant, choose
 from ..sampling.passes import BATCHES, Plan, plan
 from ..sampling.seeds import sampler_seeds
-from .point_sources import Part, Plans, Responses, joined_parts
+from .point_sources import Part, Plans, Responses, Subsets, joined_parts, on_all_rows
 
 if TYPE_CHECKING:
     from ..renderer.renderer import Renderer
@@ -34,10 +34,13 @@ class TracedEntries(NamedTuple):
     dark: BoolArray
 
 
-def responses_from_rays(setup: Setup, progress: Progress = no_progress, plans: Plans | None = None) -> Responses:
+def responses_from_rays(
+    setup: Setup, progress: Progress = no_progress, plans: Plans | None = None, subsets: Subsets | None = None
+) -> Responses:
     """Measure H by tracing all rays of all passes. Raises InputError if only Mitsuba's scalar backend works.
 
     plans : of each group; None: all as the scene says
+    subsets : as for `responses_from_points`
     """
     from ..renderer.renderer import Renderer
 
@@ -46,24 +49,33 @@ def responses_from_rays(setup: Setup, progress: Progress = no_progress, plans: P
     renderer = Renderer(setup.simulated, variant, scene.render.sampler, together=False)
     if plans is None:
         plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
-    parts: list[Part] = []
-    blocks = [(group, block) for group in renderer.groups for block in renderer.blocks(group, plans[group].samples)]
+    parts: dict[str, list[Part]] = {group: [] for group in renderer.groups}
+    chosen = {group: None if subsets is None else subsets.get(group) for group in renderer.groups}
+    blocks = [
+        (group, block)
+        for group in renderer.groups
+        if subsets is None or group in subsets
+        for block in renderer.blocks(group, plans[group].samples, chosen[group])
+    ]
     for index, (group, block) in enumerate(blocks):
         passes: list[TracedEntries] = []
         work = plans[group]
         for number in range(work.passes):
-            passes.append(one_pass(renderer, group, block, work, number, scene.render.seed))
+            passes.append(one_pass(renderer, group, block, work, number, scene.render.seed, chosen[group]))
             progress((index + (number + 1) / work.passes) / len(blocks))
-        parts.append(_joined(passes, (block.stop - block.start, setup.camera.unknowns)))
-    return joined_parts(parts, plans, variant, scene.render.seed)
+        parts[group].append(_joined(passes, (block.stop - block.start, setup.camera.unknowns)))
+    whole = [on_all_rows(each, renderer.rows(group), chosen[group], setup.camera.unknowns) for group, each in parts.items()]
+    return joined_parts(whole, plans, variant, scene.render.seed)
 
 
-def one_pass(renderer: Renderer, group: str, block: slice, work: Plan, number: int, seed: int) -> TracedEntries:
-    """Trace one pass of the pixels of a block."""
+def one_pass(
+    renderer: Renderer, group: str, block: slice, work: Plan, number: int, seed: int, subset: IntArray | None = None
+) -> TracedEntries:
+    """Trace one pass of the pixels of a block, of all or of a subset."""
     from .transport_kernels import sums_by_texel  # pyright: ignore[reportUnknownVariableType]
 
     seeds = sampler_seeds(seed, "calibration", number, work.passes)
-    texels, weights = renderer.hits(group, work.samples, seeds, block)
+    texels, weights = renderer.hits(group, work.samples, seeds, block, subset)
     weights = np.ones(texels.shape) if weights is None else weights
     counts, columns, sums = sums_by_texel(texels, weights)
     pixel = np.repeat(np.arange(counts.size), counts)

@@ -6,7 +6,7 @@ For ideal pinholes this follows from the geometry; for every other lens some ray
 # pyright: basic
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import ceil, floor
 from typing import TYPE_CHECKING
@@ -34,12 +34,13 @@ class VisiblePixels:
     spacing: int
 
 
-def visible_pixels(renderer: Renderer, group: str) -> VisiblePixels:
-    """Return the visible pixels of a group of the renderer, which is one lens type."""
+def visible_pixels(renderer: Renderer, group: str, subset: IntArray | None = None) -> VisiblePixels:
+    """Return the visible pixels of a group of the renderer, which is one lens type, or of a subset of its pixels."""
     (lens_type,) = renderer.groups[group]
-    if renderer.camera.is_ideal_pinhole:
-        return of_pinholes(renderer.camera, lens_type)
-    return _traced(renderer, group)
+    if not renderer.camera.is_ideal_pinhole:
+        return _traced(renderer, group, subset)
+    visible = of_pinholes(renderer.camera, lens_type)
+    return visible if subset is None else replace(visible, row=visible.row[subset], column=visible.column[subset])
 
 
 def of_pinholes(camera: Camera, lens_type: LensType) -> VisiblePixels:
@@ -56,13 +57,14 @@ def of_pinholes(camera: Camera, lens_type: LensType) -> VisiblePixels:
     return VisiblePixels(np.concatenate(rows), np.concatenate(columns), ceil(lens_type.ratio) + 2)
 
 
-def _traced(renderer: Renderer, group: str) -> VisiblePixels:
+def _traced(renderer: Renderer, group: str, subset: IntArray | None) -> VisiblePixels:
     camera = renderer.camera
     sizes, (lens_type,) = camera.shape, renderer.groups[group]
-    first = [np.full(lens_type.measurements, size) for size in sizes]
-    last = [np.full(lens_type.measurements, -1) for _ in sizes]
-    for block in renderer.blocks(group, SCOUTS):
-        texels, _ = renderer.hits(group, SCOUTS, lambda index: index, block)  # only bounds are taken from these rays
+    pixels = lens_type.measurements if subset is None else subset.size
+    first = [np.full(pixels, size) for size in sizes]
+    last = [np.full(pixels, -1) for _ in sizes]
+    for block in renderer.blocks(group, SCOUTS, subset):
+        texels, _ = renderer.hits(group, SCOUTS, lambda index: index, block, subset)  # only bounds are taken from them
         seen = texels >= 0
         for axis, indices in enumerate(np.divmod(texels, camera.columns)):
             first[axis][block] = np.where(seen, indices, sizes[axis]).min(axis=1)

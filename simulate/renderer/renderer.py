@@ -115,20 +115,24 @@ class Renderer:
         self._parameters[self._texels] = mi.TensorXf(texels)
         self._parameters.update()
 
-    def expose(self, group: str, samples: int, seed: Callable[[int], int]) -> FloatArray:
+    def expose(
+        self, group: str, samples: int, seed: Callable[[int], int], subset: IntArray | None = None
+    ) -> FloatArray:
         """Return the readings of a group's pixels for each picture, (channels, pixels in the order of measurements).
 
         An infinite uniform target reads its own value: the light of a pixel's rays is divided by their weights. Pixels
         that no light can reach read NaN.
         samples : rays per pixel
         seed : the sampler's seed by the index of a sensor: of the group on the fast backends, else of the sub-imager
+        subset : pixels of the group; None: all of them
         """
         if self._generators:
-            blocks = self.blocks(group, samples)
-            rays = (self._rays(group, samples, seed, block) for block in blocks)
+            blocks = self.blocks(group, samples, subset)
+            rays = (self._rays(group, samples, seed, block, subset) for block in blocks)
             return np.concatenate([self._readings(group, block) for block in rays])[None]
         images = [self._film(sensor, samples, seed(index)) for index, sensor in self._sensors[group].items()]
-        return np.concatenate(images, axis=1) / self._unit
+        films = np.concatenate(images, axis=1) / self._unit
+        return films if subset is None else films[:, subset]
 
     def _film(self, sensor: Any, samples: int, seed: int) -> FloatArray:
         """Return the radiances that a stock sensor records, (channels, pixels)."""
@@ -158,13 +162,16 @@ class Renderer:
             parts.append(self._readings(group, rays).reshape(-1, work.passes).T)
         return np.concatenate(parts, axis=1)
 
-    def blocks(self, group: str, samples: int) -> list[slice]:
+    def blocks(self, group: str, samples: int, subset: IntArray | None = None) -> list[slice]:
         """Divide the pixels of a group into blocks whose rays start together. Only on the fast backends."""
-        return self._generators[group].blocks(fitting(self._sampler, samples))
+        pixels = None if subset is None else subset.size
+        return self._generators[group].blocks(fitting(self._sampler, samples), pixels)
 
-    def _rays(self, group: str, samples: int, seed: Callable[[int], int], block: slice) -> Rays:
+    def _rays(
+        self, group: str, samples: int, seed: Callable[[int], int], block: slice, subset: IntArray | None
+    ) -> Rays:
         first = seed(list(self.groups).index(group))
-        return self._generators[group].rays(samples, seed_of(first, block.start), block)
+        return self._generators[group].rays(samples, seed_of(first, block.start), block, subset=subset)
 
     def _readings(self, group: str, rays: Rays) -> FloatArray:
         """Return the readings of the pixels of these rays: (pixels of the block,)."""
@@ -192,7 +199,7 @@ class Renderer:
         return np.where(z > 0, z, np.inf)
 
     def hits(
-        self, group: str, samples: int, seed: Callable[[int], int], block: slice
+        self, group: str, samples: int, seed: Callable[[int], int], block: slice, subset: IntArray | None = None
     ) -> tuple[IntArray, FloatArray | None]:
         """Return the pixel of f that each ray of a block meets, (pixels, samples), -1 off the target; and weights.
 
@@ -205,7 +212,7 @@ class Renderer:
                 f"expected a target of fewer than 2^24 pixels, got {self.camera.unknowns}; make it smaller"
             )
         self.set_target(np.arange(1.0, self.camera.unknowns + 1).reshape(self.camera.shape))
-        rays = self._rays(group, samples, seed, block)
+        rays = self._rays(group, samples, seed, block, subset)
         met = self._scene.ray_intersect(rays.ray)
         radiance = met.emitter(self._scene).eval(met, met.is_valid()).x
         dr.eval(radiance, rays.weight)

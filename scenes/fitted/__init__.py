@@ -1,0 +1,1 @@
+"""H by few numbers: views, and what follows from them."""

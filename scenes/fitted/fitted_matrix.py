@@ -1,0 +1,244 @@
+"""H of a calibrated camera by few numbers: views of sharp lens types, kernels of blurred ones, entries of the rest.
+
+The errors of the numbers are errors of all pixels of a sub-imager, or of a lens type, together: they do not average out
+over pixels. To first order a displaced view reads H f' along the displacement, with f' the gradient of f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+
+from ..camera import Camera
+from ..lens_type import LensType, SubImager
+from .real_boxes import RealBoxes
+from .view import COUNT, K1, ROTATION, designed, displacements, entries
+
+ALIKE = 0.05  # pixels of f that views may be displaced by where error maps take H as designed
+
+
+@dataclass(frozen=True)
+class Views:
+    """The views of all sub-imagers of one lens type.
+
+    numbers : (sub-imagers, 5) of `view`;  explained : (sub-imagers,), False where H is measured entry by entry
+    own : (sub-imagers, 5, p) factors of the error of a sub-imager's numbers, own @ xi with independent xi of variance 1
+    shared : (sub-imagers, 5, q) likewise, with the same xi for all sub-imagers
+    structure : of each number "own", "shared" or "designed"
+    """
+
+    numbers: FloatArray
+    explained: BoolArray
+    own: FloatArray
+    shared: FloatArray
+    structure: tuple[str, ...]
+
+    @property
+    def is_as_designed(self) -> bool:
+        """True if no number differs from the design, and every sub-imager is explained."""
+        return bool(self.explained.all()) and all(each == "designed" for each in self.structure)
+
+    def arrays(self, name: str) -> dict[str, Any]:
+        """Return the arrays of a file, under keys that begin with `name`."""
+        return {
+            f"{name}.numbers": self.numbers,
+            f"{name}.explained": self.explained,
+            f"{name}.own": self.own,
+            f"{name}.shared": self.shared,
+            f"{name}.structure": np.array(self.structure),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], name: str) -> Views:
+        """Read the arrays of a file. Raises KeyError or ValueError for others."""
+        numbers = np.asarray(arrays[f"{name}.numbers"], dtype=np.float64)
+        explained = np.asarray(arrays[f"{name}.explained"], dtype=np.bool_)
+        own, shared = (np.asarray(arrays[f"{name}.{key}"], dtype=np.float64) for key in ("own", "shared"))
+        structure = tuple(str(each) for each in arrays[f"{name}.structure"])
+        count = len(numbers)
+        if numbers.shape != (count, COUNT) or explained.shape != (count,) or len(structure) != COUNT:
+            raise ValueError(f"the views {name} have arrays of other shapes")
+        if own.shape[:2] != (count, COUNT) or shared.shape[:2] != (count, COUNT):
+            raise ValueError(f"the errors of the views {name} have arrays of other shapes")
+        if not all(np.isfinite(each).all() for each in (numbers, own, shared)):
+            raise ValueError(f"the views {name} have numbers that are not finite")
+        return cls(numbers, explained, own, shared, structure)
+
+
+@dataclass(frozen=True)
+class FittedMatrix:
+    """H, (M, N), of which each lens type is described by its views.
+
+    views : by the name of a lens type
+    """
+
+    camera: Camera
+    views: dict[str, Views]
+
+    @cached_property
+    def _types(self) -> list[tuple[LensType, Views, list[SubImager], list[slice]]]:
+        subs, slices = iter(self.camera.sub_imagers), iter(self.camera.slices())
+        return [
+            (lens, self.views[lens.name], [next(subs) for _ in range(lens.count)], [next(slices) for _ in range(lens.count)])
+            for lens in self.camera.types
+        ]
+
+    @cached_property
+    def numbers(self) -> FloatArray:
+        """The numbers of all sub-imagers, (sub-imagers, 5)."""
+        return np.concatenate([self.views[lens.name].numbers for lens in self.camera.types])
+
+    @cached_property
+    def is_as_designed(self) -> bool:
+        """True if H is that of the design."""
+        return all(self.views[lens.name].is_as_designed for lens in self.camera.types)
+
+    @cached_property
+    def is_boxes(self) -> bool:
+        """True if all footprints are boxes: `boxes` applies H."""
+        straight = all(
+            views.explained.all() and not views.numbers[:, [ROTATION, K1]].any() for _, views, _, _ in self._types
+        )
+        return straight and self.camera.has_box_footprints
+
+    @cached_property
+    def is_nearly_designed(self) -> bool:
+        """True if the views are where the design has them to within 0.05 pixels of f."""
+        if not self.is_boxes:
+            return False
+        return all(
+            float(np.abs(rows @ moved).max(initial=0.0)) <= ALIKE
+            for _, views, subs, _ in self._types
+            for sub, moved in zip(subs, views.numbers, strict=True)
+            for rows in displacements(self.camera, sub, _corners(sub))
+        )
+
+    @cached_property
+    def boxes(self) -> RealBoxes:
+        """H of box footprints."""
+        moved = tuple(lens.name for lens, views, _, _ in self._types if views.numbers.any())
+        return RealBoxes(self.camera, self.numbers, moved)
+
+    @property
+    def largest_deviation(self) -> tuple[float, int]:
+        """Largest deviation of a number from the design, in standard deviations, and how many numbers there are."""
+        largest, count = 0.0, 1
+        for _, views, subs, _ in self._types:
+            moved = np.abs(views.numbers - designed_views(subs))[views.explained]
+            variance = (np.square(views.own).sum(axis=2) + np.square(views.shared).sum(axis=2))[views.explained]
+            free = (variance > 0) & (np.array(views.structure) != "designed")
+            largest = max(largest, float((moved[free] / np.sqrt(variance[free])).max(initial=0.0)))
+            count += int(free.sum())
+        return largest, count
+
+    def to_sparse(self) -> sparse.csr_array:
+        """Return H, (M, N); rows of sub-imagers that are not explained are empty."""
+        parts: list[sparse.csr_array] = []
+        for _, views, subs, _ in self._types:
+            for sub, numbers, explained in zip(subs, views.numbers, views.explained, strict=True):
+                parts.append(self._rows(sub, numbers) if explained else self._no_rows(sub))
+        return sparse.csr_array(sparse.vstack(parts, format="csr"))
+
+    def _rows(self, sub: SubImager, numbers: FloatArray) -> sparse.csr_array:
+        if numbers[ROTATION] == 0 and numbers[K1] == 0 and not sub.rotation and sub.type.optics.distortion is None:
+            from .real_boxes import real_box
+
+            box = real_box(self.camera.shape, sub, numbers)
+            rows = sparse.csr_array(sparse.kron(box.down.shares, box.across.shares, format="csr"))
+            rows.eliminate_zeros()
+            return rows
+        return entries(self.camera, sub, numbers)
+
+    def _no_rows(self, sub: SubImager) -> sparse.csr_array:
+        return sparse.csr_array((sub.type.pixels[0] * sub.type.pixels[1], self.camera.unknowns))
+
+    def signature(self, rows: slice, columns: slice) -> Hashable:
+        """Return a key that is equal for two windows only if their submatrices are equal."""
+        return self.boxes.signature(rows, columns)
+
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Return the indices of the measurements that see nothing outside a window of f."""
+        return self.boxes.measurements_inside(rows, columns)
+
+    def restrict(self, camera: Camera) -> FittedMatrix:
+        """Return H of a camera with some of the lens types."""
+        return FittedMatrix(camera, {lens.name: self.views[lens.name] for lens in camera.types})
+
+    @property
+    def without_errors(self) -> FittedMatrix:
+        """The same H, taken for exact."""
+        views = {
+            name: replace(each, own=each.own[:, :, :0], shared=each.shared[:, :, :0]) for name, each in self.views.items()
+        }
+        return FittedMatrix(self.camera, views)
+
+    def directions(self, gradients: tuple[FloatArray, FloatArray]) -> sparse.csc_array:
+        """Return L, (M, q), such that the error of H f is L xi, from H applied to the gradient of f: (M,) down, across."""
+        blocks: list[sparse.csc_array] = []
+        for lens, views, subs, slices in self._types:
+            own, shared = views.own.shape[2], views.shared.shape[2]
+            parts, common = list[FloatArray](), list[FloatArray]()
+            for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
+                moves = self._moves(sub, gradients, place)
+                parts.append(moves @ views.own[number])
+                common.append(moves @ views.shared[number])
+            columns = [sparse.block_diag(parts, format="csc")] if own else []
+            columns += [sparse.csc_array(np.concatenate(common))] if shared else []
+            size = lens.measurements
+            blocks.append(sparse.csc_array(sparse.hstack(columns)) if columns else sparse.csc_array((size, 0)))
+        return sparse.csc_array(sparse.block_diag(blocks, format="csc"))
+
+    def error_variance(self, gradients: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Return the variance of each measurement by the errors of the numbers, (M,): the diagonal of L L^T."""
+        variance = np.zeros(self.camera.measurements)
+        for _, views, subs, slices in self._types:
+            for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
+                moves = self._moves(sub, gradients, place)
+                for factor in (views.own[number], views.shared[number]):
+                    variance[place] += np.square(moves @ factor).sum(axis=1)
+        return variance
+
+    def error_draw(self, gradients: tuple[FloatArray, FloatArray], rng: np.random.Generator) -> FloatArray:
+        """Return a random error of H f, L xi: (M,)."""
+        drawn = np.zeros(self.camera.measurements)
+        for _, views, subs, slices in self._types:
+            common = rng.normal(size=views.shared.shape[2])
+            for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
+                error = views.own[number] @ rng.normal(size=views.own.shape[2]) + views.shared[number] @ common
+                drawn[place] = self._moves(sub, gradients, place) @ error
+        return drawn
+
+    def _moves(self, sub: SubImager, gradients: tuple[FloatArray, FloatArray], place: slice) -> FloatArray:
+        """Return the change of a sub-imager's readings per unit of each number: (pixels, 5)."""
+        index = np.indices(sub.type.pixels).reshape(2, -1).astype(np.float64)
+        rows, columns = displacements(self.camera, sub, (index[0], index[1]))
+        return gradients[0][place, None] * rows + gradients[1][place, None] * columns
+
+
+def gradient(image: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return the derivative of f, (N,), down and across; beyond the target f is 0: (N,) each.
+
+    Averaged over a box of whole pixels the central difference is exactly the mean of the derivatives to both sides.
+    """
+    around = np.pad(np.asarray(image, dtype=np.float64).reshape(shape), 1)
+    down = (around[2:, 1:-1] - around[:-2, 1:-1]) / 2
+    across = (around[1:-1, 2:] - around[1:-1, :-2]) / 2
+    return down.ravel(), across.ravel()
+
+
+def designed_views(subs: list[SubImager]) -> FloatArray:
+    """Return the numbers of sub-imagers as designed: (sub-imagers, 5)."""
+    return np.array([designed(sub) for sub in subs])
+
+
+def _corners(sub: SubImager) -> tuple[FloatArray, FloatArray]:
+    rows, columns = (np.array([0.0, size - 1.0]) for size in sub.type.pixels)
+    down, across = np.meshgrid(rows, columns, indexing="ij")
+    return down.ravel(), across.ravel()

@@ -1,0 +1,108 @@
+"""The view of a sub-imager in five numbers, and the H that follows from it where footprints are sharp.
+
+The numbers, in this order: the shift of the middle of its view, in pixels of f downwards (`row`) and to the right
+(`column`), from its design; the relative error of its `magnification`; its `rotation` about the axis in radians, as in
+`pose.Misalignment`; and `k1` of its distortion. k2 is as designed. A view grows as its lens comes nearer to the sensor,
+and turns with the sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import hypot
+
+import numpy as np
+from scipy import sparse
+
+from ommatid.runtime.arrays import FloatArray
+
+from ..camera import Camera
+from ..lens_type import LensOptics, SubImager
+from ..optics.distortion import coefficients
+from ..optics.footprints import sub_matrix
+from ..pose import Misalignment, pose_of
+
+UNITS = {
+    "row": "pixels of f",
+    "column": "pixels of f",
+    "magnification": "relative",
+    "rotation": "rad",
+    "k1": "at r = 1, the target's corner",
+}
+COUNT = len(UNITS)
+ROW, COLUMN, MAGNIFICATION, ROTATION, K1 = range(COUNT)
+
+
+def designed(sub: SubImager) -> FloatArray:
+    """Return the numbers of a sub-imager as designed, (5,): all 0 but its k1 and its patch's rotation."""
+    numbers = np.zeros(COUNT)
+    numbers[K1] = coefficients(sub)[0]
+    return numbers
+
+
+def misaligned(camera: Camera, sub: SubImager, error: Misalignment) -> FloatArray:
+    """Return the numbers of a misaligned sub-imager; tilt, which they do not describe, is ignored."""
+    numbers = designed(sub)
+    far = camera.distance / sub.depth
+    for number, axis in ((COLUMN, 0), (ROW, 1)):
+        aside = sub.lens[axis] - sub.patch[axis]
+        view = error.position[axis] + (aside + error.position[axis]) * far / (1 + error.focal_length) - aside * far
+        numbers[number] = -view / camera.target_pitch
+    numbers[MAGNIFICATION], numbers[ROTATION] = error.focal_length, error.rotation
+    return numbers
+
+
+def misalignment(camera: Camera, sub: SubImager, numbers: FloatArray) -> Misalignment:
+    """Return the misalignment that has these numbers; the inverse of `misaligned`."""
+    far = camera.distance / sub.depth
+    lever = far / (1 + numbers[MAGNIFICATION])
+    x, y = (
+        (-numbers[number] * camera.target_pitch - (sub.lens[axis] - sub.patch[axis]) * (lever - far)) / (1 + lever)
+        for number, axis in ((COLUMN, 0), (ROW, 1))
+    )
+    return Misalignment(
+        (float(x), float(y)), rotation=float(numbers[ROTATION]), focal_length=float(numbers[MAGNIFICATION])
+    )
+
+
+def entries(camera: Camera, sub: SubImager, numbers: FloatArray) -> sparse.csr_array:
+    """Return H of a sub-imager, (its pixels, N), by exact overlap of areas.
+
+    Raises InputError if the distortion folds the image.
+    """
+    k1, k2 = float(numbers[K1]), coefficients(sub)[1]
+    optics = LensOptics(distortion=(k1, k2) if k1 or k2 else None)
+    alone = replace(sub, type=replace(sub.type, optics=optics))
+    return sub_matrix(camera, alone, pose_of(sub, misalignment(camera, sub, numbers)))
+
+
+def offsets(sub: SubImager, pixels: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return the middles of pixels (i, j) as designed, from the middle of the view, in rows and columns of f."""
+    ratio, sizes = float(sub.type.ratio), sub.type.pixels
+    down, across = (ratio * (index + 0.5 - size / 2) for index, size in zip(pixels, sizes, strict=True))
+    return down, across
+
+
+def displacements(camera: Camera, sub: SubImager, pixels: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return how far a view's pixels (i, j) move per unit of each number: (pixels, 5), in rows and in columns of f.
+
+    To first order around the design, without rotation; of k1 the move towards the lens's axis on the target.
+    """
+    down, across = offsets(sub, pixels)
+    ones, none = np.ones_like(down), np.zeros_like(down)
+    middle = sub.type.middle(sub.window)
+    axis = camera.rows / 2 - sub.lens[1] / camera.target_pitch, camera.columns / 2 - sub.lens[0] / camera.target_pitch
+    aside = down + middle[0] - axis[0], across + middle[1] - axis[1]
+    square = (np.square(aside[0]) + np.square(aside[1])) * (camera.target_pitch / camera.half_diagonal) ** 2
+    rows = np.column_stack([ones, none, -down, across, -aside[0] * square])
+    columns = np.column_stack([none, ones, -across, -down, -aside[1] * square])
+    return rows, columns
+
+
+def scales(camera: Camera, sub: SubImager) -> FloatArray:
+    """Return the changes of the numbers that move the edge of a view by about a pixel of f: (5,)."""
+    half = float(sub.type.ratio) * hypot(*sub.type.pixels) / 2
+    aside = hypot(sub.lens[0] - sub.patch[0], sub.lens[1] - sub.patch[1]) * camera.distance / sub.depth
+    furthest = half + aside / camera.target_pitch
+    corner = camera.half_diagonal / camera.target_pitch
+    return np.array([1.0, 1.0, 1 / half, 1 / half, corner**2 / furthest**3])

@@ -1,0 +1,1 @@
+"""H by few numbers instead of its noisy entries: `calibration.fit`."""

@@ -1,0 +1,102 @@
+"""The chart of a calibration: the few sensor pixels from whose rows of H a smooth map of the field follows.
+
+A grid of at most 12 x 12 pixels, corners included, serves any sub-imager: with n pixels along a side the error of a
+shift falls as 1/n, that of a magnification too, since its lever is the patch itself; and 12 leave 139 degrees of freedom to the
+F test for what five numbers do not explain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
+
+SIDE = 12  # most pixels of a chart along a side of a sub-imager
+BESIDE = 1  # pixels of f around what a pixel's rays meet, where a model may expect light too
+
+
+def chart_of(lens_type: LensType, whole: BoolArray | None = None) -> IntArray:
+    """Return the pixels of a lens type that are measured, by their number in the type, rising: (pixels,).
+
+    whole : (sub-imagers,), True for those of which all pixels are measured
+    """
+    rows, columns = (np.unique(np.linspace(0, size - 1, min(size, SIDE)).round().astype(np.int64)) for size in lens_type.pixels)
+    few = (rows[:, None] * lens_type.pixels[1] + columns).ravel()
+    size = lens_type.pixels[0] * lens_type.pixels[1]
+    if whole is None:
+        return (np.arange(lens_type.count)[:, None] * size + few).ravel()
+    return (np.flatnonzero(whole)[:, None] * size + np.arange(size)).ravel()
+
+
+@dataclass(frozen=True)
+class ChartRows:
+    """Measured rows of H of one sub-imager, each in a window of f of the same size W x V.
+
+    down, across : (pixels,) i and j in the sub-imager;  row, column : (pixels,) of f where the window begins
+    values : (pixels, W, V);  batches : (batches, pixels, W, V) deviations
+    """
+
+    down: FloatArray
+    across: FloatArray
+    row: IntArray
+    column: IntArray
+    values: FloatArray
+    batches: Float32Array
+
+    @property
+    def light(self) -> FloatArray:
+        """Share of a pixel's rays that meet the target: (pixels,)."""
+        return self.values.sum(axis=(1, 2))
+
+    def centroids(self) -> tuple[FloatArray, FloatArray]:
+        """Return the centroids of the rows, in rows and columns of f: (pixels,) each."""
+        return centroids(self.values, self.row, self.column)
+
+    def batch_centroids(self) -> tuple[FloatArray, FloatArray]:
+        """Return the deviations of the batches' centroids: (batches, pixels), in rows and columns of f."""
+        down, across = self.centroids()
+        each = [centroids(self.values + batch, self.row, self.column) for batch in self.batches]
+        return np.array([one[0] - down for one in each]), np.array([one[1] - across for one in each])
+
+
+def centroids(values: FloatArray, row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the centroids of rows of H in windows: (pixels, W, V) to (pixels,) rows and columns of f."""
+    light = np.maximum(values.sum(axis=(1, 2)), np.finfo(float).tiny)
+    down = np.einsum("pwv,w->p", values, np.arange(values.shape[1]) + 0.5) / light
+    across = np.einsum("pwv,v->p", values, np.arange(values.shape[2]) + 0.5) / light
+    return row + down, column + across
+
+
+def chart_rows(camera: Camera, lens_type: LensType, matrix: sparse.csr_array, batches: Float32Array) -> list[ChartRows]:
+    """Return the measured rows of each sub-imager of a lens type.
+
+    matrix : (measurements of the type, N), rows that were not measured, or got no light, are empty
+    """
+    size = lens_type.pixels[0] * lens_type.pixels[1]
+    lit = np.flatnonzero(np.diff(matrix.indptr))
+    starts, counts = matrix.indptr[lit].astype(np.int64), np.diff(matrix.indptr)[lit]
+    cells = np.repeat(np.arange(lit.size), counts)
+    where = np.divmod(matrix.indices.astype(np.int64), camera.columns)
+    windows: list[tuple[IntArray, int]] = []
+    for axis, indices in enumerate(where):
+        first, last = (extreme.reduceat(indices, starts) for extreme in (np.minimum, np.maximum))
+        width = min(int((last - first).max(initial=0)) + 1 + 2 * BESIDE, camera.shape[axis])
+        windows.append((np.clip(first - BESIDE, 0, camera.shape[axis] - width), width))
+    (row, high), (column, wide) = windows
+    inside = (where[0] - row[cells]) * wide + where[1] - column[cells]
+    dense = np.zeros((1 + len(batches), lit.size, high * wide))
+    for layer, values in zip(dense, [matrix.data, *batches], strict=True):
+        layer[cells, inside] = values
+    dense = dense.reshape(1 + len(batches), lit.size, high, wide)
+    ends = np.searchsorted(lit, size * np.arange(lens_type.count + 1))
+    result: list[ChartRows] = []
+    for first, last in zip(ends[:-1], ends[1:], strict=True):
+        part = slice(int(first), int(last))
+        down, across = (each.astype(np.float64) for each in np.divmod(lit[part] % size, lens_type.pixels[1]))
+        result.append(ChartRows(down, across, row[part], column[part], dense[0, part], dense[1:, part].astype(np.float32)))
+    return result

@@ -1,0 +1,252 @@
+"""The views of a lens type's sub-imagers from the rows of H of a chart: as few numbers as explain them.
+
+The centroid of a row moves as the view does, exactly so while the row is whole, so that the numbers of a view follow from
+those of its pixels by linear least squares. Some of the numbers may be the lens type's, the same for all of its
+sub-imagers, or as designed: from five numbers of each sub-imager, step by step, tests against the scatter of the batches
+remove what the centroids do not need. Rows of different pixels share no rays, so that the covariance is that of
+independent centroids whose variances the batches show (sandwich estimator: White 1980, Econometrica 48, 817).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.view import COLUMN, COUNT, K1, MAGNIFICATION, ROTATION, ROW, designed, displacements, scales
+from ommatid.scenes.lens_type import SubImager
+
+from ...sampling.passes import BATCHES
+from .chart import ChartRows, centroids
+from .view_model import has_boxes, predicted
+
+SIGNIFICANCE = 0.01  # of all tests of a kind together, at which a correct model is rejected
+STEPS = 12  # of Gauss and Newton; 2 but where views are displaced by more than a pixel of f, or rotated
+SETTLED = 0.01  # of a ray's share of a centroid, below which another step changes nothing
+LEAST_LIGHT = 0.3  # of a pixel's rays that have to meet the target for its centroid to be used, and
+LOST = 0.02  # of them that may miss it where footprints are no boxes
+NEAR = 1e-3  # pixels of f, for the derivatives of centroids: 1 of a pixel seen as a whole, less at the target's edge
+REDUCTIONS = (((K1,), "designed"), ((ROTATION,), "shared"), ((ROTATION,), "designed"))
+REDUCTIONS += (((MAGNIFICATION,), "shared"), ((MAGNIFICATION,), "designed"), ((ROW, COLUMN), "designed"))
+Structure = tuple[str, ...]  # of each number "own", "shared" or "designed"
+FREE: Structure = ("own", "own", "own", "own", "shared")  # distortion is the lens type's
+
+
+@dataclass(frozen=True)
+class ViewFit:
+    """Fitted views of a lens type's sub-imagers; see `fitted_matrix.Views`."""
+
+    numbers: FloatArray
+    own: FloatArray
+    shared: FloatArray
+    structure: Structure
+    chances: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Centroids:
+    """The linear problem of one sub-imager: moves of its centroids, rows first and then columns of f.
+
+    design : (2 pixels, 5) per unit of each number, in `scales`;  moved : (2 pixels,) from the design
+    variance : (2 pixels,) of these
+    """
+
+    design: FloatArray
+    moved: FloatArray
+    variance: FloatArray
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Numbers of all sub-imagers, in `scales` and from the design, for one structure.
+
+    freedom : degrees of freedom of the variances
+    """
+
+    numbers: FloatArray
+    own: FloatArray
+    shared: FloatArray
+    freedom: int
+
+
+def fit_views(camera: Camera, subs: list[SubImager], charts: list[ChartRows], rays: int) -> ViewFit:
+    """Fit the views of a lens type's sub-imagers. rays : per pixel, of all passes."""
+    start = np.array([designed(sub) for sub in subs])
+    units = np.array([scales(camera, sub) for sub in subs])
+
+    def problems_at(numbers: FloatArray) -> list[Centroids]:
+        return [
+            _centroids(camera, sub, numbers[n], charts[n], units[n], rays, (numbers[n] - start[n]) / units[n])
+            for n, sub in enumerate(subs)
+        ]
+
+    def iterated(numbers: FloatArray, structure: Structure) -> tuple[FloatArray, list[Centroids], Solution]:
+        for step in range(STEPS):
+            problems = problems_at(numbers)
+            solution = solve(problems, structure)
+            before, numbers = numbers, start + solution.numbers * units
+            if np.abs((numbers - before) / units).max(initial=0.0) < SETTLED / rays or step == STEPS - 1:
+                return numbers, problems, solution
+        raise AssertionError
+
+    numbers, problems, _ = iterated(start, FREE)
+    structure, chances = _structure(problems)
+    numbers, problems, solution = iterated(numbers, structure)
+    doubtful = _errors_of_design(problems, structure, solution)
+    return ViewFit(numbers, doubtful[0] * units[:, :, None], doubtful[1] * units[:, :, None], structure, chances)
+
+
+def _errors_of_design(
+    problems: list[Centroids], structure: Structure, solution: Solution
+) -> tuple[FloatArray, FloatArray]:
+    """Return the factors of the errors, with those of the numbers that the structure leaves as designed.
+
+    A number that may be as designed may also be as measured: its deviation, or its standard error if that is larger,
+    remains uncertain, for the lens type or, for the position of a view, for each sub-imager.
+    """
+    kinds = tuple("own" if number in (ROW, COLUMN) else "shared" for number in range(COUNT))
+    loose = solve(problems, tuple(kinds[n] if each == "designed" else each for n, each in enumerate(structure)))
+    own, shared = [solution.own], [solution.shared]
+    for number, each in enumerate(structure):
+        if each != "designed":
+            continue
+        column = np.zeros((len(problems), COUNT, 1))
+        factor = loose.own if kinds[number] == "own" else loose.shared
+        deviation = np.sqrt(np.square(factor[:, number]).sum(axis=1))
+        column[:, number, 0] = np.maximum(np.abs(loose.numbers[:, number]), deviation)
+        (own if kinds[number] == "own" else shared).append(column)
+    return np.concatenate(own, axis=2), np.concatenate(shared, axis=2)
+
+
+def _centroids(
+    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows, units: FloatArray, rays: int, from_design: FloatArray
+) -> Centroids:
+    """Return the moves of the centroids from the design, linear around these numbers."""
+    model = predicted(camera, sub, numbers, chart)
+    boxes = has_boxes(sub, numbers)
+    least = LEAST_LIGHT if boxes else 1 - LOST
+    kept = (model.sum(axis=(1, 2)) > least) & (chart.light > least)
+    expected = centroids(model, chart.row, chart.column)
+    slopes = _slopes(camera, sub, numbers, chart) if boxes else [np.ones(kept.size)] * 2
+    measured, scatter = chart.centroids(), chart.batch_centroids()
+    design = np.concatenate(displacements(camera, sub, (chart.down, chart.across))) * units
+    design *= np.concatenate(slopes)[:, None]
+    both = np.tile(kept, 2)
+    moved = np.concatenate([one - other for one, other in zip(measured, expected, strict=True)]) + design @ from_design
+    count = len(scatter[0])
+    variance = np.square(np.concatenate(scatter, axis=1)).sum(axis=0) / (count * (count - 1))
+    # A view that moves by less than m / 2 rays of all its pixels together moves none of them across an edge.
+    unseen = (float(sub.type.ratio) / (2 * rays)) ** 2 / max(kept.sum(), 1)
+    return Centroids(design[both], moved[both], variance[both] + unseen)
+
+
+def _slopes(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> list[FloatArray]:
+    """Return how far centroids move per pixel of f by which the view is shifted, down and across: (pixels,) each."""
+    slopes: list[FloatArray] = []
+    for axis in (ROW, COLUMN):
+        shift = NEAR * (np.arange(COUNT) == axis)
+        ahead, behind = (
+            centroids(predicted(camera, sub, numbers + sign * shift, chart), chart.row, chart.column)[axis]
+            for sign in (1, -1)
+        )
+        slopes.append((ahead - behind) / (2 * NEAR))
+    return slopes
+
+
+def solve(problems: list[Centroids], structure: Structure) -> Solution:
+    """Solve for the numbers of all sub-imagers, with the factors of their errors."""
+    own, shared = (np.array([each == kind for each in structure]) for kind in ("own", "shared"))
+    typical = _typical(problems)
+    reduced = [_reduced(problem, own, shared, typical) for problem in problems]
+    size = int(shared.sum())
+    common, root = np.zeros(size), np.zeros((size, size))
+    if size:
+        information = sum((each.rest.T @ each.rest for each in reduced), typical * np.eye(size))
+        pairs = list(zip(problems, reduced, strict=True))
+        slope = sum((each.rest.T @ problem.moved for problem, each in pairs), np.zeros(size))
+        scatter = sum(((each.rest.T * problem.variance) @ each.rest for problem, each in pairs), np.zeros((size, size)))
+        inverse = np.linalg.inv(information)
+        common, root = inverse @ slope, _root(inverse @ scatter @ inverse)
+    numbers = np.zeros((len(problems), COUNT))
+    errors, common_errors = np.zeros((len(problems), COUNT, int(own.sum()))), np.zeros((len(problems), COUNT, size))
+    for n, (problem, each) in enumerate(zip(problems, reduced, strict=True)):
+        numbers[n, shared] = common
+        numbers[n, own] = each.gain @ problem.moved - each.link @ common
+        errors[n][own] = _root(each.covariance)
+        common_errors[n][shared] = root
+        common_errors[n][own] = -each.link @ root
+    freedom = (BATCHES - 1) * max(sum(problem.moved.size for problem in problems), 1)
+    return Solution(numbers, errors, common_errors, freedom)
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """A sub-imager's problem without its own numbers: own = gain moved - link shared."""
+
+    gain: FloatArray
+    link: FloatArray
+    rest: FloatArray
+    covariance: FloatArray
+
+
+def _reduced(problem: Centroids, own: BoolArray, shared: BoolArray, typical: float) -> _Reduced:
+    mine, others = problem.design[:, own], problem.design[:, shared]
+    # A number that the centroids do not determine stays within a pixel of f of its design, and as uncertain.
+    inverse = np.linalg.inv(mine.T @ mine + typical * np.eye(mine.shape[1]))
+    gain = inverse @ mine.T
+    link = gain @ others
+    covariance = (gain * problem.variance) @ gain.T + np.square(typical) * inverse @ inverse
+    return _Reduced(gain, link, others - mine @ link, covariance)
+
+
+def _typical(problems: list[Centroids]) -> float:
+    """Return the mean variance of a centroid."""
+    total = sum(problem.variance.size for problem in problems)
+    return float(sum(problem.variance.sum() for problem in problems)) / max(total, 1) or 1.0
+
+
+def _structure(problems: list[Centroids]) -> tuple[Structure, dict[str, float]]:
+    """Remove numbers one after the other, as long as F tests allow it. Returns their chances too."""
+    structure, chances = FREE, dict[str, float]()
+    current = solve(problems, structure)
+    for numbers, kind in REDUCTIONS:
+        changed = tuple(kind if number in numbers else each for number, each in enumerate(structure))
+        if kind == "designed" and any(structure[number] == "own" for number in numbers) and numbers != (ROW, COLUMN):
+            continue  # each sub-imager needs its own
+        if numbers == (ROW, COLUMN) and any(each != "designed" for each in structure[2:]):
+            continue  # nothing simpler: the box footprints are displaced anyway
+        chance = _chance(current, numbers, kind)
+        chances[f"{' and '.join(NAMES[number] for number in numbers)} {kind}"] = chance
+        if chance >= SIGNIFICANCE / len(REDUCTIONS):
+            structure = changed
+            current = solve(problems, structure)
+    return structure, chances
+
+
+def _chance(solution: Solution, numbers: tuple[int, ...], kind: str) -> float:
+    """Return the probability of numbers that differ as much if they are the same, or as designed (Wald's test)."""
+    squares, freedom = 0.0, 0
+    for number in numbers:
+        values, variance = solution.numbers[:, number], np.square(solution.own[:, number]).sum(axis=1)
+        common = float(np.square(solution.shared[0, number]).sum())
+        if kind == "shared":
+            weights = 1 / variance
+            values = values - float(weights @ values / weights.sum())
+            freedom -= 1
+        elif not variance.any():
+            values, variance = values[:1], np.array([common])
+        squares += float((np.square(values) / variance).sum())
+        freedom += values.size
+    return float(stats.f.sf(squares / freedom, freedom, solution.freedom)) if freedom else 1.0
+
+
+NAMES = ("row", "column", "magnification", "rotation", "k1")
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Return a square root of a covariance matrix that may be singular."""
+    values, axes = np.linalg.eigh(covariance)
+    return axes * np.sqrt(np.maximum(values, 0.0))

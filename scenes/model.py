@@ -9,29 +9,26 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from math import ceil
 from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, aslinearoperator
+from scipy.sparse.linalg import LinearOperator
 
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
 from .camera import Camera
 from .fitted.fitted_matrix import FittedMatrix, gradient
+from .layout import stored_rows
 from .optics.boxes import BoxFootprints
 from .scene import Scene
-from .shrinkage import shrink_variances
+from .shrinkage import shrunk_by_contrast
 
-GROUP_SIZE = 200  # fewest pixels of similar contrast whose variances are shrunk together
-MOST_GROUPS = 24  # of pixels per lens type
 RECORDED = "recorded points"  # method of a model whose every entry was measured by itself
 ROUNDED = 1e-6  # deviation of the sum of a row, about 1, that is float32's rounding
 FEWEST_BATCHES = 4  # that have two halves with a variance each
-EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
 
 
 @dataclass(frozen=True)
@@ -124,8 +121,6 @@ class Model:
 
     def as_linear_operator(self) -> LinearOperator:
         """Return H as a SciPy linear operator, (M, N), for iterative solvers; H need not be stored."""
-        if self.stored is not None:
-            return aslinearoperator(self.stored)
         return LinearOperator(
             (self.measurements, self.unknowns),
             matvec=lambda image: self.forward(image.ravel()),
@@ -137,19 +132,14 @@ class Model:
         """Indices of the measurements that see nothing outside a window of f: (m,)."""
         if self.has_boxes:
             return self.boxes.measurements_inside(rows, columns)
-        top, bottom, left, right = self._extents
-        inside = (top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop)
-        return np.flatnonzero(inside)
+        return stored_rows.inside(self._extents, rows, columns)
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """H from a window of f to the measurements that see nothing outside it: (m, pixels of the window)."""
         if self.has_boxes:
             return self.boxes.submatrix(rows, columns)
         inside = self.matrix[self.measurements_inside(rows, columns)]
-        row, column = np.divmod(inside.indices, self.camera.columns)
-        shape = rows.stop - rows.start, columns.stop - columns.start
-        indices = (row - rows.start) * shape[1] + column - columns.start
-        return sparse.csr_array((inside.data, indices, inside.indptr), shape=(inside.shape[0], shape[0] * shape[1]))
+        return stored_rows.on_window(inside, self.camera.columns, rows, columns)
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """A key that is equal for two windows only if their submatrices are equal."""
@@ -164,16 +154,8 @@ class Model:
         return int(max((bottom - top).max(), (right - left).max())) + 1
 
     @cached_property
-    def _extents(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """First and last row, first and last column of f that each measurement sees; EMPTY if none."""
-        row, column = np.divmod(self.matrix.indices.astype(np.int64), self.camera.columns)
-        nonempty = np.diff(self.matrix.indptr) > 0
-        starts = self.matrix.indptr[:-1][nonempty]
-        extents = [np.full(nonempty.size, EMPTY) for _ in range(4)]
-        for extent, (values, extreme) in zip(extents, product((row, column), (np.minimum, np.maximum)), strict=True):
-            extent[nonempty] = extreme.reduceat(values, starts)
-        top, bottom, left, right = extents
-        return top, bottom, left, right
+    def _extents(self) -> stored_rows.Extents:
+        return stored_rows.extents(self.matrix, self.camera.columns)
 
     def restrict(self, names: tuple[str, ...]) -> Model:
         """The model of only the named lens types, in its own order. Raises InputError for an unknown name."""
@@ -238,19 +220,7 @@ class Model:
         variance += self._lost_variance * level**2
         scatter = self.scatter(flat)
         excess = sum((self.scatter(image) for image in noise), np.zeros(self.measurements)) / max(len(noise), 1)
-        if self.record.get("fit"):
-            # Entries that follow from a few fitted parameters are correlated in ways that no sum over entries shows.
-            return np.maximum(scatter - excess, 0.0)
-        for pixels in self.camera.type_slices():
-            uncertain = pixels.start + np.flatnonzero(variance[pixels] > 0)
-            by_contrast = uncertain[np.argsort(variance[uncertain])]
-            for group in np.array_split(by_contrast, max(1, min(uncertain.size // GROUP_SIZE, MOST_GROUPS))):
-                if group.size:
-                    variance[group] *= shrink_variances(scatter[group] / variance[group], count)
-                    # Ratios of flat pixels have long tails, whose posterior means do not add up to the scatter.
-                    total = max(float(scatter[group].sum() - excess[group].sum()), 0.0)
-                    variance[group] *= total / (float(variance[group].sum()) or 1.0)
-        return variance
+        return shrunk_by_contrast(variance, scatter, excess, self.camera.type_slices(), count)
 
     def scatter(self, image: FloatArray) -> FloatArray:
         """Variance of H f of one image, (N,), by the batches alone, where there are two or more: (M,)."""

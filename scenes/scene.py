@@ -101,7 +101,7 @@ class CalibrationTable(Table):
     )
     fit: Literal["auto", "geometry", "none"] | None = Field(
         default=None,
-        description='"auto" (default): H by few numbers where they explain it; "geometry": views alone; "none": entries',
+        description='"auto": H by few numbers where they explain it; "geometry": by views alone; "none": entries',
     )
 
     @property
@@ -147,7 +147,8 @@ class Scene(Table):
     def _check_combination(self) -> Scene:
         if self.noise is not None and self.sensor is not None:
             raise ValueError("expected [noise] for an ideal sensor or [sensor] for a real one, got both; remove one")
-        if not self.camera.walls and (self.calibration.method != "transport" or self.calibration.fit in ("auto", "geometry")):
+        fits = self.calibration.fit in ("auto", "geometry")
+        if not self.camera.walls and (self.calibration.method != "transport" or fits):
             raise ValueError(
                 "camera.walls = false leaves H without a closed form: expected calibration.method 'transport', no fit,"
                 f" got '{self.calibration.method}'"

@@ -15,6 +15,7 @@ GROUP_SIZE = 2000  # fewest quantities with similar neighbours that are taken to
 MOST_GROUPS = 24
 STEP = 0.0625  # of the logarithm, in standard deviations of that of a sample variance
 KERNEL = 4  # steps: standard deviation of the kernel that smooths their distribution
+CONTRAST_GROUP = 200  # fewest pixels of similar contrast whose variances are shrunk together
 LEAST_FREEDOM = 10  # of a sample variance, below which passes are too few for that
 
 
@@ -100,3 +101,24 @@ def _inverse_trigamma(value: float) -> float:
         return _trigamma(float(np.exp(logarithm))) - value
 
     return float(np.exp(cast(Any, optimize).brentq(difference, -30.0, 30.0)))
+
+
+def shrunk_by_contrast(
+    variance: FloatArray, scatter: FloatArray, excess: FloatArray, slices: list[slice], repeats: int
+) -> FloatArray:
+    """Return the variances of measurements from their scatter, shrunk among pixels of a lens type with like contrast.
+
+    variance : (M,) as if errors of entries were independent, which rises with contrast, 0 where H is certain
+    scatter, excess : (M,) sample variances of few repeats, and the part of them that noise in the image explains
+    """
+    variance = variance.copy()
+    for pixels in slices:
+        uncertain = pixels.start + np.flatnonzero(variance[pixels] > 0)
+        by_contrast = uncertain[np.argsort(variance[uncertain])]
+        for group in np.array_split(by_contrast, max(1, min(uncertain.size // CONTRAST_GROUP, MOST_GROUPS))):
+            if group.size:
+                variance[group] *= shrink_variances(scatter[group] / variance[group], repeats)
+                # Ratios of flat pixels have long tails, whose posterior means do not add up to the scatter.
+                total = max(float(scatter[group].sum() - excess[group].sum()), 0.0)
+                variance[group] *= total / (float(variance[group].sum()) or 1.0)
+    return variance

@@ -34,7 +34,13 @@ def scene(
     lenses: Lenses = (("1/3", [3, 3], [5, 5]),),
     **tables: Any,
 ) -> Scene:
-    """A scene with lens types A, B, ... of (magnification, array, pixels) and more tables by name."""
+    """A scene with lens types A, B, ... of (magnification, array, pixels) and more tables by name.
+
+    A calibrated H has entries, which most tests are about, unless `calibration` names another fit.
+    """
+    calibration = tables.get("calibration", {})
+    if calibration.get("method") != "ideal":
+        tables = tables | {"calibration": {"fit": "none"} | calibration}
     names = "ABCDEFGH"
     data: dict[str, Any] = {
         "target": {

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 
 from ..camera import Camera
 from ..lens_type import LensType, SubImager
-from .real_boxes import RealBoxes
+from .real_boxes import RealBoxes, real_box
 from .view import COUNT, K1, ROTATION, designed, displacements, entries
 
 ALIKE = 0.05  # pixels of f that views may be displaced by where error maps take H as designed
@@ -86,7 +87,7 @@ class FittedMatrix:
     def _types(self) -> list[tuple[LensType, Views, list[SubImager], list[slice]]]:
         subs, slices = iter(self.camera.sub_imagers), iter(self.camera.slices())
         return [
-            (lens, self.views[lens.name], [next(subs) for _ in range(lens.count)], [next(slices) for _ in range(lens.count)])
+            (lens, self.views[lens.name], list(islice(subs, lens.count)), list(islice(slices, lens.count)))
             for lens in self.camera.types
         ]
 
@@ -148,8 +149,6 @@ class FittedMatrix:
 
     def _rows(self, sub: SubImager, numbers: FloatArray) -> sparse.csr_array:
         if numbers[ROTATION] == 0 and numbers[K1] == 0 and not sub.rotation and sub.type.optics.distortion is None:
-            from .real_boxes import real_box
-
             box = real_box(self.camera.shape, sub, numbers)
             rows = sparse.csr_array(sparse.kron(box.down.shares, box.across.shares, format="csr"))
             rows.eliminate_zeros()
@@ -175,12 +174,13 @@ class FittedMatrix:
     def without_errors(self) -> FittedMatrix:
         """The same H, taken for exact."""
         views = {
-            name: replace(each, own=each.own[:, :, :0], shared=each.shared[:, :, :0]) for name, each in self.views.items()
+            name: replace(each, own=each.own[:, :, :0], shared=each.shared[:, :, :0])
+            for name, each in self.views.items()
         }
         return FittedMatrix(self.camera, views)
 
     def directions(self, gradients: tuple[FloatArray, FloatArray]) -> sparse.csc_array:
-        """Return L, (M, q), such that the error of H f is L xi, from H applied to the gradient of f: (M,) down, across."""
+        """Return L, (M, q), such that the error of H f is L xi; gradients : H f' down and across, (M,) each."""
         blocks: list[sparse.csc_array] = []
         for lens, views, subs, slices in self._types:
             own, shared = views.own.shape[2], views.shared.shape[2]

@@ -83,7 +83,9 @@ def offsets(sub: SubImager, pixels: tuple[FloatArray, FloatArray]) -> tuple[Floa
     return down, across
 
 
-def displacements(camera: Camera, sub: SubImager, pixels: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+def displacements(
+    camera: Camera, sub: SubImager, pixels: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
     """Return how far a view's pixels (i, j) move per unit of each number: (pixels, 5), in rows and in columns of f.
 
     To first order around the design, without rotation; of k1 the move towards the lens's axis on the target.
@@ -93,7 +95,8 @@ def displacements(camera: Camera, sub: SubImager, pixels: tuple[FloatArray, Floa
     middle = sub.type.middle(sub.window)
     axis = camera.rows / 2 - sub.lens[1] / camera.target_pitch, camera.columns / 2 - sub.lens[0] / camera.target_pitch
     aside = down + middle[0] - axis[0], across + middle[1] - axis[1]
-    square = (np.square(aside[0]) + np.square(aside[1])) * (camera.target_pitch / camera.half_diagonal) ** 2
+    over = float(sub.type.ratio) ** 2 / 3  # by which the mean of (x^2 + y^2) x over a footprint exceeds its middle's
+    square = (np.square(aside[0]) + np.square(aside[1]) + over) * (camera.target_pitch / camera.half_diagonal) ** 2
     rows = np.column_stack([ones, none, -down, across, -aside[0] * square])
     columns = np.column_stack([none, ones, -across, -down, -aside[1] * square])
     return rows, columns

@@ -125,3 +125,10 @@ def agreement(matrix: sparse.csr_array, variance: FloatArray, camera: Camera, pa
     chance = -np.expm1(entries * np.log1p(-single)) if single < 1 else 1.0
     rms = float(np.sqrt((difference.data**2).sum() / max(entries, 1)))
     return {"rms_difference_from_ideal": rms, "max_z": largest, "p_value": float(chance)}
+
+
+def explains(setup: Setup) -> bool:
+    """Return True if few numbers are expected to explain all of H: the views of sharp lens types."""
+    from .fit.fit import is_sharp
+
+    return fits(setup) and all(is_sharp(setup.simulated, lens) for lens in setup.simulated.types)

@@ -9,6 +9,7 @@ the reading of a pass is the row of H of that pass, applied to the picture.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -130,22 +131,24 @@ def best_plans(setup: Setup, plans: Plans) -> Plans:
     return {name: work if work.total > wanted.total else wanted for name, wanted in plans.items()}
 
 
-def pilot(setup: Setup, plans: Plans, fit: bool = False) -> Pilot:
-    """Trace a pilot for the samples of `plans`.
+def setup_of_pilot(setup: Setup, **calibration: Any) -> Setup:
+    """Return the setup of a calibration by rays with seeds of its own and some other settings.
 
-    fit : True if the geometry is fitted as the scene's calibration asks
     Raises InputError if only Mitsuba's scalar backend works.
     """
     scene = setup.scene
-    traced = _affordable(setup, plans)
-    calibration = scene.calibration.model_copy(
-        update={"method": "transport", "samples": max(work.total for work in traced.values())}
-        | ({} if fit else {"fit": None})
-    )
+    changed = scene.calibration.model_copy(update={"method": "transport", **calibration})
     render = scene.render.model_copy(
         update={"seed": repeat_seed(scene.render.seed, "pilot", 0), "variant": _fast_variant(scene.render.variant)}
     )
-    changed = replace(setup, scene=with_tables(scene, calibration=calibration, render=render))
+    return replace(setup, scene=with_tables(scene, calibration=changed, render=render))
+
+
+def pilot(setup: Setup, plans: Plans) -> Pilot:
+    """Trace a pilot for the samples of `plans`, entry by entry. Raises InputError as `setup_of_pilot` does."""
+    scene = setup.scene
+    traced = _affordable(setup, plans)
+    changed = setup_of_pilot(setup, samples=max(work.total for work in traced.values()), fit="none")
     model = rendered_model(changed, plans=traced, float64=scene.calibration.samples == "auto")
     pinholes = all(lens.optics.aperture is None and lens.optics.surfaces is None for lens in setup.simulated.types)
     exponent = EXPONENTS.get(scene.render.sampler, STRATIFIED) if pinholes else 1.0
@@ -192,17 +195,17 @@ def _rays(camera: Camera, plans: Plans) -> int:
 def with_errors(model: Model, rng: np.random.Generator) -> Model:
     """Return a model whose H deviates from the true one as a measured one does, by a random draw from its batches.
 
-    Rows have independent errors, or all the same weights where a few fitted parameters cause them.
+    Rows have independent errors.
     """
     count = len(model.batches)
     if count < 2:
         return model
     matrix = model.matrix
-    weights = rng.normal(size=(count, 1 if model.record.get("fit") else model.measurements))
+    weights = rng.normal(size=(count, model.measurements))
     rows = np.repeat(np.arange(model.measurements), np.diff(matrix.indptr))
     errors = np.zeros(matrix.nnz)
     for batch, weight in zip(model.batches, weights, strict=True):
-        errors += batch * np.broadcast_to(weight, model.measurements)[rows]
+        errors += batch * weight[rows]
     values = matrix.data + errors / (count * (count - 1)) ** 0.5
     stored = sparse.csr_array((values, matrix.indices, matrix.indptr), shape=matrix.shape)
     return replace(model, stored=stored)

@@ -102,7 +102,9 @@ def responses_from_points(
         finished = {**finished, **sweep.state()} if checkpoint is not None else finished
         parts[group].append(sweep.part(work))
         done += shares[group]
-    whole = [on_all_rows(each, renderer.rows(group), chosen.get(group), camera.unknowns) for group, each in parts.items()]
+    whole = [
+        on_all_rows(each, renderer.rows(group), chosen.get(group), camera.unknowns) for group, each in parts.items()
+    ]
     return joined_parts(whole, plans, variant, scene.render.seed)
 
 

@@ -64,7 +64,9 @@ def responses_from_rays(
             passes.append(one_pass(renderer, group, block, work, number, scene.render.seed, chosen[group]))
             progress((index + (number + 1) / work.passes) / len(blocks))
         parts[group].append(_joined(passes, (block.stop - block.start, setup.camera.unknowns)))
-    whole = [on_all_rows(each, renderer.rows(group), chosen[group], setup.camera.unknowns) for group, each in parts.items()]
+    whole = [
+        on_all_rows(each, renderer.rows(group), chosen[group], setup.camera.unknowns) for group, each in parts.items()
+    ]
     return joined_parts(whole, plans, variant, scene.render.seed)
 
 

@@ -59,8 +59,8 @@ def test_a_source_assigned_to_the_wrong_pixel_is_detected(monkeypatch: pytest.Mo
     camera = derive(described)
     right = point_sources.visible_pixels
 
-    def wrong(renderer: Any, group: str) -> VisiblePixels:
-        visible = right(renderer, group)
+    def wrong(renderer: Any, group: str, subset: Any) -> VisiblePixels:
+        visible = right(renderer, group, subset)
         return replace(visible, row=visible.row + 3, column=visible.column + 3)
 
     monkeypatch.setattr(point_sources, "visible_pixels", wrong)

@@ -21,8 +21,10 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.adaptive_render import AIM as RENDERING_AIM
 from ommatid.simulate.adaptive_render import DONE as RENDERING_DONE
+from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.calibration import pilot
 from ommatid.simulate.calibration.adaptive_rounds import AIM, DONE
+from ommatid.simulate.calibration.entries import explains
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 from ommatid.simulate.noise_target import SHARE, allowed_variance, check_noise_target
 from ommatid.simulate.render import exposed
@@ -86,6 +88,9 @@ def predicted_recording(setup: Setup) -> PredictedRecording:
         designed = camera.model if same else ideal_model(setup.scene, setup.camera)
         true = None if same or not _differs(camera.model, designed) else camera.model.matrix
         return PredictedRecording(stack, designed, true, designed, image, truth, assumes)
+    fitted = _fitted(setup, stack)
+    if fitted is not None:
+        return PredictedRecording(stack, fitted, None, camera.model, image, truth, assumes)
     model, said_of_model = _calibrated(setup, camera, stack)
     return PredictedRecording(stack, model, None, camera.model, image, truth, (*assumes, *said_of_model))
 
@@ -130,10 +135,11 @@ def _camera(setup: Setup) -> _Camera:
     """Return H of the camera that records: in closed form, or where it has none from a pilot."""
     scene, simulated = setup.scene, setup.simulated
     calibrated = scene.calibration.method != "ideal"
-    if setup.has_structured_matrix and setup.has_closed_form and simulated.tolerance is None:
+    boxes = setup.camera.has_box_footprints and simulated.tolerance is None and setup.has_closed_form
+    if boxes and (setup.has_structured_matrix or explains(setup)):
         return _Camera(ideal_model(scene, setup.camera), None, ())
     plans = pilot.calibration_plans(setup)
-    uncertain = pilot.pilot(setup, plans, fit=True) if calibrated else None
+    uncertain = pilot.pilot(setup, plans) if calibrated and not explains(setup) else None
     assumes = _extrapolation("H", uncertain is not None and uncertain.extrapolated)
     if setup.has_closed_form:
         matrix = true_matrix(simulated)
@@ -147,17 +153,25 @@ def _camera(setup: Setup) -> _Camera:
 def _traced_matrix(setup: Setup, uncertain: pilot.Pilot | None, plans: pilot.Plans) -> sparse.csr_array:
     """Return H by a pilot of as many rays as are affordable; `uncertain`, of `plans`, serves where it has as many."""
     best = pilot.best_plans(setup, plans if uncertain is not None else pilot.rendering_plans(setup))
-    if uncertain is not None and best == plans and setup.scene.calibration.fit is None:
+    if uncertain is not None and best == plans:
         return uncertain.model.matrix
     return pilot.pilot(setup, best).model.matrix
 
 
+def _fitted(setup: Setup, stack: Stack) -> Model | None:
+    """Return H as a calibration by few numbers finds it, with seeds of its own; None where they do not explain it."""
+    if setup.scene.calibration.method == "ideal" or not explains(setup):
+        return None
+    rule = for_stack(stack) if setup.scene.calibration.samples == "auto" else None
+    model = calibrate(pilot.setup_of_pilot(setup), stopping_rule=rule)
+    return None if model.fitted is None or model.variance.any() else model
+
+
 def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Assumptions]:
     """Return H as the scene's calibration may measure it: the true one with errors, and their uncertainty."""
-    if camera.pilot is None:
-        raise ValueError("expected a scene whose H is calibrated, got one with the ideal H")
+    uncertain = pilot.pilot(setup, pilot.calibration_plans(setup)) if camera.pilot is None else camera.pilot
     true = camera.model.matrix
-    model = camera.pilot.around(true)
+    model = uncertain.around(true)
     model = replace(model, record={**model.record, "method": setup.scene.calibration.method})
     rng = np.random.default_rng([setup.scene.render.seed, ERRORS])
     if setup.scene.calibration.samples != "auto":
@@ -167,14 +181,14 @@ def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Ass
         f"the uncertainty of H adds {100 * min(adds, AIM):.2g} %, which calibration.samples 'auto' aims at or finds",
     )
     if adds > DONE:
-        model = replace(camera.pilot.around(true, AIM / adds), record=model.record)
+        model = replace(uncertain.around(true, AIM / adds), record=model.record)
     return pilot.with_errors(model, rng), said
 
 
 def _rendering_variance(setup: Setup, camera: _Camera, image: FloatArray) -> tuple[FloatArray, Assumptions]:
     """Return the variance of the rendered light, (M,)."""
     scene, plans = setup.scene, pilot.rendering_plans(setup)
-    same = camera.pilot is not None and plans == pilot.calibration_plans(setup) and scene.calibration.fit is None
+    same = camera.pilot is not None and plans == pilot.calibration_plans(setup)
     traced = camera.pilot if same and camera.pilot is not None else pilot.pilot(setup, plans)
     light = camera.model.forward(image)
     floor = rounding_variance(light, max(work.samples for work in plans.values()))

@@ -1,13 +1,14 @@
 """The chart of a calibration: the few sensor pixels from whose rows of H a smooth map of the field follows.
 
-A grid of at most 12 x 12 pixels, corners included, serves any sub-imager: with n pixels along a side the error of a
-shift falls as 1/n, that of a magnification too, since its lever is the patch itself; and 12 leave 139 degrees of freedom to the
-F test for what five numbers do not explain.
+A grid of at most 12 x 12 pixels, corners included, serves any sub-imager: with n pixels along a side the errors of
+shift, magnification and rotation fall as 1/n, as fast as with all pixels and more samples in each, and twelve leave
+280 degrees of freedom to the F test for what five numbers do not explain.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
@@ -25,7 +26,9 @@ def chart_of(lens_type: LensType, whole: BoolArray | None = None) -> IntArray:
 
     whole : (sub-imagers,), True for those of which all pixels are measured
     """
-    rows, columns = (np.unique(np.linspace(0, size - 1, min(size, SIDE)).round().astype(np.int64)) for size in lens_type.pixels)
+    rows, columns = (
+        np.unique(np.linspace(0, size - 1, min(size, SIDE)).round().astype(np.int64)) for size in lens_type.pixels
+    )
     few = (rows[:, None] * lens_type.pixels[1] + columns).ravel()
     size = lens_type.pixels[0] * lens_type.pixels[1]
     if whole is None:
@@ -95,8 +98,10 @@ def chart_rows(camera: Camera, lens_type: LensType, matrix: sparse.csr_array, ba
     dense = dense.reshape(1 + len(batches), lit.size, high, wide)
     ends = np.searchsorted(lit, size * np.arange(lens_type.count + 1))
     result: list[ChartRows] = []
-    for first, last in zip(ends[:-1], ends[1:], strict=True):
-        part = slice(int(first), int(last))
+    for first, last in pairwise(ends.tolist()):
+        part = slice(first, last)
         down, across = (each.astype(np.float64) for each in np.divmod(lit[part] % size, lens_type.pixels[1]))
-        result.append(ChartRows(down, across, row[part], column[part], dense[0, part], dense[1:, part].astype(np.float32)))
+        result.append(
+            ChartRows(down, across, row[part], column[part], dense[0, part], dense[1:, part].astype(np.float32))
+        )
     return result

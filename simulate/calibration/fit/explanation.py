@@ -1,7 +1,8 @@
 """Whether the numbers of a view explain the measured rows of H of a sub-imager: an F test.
 
 The weighted sum of squares of the residuals of all entries, those that are zero included, is compared with that of the
-batches, whose rays scatter as those of the mean do. The weights are those of independent rays.
+batches, whose rays scatter as those of the mean do. The weights are those of independent rays, but where cells hold few
+of them.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from ommatid.runtime.arrays import FloatArray
 
 from .chart import ChartRows
 
+FEW = 8  # rays of a cell, below which its weight hardly grows: single rays there would decide
 STRAY = 0.5  # rays that each cell may miss or have in excess, by rounding of positions to float32
 
 
@@ -35,7 +37,7 @@ class Explanation:
 
 def explanation(chart: ChartRows, model: FloatArray, rays: int) -> Explanation:
     """Compare measured rows with those of a model, (pixels, W, V). rays : per pixel, of all passes."""
-    weights = (rays / (model + 0.5 / rays)).ravel()
+    weights = (rays / (model + FEW / rays)).ravel()
     residual = (chart.values - model).ravel()
     batches = chart.batches.reshape(len(chart.batches), -1)
     gram = np.asarray((batches * weights) @ batches.T, dtype=np.float64)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views
@@ -21,7 +21,7 @@ from ommatid.scenes.fitted.view import COUNT, UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 
 from ..point_sources import Responses, Subsets
-from .chart import ChartRows, chart_of, chart_rows
+from .chart import chart_of, chart_rows
 from .explanation import Explanation, explanation
 from .view_fit import SIGNIFICANCE, ViewFit, fit_views
 from .view_model import predicted
@@ -140,7 +140,9 @@ def _record(camera: Camera, fits: dict[str, _TypeFit], subsets: Subsets) -> dict
     """Return the entry of a model's record."""
     explained = np.concatenate([each.views.explained for each in fits.values()])
     names = [sub.name for sub in camera.sub_imagers]
-    expected = sum(each.expected for fit in fits.values() for each in fit.explanations)
+    left, expected = (
+        sum(getattr(each, name) for fit in fits.values() for each in fit.explanations) for name in ("left", "expected")
+    )
     return {
         "kind": "auto",
         "accepted": int(explained.sum()),
@@ -148,19 +150,21 @@ def _record(camera: Camera, fits: dict[str, _TypeFit], subsets: Subsets) -> dict
         "structure": {name: dict(zip(UNITS, fit.views.structure, strict=True)) for name, fit in fits.items()},
         "chances": {name: fit.fit.chances for name, fit in fits.items() if fit.fit is not None},
         "parameters": {
-            name: _statistics(fit, subs) for (name, fit), subs in zip(fits.items(), _by_type(camera), strict=True) if fit.fit is not None
+            name: _statistics(fit, subs)
+            for (name, fit), subs in zip(fits.items(), _by_type(camera), strict=True)
+            if fit.views.explained.any()
         },
         "units": UNITS,
         "chart": {name: int(pixels.size) for name, pixels in subsets.items() if pixels is not None},
-        "chi_squared": sum(each.left for fit in fits.values() for each in fit.explanations) / expected if expected else None,
+        "chi_squared": left / expected if expected else None,
     }
 
 
 def _statistics(fit: _TypeFit, subs: list[SubImager]) -> dict[str, dict[str, float]]:
     """Return the deviations of the numbers from the design and their standard errors, over the sub-imagers."""
     views = fit.views
-    moved = views.numbers - np.array([designed(sub) for sub in subs])
-    variance = np.square(views.own).sum(axis=2) + np.square(views.shared).sum(axis=2)
+    moved = (views.numbers - np.array([designed(sub) for sub in subs]))[views.explained]
+    variance = (np.square(views.own).sum(axis=2) + np.square(views.shared).sum(axis=2))[views.explained]
     return {
         name: {
             "mean": float(moved[:, at].mean()),

@@ -1,15 +1,16 @@
 """The views of a lens type's sub-imagers from the rows of H of a chart: as few numbers as explain them.
 
-The centroid of a row moves as the view does, exactly so while the row is whole, so that the numbers of a view follow from
-those of its pixels by linear least squares. Some of the numbers may be the lens type's, the same for all of its
-sub-imagers, or as designed: from five numbers of each sub-imager, step by step, tests against the scatter of the batches
-remove what the centroids do not need. Rows of different pixels share no rays, so that the covariance is that of
-independent centroids whose variances the batches show (sandwich estimator: White 1980, Econometrica 48, 817).
+The centroid of a row moves as the view does, exactly so while the row is whole, so that the numbers of a view follow
+from those of its pixels by linear least squares. Some of the numbers may be the lens type's, the same for all of its
+sub-imagers, or as designed: from four numbers of each sub-imager and the type's distortion, step by step, tests against
+the scatter of the batches remove what the centroids do not need. Rows of different pixels share no rays, so that the
+covariance is that of independent centroids whose variances the batches show (sandwich estimator: White 1980,
+Econometrica 48, 817).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -18,6 +19,7 @@ from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.view import COLUMN, COUNT, K1, MAGNIFICATION, ROTATION, ROW, designed, displacements, scales
 from ommatid.scenes.lens_type import SubImager
+from ommatid.scenes.shrinkage import shrink_variances
 
 from ...sampling.passes import BATCHES
 from .chart import ChartRows, centroids
@@ -28,7 +30,8 @@ STEPS = 12  # of Gauss and Newton; 2 but where views are displaced by more than 
 SETTLED = 0.01  # of a ray's share of a centroid, below which another step changes nothing
 LEAST_LIGHT = 0.3  # of a pixel's rays that have to meet the target for its centroid to be used, and
 LOST = 0.02  # of them that may miss it where footprints are no boxes
-NEAR = 1e-3  # pixels of f, for the derivatives of centroids: 1 of a pixel seen as a whole, less at the target's edge
+NEAR = 0.05  # pixels of f, for the derivatives of centroids: 1 of a pixel seen as a whole, less at the target's edge
+ROUNDED = 1e-9  # of a pixel's light
 REDUCTIONS = (((K1,), "designed"), ((ROTATION,), "shared"), ((ROTATION,), "designed"))
 REDUCTIONS += (((MAGNIFICATION,), "shared"), ((MAGNIFICATION,), "designed"), ((ROW, COLUMN), "designed"))
 Structure = tuple[str, ...]  # of each number "own", "shared" or "designed"
@@ -51,16 +54,17 @@ class Centroids:
     """The linear problem of one sub-imager: moves of its centroids, rows first and then columns of f.
 
     design : (2 pixels, 5) per unit of each number, in `scales`;  moved : (2 pixels,) from the design
-    variance : (2 pixels,) of these
+    variance : (2 pixels,) of these;  unseen : variance that no ray shows
     """
 
     design: FloatArray
     moved: FloatArray
     variance: FloatArray
+    unseen: float
 
 
 @dataclass(frozen=True)
-class Solution:
+class ViewSolution:
     """Numbers of all sub-imagers, in `scales` and from the design, for one structure.
 
     freedom : degrees of freedom of the variances
@@ -75,15 +79,18 @@ class Solution:
 def fit_views(camera: Camera, subs: list[SubImager], charts: list[ChartRows], rays: int) -> ViewFit:
     """Fit the views of a lens type's sub-imagers. rays : per pixel, of all passes."""
     start = np.array([designed(sub) for sub in subs])
-    units = np.array([scales(camera, sub) for sub in subs])
+    smallest = np.min([scales(camera, sub) for sub in subs], axis=0)
+    units = np.tile(smallest, (len(subs), 1))  # the same for all, who may share numbers
 
     def problems_at(numbers: FloatArray) -> list[Centroids]:
-        return [
-            _centroids(camera, sub, numbers[n], charts[n], units[n], rays, (numbers[n] - start[n]) / units[n])
-            for n, sub in enumerate(subs)
-        ]
+        return _shrunk(
+            [
+                _centroids(camera, sub, numbers[n], charts[n], units[n], rays, (numbers[n] - start[n]) / units[n])
+                for n, sub in enumerate(subs)
+            ]
+        )
 
-    def iterated(numbers: FloatArray, structure: Structure) -> tuple[FloatArray, list[Centroids], Solution]:
+    def iterated(numbers: FloatArray, structure: Structure) -> tuple[FloatArray, list[Centroids], ViewSolution]:
         for step in range(STEPS):
             problems = problems_at(numbers)
             solution = solve(problems, structure)
@@ -100,29 +107,55 @@ def fit_views(camera: Camera, subs: list[SubImager], charts: list[ChartRows], ra
 
 
 def _errors_of_design(
-    problems: list[Centroids], structure: Structure, solution: Solution
+    problems: list[Centroids], structure: Structure, solution: ViewSolution
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the factors of the errors, with those of the numbers that the structure leaves as designed.
+    """Return the factors of the errors, with those of the numbers that the structure simplifies.
 
-    A number that may be as designed may also be as measured: its deviation, or its standard error if that is larger,
-    remains uncertain, for the lens type or, for the position of a view, for each sub-imager.
+    Sub-imagers whose numbers could not be told apart may differ by as much as would have gone unnoticed: the excess of
+    their scatter over that of their errors, and its standard error. A number of the type that could not be told from
+    the design may deviate by as much as it was measured to, or by its standard error if that is larger.
     """
-    kinds = tuple("own" if number in (ROW, COLUMN) else "shared" for number in range(COUNT))
-    loose = solve(problems, tuple(kinds[n] if each == "designed" else each for n, each in enumerate(structure)))
+    free, count = solve(problems, FREE), len(problems)
+    common = solve(problems, tuple("own" if number in (ROW, COLUMN) else "shared" for number in range(COUNT)))
     own, shared = [solution.own], [solution.shared]
-    for number, each in enumerate(structure):
-        if each != "designed":
-            continue
-        column = np.zeros((len(problems), COUNT, 1))
-        factor = loose.own if kinds[number] == "own" else loose.shared
-        deviation = np.sqrt(np.square(factor[:, number]).sum(axis=1))
-        column[:, number, 0] = np.maximum(np.abs(loose.numbers[:, number]), deviation)
-        (own if kinds[number] == "own" else shared).append(column)
+    for number, kind in enumerate(structure):
+        if FREE[number] == "own" and kind != "own":
+            variance = np.square(free.own[:, number]).sum(axis=1)
+            values = free.numbers[:, number]
+            if number not in (ROW, COLUMN):
+                values = values - values.mean()
+            between = (
+                max(float((np.square(values) - variance).mean()), 0.0) + float(variance.mean()) * (2 / count) ** 0.5
+            )
+            own.append(_column(count, number, between**0.5))
+        if number not in (ROW, COLUMN) and kind == "designed":
+            error = float(np.square(common.shared[0, number]).sum()) ** 0.5
+            shared.append(_column(count, number, max(abs(float(common.numbers[0, number])), error)))
     return np.concatenate(own, axis=2), np.concatenate(shared, axis=2)
 
 
+def _column(count: int, number: int, deviation: float) -> FloatArray:
+    """Return a factor of the error of one number: (sub-imagers, 5, 1)."""
+    column = np.zeros((count, COUNT, 1))
+    column[:, number] = deviation
+    return column
+
+
+def _shrunk(problems: list[Centroids]) -> list[Centroids]:
+    """Return the problems with variances that eight batches alone would leave too uncertain for tests."""
+    variances = shrink_variances(np.concatenate([problem.variance for problem in problems]), BATCHES)
+    parts = np.split(variances, np.cumsum([problem.variance.size for problem in problems])[:-1])
+    return [replace(problem, variance=part + problem.unseen) for problem, part in zip(problems, parts, strict=True)]
+
+
 def _centroids(
-    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows, units: FloatArray, rays: int, from_design: FloatArray
+    camera: Camera,
+    sub: SubImager,
+    numbers: FloatArray,
+    chart: ChartRows,
+    units: FloatArray,
+    rays: int,
+    from_design: FloatArray,
 ) -> Centroids:
     """Return the moves of the centroids from the design, linear around these numbers."""
     model = predicted(camera, sub, numbers, chart)
@@ -130,7 +163,10 @@ def _centroids(
     least = LEAST_LIGHT if boxes else 1 - LOST
     kept = (model.sum(axis=(1, 2)) > least) & (chart.light > least)
     expected = centroids(model, chart.row, chart.column)
-    slopes = _slopes(camera, sub, numbers, chart) if boxes else [np.ones(kept.size)] * 2
+    slopes = [np.ones(kept.size)] * 2
+    if boxes:
+        slopes, even = _slopes(camera, sub, numbers, chart)
+        kept &= even
     measured, scatter = chart.centroids(), chart.batch_centroids()
     design = np.concatenate(displacements(camera, sub, (chart.down, chart.across))) * units
     design *= np.concatenate(slopes)[:, None]
@@ -140,23 +176,28 @@ def _centroids(
     variance = np.square(np.concatenate(scatter, axis=1)).sum(axis=0) / (count * (count - 1))
     # A view that moves by less than m / 2 rays of all its pixels together moves none of them across an edge.
     unseen = (float(sub.type.ratio) / (2 * rays)) ** 2 / max(kept.sum(), 1)
-    return Centroids(design[both], moved[both], variance[both] + unseen)
+    return Centroids(design[both], moved[both], variance[both], unseen)
 
 
-def _slopes(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> list[FloatArray]:
-    """Return how far centroids move per pixel of f by which the view is shifted, down and across: (pixels,) each."""
-    slopes: list[FloatArray] = []
+def _slopes(
+    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
+) -> tuple[list[FloatArray], BoolArray]:
+    """Return how far centroids move per pixel of f by which the view is shifted, down and across: (pixels,) each.
+
+    And which pixels do so evenly: one that ends at the target's edge moves less outwards than inwards.
+    """
+    slopes, even = list[FloatArray](), np.ones(len(chart.row), dtype=np.bool_)
     for axis in (ROW, COLUMN):
         shift = NEAR * (np.arange(COUNT) == axis)
-        ahead, behind = (
-            centroids(predicted(camera, sub, numbers + sign * shift, chart), chart.row, chart.column)[axis]
-            for sign in (1, -1)
-        )
-        slopes.append((ahead - behind) / (2 * NEAR))
-    return slopes
+        ahead, behind = (predicted(camera, sub, numbers + sign * shift, chart) for sign in (1, -1))
+        moved = [centroids(each, chart.row, chart.column)[axis] for each in (ahead, behind)]
+        slopes.append((moved[0] - moved[1]) / (2 * NEAR))
+        whole = [each.sum(axis=(1, 2)) > 1 - ROUNDED for each in (ahead, behind)]
+        even &= whole[0] == whole[1]
+    return slopes, even
 
 
-def solve(problems: list[Centroids], structure: Structure) -> Solution:
+def solve(problems: list[Centroids], structure: Structure) -> ViewSolution:
     """Solve for the numbers of all sub-imagers, with the factors of their errors."""
     own, shared = (np.array([each == kind for each in structure]) for kind in ("own", "shared"))
     typical = _typical(problems)
@@ -179,7 +220,7 @@ def solve(problems: list[Centroids], structure: Structure) -> Solution:
         common_errors[n][shared] = root
         common_errors[n][own] = -each.link @ root
     freedom = (BATCHES - 1) * max(sum(problem.moved.size for problem in problems), 1)
-    return Solution(numbers, errors, common_errors, freedom)
+    return ViewSolution(numbers, errors, common_errors, freedom)
 
 
 @dataclass(frozen=True)
@@ -226,7 +267,7 @@ def _structure(problems: list[Centroids]) -> tuple[Structure, dict[str, float]]:
     return structure, chances
 
 
-def _chance(solution: Solution, numbers: tuple[int, ...], kind: str) -> float:
+def _chance(solution: ViewSolution, numbers: tuple[int, ...], kind: str) -> float:
     """Return the probability of numbers that differ as much if they are the same, or as designed (Wald's test)."""
     squares, freedom = 0.0, 0
     for number in numbers:

@@ -90,8 +90,6 @@ class RayGenerator:
         since Mitsuba seeds by the first lane of each wavefront. The passes of one pixel are adjacent.
         subset : pixels that the block selects from; None: all
         """
-        import drjit as dr
-        import mitsuba as mi
 
         samples = fitting(self._sampler_name, samples)
         self.sampler.set_sample_count(samples)

@@ -164,7 +164,10 @@ class AdaptiveRounds:
         seeds = [sampler_seeds(seed, "data", number, MOST_PASSES) for number in range(work.passes)]
         rows = slice(self._slices[indices[0]].start, self._slices[indices[-1]].stop)
         for part, values in expose_exactly(self._renderer, self._world, indices, work, seeds):
-            mean, variance = values.mean(axis=0), values.var(axis=0, ddof=1) / work.passes
+            tally = Tally(part.stop - part.start)
+            for passed in values:
+                tally.add(passed)
+            mean, variance = tally.mean, tally.variance
             floor = rounding_variance(mean, self._renderer.float32_samples(work.samples))
             self.mean[part], self.variance[part] = mean, np.maximum(variance, floor)
             self._open[part] = variance > floor

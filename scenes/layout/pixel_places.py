@@ -26,7 +26,9 @@ class PixelPlaces:
         self._indices = np.array([index for index, _, _ in chosen])
         self._columns = np.array([sub.type.pixels[1] for _, sub, _ in chosen])
         self._corners = np.array([corner_offset(camera, sub) for _, sub, _ in chosen])
-        self._poses = [pose for _, _, pose in chosen]
+        self._middles = np.array([pose.middle for _, _, pose in chosen])
+        self._axes = np.array([pose.axes for _, _, pose in chosen])
+        self._lenses = np.array([pose.lens for _, _, pose in chosen])
         self._pitch = camera.pixel_pitch
         self._turned = camera.tolerance is not None or any(lens_type.is_rotated for lens_type in camera.types)
 
@@ -36,25 +38,27 @@ class PixelPlaces:
         return int(self._starts[-1])
 
     def numbers(self, pixels: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the number of each pixel within its sub-imager, and that of the sub-imager in the camera."""
-        own = self._own(pixels)
-        return pixels - self._starts[own], self._indices[own]
+        """Return the number of each of some ascending pixels within its sub-imager, and the latter's in the camera."""
+        counts = self._counts(pixels)
+        return pixels - np.repeat(self._starts[:-1], counts), np.repeat(self._indices, counts)
 
     def at(self, pixels: IntArray) -> FloatArray:
         """Return rows of (pixels,): x, y, z of each pixel's corner from its lens, x and y of the lens, and the axes.
 
         The axes of the patch, 6 rows, are there only where patches of the camera are tilted or rotated.
+        pixels : ascending
         """
-        own = self._own(pixels)
-        row, column = np.divmod(pixels - self._starts[own], self._columns[own])
-        u = self._corners[own, 0] + column * self._pitch
-        v = self._corners[own, 1] + row * self._pitch
-        middles, axes = np.array([pose.middle for pose in self._poses]), np.array([pose.axes for pose in self._poses])
-        lenses = np.array([pose.lens for pose in self._poses])
+        counts = self._counts(pixels)
+        row, column = np.divmod(pixels - np.repeat(self._starts[:-1], counts), np.repeat(self._columns, counts))
+        u = np.repeat(self._corners[:, 0], counts) + column * self._pitch
+        v = np.repeat(self._corners[:, 1], counts) + row * self._pitch
+        (x, y, z), lenses = np.repeat(self._middles, counts, axis=0).T, np.repeat(self._lenses, counts, axis=0).T
         if not self._turned:
-            return np.stack([middles[own, 0] + u, middles[own, 1] + v, middles[own, 2], *lenses[own].T])
-        corners = [middles[own, axis] + axes[own, axis, 0] * u + axes[own, axis, 1] * v for axis in range(3)]
-        return np.stack([*corners, *lenses[own].T, *axes[own].reshape(-1, 6).T])
+            return np.stack([x + u, y + v, z, *lenses])
+        axes = np.repeat(self._axes.reshape(-1, 6), counts, axis=0).T
+        corners = [at + axes[2 * axis] * u + axes[2 * axis + 1] * v for axis, at in enumerate((x, y, z))]
+        return np.stack([*corners, *lenses, *axes])
 
-    def _own(self, pixels: IntArray) -> IntArray:
-        return np.searchsorted(self._starts, pixels, side="right") - 1
+    def _counts(self, pixels: IntArray) -> IntArray:
+        """Return how many of some ascending pixels each sub-imager has."""
+        return np.diff(np.searchsorted(pixels, self._starts))

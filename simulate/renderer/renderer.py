@@ -126,16 +126,17 @@ class Renderer:
         self._parameters[self._texels] = mi.TensorXf(texels)
         self._parameters.update()
 
-    def expose(self, group: str, samples: int, seed: Callable[[int], int]) -> FloatArray:
+    def expose(self, group: str, samples: int, seed: Callable[[int], int], block: slice | None = None) -> FloatArray:
         """Return the readings of a group's pixels for each picture, (channels, pixels in the order of measurements).
 
         An infinite uniform target reads its own value: the light of a pixel's rays is divided by their weights. Pixels
         that no light can reach read NaN.
         samples : rays per pixel
         seed : the sampler's seed by the index of a sensor: of the group on the fast backends, else of the sub-imager
+        block : one of `blocks`, on the fast backends; else, and if absent, all pixels
         """
         if self._generators:
-            blocks = self.blocks(group, samples)
+            blocks = self.blocks(group, samples) if block is None else [block]
             rays = (self._rays(group, samples, seed, block) for block in blocks)
             return np.concatenate([self._readings(group, block) for block in rays])[None]
         images = [self._film(sensor, samples, seed(index)) for index, sensor in self._sensors[group].items()]

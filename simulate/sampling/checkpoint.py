@@ -40,7 +40,7 @@ class Checkpoint:
         return state if str(state.pop("fingerprint", "")) == self._fingerprint else {}
 
     def offer(self, latest: Callable[[], State]) -> None:
-        """Register the current state, which is written every 30 seconds or more and when the computation is interrupted."""
+        """Register the current state, written every 30 seconds or more, and when the computation is interrupted."""
         self._latest = latest
         if monotonic() - self._saved > self._spacing:
             self.save()

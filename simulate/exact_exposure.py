@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.camera import Camera
 
 from .renderer.renderer import Renderer
@@ -29,6 +29,7 @@ def expose_exactly(
         yield from renderer.expose_grid(rows, work, margin(camera, camera.sub_imagers[indices[0]].type), keys)
         return
     for index in indices:
-        pixels = np.arange(slices[index].stop - slices[index].start)
+        rows, columns = camera.sub_imagers[index].type.pixels
+        pixels: IntArray = np.arange(rows * columns)
         values = renderer.expose_alone(index, pixels, work, lambda number, index=index: seeds[number](index))
         yield slices[index], values

@@ -35,6 +35,6 @@ class Grid:
         draws = mi.sample_tea_32(first[0] + cell, first[1], ROUNDS)
         u, v = (mi.Float(draw >> (32 - BITS)) * 2.0**-BITS for draw in draws)
         margin, free = dr.opaque(mi.Float, self.margin), dr.opaque(mi.Float, 1 - 2 * self.margin)
-        inverse = dr.opaque(mi.Float, 1 / self.cells)
+        inverse: Any = dr.opaque(mi.Float, 1 / self.cells)
         column = cell - row * cells
-        return mi.Point2f(column + margin + free * u, row + margin + free * v) * inverse
+        return mi.Point2f((column + margin + free * u) * inverse, (row + margin + free * v) * inverse)

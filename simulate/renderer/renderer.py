@@ -87,7 +87,8 @@ class Renderer:
             }
         self._unit = 1.0  # radiance of a value of 1
         self.direct_only = False
-        self._texels, self._texture = "target.emitter.radiance.data", None
+        self._texels = "target.emitter.radiance.data"
+        self._texture: Any = None
         if world is None:
             texture: Any = mi.load_dict(self._black()) if fast else self._black()
             self._scene = mi.load_dict(scene_of(target_of(camera, texture)))

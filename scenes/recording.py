@@ -154,7 +154,13 @@ def flat_values(sensor: SensorTable, camera: Camera, response: FloatArray) -> Fl
 
 def expected_recording(sensor: SensorTable, camera: Camera, response: FloatArray, values: FloatArray) -> Recording:
     """The expected recording of light of `values`, (M,), by pixels of equal dark signal and response."""
-    level = flat_values(sensor, camera, response)
-    dark = np.full(camera.measurements, sensor.gain * dark_electrons(sensor) + sensor.black_level)
+    return expected_recording_of(sensor, flat_values(sensor, camera, response), response, values)
+
+
+def expected_recording_of(
+    sensor: SensorTable, level: FloatArray, response: FloatArray, values: FloatArray
+) -> Recording:
+    """The expected recording of light of `values` by some pixels, whose flat frames show a target of value `level`."""
+    dark = np.full(values.size, sensor.gain * dark_electrons(sensor) + sensor.black_level)
     digital, flat = (dark + sensor.gain * response * light for light in (values, level))
     return Recording(sensor, digital, dark, flat, level)

@@ -20,6 +20,7 @@ from ommatid.runtime.errors import InputError
 from .camera import Camera, derive
 from .formats import exr
 from .formats.provenance import checked
+from .lens_type import adjacent_slices
 from .recording import Recording
 from .scene import Scene, parse
 
@@ -125,16 +126,21 @@ def read(path: Path) -> Stack:
         raise InputError(f"{path}: holds variances below 0; make it again")
     if scene.sensor is None:
         return Stack(scene, camera, _joined(parts, "Y"), variance, record)
+    sizes = [sub.type.pixels[0] * sub.type.pixels[1] for sub in camera.sub_imagers]
     digital, dark, flat = (_joined(parts, name) for name in ("Y", *SENSOR_CHANNELS))
-    recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts))
+    recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts, sizes))
     return stack_from_recording(scene, camera, recording, variance, record)
 
 
 def _joined(parts: list[exr.Part], channel: str) -> FloatArray:
-    return np.concatenate([part.channels[channel].ravel() for part in parts]).astype(np.float64)
+    sizes = [part.channels[channel].size for part in parts]
+    joined = np.empty(sum(sizes))
+    for part, pixels in zip(parts, adjacent_slices(sizes), strict=True):
+        joined[pixels] = part.channels.pop(channel).ravel()  # released, so that no channel is held twice
+    return joined
 
 
-def _flat_values(path: Path, parts: list[exr.Part]) -> FloatArray:
+def _flat_values(path: Path, parts: list[exr.Part], sizes: list[int]) -> FloatArray:
     values = [part.record.get(FLAT_VALUE) for part in parts]
     for part, value in zip(parts, values, strict=True):
         if not isinstance(value, float) or not 0 < value < inf:
@@ -142,5 +148,4 @@ def _flat_values(path: Path, parts: list[exr.Part]) -> FloatArray:
                 f"{path}: part '{part.name}' should say {FLAT_VALUE}, the value of the flat frames' target, a number"
                 f" above 0, got {value!r}; make it again"
             )
-    sizes = [part.channels["Y"].size for part in parts]
     return np.repeat(np.array(values, dtype=np.float64), sizes)

@@ -5,33 +5,36 @@ A round renders those pixels of a sub-imager that need it (a stock sensor render
 its own: earlier rounds only determine how many samples it takes. A pixel is done once its variance, estimated from 16
 passes or more, is half of the allowed one, and rounds are planned for a quarter: so a variance that is underestimated
 by chance lets no bad pixel pass, and few rounds need another. Through pinholes, stratified samples make the variance
-fall like 1 / samples^1.5, since only those at the edges of pixels of f err; where the grid of samples fits these edges
-none do, except rays that float32 rounds across an edge. The seeds of a sub-imager do not depend on the other ones.
+fall like 1 / samples^1.5, since only those at the edges of pixels of f err. Where a grid of samples fits these edges
+none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.exact_grid`), and are
+done where these agree. The seeds of a sub-imager do not depend on the other ones.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from math import ceil, inf, log
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby
+from math import inf
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import posterior_variances
 
-from .noise_target import allowed_variance
+from .exact_exposure import expose_exactly
+from .noise_target import AllowedVariance, allowed_variance
 from .renderer.renderer import Renderer
 from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint, State
+from .sampling.exact_grid import exact_plan
 from .sampling.passes import (
-    FEWEST_PASSES,
     MOST_SAMPLES,
     Plan,
     Tally,
@@ -41,6 +44,7 @@ from .sampling.passes import (
     samples_within,
 )
 from .sampling.seeds import sampler_seeds
+from .sampling.sub_imager_progress import LEAPS, SubImagerProgress, mean_of_known
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
 LEAST = 256  # samples per pixel of a first round, at least
@@ -49,62 +53,9 @@ MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
 MOST_PASSES = 1024  # of all rounds of a sub-imager: they number its seeds
 EXPONENTS = {"independent": 1.0}  # of the fall of the variance with the samples of a pass, before it is measured
 STRATIFIED = 1.5  # the same for all other samplers
-STEEPEST = 2.0  # largest exponent that a measurement is trusted with
-LEAPS = (2.0, 64.0)  # least and largest growth of the samples from one round to the next
 
 REACHED = "reached"  # how a sub-imager ends; otherwise the reason why it could not:
 TIME, SAMPLES, FLOAT32 = "render.time is over", "no more samples are taken", "float32 rounds as much"
-
-
-@dataclass
-class SubImagerProgress:
-    """Progress of one sub-imager.
-
-    next, last : plans of the next round and of the last one
-    spent : samples of all rounds per pixel that was in each of them;  fewest : the same for the first pixel to be done
-    rays : of all rounds;  seeds : number of passes so far
-    scatter : variance of one pass of the last round, mean over the unfinished pixels
-    exponent : of its fall with the samples of a pass;  ended : why the sub-imager ended, "" before that
-    """
-
-    next: Plan
-    exponent: float
-    last: Plan = field(default_factory=lambda: Plan(0, 0))
-    rounds: int = 0
-    spent: int = 0
-    fewest: int = 0
-    rays: int = 0
-    seeds: int = 0
-    scatter: float = 0.0
-    ended: str = ""
-
-    @staticmethod
-    def from_json(values: dict[str, Any]) -> SubImagerProgress:
-        """Create the progress from its fields in JSON's types."""
-        fields: dict[str, Any] = {**values, **{name: Plan(**values[name]) for name in ("next", "last")}}
-        return SubImagerProgress(**fields)
-
-    def add_round(self, work: Plan, variance: FloatArray) -> None:
-        """Account for a round, from its plan and the variances of its pixels' means."""
-        scatter = _mean(variance) * work.passes
-        if self.scatter > 0 and scatter > 0 and work.samples > self.last.samples:
-            fall = log(self.scatter / scatter) / log(work.samples / self.last.samples)
-            self.exponent = min(max(fall, 1.0), STEEPEST)
-        self.last, self.rounds = work, self.rounds + 1
-        self.spent, self.seeds, self.rays = (
-            self.spent + work.total,
-            self.seeds + work.passes,
-            self.rays + work.total * variance.size,
-        )
-
-    def predicted_samples(self, factor: float, most: int) -> int:
-        """Predict the samples per pixel that divide the variance by `factor`, in passes of at most `most`."""
-        each = self.last.samples * (factor * self.last.passes / FEWEST_PASSES) ** (1 / self.exponent)
-        total = FEWEST_PASSES * each
-        if each > most:
-            total = most * self.last.passes * factor * (self.last.samples / most) ** self.exponent
-        fewest, largest = (leap * self.last.total for leap in LEAPS)
-        return ceil(min(max(total, fewest), largest))
 
 
 @dataclass(frozen=True)
@@ -129,11 +80,6 @@ class AdaptiveRendering:
         return self.details
 
 
-def _mean(variance: FloatArray) -> float:
-    known = variance[np.isfinite(variance)]
-    return float(known.mean()) if known.size else 0.0
-
-
 def render_until(
     setup: Setup,
     progress: Progress = no_progress,
@@ -154,15 +100,22 @@ def render_until(
     state = State() if checkpoint is None else checkpoint.state()
     rounds.resume(state)
     start = clock() - float(state.get("seconds", 0.0))
+
+    def save() -> None:
+        if checkpoint is not None:
+            checkpoint.offer(lambda: {**rounds.state(), "seconds": np.array(clock() - start)})
+
     limit = inf if scene.render.time is None else scene.render.time
+    for indices in rounds.exact:
+        ended = len(rounds.sub_imagers) - len(rounds.unfinished)
+        for done in rounds.render_exact(indices):
+            progress((ended + done * len(indices) / 2) / len(rounds.sub_imagers))
+        save()
     while unfinished := rounds.unfinished:
         for number, index in enumerate(unfinished):
             left = (limit - (clock() - start)) / (len(unfinished) - number)
             rounds.render_round(index, left, rounds.rays / max(clock() - start, 1e-9))
-            if checkpoint is not None:
-                # A whole state, so that an interruption within the next round finds it unchanged.
-                state = {**rounds.state(), "seconds": np.array(clock() - start)}
-                checkpoint.offer(lambda state=state: state)
+            save()
             progress(1 - len(rounds.unfinished) / len(rounds.sub_imagers))
     progress(1.0)
     details = {"variant": variant, **rounds.record()}
@@ -172,14 +125,18 @@ def render_until(
 class AdaptiveRounds:
     """The rounds of all sub-imagers: (M,) `mean` and `variance` of the last round of each."""
 
-    def __init__(self, setup: Setup, renderer: Renderer, allowed: Callable[[FloatArray], FloatArray]) -> None:
-        """Plan the first rounds. allowed : from the light, (M,), to the allowed variance, (M,)."""
+    def __init__(self, setup: Setup, renderer: Renderer, allowed: AllowedVariance) -> None:
+        """Plan the first rounds. allowed : from light on some measurements, and their slice, to its variance."""
         self._scene, self._camera, self._renderer, self._allowed = setup.scene, setup.camera, renderer, allowed
         self._slices = setup.camera.slices()
         self.mean, self.variance = np.zeros(setup.camera.measurements), np.zeros(setup.camera.measurements)
         self._open = np.ones(setup.camera.measurements, dtype=np.bool_)  # pixels that are not done
         exponent = EXPONENTS.get(setup.scene.render.sampler, STRATIFIED)
-        self.sub_imagers = [SubImagerProgress(self._grid(index, LEAST), exponent) for index in range(len(self._slices))]
+        self._world, flat, sampler = setup.world.simulated, setup.scene.world is None, setup.scene.render.sampler
+        numbers = range(len(self._slices))
+        self._exact = [exact_plan(self._world, index, sampler) if flat else None for index in numbers]
+        plans = [self._grid(index, LEAST) if exact is None else exact for index, exact in enumerate(self._exact)]
+        self.sub_imagers = [SubImagerProgress(work, exponent) for work in plans]
 
     @property
     def unfinished(self) -> list[int]:
@@ -191,18 +148,56 @@ class AdaptiveRounds:
         """Rays of all rounds."""
         return sum(sub.rays for sub in self.sub_imagers)
 
+    @property
+    def exact(self) -> list[list[int]]:
+        """Indices of the sub-imagers that a grid has yet to show without error; a list of those rendered together."""
+        waiting = [index for index, sub in enumerate(self.sub_imagers) if self._exact[index] and not sub.rounds]
+        types = groupby(waiting, lambda index: self._camera.sub_imagers[index].type.name)
+        return [list(indices) for _, indices in types]
+
+    def render_exact(self, indices: list[int]) -> Iterator[float]:
+        """Render adjacent sub-imagers of one lens type on their exact grid, and yield the finished share of them.
+
+        Pixels whose passes agree are done: their variance is float32's rounding. The others take part in the rounds.
+        """
+        work, seed = self.sub_imagers[indices[0]].next, self._scene.render.seed
+        seeds = [sampler_seeds(seed, "data", number, MOST_PASSES) for number in range(work.passes)]
+        rows = slice(self._slices[indices[0]].start, self._slices[indices[-1]].stop)
+        for part, values in expose_exactly(self._renderer, self._world, indices, work, seeds):
+            tally = Tally(part.stop - part.start)
+            for passed in values:
+                tally.add(passed)
+            mean, variance = tally.mean, tally.variance
+            floor = rounding_variance(mean, self._renderer.float32_samples(work.samples))
+            self.mean[part], self.variance[part] = mean, np.maximum(variance, floor)
+            self._open[part] = variance > floor
+            yield (part.stop - rows.start) / (rows.stop - rows.start)
+        for index in indices:
+            self.sub_imagers[index] = self._after_exact(index, work)
+
+    def _after_exact(self, index: int, work: Plan) -> SubImagerProgress:
+        sub, still = replace(self.sub_imagers[index]), self._open[self._slices[index]]
+        sub.add_round(work, np.zeros(still.size))
+        sub.fewest = 0 if still.all() else sub.spent
+        if still.any():
+            sub.next = self._grid(index, LEAST)
+        else:
+            self._end(sub, index, FLOAT32)
+        return sub
+
     def render_round(self, index: int, seconds: float = inf, speed: float = inf) -> None:
         """Render the next round of a sub-imager and plan the one after it, or end it.
 
         seconds : time limit of the round at `speed` rays per second; too little for a useful round ends it instead
         """
-        sub, start = self.sub_imagers[index], self._slices[index].start
+        sub, start = replace(self.sub_imagers[index]), self._slices[index].start
         pixels = np.flatnonzero(self._open[self._slices[index]])
         work = sub.next
         if sub.rounds and seconds < inf:
             work = self._affordable(index, seconds * speed / pixels.size)
             if work.total < LEAPS[0] * sub.last.total:
-                self._end(index, TIME)
+                self._end(sub, index, TIME)
+                self.sub_imagers[index] = sub
                 return
         seed, first = self._scene.render.seed, sub.seeds
         tally = Tally(pixels.size)
@@ -214,7 +209,9 @@ class AdaptiveRounds:
         self.mean[start + pixels] = tally.mean
         self.variance[start + pixels] = np.maximum(posterior_variances(tally.variance, work.passes), floor)
         sub.add_round(work, tally.variance)
-        self._plan_next(index, start + pixels)
+        still = self._plan_next(sub, index, pixels)
+        # An interruption before this leaves a state from which the round is repeated.
+        self._open[start + pixels], self.sub_imagers[index] = still, sub
 
     def _affordable(self, index: int, samples: float) -> Plan:
         """Return the next round's plan, or one of about `samples` per pixel if that is less."""
@@ -224,31 +221,33 @@ class AdaptiveRounds:
         less = self._grid(index, max(int(samples), 1), wanted.samples)
         return less if less.total < wanted.total else wanted
 
-    def _plan_next(self, index: int, rows: IntArray) -> None:
-        """Determine which of the rendered pixels are not done, and the plan of their next round."""
-        sub, allowed = self.sub_imagers[index], self._allowed(self.mean)[rows]
+    def _plan_next(self, sub: SubImagerProgress, index: int, pixels: IntArray) -> BoolArray:
+        """Plan the next round of a sub-imager, and return True for those of the rendered pixels that are not done."""
+        rows = self._slices[index]
+        mean, variance = self.mean[rows][pixels], self.variance[rows][pixels]
         # No number of samples gets below the rounding.
         fewest = self._renderer.float32_samples(self._grid(index, LEAST).samples)
-        target = np.maximum(allowed, rounding_variance(self.mean[rows], fewest) / AIM)
-        self._open[rows] = still = self.variance[rows] > DONE * target  # False for NaN: pixels that receive no light
+        target = np.maximum(self._allowed(self.mean[rows], rows)[pixels], rounding_variance(mean, fewest) / AIM)
+        still = variance > DONE * target  # False for NaN: pixels that receive no light
         if not still.all() and not sub.fewest:
             sub.fewest = sub.spent
         if not still.any():
-            self._end(index, FLOAT32)
-            return
-        values, variance, target = self.mean[rows][still], self.variance[rows][still], target[still]
-        sub.scatter = _mean(variance) * sub.last.passes
+            self._end(sub, index, FLOAT32)
+            return still
+        values, variance, target = mean[still], variance[still], target[still]
+        sub.scatter = mean_of_known(variance) * sub.last.passes
         float64 = self._renderer.float32_samples(2) == 1
         most = MOST_EXACT if float64 else min(samples_within(values, AIM * target), MOST_SAMPLES)
         total = sub.predicted_samples(float((variance / (AIM * target)).max()), most)
         sub.next = self._grid(index, min(total, MOST), most)
         if sub.next.total < LEAPS[0] * sub.last.total or sub.seeds + sub.next.passes > MOST_PASSES:
-            self._end(index, SAMPLES)
+            self._end(sub, index, SAMPLES)
+        return still
 
-    def _end(self, index: int, why: str) -> None:
+    def _end(self, sub: SubImagerProgress, index: int, why: str) -> None:
         """End a sub-imager: its target is reached, or it is not for the reason `why`."""
-        sub, rows = self.sub_imagers[index], self._slices[index]
-        beyond = self.variance[rows] > self._allowed(self.mean)[rows]
+        rows = self._slices[index]
+        beyond = self.variance[rows] > self._allowed(self.mean[rows], rows)
         sub.ended, sub.fewest = why if beyond.any() else REACHED, sub.fewest or sub.spent
 
     def _grid(self, index: int, samples: int, most: int = MOST_SAMPLES) -> Plan:
@@ -259,8 +258,7 @@ class AdaptiveRounds:
     def state(self) -> State:
         """Return the arrays of a checkpoint."""
         courses = json.dumps([asdict(sub) for sub in self.sub_imagers])
-        mean, variance, still = self.mean.copy(), self.variance.copy(), self._open.copy()
-        return {"mean": mean, "variance": variance, "open": still, "courses": np.array(courses)}
+        return {"mean": self.mean, "variance": self.variance, "open": self._open, "courses": np.array(courses)}
 
     def resume(self, state: State) -> None:
         """Continue from a checkpoint, if it is not empty."""

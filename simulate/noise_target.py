@@ -8,10 +8,11 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.recording import expected_recording
+from ommatid.scenes.recording import expected_recording_of, flat_values
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
+AllowedVariance = Callable[[FloatArray, slice], FloatArray]  # of light on some measurements, and their slice
 SHARE = 0.1  # of the sensor's variance
 
 
@@ -26,8 +27,8 @@ def check_noise_target(scene: Scene) -> None:
         )
 
 
-def allowed_variance(setup: Setup) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from the light on all pixels, (M,), to the allowed variance of its rendering, (M,).
+def allowed_variance(setup: Setup) -> AllowedVariance:
+    """Return the function from light on some measurements, and their slice, to the allowed variance of its rendering.
 
     NaN where a pixel receives no light. Raises InputError if the sensor adds no noise.
     """
@@ -35,13 +36,15 @@ def allowed_variance(setup: Setup) -> Callable[[FloatArray], FloatArray]:
     sensor, noise = setup.scene.sensor, setup.scene.noise
     if sensor is None:
         known = 0.0 if noise is None else noise.variance + noise.quantisation_variance
-        return lambda light: np.full(light.shape, SHARE * known)
+        return lambda light, _: np.full(light.shape, SHARE * known)
     from .sensor.response import response
 
     electrons = response(setup)
+    level = flat_values(sensor, setup.camera, electrons)
 
-    def of_sensor(light: FloatArray) -> FloatArray:
+    def of_sensor(light: FloatArray, rows: slice) -> FloatArray:
         values = np.maximum(np.nan_to_num(light), 0.0)
-        return SHARE * expected_recording(sensor, setup.camera, electrons, values).noise_variance(values)
+        expected = expected_recording_of(sensor, level[rows], electrons[rows], values)
+        return SHARE * expected.noise_variance(values)
 
     return of_sensor

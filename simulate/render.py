@@ -23,7 +23,7 @@ from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint
-from .sampling.passes import OverPasses, Plan, Tally, plan, rounding_variance
+from .sampling.passes import OverPasses, Plan, plan, rounding_variance
 from .sampling.seeds import sampler_seeds
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
@@ -42,16 +42,13 @@ class Rendering(OverPasses):
 
     def stated_variance(self, camera: Camera) -> FloatArray:
         """Return the variance, (M,), shrunk among pixels with like neighbours, and never below float32's rounding."""
-        around = np.concatenate(
-            [
-                mean_of_neighbours(self.variance[pixels].reshape(sub.type.pixels)).ravel()
-                for sub, pixels in zip(camera.sub_imagers, camera.slices(), strict=True)
-            ]
-        )
-        shrunk = [
-            posterior_variances_among(self.variance[part], around[part], self.passes) for part in camera.type_slices()
-        ]
-        return np.maximum(np.concatenate(shrunk), rounding_variance(self.mean, self.samples))
+        stated = np.empty_like(self.variance)
+        for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
+            images = self.variance[rows].reshape(lens_type.count, *lens_type.pixels)
+            around = np.concatenate([mean_of_neighbours(image).ravel() for image in images])
+            shrunk = posterior_variances_among(self.variance[rows], around, self.passes)
+            stated[rows] = np.maximum(shrunk, rounding_variance(self.mean[rows], self.samples))
+        return stated
 
 
 def mean_of_neighbours(image: FloatArray) -> FloatArray:
@@ -95,9 +92,10 @@ def light(
     work : passes and their samples; None: as the scene's `render.samples` asks
     Raises InputError if the requested variant does not work here, ValueError if the samples are "auto".
     """
+    from .film_bands import render_bands
     from .renderer.renderer import Renderer
 
-    scene, camera = setup.scene, setup.camera
+    scene = setup.scene
     if scene.render.samples == "auto":
         raise ValueError("expected a number of samples, got 'auto', which `render_until` renders")
     variant = choose(scene.render.variant)
@@ -105,25 +103,14 @@ def light(
     world = None if scene.world is None else scene
     renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=world)
     renderer.set_target(setup.world.image)
-    tally = Tally(camera.measurements)
-    if checkpoint is not None:
-        tally.resume("light", checkpoint.state())
-    for number in range(tally.count, work.passes):
-        values = np.empty(camera.measurements)
-        for group in renderer.groups:
-            seed = sampler_seeds(scene.render.seed, "data", number, work.passes)
-            values[renderer.rows(group)] = renderer.expose(group, work.samples, seed)[0]
-        tally.add(values)
-        if checkpoint is not None:
-            checkpoint.offer(lambda: tally.state("light"))
-        progress((number + 1) / work.passes)
+    mean, variance = render_bands(renderer, scene.render.seed, work, progress, checkpoint)
     return Rendering(
         passes=work.passes,
         samples=work.samples,
         variant=variant,
         first_seed=sampler_seeds(scene.render.seed, "data", 0, work.passes)(0),
-        mean=tally.mean,
-        variance=tally.variance,
+        mean=mean,
+        variance=variance,
         direct_only=renderer.direct_only,
     )
 

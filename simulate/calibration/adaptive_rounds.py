@@ -20,10 +20,11 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
-from ..adaptive_render import EXPONENTS, STEEPEST, STRATIFIED
+from ..adaptive_render import EXPONENTS, STRATIFIED
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import MOST_SAMPLES, cells_of, on_grid
+from ..sampling.sub_imager_progress import STEEPEST
 from .entries import rendered_model
 from .point_sources import Plans
 from .stopping_rule import StoppingRule

@@ -7,7 +7,7 @@ from math import atan, degrees
 from typing import Any
 
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.lens_type import SubImager
+from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Sampler
 
 from ..sampling.samplers import fitting
@@ -54,6 +54,19 @@ def stock_sensor(
         "to_world": mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0]),
         "film": film(columns, rows, channels),
         "sampler": {"type": sampler, "sample_count": fitting(sampler, samples)},
+    }
+
+
+def stock_sensors(
+    camera: Camera, types: tuple[LensType, ...], sampler: Sampler, channels: int, far: float
+) -> dict[int, Any]:
+    """Create Mitsuba's sensors of the sub-imagers of some lens types, by their number in the camera."""
+    import mitsuba as mi
+
+    return {
+        index: mi.load_dict(stock_sensor(camera, sub, sampler, 16, channels, far))
+        for index, sub in enumerate(camera.sub_imagers)
+        if sub.type in types
     }
 
 

@@ -1,7 +1,8 @@
 """Rays of all sensor pixels on Mitsuba's fast backends, with a given number per pixel, all started together.
 
 The samples of one pixel are adjacent lanes, so that a pixel's sum is the sum of a block, in float64 and the same on any
-number of threads. A random number is drawn for an effect only if the lenses have it: two for the position in the pixel,
+number of threads. Positions of pixels are computed for one block at a time, so that memory does not grow with the film.
+A random number is drawn for an effect only if the lenses have it: two for the position in the pixel,
 two more for an aperture, one more for several wavelengths, and without walls one for the lens. Lengths are
 millimetres.
 """
@@ -16,11 +17,12 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.layout.pixel_places import PixelPlaces
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.pose import corner_offset, poses
 from ommatid.scenes.scene import Sampler
 
 from ..sampling.samplers import RELATED_DRAWS, fitting
+from .grid import Grid
 from .lens import Distance, LensModel, ThinLens
 from .reseeded_sampler import ReseededSampler
 
@@ -53,24 +55,22 @@ class RayGenerator:
 
         has_world : True if the sampler is also used for what the rays meet
         """
-        import drjit as dr
         import mitsuba as mi
 
         self._sampler_name: Sampler = sampler
         self._has_world = has_world
         self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": fitting(sampler, 16)})
-        self.pixels = sum(lens_type.measurements for lens_type in types)
         self.lens = lens_of(camera, types[0])
-        self._tables = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in _tables(camera, types)]
-        dr.make_opaque(self._tables)
+        self._places = PixelPlaces(camera, types)
+        self.pixels = self._places.count
+        self._loaded: tuple[slice, list[Any], Any] | None = None  # of the last block of all pixels
         self._pitch = float(camera.pixel_pitch)
-        self._crossing, self._own = None, None
+        self._crossing = None
         if not camera.walls:
             from .crosstalk import Crosstalk
 
             models = {lens_type.name: lens_of(camera, lens_type) for lens_type in camera.types}
             self._crossing = Crosstalk(camera, models)
-            self._own = mi.UInt32(own_lenses(camera, types).astype(np.uint32))
             self.lens.tail = self._crossing.tail
 
     def follow(self, distance: Distance) -> None:
@@ -90,63 +90,76 @@ class RayGenerator:
         since Mitsuba seeds by the first lane of each wavefront. The passes of one pixel are adjacent.
         subset : pixels that the block selects from; None: all
         """
-        import drjit as dr
-        import mitsuba as mi
 
         samples = fitting(self._sampler_name, samples)
         self.sampler.set_sample_count(samples)
         self.sampler.set_samples_per_wavefront(samples)
         lanes = (block.stop - block.start) * passes * samples
         self.sampler.seed(seed, lanes)
-        each = dr.opaque(mi.UInt32, passes * samples)
-        index = dr.arange(mi.UInt32, lanes) // each + dr.opaque(mi.UInt32, block.start)
-        if subset is not None:
-            index = dr.gather(mi.UInt32, mi.UInt32(subset.astype(np.uint32)), index)
-        corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in self._tables)
-        at = self.sampler.next_2d() * self._pitch
+        draws = ReseededSampler(self.sampler, seed, lanes)
+        places = self._load(block, subset)
+        ray, weight = self._emit(places, passes * samples, lanes, self.sampler.next_2d(), draws)
+        if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
+            draws.reseeded()
+        return Rays(ray, weight, samples)
+
+    def grid_rays(self, grid: Grid, passes: int, keys: IntArray, pixels: IntArray) -> Rays:
+        """Start one ray per cell of a grid over each pixel and pass, of pinholes, by random numbers of each pixel.
+
+        The numbers depend on the key of a pixel's sub-imager and pass, and on the pixel's place in the sub-imager.
+        keys : (sub-imagers of the camera, passes) of 32 bits;  pixels : of the group. The passes of one are adjacent.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        lanes = pixels.size * passes * grid.cells**2
+        lane = dr.arange(mi.UInt32, lanes)
+        of_pass = lane // dr.opaque(mi.UInt32, grid.cells**2)
+        numbers, own = self._places.numbers(pixels)
+        key = mi.UInt32(keys[own].astype(np.uint32).ravel())
+        number = dr.gather(mi.UInt32, mi.UInt32(numbers.astype(np.uint32)), of_pass // dr.opaque(mi.UInt32, passes))
+        at = grid.position(lane, dr.gather(mi.UInt32, key, of_pass), number)
+        places = self._load(slice(0, pixels.size), pixels)
+        ray, weight = self._emit(places, passes * grid.cells**2, lanes, at, None)
+        return Rays(ray, weight, grid.cells**2)
+
+    def _load(self, block: slice, subset: IntArray | None) -> tuple[list[Any], Any]:
+        """Load the places of the pixels of a block: coordinates and axes, and the number of each pixel's lens."""
+        import mitsuba as mi
+
+        if subset is None and self._loaded is not None and self._loaded[0] == block:
+            return self._loaded[1:]
+        pixels = np.arange(block.start, block.stop) if subset is None else subset[block]
+        coordinates = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in self._places.at(pixels)]
+        own = mi.UInt32(self._places.numbers(pixels)[1].astype(np.uint32))
+        if subset is None:
+            self._loaded = block, coordinates, own
+        return coordinates, own
+
+    def _emit(self, places: tuple[list[Any], Any], each: int, lanes: int, at: Any, draws: Any) -> tuple[Any, Any]:
+        """Return Mitsuba's rays, `each` per pixel, from points `at` of pixels, each in [0, 1)^2, and their weights."""
+        import drjit as dr
+        import mitsuba as mi
+
+        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
+        corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in places[0])
+        at = at * self._pitch
         if axes:
             x = corner_x + axes[0] * at.x + axes[1] * at.y
             y = corner_y + axes[2] * at.x + axes[3] * at.y
             z = corner_z + axes[4] * at.x + axes[5] * at.y
         else:
             x, y, z = corner_x + at.x, corner_y + at.y, corner_z
-        draws = ReseededSampler(self.sampler, seed, lanes)
         if self._crossing is None:
             start, direction, weight = self.lens.emit(x, y, -z, draws, (lens_x, lens_y))
         else:
-            own = dr.gather(mi.UInt32, self._own, index)
+            own = dr.gather(mi.UInt32, places[1], index)
             start, direction, weight = self._crossing.emit(own, (x, y, -z), draws, (lens_x, lens_y))
-        if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
-            draws.reseeded()
         ray = dr.zeros(mi.RayDifferential3f, lanes)
         ray.o = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
         ray.d = dr.normalize(mi.Vector3f(*direction))
         ray.maxt = dr.largest(mi.Float)
-        return Rays(ray, weight, samples)
-
-
-def _tables(camera: Camera, types: tuple[LensType, ...]) -> list[FloatArray]:
-    """Return rows of (pixels,): x, y, z of each pixel's corner from its lens, x and y of the lens, and the axes of the
-    patch where patches are tilted or rotated."""
-    turned = camera.tolerance is not None or any(lens_type.is_rotated for lens_type in camera.types)
-    parts: list[FloatArray] = []
-    for sub, pose in zip(camera.sub_imagers, poses(camera), strict=True):
-        if sub.type not in types:
-            continue
-        row, column = (index.ravel() for index in np.indices(sub.type.pixels))
-        u, v = corner_offset(camera, sub)
-        corner = np.stack([u + column * camera.pixel_pitch, v + row * camera.pixel_pitch])
-        constant = [*pose.lens, *(pose.axes.ravel() if turned else ())]
-        constants = np.repeat(np.array(constant)[:, None], row.size, axis=1)
-        parts.append(np.concatenate([pose.middle[:, None] + pose.axes @ corner, constants]))
-    return list(np.concatenate(parts, axis=1))
-
-
-def own_lenses(camera: Camera, types: tuple[LensType, ...]) -> IntArray:
-    """Return the number of each pixel's sub-imager in the camera, (pixels,)."""
-    numbers = [np.full(rows.stop - rows.start, number) for number, rows in enumerate(camera.slices())]
-    chosen = zip(camera.sub_imagers, numbers, strict=True)
-    return np.concatenate([number for sub, number in chosen if sub.type in types])
+        return ray, weight
 
 
 def lens_of(camera: Camera, lens_type: LensType) -> LensModel:

@@ -9,7 +9,8 @@ and can round up to the next one's.) Around the target, or instead of it, there 
 # pyright: basic
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from math import isqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +25,8 @@ from ommatid.scenes.scene import Sampler, Scene
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting
 from ..sampling.seeds import seed_of
-from .plugins import BLOCK, scene_of, stock_sensor, target_of, texture_of
+from .grid import Grid
+from .plugins import BLOCK, scene_of, stock_sensor, stock_sensors, target_of, texture_of
 from .variant import activate, check_fast_variant
 
 if TYPE_CHECKING:
@@ -70,7 +72,6 @@ class Renderer:
             self.groups = {"camera": camera.types}
         self.channels = 3 if variant.endswith("rgb") and world is None else 1
         self.exact_below = EXACT_SUMS[fast]
-        self._far = 2.0 if world is None else FAR
         self._generators: dict[str, RayGenerator] = {}
         self._sensors: dict[str, dict[int, Any]] = {}
         if fast:
@@ -80,16 +81,27 @@ class Renderer:
                 group: RayGenerator(camera, types, sampler, world is not None) for group, types in self.groups.items()
             }
         else:
-            self._sensors = {group: self._stock_sensors(types, sampler) for group, types in self.groups.items()}
+            far = 2.0 if world is None else FAR
+            self._sensors = {
+                group: stock_sensors(camera, types, sampler, self.channels, far) for group, types in self.groups.items()
+            }
         self._unit = 1.0  # radiance of a value of 1
         self.direct_only = False
         self._texels = "target.emitter.radiance.data"
+        self._texture: Any = None
         if world is None:
-            self._scene = mi.load_dict(scene_of(target_of(camera, self._black())))
+            texture: Any = mi.load_dict(self._black()) if fast else self._black()
+            self._scene = mi.load_dict(scene_of(target_of(camera, texture)))
+            self._texture = texture if fast else None
             self._integrator: Any = self._scene.integrator()
         else:
             self._build_world(world, variant)
         self._parameters = mi.traverse(self._scene)
+
+    @property
+    def is_fast(self) -> bool:
+        """True on the backends where the rays of many pixels start together."""
+        return bool(self._generators)
 
     @property
     def has_equal_weights(self) -> bool:
@@ -116,7 +128,12 @@ class Renderer:
         self._parameters.update()
 
     def expose(
-        self, group: str, samples: int, seed: Callable[[int], int], subset: IntArray | None = None
+        self,
+        group: str,
+        samples: int,
+        seed: Callable[[int], int],
+        subset: IntArray | None = None,
+        block: slice | None = None,
     ) -> FloatArray:
         """Return the readings of a group's pixels for each picture, (channels, pixels in the order of measurements).
 
@@ -125,9 +142,10 @@ class Renderer:
         samples : rays per pixel
         seed : the sampler's seed by the index of a sensor: of the group on the fast backends, else of the sub-imager
         subset : pixels of the group; None: all of them
+        block : one of `blocks`, on the fast backends; else, and if absent, all of them
         """
         if self._generators:
-            blocks = self.blocks(group, samples, subset)
+            blocks = self.blocks(group, samples, subset) if block is None else [block]
             rays = (self._rays(group, samples, seed, block, subset) for block in blocks)
             return np.concatenate([self._readings(group, block) for block in rays])[None]
         images = [self._film(sensor, samples, seed(index)) for index, sensor in self._sensors[group].items()]
@@ -162,6 +180,21 @@ class Renderer:
             parts.append(self._readings(group, rays).reshape(-1, work.passes).T)
         return np.concatenate(parts, axis=1)
 
+    def expose_grid(self, rows: slice, work: Plan, margin: float, keys: IntArray) -> Iterator[tuple[slice, FloatArray]]:
+        """Yield the readings of pixels of one group, by blocks: measurements, and (passes, pixels).
+
+        work : passes with a square number of samples, in whose cells they keep a `margin` to the edges
+        keys : of each sub-imager of the camera and pass, from which the random numbers of its pixels follow. Values do
+            not depend on which others are rendered. Only on the fast backends, and for pinholes.
+        """
+        group, first = next((name, at.start) for name in self.groups if (at := self.rows(name)).stop >= rows.stop)
+        generator = self._generators[group]
+        grid = Grid(isqrt(work.samples), margin)
+        for block in generator.blocks(work.total, rows.stop - rows.start):
+            part = slice(rows.start + block.start, rows.start + block.stop)
+            rays = generator.grid_rays(grid, work.passes, keys, np.arange(part.start - first, part.stop - first))
+            yield part, self._readings(group, rays).reshape(-1, work.passes).T
+
     def blocks(self, group: str, samples: int, subset: IntArray | None = None) -> list[slice]:
         """Divide the pixels of a group into blocks whose rays start together. Only on the fast backends."""
         pixels = None if subset is None else subset.size
@@ -176,12 +209,23 @@ class Renderer:
     def _readings(self, group: str, rays: Rays) -> FloatArray:
         """Return the readings of the pixels of these rays: (pixels of the block,)."""
         sampler = self._generators[group].sampler
-        light = self._integrator.sample(self._scene, sampler, rays.ray, None, True)[0].x
+        if self._texture is None:
+            light = self._integrator.sample(self._scene, sampler, rays.ray, None, True)[0].x
+        else:
+            light = self._radiance(rays.ray)
         if rays.weight is None:
             return rays.sums(light)[0] / rays.samples / self._unit
         total, weight = rays.sums(light * rays.weight, rays.weight)
         share = self.captured(group) / self._unit
         return np.divide(total * share, weight, out=np.full(weight.size, np.nan), where=weight > 0)
+
+    def _radiance(self, ray: Any) -> Any:
+        """Return the target's radiance where rays meet it: what the integrator yields, in a third of the time."""
+        import mitsuba as mi
+
+        met = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        at = met.compute_surface_interaction(ray, int(mi.RayFlags.UV))
+        return self._texture.eval_1(at, at.is_valid())
 
     def depths(self, pinhole: Camera, seed: int) -> FloatArray:
         """Return the distance along z that a pinhole camera's only sub-imager sees at a point per pixel, (pixels,).
@@ -251,15 +295,6 @@ class Renderer:
         met = self._scene.ray_intersect_preliminary(ray, coherent=False)
         far = FAR * self.camera.distance
         return dr.minimum(dr.select(met.is_valid(), met.t * ray.d.z, far), far)
-
-    def _stock_sensors(self, types: tuple[LensType, ...], sampler: Sampler) -> dict[int, Any]:
-        import mitsuba as mi
-
-        return {
-            index: mi.load_dict(stock_sensor(self.camera, sub, sampler, 16, self.channels, self._far))
-            for index, sub in enumerate(self.camera.sub_imagers)
-            if sub.type in types
-        }
 
     def _black(self) -> dict[str, Any]:
         import mitsuba as mi

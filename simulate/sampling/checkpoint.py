@@ -18,6 +18,7 @@ from ommatid.scenes.formats import npz
 State = dict[str, NDArray[Any]]
 
 SPACING = 30.0  # seconds between two savings: the work that a power cut may lose
+SHARE = 0.02  # of the time, at most, that goes into saving: after a large state the next one waits longer
 
 
 class Checkpoint:
@@ -27,7 +28,7 @@ class Checkpoint:
         """Create the checkpoint of the result at `path`; nothing is read or written yet."""
         self._path = _beside(path)
         self._fingerprint = fingerprint
-        self._saved = monotonic()
+        self._saved, self._spacing = monotonic(), SPACING
         self._latest: Callable[[], State] | None = None
 
     def state(self) -> State:
@@ -39,15 +40,16 @@ class Checkpoint:
         return state if str(state.pop("fingerprint", "")) == self._fingerprint else {}
 
     def offer(self, latest: Callable[[], State]) -> None:
-        """Register the current state, which is written every 30 seconds and when the computation is interrupted."""
+        """Register the current state, written every 30 seconds or more, and when the computation is interrupted."""
         self._latest = latest
-        if monotonic() - self._saved > SPACING:
+        if monotonic() - self._saved > self._spacing:
             self.save()
 
     def save(self) -> None:
         """Write the state that was offered last. Raises MachineError."""
         if self._latest is None:
             return
+        start = monotonic()
         state = {**self._latest(), "fingerprint": np.array(self._fingerprint)}
 
         def fill(beside: Path) -> None:
@@ -56,6 +58,7 @@ class Checkpoint:
 
         write_whole(self._path, fill)
         self._saved = monotonic()
+        self._spacing = max(SPACING, (self._saved - start) / SHARE)
 
 
 def _beside(path: Path) -> Path:

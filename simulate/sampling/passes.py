@@ -107,11 +107,12 @@ class Tally:
             self._mean, self._squares = state[f"{name}.mean"], state[f"{name}.squares"]
 
     def add(self, values: FloatArray) -> None:
-        """Add one pass."""
-        self.count += 1
-        deviation = values - self._mean
-        self._mean += deviation / self.count
-        self._squares += deviation * (values - self._mean)
+        """Add one pass. An interruption leaves the tally as it was."""
+        deviation, count = values - self._mean, self.count + 1
+        mean = self._mean + deviation / count
+        deviation *= values - mean
+        deviation += self._squares
+        self.count, self._mean, self._squares = count, mean, deviation
 
     @property
     def mean(self) -> FloatArray:

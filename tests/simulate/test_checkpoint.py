@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from ommatid.simulate.cache import cached_model, cached_stack
 from ommatid.simulate.sampling import checkpoint
 from ommatid.simulate.sampling.checkpoint import Checkpoint, open_checkpoint
 
-from ..examples import scene
+from ..examples import VARIANTS, needs, scene
 
 
 class Interruption(Exception):
@@ -57,6 +58,31 @@ def test_a_rendering_continues(tmp_path: Path, fraction: float) -> None:
     np.testing.assert_array_equal(continued.variance, whole.variance)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["stack.exr", "whole.exr"]
     assert stack.read(tmp_path / "stack.exr").record["passes"] == 16
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_bands_change_no_bit_and_a_rendering_continues_within_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str
+) -> None:
+    """The film of 481 pixels is rendered in bands of at most 300, an interruption in the second of them."""
+    needs(variant)
+    render = tiny().scene.render.model_copy(update={"variant": variant})
+    setup = replace(tiny(), scene=tiny().scene.model_copy(update={"render": render}))
+    whole, _ = cached_stack(tmp_path / "whole.exr", setup, no_progress)
+    monkeypatch.setattr("ommatid.simulate.film_bands.BAND", 300)
+    monkeypatch.setattr("ommatid.simulate.renderer.rays.MOST_RAYS", 2**10)
+    with pytest.raises(KeyboardInterrupt):
+        cached_stack(tmp_path / "stack.exr", setup, after(0.7))
+    fractions: list[float] = []
+    continued, _ = cached_stack(tmp_path / "stack.exr", setup, fractions.append)
+    assert min(fractions) > 0.7
+    assert fractions == sorted(fractions)
+    monkeypatch.setattr("ommatid.simulate.film_bands.BAND", 10**6)
+    at_once, _ = cached_stack(tmp_path / "once.exr", setup, no_progress)
+    np.testing.assert_array_equal(continued.values, at_once.values)
+    np.testing.assert_array_equal(continued.variance, at_once.variance)
+    if variant.startswith("scalar"):  # elsewhere the streams of samplers follow from the rays that start together
+        np.testing.assert_array_equal(continued.values, whole.values)
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.6])
@@ -109,3 +135,23 @@ def test_checkpoints_are_written_regularly(tmp_path: Path, monkeypatch: pytest.M
         one.offer(lambda: {"done": np.array(1)})
         assert Checkpoint(tmp_path / "result", "mine").state()["done"] == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_large_checkpoints_take_a_small_share_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A state that takes 3 s to write is written again only when 50 times as much time is over."""
+    now, writes = [0.0], list[float]()
+
+    def write(path: Path, fill: object) -> None:
+        del path, fill
+        writes.append(now[0])
+        now[0] += 3.0
+
+    monkeypatch.setattr(checkpoint, "monotonic", lambda: now[0])
+    monkeypatch.setattr(checkpoint, "write_whole", write)
+    kept = Checkpoint(tmp_path / "result", "mine")
+    while now[0] < 1000:
+        now[0] += 1.0
+        kept.offer(dict)
+    assert writes[0] == pytest.approx(31)
+    assert all(later - earlier >= 3 / checkpoint.SHARE for earlier, later in pairwise(writes))
+    assert 3.0 * len(writes) <= 2 * checkpoint.SHARE * now[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output import run_json
@@ -13,7 +14,9 @@ from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
 
 from .data import read_run
-from .point_response import IdealMatrix
+
+if TYPE_CHECKING:
+    from .point_response import IdealMatrix  # imports Bokeh
 
 REPORT = "report.html"
 HERE = Path(__file__).parent

@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse, special
 
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.runtime.processors import processors
@@ -62,7 +62,7 @@ class GeometryFit:
     def chance(self) -> float:
         """Probability of a sum of squares at least as large if the model is correct."""
         ratio = self.left / self.expected
-        return float(stats.f.sf(ratio, self.freedom, self.freedom * (len(self.deviations) - 1)))
+        return float(special.fdtrc(self.freedom, self.freedom * (len(self.deviations) - 1), ratio))
 
     @property
     def deviation(self) -> FloatArray:

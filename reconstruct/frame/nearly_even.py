@@ -5,7 +5,7 @@ Let C = K^-1 for the mean weight w of each lens type, let (1 + d_i) w be the wei
     p_ij = w (C h_i)_j^2 / C_jj
 
 its share in the variance of pixel j. Far from the edges shares do not depend on the place, and add up to 1 less what
-the prior brings. The diagonal of K^-1 is convex in the weights, and weights other than the best ones do no better, so that
+the prior brings. The diagonal of K^-1 is convex in the weights, and weights other than the best do no better, so that
 
     1 - sum of p d  <=  variance / C_jj  <=  1 - sum of p d / (1 + d).
 

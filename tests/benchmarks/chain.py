@@ -1,4 +1,4 @@
-"""The whole chain from picture to page, stage by stage: `python -m tests.benchmarks chain [SIZE...] [--cases NAME,...]`.
+"""The whole chain from picture to page, stage by stage: `python -m tests.benchmarks chain [SIZE...] [--cases NAMES]`.
 
 Every case is a command `ommatid run` in a process of its own, whose time, processor time, peak memory and files are
 measured from outside, and whose stages come from run.json. Frames of 60 k - 1 pixels a side are seen by all three lens

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse, stats
+from scipy import sparse, special
 
 from ommatid.runtime.arrays import FloatArray
 
@@ -129,7 +129,7 @@ def interval(mean: float, variance: float, count: int) -> Interval:
     if variance <= 0:
         return Interval(mean / count, mean / count, mean / count)
     shape, scale = mean**2 / variance, variance / mean
-    low, high = (float(stats.gamma.ppf(level, shape, scale=scale)) for level in COVERAGE)
+    low, high = (float(special.gammaincinv(shape, level)) * scale for level in COVERAGE)
     return Interval(mean / count, low / count, high / count, variance / count**2)
 
 

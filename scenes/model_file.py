@@ -53,9 +53,8 @@ def write(path: Path, model: Model) -> None:
     record = json.dumps({"description": description, "sha256": _seal(arrays, description)})
 
     def fill(beside: Path) -> None:
-        with beside.open("wb") as stream:
-            savez: Any = np.savez_compressed
-            savez(stream, format=np.array(layout), _is_array=np.array(True), ommatid=record, **arrays)
+        members = {"format": np.array(layout), "_is_array": np.array(True), "ommatid": np.array(record), **arrays}
+        npz.write(beside, members)
         try:
             _arrays(beside)
         except InputError as error:

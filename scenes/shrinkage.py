@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from scipy import ndimage, optimize, signal, special
+from scipy import ndimage, optimize, special
 
 from ommatid.runtime.arrays import FloatArray
 
@@ -51,8 +51,11 @@ def posterior_variances(variance: FloatArray, repeats: int) -> FloatArray:
     middles = logarithms.min() + step * (np.arange(counts.size) - 3 * KERNEL + 0.5)
     density = ndimage.gaussian_filter1d(counts, KERNEL, mode="constant", truncate=3)
     # The integral from one bin on is that from the next on, times e^(1 - v/2) per unit of the logarithm, and its own.
-    ratio = np.exp((1 - freedom / 2) * step)
-    above = signal.lfilter([1.0], [1.0, -ratio], density[::-1])[::-1] - density / 2
+    ratio = float(np.exp((1 - freedom / 2) * step))
+    above, beyond = np.empty_like(density), 0.0
+    for index in range(density.size - 1, -1, -1):
+        above[index] = beyond = float(density[index]) + ratio * beyond
+    above -= density / 2
     shrinkage = np.divide(freedom / 2 * step * above, density, out=np.zeros_like(above), where=density > 0)
     # Where the density is small it is uncertain, and the means rise: neighbours are averaged until they do.
     means = np.exp(middles[0]) * _isotonic(np.exp(middles - middles[0]) * shrinkage, density)

@@ -39,7 +39,8 @@ def document(ended: Ended) -> Any:
 def numbers(description: dict[str, Any]) -> dict[str, Any]:
     """A run's description without names, fingerprints and times."""
     kept = {key: value for key, value in description.items() if key not in ("fingerprint", "scene", "file", "spent")}
-    stages = {name: {**stage, "seconds": None} for name, stage in description["stages"].items()}
+    computing = ("render", "calibrate", "reconstruct")
+    stages = {name: {**description["stages"][name], "seconds": None} for name in computing}
     return {**kept, "stages": stages}
 
 

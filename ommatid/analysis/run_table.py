@@ -84,6 +84,8 @@ def _stage_rows(report: RunReport) -> list[Row]:
             details.append(f"{_method(report.solver)}, {report.unknowns} unknowns")
         label = "import" if stage.method == "imported" else name
         lines.append((f"{label}, seconds", ", ".join([f"{stage.seconds:.2f}", *details])))
+    if report.spent.start_up is not None:
+        lines.append(("start-up, seconds", f"{report.spent.start_up:.2f}"))
     return lines
 
 

@@ -28,10 +28,14 @@ LAST = "run.json"  # is written last, since it vouches for the other files
 
 @dataclass(frozen=True)
 class RunObserver:
-    """Callbacks of a run: `progress` yields a context for a stage; `done` takes a stage and True if it was executed."""
+    """Callbacks of a run: `progress` yields a context for a stage; `done` takes a stage and True if it was executed.
+
+    start_up : returns the seconds since the process started; None where it runs other scenes, too
+    """
 
     progress: Callable[[str], AbstractContextManager[Progress]]
     done: Callable[[str, bool], None]
+    start_up: Callable[[], float] | None = None
 
 
 Stages = Callable[[Setup, Path, RunObserver], dict[str, Any]]

@@ -73,11 +73,15 @@ def progress_bar(stage: str) -> Generator[Progress]:
         yield lambda fraction: bar.update(task, completed=fraction)
 
 
-def observer(folder: Path) -> RunObserver:
-    """Create the observer that shows the progress of a run in `folder`, and says which stages are done."""
+def observer(folder: Path, *, alone: bool = False) -> RunObserver:
+    """Create the observer that shows the progress of a run in `folder`, and says which stages are done.
+
+    alone : True if the process runs this scene alone, so that its start belongs to the run
+    """
     from ommatid.batch.remote import RunObserver
+    from ommatid.runtime.processors import seconds_since_start
 
     def done(stage: str, made: bool) -> None:
         say_done(stage, made, folder / FILE_OF_STAGE[stage] if stage in FILE_OF_STAGE else None)
 
-    return RunObserver(progress_bar, done)
+    return RunObserver(progress_bar, done, seconds_since_start if alone else None)

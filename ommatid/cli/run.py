@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -55,7 +56,8 @@ def run(
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
     stages, workers = stages_within(within, members, STARTED, output.say, scheduler, workers)
-    batch = scene_batch(*asked, stages, output.observer, report)
+    observer = partial(output.observer, alone=len(members) == 1)
+    batch = scene_batch(*asked, stages, observer, report)
     pool = scheduler, workers
     outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder)
     finish_batch(outcome, as_json, strict)

@@ -5,15 +5,20 @@ from __future__ import annotations
 import hashlib
 import re
 from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
 
 from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.time_spent import without_page
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
 
 from .data import read_run
-from .point_response import IdealMatrix
+
+if TYPE_CHECKING:
+    from .point_response import IdealMatrix  # imports Bokeh
 
 REPORT = "report.html"
 HERE = Path(__file__).parent
@@ -29,12 +34,14 @@ def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
     recorded = stack.read(folder / "stack.exr")
     bench = next(bench_tables(folder, recorded.camera.describe()), None)
     described = None if bench is None else bench.describe()
-    stamp = fingerprint([run_json.read(folder).plain(), described, versions("bokeh"), sources_digest()])
+    stamp = fingerprint([without_page(run_json.read(folder)), described, versions("bokeh"), sources_digest()])
 
     def make() -> str:
+        begun = perf_counter()
         from .document import page  # imports Bokeh
+        from .tables import with_page_time
 
-        return page(read_run(folder, recorded), ideal, bench, stamp)
+        return with_page_time(page(read_run(folder, recorded), ideal, bench, stamp), perf_counter() - begun)
 
     return cached(folder / REPORT, stamp, read_stamp, make, write_text)[1]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from ommatid.runtime.arrays import FloatArray
 
@@ -55,7 +55,7 @@ def groups(run: Run) -> list[ErrorGroup]:
 def _group(errors: FloatArray, variances: FloatArray) -> ErrorGroup:
     predicted = float(np.sqrt(variances.mean()))
     low, high = (
-        predicted * float(np.sqrt(stats.chi2.ppf(quantile, errors.size) / errors.size))
+        predicted * float(np.sqrt(2 * special.gammaincinv(errors.size / 2, quantile) / errors.size))
         for quantile in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
     )
     return ErrorGroup(int(errors.size), predicted, float(np.sqrt(errors.mean())), low, high)

@@ -217,8 +217,9 @@ def document(figures: Sequence[Any]) -> str:
     The same figures always give the same text: Bokeh numbers its models through a process, and they are renumbered.
     """
     bokeh_document = Document()
-    for plot in figures:
-        bokeh_document.add_root(plot)
+    with bokeh_document.models.freeze():  # else it looks for all models after each figure
+        for plot in figures:
+            bokeh_document.add_root(plot)
     numbers: dict[str, str] = {}
     content = _renumbered(bokeh_document.to_json(deferred=False), numbers)
     roots = {numbers[plot.id]: f"plot-{plot.name}" for plot in figures}

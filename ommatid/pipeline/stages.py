@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
-from ommatid.reconstruct.output.run_json import RunReport, StudyCase
+from ommatid.reconstruct.output.run_json import RunReport, StudyCase, TimeReport
+from ommatid.reconstruct.output.time_spent import FILES, PAGE, with_stage
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
@@ -59,14 +61,12 @@ def process_count(changes: Sequence[str], lenses: Sequence[str], members: Sequen
 
 def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     """Execute all stages of a scene, here or on a worker, and return the content of run.json."""
-    report = results(setup, folder, observer)
-    write_page(setup.camera, folder, observer)
-    return report.plain()
+    return with_page(results(setup, folder, observer), setup.camera, folder, observer).plain()
 
 
 @one_thread()
 def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
-    """Execute all stages of a scene except the page."""
+    """Execute all stages of a scene except the page. What is left of the time is that of its files."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.method_choice import choose_method
@@ -80,38 +80,61 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
     choose_method(scene, camera, setup.has_structured_matrix)  # checks the memory before any work
     study.check_study(scene, camera)
-    stack = _rendered(setup, folder, observer)
+    start_up, begun = None if observer.start_up is None else observer.start_up(), perf_counter()
+    stack, rendered = _rendered(setup, folder, observer)
     with observer.progress("calibrate") as progress:
-        model, made = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
-    observer.done("calibrate", made)
+        model, calibrated = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
+    observer.done("calibrate", calibrated)
     with observer.progress("reconstruct") as progress:
         report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     observer.done("reconstruct", made)
-    complete = report
+    complete, worked = report, {"render": rendered, "calibrate": calibrated, "reconstruct": made}
     if scene.world is not None:
         from ommatid.analysis.depth_error import depth_error_of_run
 
         complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
+    if made:
+        computing = sum(complete.stages[name].seconds for name, ran in worked.items() if ran)
+        complete = with_stage(complete, FILES, max(perf_counter() - begun - computing, 0.0))
+        if start_up is not None:
+            spent = TimeReport.model_validate({**complete.spent.plain(), "start_up": start_up})
+            complete = complete.with_changes(spent=spent)
     if scene.study is not None:
-        complete = complete.with_changes(study=_studied(setup, stack, folder, observer))
+        begun = perf_counter()
+        cases, made = _studied(setup, stack, folder, observer)
+        complete = complete.with_changes(study=cases)
+        complete = with_stage(complete, "study", perf_counter() - begun) if made else complete
     if complete.plain() != report.plain():
         run_json.write(folder, complete)
     return complete
 
 
-def write_page(camera: Camera, folder: Path, observer: RunObserver) -> None:
-    """Write report.html of the results in a folder, unless it is up to date."""
+def with_page(report: RunReport, camera: Camera, folder: Path, observer: RunObserver) -> RunReport:
+    """Write report.html of a folder whose run.json is `report`; add the time that it took to run.json."""
+    begun = perf_counter()
+    if not write_page(camera, folder, observer):
+        return report
+    from ommatid.reconstruct.output import run_json
+
+    complete = with_stage(report, PAGE, perf_counter() - begun)
+    run_json.write(folder, complete)
+    return complete
+
+
+def write_page(camera: Camera, folder: Path, observer: RunObserver) -> bool:
+    """Write report.html of the results in a folder unless it is up to date, and return True if it was written."""
     from ommatid.page.cached import cached_page
     from ommatid.simulate.ideal import matrix_as_designed
 
     with observer.progress("report"):
         made = cached_page(folder, partial(matrix_as_designed, camera))
     observer.done("report", made)
+    return made
 
 
 def render(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     """Render a scene, here or on a worker, and describe its stack."""
-    stack = _rendered(setup, folder, observer)
+    stack, _ = _rendered(setup, folder, observer)
     return {"sub_images": len(setup.camera.sub_imagers), **stack.record}
 
 
@@ -168,17 +191,17 @@ def library_versions(with_variant: bool) -> dict[str, str]:
     return required
 
 
-def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> Stack:
+def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> tuple[Stack, bool]:
     check_scene(setup, calibrates=False)
     prepare(setup, folder)
     with observer.progress("render") as progress:
         stack, made = cached_stack(folder / "stack.exr", setup, progress)
     observer.done("render", made)
-    return stack
+    return stack, made
 
 
-def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> tuple[StudyCase, ...]:
-    """Reconstruct the stack with every model of H that the scene's study names."""
+def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> tuple[tuple[StudyCase, ...], bool]:
+    """Reconstruct the stack with every model of H that the scene's study names; True if that had to be done."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.models import study_models
     from ommatid.analysis.study import cached_study
@@ -188,4 +211,4 @@ def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) ->
         known = study_models(setup, folder, no_progress, for_stack(stack))
         cases, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
     observer.done("study", made)
-    return cases
+    return cases, made

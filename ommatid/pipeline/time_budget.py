@@ -263,5 +263,4 @@ def _finish(
     """Add the request and the times to run.json and to the page, and return the description."""
     report = report.with_changes(spent=TimeReport.model_validate({**report.spent.plain(), **spent}))
     run_json.write(folder, report)
-    stages.write_page(setup.camera, folder, observer)
-    return report.plain()
+    return stages.with_page(report, setup.camera, folder, observer).plain()

@@ -1,11 +1,13 @@
-"""Number of available processors, and linear algebra that does not depend on it."""
+"""Number of available processors, age of the process, and linear algebra that does not depend on it."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 
+import psutil
 from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
 
@@ -14,6 +16,11 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def seconds_since_start() -> float:
+    """Return the seconds since this process started."""
+    return time.time() - psutil.Process().create_time()
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from functools import cached_property
 from math import ceil
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
@@ -23,6 +24,7 @@ from ..methods.method import EstimationTask, is_uniform
 from .banded_system import BandedSystem, leaves_null_space
 from .conjugate_gradients import FrameSystem
 from .map_check import ExactVariances, MapCheck, check_map
+from .nearly_even import LARGEST_GAP, NearlyEven
 from .preconditioner import Preconditioner, is_sliding
 from .selected_inverse import whole_variances
 from .stencil import Stencil, box_stencil, even_couplings, pixel_numbers, stored_stencil
@@ -167,12 +169,22 @@ class ErrorMap:
             pixels = pixel_numbers(model.camera.shape, rows, columns)
             return stored_stencil(self._by_pixel, weights, prior, pixels, reach)
 
-        even = None
+        even, known = None, None
         if all(is_sliding(lens_type) for lens_type in model.camera.types) and reach >= max(widths) - 1:
             means = tuple(float(weights[part].mean()) for part in model.camera.type_slices())
             system = replace(self.system.preconditioner, weights=means, prior=prior)
             even = EvenNoise(even_couplings(widths, means, prior, reach), interior_variance(system))
-        return frame_variances(source, model.camera.shape, halo, even)
+            if self._needs_window is not None:
+                known = NearlyEven(model.camera, system).variances(weights)
+                known[self._needs_window] = np.nan
+        return frame_variances(source, model.camera.shape, halo, even, known)
+
+    @cached_property
+    def _needs_window(self) -> NDArray[np.bool_] | None:
+        """Pixels whose noise is too uneven for a correction of the even map, (rows, columns); None: all."""
+        if not (self.task.model.is_exact and self.task.complete and self.as_expected):
+            return None
+        return NearlyEven(self.task.model.camera, self.system.preconditioner).gap(self.system.weights) > LARGEST_GAP
 
     @cached_property
     def _by_pixel(self) -> sparse.csc_array:

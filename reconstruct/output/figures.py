@@ -18,8 +18,10 @@ from ommatid.scenes.stack import Stack
 
 from ..restore import Reconstruction
 
-COLUMN_INCHES = 3.4
+COLUMN_INCHES, ROW_INCHES = 3.4, 3.6
+LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.55, 0.95, 0.6  # inches around all panels; a layout by matplotlib takes a second
 RESOLUTION = 110
+MOST_SHOWN = 480  # rows and columns of a map that a panel can show
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,10 @@ def write_overview(path: Path, title: str, stack: Stack, restoration: Reconstruc
     deviation = np.sqrt(restoration.expected.variance).reshape(shape)
     below.append(OverviewPanel("Expected standard deviation", deviation, "deviation"))
     across = max(len(above), len(below) + 1)
-    figure: Any = Figure(figsize=(COLUMN_INCHES * across, 7.2), dpi=RESOLUTION, layout="constrained")
+    width, height = COLUMN_INCHES * across, 2 * ROW_INCHES
+    figure: Any = Figure(figsize=(width, height), dpi=RESOLUTION)
+    edges = {"left": LEFT / width, "right": 1 - RIGHT / width, "bottom": BOTTOM / height, "top": 1 - TOP / height}
+    figure.subplots_adjust(**edges, wspace=0.5, hspace=0.55)
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
     grey = _grey_range(restoration)
@@ -72,9 +77,10 @@ def _draw_budget(axes: Any, restoration: Reconstruction) -> None:
     bars = axes.barh(list(shares), list(shares.values()), color="tab:blue")
     axes.bar_label(bars, [f"{share:.2g} %" for share in shares.values()], padding=3, fontsize=8)
     axes.invert_yaxis()
-    axes.set_xlim(0, 1.25 * max(shares.values()))
-    axes.set_box_aspect(0.9)
-    axes.set_title(f"Causes of the expected squared error\nof {mse:.3g} per pixel", fontsize=10)
+    axes.set_xlim(0, 1.5 * max(shares.values()))
+    axes.set_box_aspect(1.4)
+    axes.set_anchor("E")  # names stand on the left
+    axes.set_title(f"Causes of the expected squared error\nof {mse:.3g} per pixel", fontsize=10, loc="right")
     axes.set_xlabel("share (%)", fontsize=8)
     axes.tick_params(labelsize=8)
 
@@ -106,7 +112,16 @@ def _draw_panel(figure: Any, axes: Any, panel: OverviewPanel, grey: tuple[float,
     elif panel.content == "deviation":
         low, high, colours = 0.0, float(panel.image.max()) or 1.0, "viridis"
         label = "standard deviation (units of the values)"
-    drawn = axes.imshow(panel.image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+    rows, columns = panel.image.shape
+    each = max(1, max(rows, columns) // MOST_SHOWN)
+    drawn = axes.imshow(
+        panel.image[::each, ::each],
+        cmap=colours,
+        vmin=low,
+        vmax=high,
+        interpolation="nearest",
+        extent=(-0.5, columns - 0.5, rows - 0.5, -0.5),
+    )
     axes.set_title(panel.title, fontsize=10)
     unit = "sensor pixels" if panel.content == "recorded" else "target pixels"
     axes.set_xlabel(f"column ({unit})", fontsize=8)

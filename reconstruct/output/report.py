@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from math import isfinite
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -38,10 +39,12 @@ from .time_spent import time_spent
 
 def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunReport:
     """Return the content of run.json, without a fingerprint."""
+    start = perf_counter()
+    held_out = _held_out(restoration)
     stages = {
         "render": _stage(stack.record),
         "calibrate": _stage(model.record),
-        "reconstruct": StageReport(seconds=restoration.seconds),
+        "reconstruct": StageReport(seconds=restoration.seconds + perf_counter() - start),
     }
     error = _error(restoration)
     as_run = stack.scene.model_copy(update={"calibration": model.scene.calibration})
@@ -71,7 +74,7 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
             calibration=model.record.get("first_seed"),
         ),
         spent=time_spent(stages, error, calibrated=model.record["method"] != "ideal"),
-        **_held_out(restoration),
+        **held_out,
     )
 
 

@@ -179,11 +179,15 @@ class RequestedTime(Record):
 
 
 class TimeReport(Record):
-    """Seconds of all stages, the gain from more samples, and the request of --within if there was one."""
+    """Seconds of all stages, the gain from more samples, and the request of --within if there was one.
+
+    start_up : seconds from the start of the process to the first stage, where the process ran this scene alone
+    """
 
     seconds: float
     stages: dict[str, float]
     noise_alone: float
+    start_up: float | None = None
     more: tuple[MoreTime, ...] = ()
     within: float | None = None
     asked: RequestedTime | None = None

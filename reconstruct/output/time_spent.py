@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from .run_json import ErrorReport, MoreTime, StageReport, TimeReport
+from .run_json import ErrorReport, MoreTime, RunReport, StageReport, TimeReport
 
 INDEPENDENT = 1.0  # variance of independent samples falls as 1 / samples
 STRATIFIED = 1.5  # that of all other samplers as samples^-1.5, for pinholes
 MORE = (2, 4, 16)  # factors on the number of samples
+FILES, PAGE = "files", "page"  # stages beside those that compute: reading, checking and writing files; the report
 STAGES = {"render": "rendering", "calibrate": "calibration"}  # to their parts of the error budget
 
 
@@ -36,3 +37,25 @@ def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibra
         for times in MORE
     )
     return TimeReport(seconds=total, stages=seconds, noise_alone=rest, more=more)
+
+
+def with_stage(report: RunReport, name: str, seconds: float) -> RunReport:
+    """Return a report with the time of one more stage, which changes none of its other numbers."""
+    stages = {**report.stages, name: StageReport(seconds=seconds)}
+    spent = time_spent(stages, report.error, calibrated=report.stages["calibrate"].method != "ideal")
+    asked = report.spent.model_dump(include={"within", "asked", "chosen", "start_up"}, exclude_unset=True)
+    if report.spent.within is not None:
+        asked["seconds"] = report.spent.seconds  # of all trials together
+    return report.with_changes(stages=stages, spent=TimeReport.model_validate({**spent.plain(), **asked}))
+
+
+def without_page(report: RunReport) -> dict[str, object]:
+    """Return the content of run.json that does not depend on the time that the page took."""
+    content = report.plain()
+    content["stages"].pop(PAGE, None)
+    content["spent"]["stages"].pop(PAGE, None)
+    if report.spent.within is None:
+        del content["spent"]["seconds"]
+    for more in content["spent"].get("more", ()):
+        del more["seconds"]
+    return content

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from ..expected_error import COVERAGE, Interval
 from .causes import RunEvidence, likely_causes, listed, named
@@ -108,7 +108,7 @@ def _judge_residual(parts: list[ResidualPart], evidence: RunEvidence, check: Err
     findings.passed.append(f"the residual is {whole.ratio:.3g} times its expectation")
     uncertain = check.calibration_share > SIZE
     shortfall = (whole.prior - whole.chi_squared) / (2 * whole.prior) ** 0.5 if whole.prior else 0.0
-    if whole.chi_squared < (1 - SIZE) * whole.prior and float(stats.norm.sf(shortfall)) < SIGNIFICANCE:
+    if whole.chi_squared < (1 - SIZE) * whole.prior and float(special.ndtr(-shortfall)) < SIGNIFICANCE:
         findings.notes.append(
             f"the residual is {whole.chi_squared / whole.prior:.3g} times that of images drawn from the prior: the"
             f" picture is smoother than the prior, or the noise{' or the uncertainty of H' if uncertain else ''} is"
@@ -172,7 +172,7 @@ def error_p_value(mse: float, interval: Interval) -> float:
 
     def difference(logarithm: float) -> float:
         shape = float(np.exp(logarithm))
-        return float(stats.gamma.ppf(level, shape)) / shape - end / interval.mse
+        return float(special.gammaincinv(shape, level)) / shape - end / interval.mse
 
     shape = float(np.exp(cast(Any, optimize).brentq(difference, *SHAPES)))
     return _tail(shape, mse / interval.mse, above)
@@ -180,7 +180,7 @@ def error_p_value(mse: float, interval: Interval) -> float:
 
 def _tail(shape: float, ratio: float, above: bool) -> float:
     """Return the probability of a gamma variate of mean 1 beyond `ratio`."""
-    return float(stats.gamma.sf(shape * ratio, shape) if above else stats.gamma.cdf(shape * ratio, shape))
+    return float(special.gammaincc(shape, shape * ratio) if above else special.gammainc(shape, shape * ratio))
 
 
 def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:

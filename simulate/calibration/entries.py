@@ -7,7 +7,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse, special
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
@@ -121,7 +121,7 @@ def agreement(matrix: sparse.csr_array, variance: FloatArray, camera: Camera, pa
     variances[variances == 0] = unseen
     values = np.asarray(difference[difference.nonzero()], dtype=np.float64).ravel()
     largest = float(np.max(np.abs(values) / np.sqrt(variances), initial=0.0))
-    single = 2 * float(stats.t.sf(largest, passes - 1))
+    single = 2 * float(special.stdtr(passes - 1, -largest))
     chance = -np.expm1(entries * np.log1p(-single)) if single < 1 else 1.0
     rms = float(np.sqrt((difference.data**2).sum() / max(entries, 1)))
     return {"rms_difference_from_ideal": rms, "max_z": largest, "p_value": float(chance)}

@@ -1,9 +1,10 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
 `python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`,
-`frames`, `film`, which takes ten minutes, and `nasty`, which takes half an hour. No speed is asserted.
-`python -m tests.benchmarks coverage` measures error bars instead, for hours, and is run by itself (`coverage --help`).
-Other load slows both sides of a ratio alike, so compare ratios rather than times.
+`frames`, `film`, which takes ten minutes, and `nasty`, which takes half an hour. No speed is asserted. `coverage`, which
+measures error bars for hours, and `chain`, the time, memory and files of every stage of a run from 239 x 239 pixels on,
+are run by themselves (`coverage --help`). Other load slows both sides of a ratio alike, so compare ratios rather than
+times.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from ommatid.simulate.renderer.variant import unusable_reason
 from .alternation import VARIANTS, Row
 from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
+from .chain import command as chain
 from .coverage.command import command as coverage
 from .film import film_table
 from .forms import NOISE, form_rows
@@ -41,7 +43,7 @@ from .nasty import nasty_table
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
-COVERAGE = "coverage"
+CHAIN, COVERAGE = "chain", "coverage"
 
 
 def main() -> None:
@@ -49,11 +51,15 @@ def main() -> None:
     if sys.argv[1:2] == [COVERAGE]:
         coverage(sys.argv[2:])
         return
+    if sys.argv[1:2] == [CHAIN]:
+        chain(sys.argv[2:])
+        return
     names = sys.argv[1:] or list(PARTS)
     unknown = [name for name in names if name not in PARTS]
     if unknown:
         raise SystemExit(
-            f"{unknown[0]!r} is not a part of the benchmarks; expected {COVERAGE}, or some of: {', '.join(PARTS)}"
+            f"{unknown[0]!r} is not a part of the benchmarks; expected {CHAIN}, {COVERAGE},"
+            f" or some of: {', '.join(PARTS)}"
         )
     console = Console()
     console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell

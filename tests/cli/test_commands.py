@@ -162,7 +162,7 @@ def test_a_run_writes_its_files_and_no_others(finished: Path) -> None:
 
 def test_run_json_keeps_the_contract(finished: Path) -> None:
     run = json.loads((finished / "run.json").read_text(encoding="utf-8"))
-    assert set(run["stages"]) == {"render", "calibrate", "reconstruct"}
+    assert set(run["stages"]) == {"render", "calibrate", "reconstruct", "files", "page"}
     assert all(stage["seconds"] >= 0 for stage in run["stages"].values())
     error = run["error"]
     assert {"mse", "trimmed_mse", "predicted_mse", "psnr", "ssim", "budget"} <= set(error)

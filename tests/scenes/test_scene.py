@@ -6,12 +6,14 @@ from fractions import Fraction
 from math import radians
 from pathlib import Path
 
+import pint
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import Scene, read, resolved, with_changes, write
+from ommatid.scenes.tables.units import FACTORS
 
 from ..examples import GALLERY, scene
 
@@ -113,3 +115,13 @@ def test_refusals_name_file_key_and_what_was_expected(change: str, words: list[s
     assert "\n" not in message
     for word in words:
         assert word in message
+
+
+REGISTRY = pint.UnitRegistry()
+
+
+@given(unit=st.sampled_from(sorted(FACTORS)), number=st.integers(1, 10**6) | st.floats(1e-6, 1e6))
+def test_common_units_are_those_of_pint_to_the_last_bit(unit: tuple[str, str], number: float) -> None:
+    """A scene means the same with and without the table of factors."""
+    exact = float(REGISTRY.Quantity(f"{number} {unit[0]}").to(unit[1]).magnitude)
+    assert float(number) * FACTORS[unit] == exact

@@ -1,0 +1,165 @@
+"""The whole chain from picture to page, stage by stage: `python -m tests.benchmarks chain [SIZE...] [--cases NAMES]`.
+
+Every case is a command `ommatid run` in a process of its own, whose time, processor time, peak memory and files are
+measured from outside, and whose stages come from run.json. Frames of 60 k - 1 pixels a side are seen by all three lens
+types to their edges.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ommatid.scenes.constants import WHITE
+
+ROOT = Path(__file__).parents[2]
+SIZES = (239, 479, 1019)
+NARROWEST = 200
+PITCH = 4.4e-3  # mm between lenses per pixel of f's side: sub-images of pixels of 6 um do not overlap
+STAGES = ("start-up", "render", "calibrate", "reconstruct", "files", "page")
+LENSES = ("I", "II", "III")
+AUTO = ("render.samples=auto", "calibration.samples=auto")
+APERTURE = "1 mm"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene with changes of its keys, and the largest side for which it is of use."""
+
+    name: str
+    scene: str
+    changes: tuple[str, ...]
+    largest: int = 5000
+
+
+CASES = (
+    Case("ideal pinholes", "photo.toml", (*AUTO, "calibration.method=ideal")),
+    Case("point sources", "photo.toml", AUTO),
+    Case("thin lens", "photo.toml", (*AUTO, *(f'camera.lens.{name}.aperture="{APERTURE}"' for name in LENSES))),
+    Case(
+        "doublet",
+        "doublet.toml",
+        (*AUTO, "target.detail=1", "study=", *(f'camera.lens.{name}.pixels="fit"' for name in LENSES)),
+        largest=239,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A run of a case: seconds, processor seconds, peak memory and bytes of files, run.json, and why it failed."""
+
+    seconds: float
+    processor: float
+    memory: float
+    files: dict[str, int]
+    report: dict[str, Any]
+    failure: str = ""
+
+
+def command(arguments: Sequence[str]) -> None:
+    """Measure the cases at the sizes of the command line, and print a row as soon as it is complete."""
+    parser = ArgumentParser("python -m tests.benchmarks chain", description=str(__doc__).splitlines()[0])
+    parser.add_argument("sizes", nargs="*", type=int, metavar="SIZE", help="pixels a side; default: 239 479 1019")
+    parser.add_argument("--cases", default="", metavar="NAME,...", help="ideal, point, thin or doublet; default: all")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a key of every scene")
+    options = parser.parse_args(arguments)
+    chosen = [word for word in options.cases.split(",") if word]
+    console = Console()
+    console.width = max(console.width, NARROWEST)
+    for case in CASES:
+        if chosen and not any(case.name.startswith(word) for word in chosen):
+            continue
+        for size in options.sizes or SIZES:
+            if size <= case.largest:
+                console.print(table([(case, size, measure(case, size, options.set))]))
+
+
+def measure(case: Case, size: int, changes: Sequence[str] = ()) -> Measurement:
+    """Run a case once in a process and a folder of its own."""
+    with TemporaryDirectory(prefix="ommatid-chain-") as folder:
+        picture = Path(folder) / "picture.npy"
+        np.save(picture, picture_of(size))
+        out = Path(folder) / "out"
+        settings = (f'target.image="{picture}"', "target.origin=[0,0]", f"target.shape=[{size},{size}]")
+        pitch = f'camera.lens_pitch="{max(1.0, round(PITCH * size, 2)) * _pixel(case):g} mm"'
+        words = [word for change in (*settings, pitch, *case.changes, *changes) for word in ("--set", change)]
+        code = [sys.executable, "-m", "ommatid", "run", str(ROOT / "scenes" / case.scene), *words, "-o", str(out)]
+        begun = perf_counter()
+        process = Popen(code, cwd=ROOT, stdout=DEVNULL, stderr=PIPE)
+        errors = b"" if process.stderr is None else process.stderr.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = perf_counter() - begun
+        process.returncode = os.waitstatus_to_exitcode(status)
+        made = out / Path(case.scene).stem
+        files = {path.name: path.stat().st_size for path in made.iterdir()} if made.is_dir() else {}
+        report = json.loads((made / "run.json").read_text("utf-8")) if "run.json" in files else {}
+        failure = errors.decode(errors="replace").strip().splitlines()[-1] if process.returncode else ""
+    kilobytes = usage.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
+    return Measurement(seconds, usage.ru_utime + usage.ru_stime, kilobytes * 1024, files, report, failure)
+
+
+def _pixel(case: Case) -> float:
+    """Return the pitch of the sensor pixels of a case, relative to 6 um."""
+    return 3.0 if case.scene == "doublet.toml" else 1.0
+
+
+def picture_of(size: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    """Return a photograph of size x size pixels: scikit-image's, mirrored as often as needed, with grain of its own."""
+    from skimage import data
+
+    photograph = np.asarray(data.camera(), dtype=np.float32)
+    times = -(-size // photograph.shape[0])
+    picture = np.pad(photograph, [(0, (times - 1) * side) for side in photograph.shape], mode="symmetric")
+    grain = np.random.default_rng(0).normal(0, 3, (size, size))
+    return np.clip(picture[:size, :size] + grain, 0, WHITE).astype(np.float32)
+
+
+def table(rows: Sequence[tuple[Case, int, Measurement]]) -> Table:
+    """Return the measurements as a table."""
+    result = Table(title="From picture to page")
+    for name in ("case", "side", "all", "processors", *STAGES, "memory", "files", "stack", "model", "page's file"):
+        result.add_column(name, justify="left" if name == "case" else "right")
+    for name in ("error", "promised (99 %)"):
+        result.add_column(name, justify="right")
+    for case, size, measured in rows:
+        result.add_row(case.name, str(size), *_cells(measured))
+    return result
+
+
+def _cells(measured: Measurement) -> list[str]:
+    whole = [f"{measured.seconds:.1f} s", f"{measured.processor:.1f} s"]
+    if measured.failure:
+        return [*whole, measured.failure]
+    stages, error = measured.report["stages"], measured.report["error"]
+    seconds = {name: stage["seconds"] for name, stage in stages.items()}
+    seconds["start-up"] = measured.report["spent"].get("start_up", 0.0)
+    interval = error.get("expected_given_truth")
+    promised = f"{error['predicted_mse']:.4g}"
+    if interval is not None:
+        promised = f"{interval['mse']:.4g} ({interval['low']:.4g} to {interval['high']:.4g})"
+    sizes = [
+        sum(measured.files.values()),
+        *(measured.files[name] for name in ("stack.exr", "model.npz", "report.html")),
+    ]
+    return [
+        *whole,
+        *(f"{seconds.get(name, 0.0):.1f} s" for name in STAGES),
+        f"{measured.memory / 1e9:.2f} GB",
+        *(f"{size / 1e6:.3g} MB" for size in sizes),
+        f"{error['mse']:.4g}",
+        promised,
+    ]

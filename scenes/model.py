@@ -167,6 +167,21 @@ class Model:
             record={key: value for key, value in self.record.items() if key != "agreement"},  # of all lens types
         )
 
+    def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
+        """L, (M, q), such that the error of H f by that of few numbers is L xi with independent xi of variance 1."""
+        del image
+        return None
+
+    def error_variance(self, image: FloatArray) -> FloatArray | None:
+        """Variance of each measurement by the errors of few numbers, (M,): the diagonal of L L^T."""
+        directions = self.error_directions(image)
+        return None if directions is None else np.asarray(directions.power(2).sum(axis=1), dtype=np.float64).ravel()
+
+    def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
+        """A random error of H f by those of few numbers, L xi: (M,)."""
+        directions = self.error_directions(image)
+        return None if directions is None else directions @ rng.normal(size=directions.shape[1])
+
     def variance_from_model(self, image: FloatArray, noise: Sequence[FloatArray] = ()) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement of `image`: (M,).
 

@@ -19,7 +19,7 @@ from scipy import special
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
 
-from .residual_power import ResidualPower
+from .residual_power import ResidualPower, SharedResidual
 
 Kind = Literal["all", "lens type", "sub-imager", "region"]
 
@@ -127,10 +127,14 @@ class _Sums:
         expected, variance = prior, self._variance(power.prior, labels, count)
         if power.samples is not None:
             variance = np.maximum(variance, self._variance_of_samples(power.samples, labels, count))
+        if power.shared is not None:
+            variance = variance + self._variance_of_shared(power.shared, labels, count)
         if power.bias is not None and power.noise is not None:
             bias = _sums(labels, power.bias, count)
             given = bias + _sums(labels, power.noise, count)
             variance_given = self._variance(power.noise, labels, count) + 4 * residual.largest * bias
+            if power.shared_given is not None:
+                variance_given = variance_given + self._variance_of_shared(power.shared_given, labels, count, bias)
             expected, variance = np.where(given > prior, [given, variance_given], [prior, variance])
         variance *= 1 + (1 / power.draws if power.draws else 0.0)
         p_values = _p_values(squares, expected, variance)
@@ -159,6 +163,18 @@ class _Sums:
             shared = _sums(self.subs + subs * labels, residual.shared * power, subs * count).reshape(count, subs)
             variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance
+
+    def _variance_of_shared(
+        self, shared: SharedResidual, labels: IntArray, count: int, bias: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Return what errors with the covariance W, of few degrees of freedom, add to the variance of the sums.
+
+        That is 2 tr W^2 and the products with the noise, 4 tr(W W'), and with the certain part, 4 b^T W b; half of the
+        former is counted as noise already. No eigenvalue of W is above the root of tr W^2.
+        """
+        squared = shared.squared_traces(labels, count)
+        products = self.residual.largest * _sums(labels, shared.power, count)
+        return 2 * squared + 2 * products + 4 * bias * np.sqrt(squared)
 
     def _variance_of_samples(self, samples: Float32Array, labels: IntArray, count: int) -> FloatArray:
         """Return 2 tr W^2 of each part from pairs of draws, with a margin since they are few."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import fft
+from scipy import fft, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.progress import Progress, no_progress
@@ -99,6 +99,12 @@ class EstimationTask:
         """Variance by errors of few numbers of H that is part of the expected noise: (measurements used,)."""
         variance = None if self.shared_image is None else self.model.error_variance(self.shared_image)
         return np.zeros(self.expected_noise.size) if variance is None else variance[self.used]
+
+    @cached_property
+    def shared_directions(self) -> sparse.csc_array | None:
+        """L of the errors that are part of the expected noise, (measurements used, q); None where there are none."""
+        directions = None if self.shared_image is None else self.model.error_directions(self.shared_image)
+        return None if directions is None else sparse.csc_array(sparse.csr_array(directions)[self.used])
 
     def on_all_measurements(self, values: FloatArray, fill: float) -> FloatArray:
         """Return values of the used measurements on all of them: (measurements used,) to (M,), else `fill`."""

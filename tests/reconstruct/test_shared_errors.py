@@ -10,6 +10,7 @@ import pytest
 from scipy import sparse, stats
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_for
+from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.method import Execution, MethodResult, PosteriorOperators
 from ommatid.reconstruct.model_error import shared_errors as module
@@ -182,7 +183,9 @@ def test_random_combinations_have_the_same_mean(monkeypatch: pytest.MonkeyPatch)
 def test_errors_of_few_numbers_do_not_average_out_over_a_region() -> None:
     """On a slope, a view's shift changes all its readings alike: the mean of a region errs by three times more."""
     assumed, result = prepared("exponential")  # whose pixels' correlation does not change this
-    slope_of_columns = 127.5 + 5.0 * np.tile(np.arange(SHAPE[1]) - SHAPE[1] // 2, SHAPE[0])
+    slope_of_columns: FloatArray = 127.5 + 5.0 * np.tile(
+        np.arange(SHAPE[1], dtype=np.float64) - SHAPE[1] // 2, SHAPE[0]
+    )
     task, operators = assumed.method.task, operators_of(assumed)
     errors = shared_errors(task, operators, slope_of_columns)
     assert errors is not None
@@ -254,3 +257,22 @@ def test_errors_without_effect_are_left_out_with_a_bound() -> None:
     errors = shared_errors(assumed.method.task, operators_of(assumed), picture)
     assert errors is not None
     assert float(errors.variance.mean()) < result.left_out
+
+
+def test_the_held_out_check_allows_for_errors_of_few_numbers() -> None:
+    stack, model, _ = case("independent", 5 * SHIFT)
+    rng = np.random.default_rng(4)
+    deviates: list[float] = []
+    image = np.zeros(model.unknowns)
+    for _ in range(4):
+        image = model.scene.prior.mean + model.scene.prior.variance**0.5 * rng.normal(size=model.unknowns)
+        check = check_held_out(recorded(stack, model, image, rng), model, fitted=False)
+        assert check.trusted
+        deviates += [sub.z for sub in check.sub_imagers if sub.z is not None]
+    # Taken for independent, they make the deviates spread by 1.2 to 1.6.
+    assert abs(np.std(deviates) - 1) < 4 / (2 * len(deviates)) ** 0.5
+    wrong = recorded(stack, model, image, rng)
+    part, values = model.camera.slices()[4], wrong.values.copy()
+    values[part] += 10 * model.changes(image)[1][part]
+    check = check_held_out(replace(wrong, values=values), model, fitted=False)
+    assert [sub.sub.name for sub in check.sub_imagers if sub.named] == [model.camera.sub_imagers[4].name]

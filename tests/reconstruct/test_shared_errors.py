@@ -10,6 +10,7 @@ import pytest
 from scipy import sparse, stats
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_for
+from ommatid.reconstruct.detail.detailed_model import DetailedModel
 from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.method import Execution, MethodResult, PosteriorOperators
@@ -19,8 +20,9 @@ from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.reconstruct.verdict.residual_parts import WhitenedResidual, residual_parts
 from ommatid.reconstruct.verdict.residual_power import squared_trace
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
+from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
@@ -65,11 +67,16 @@ class ShiftedModel(Model):
 
 
 @cache
-def case(kind: str = "independent", shift: float = SHIFT) -> tuple[Stack, ShiftedModel, FloatArray]:
-    """A stack without values, the model that its estimator is given, and the picture."""
+def case(kind: str = "independent", shift: float = SHIFT, detail: int = 1) -> tuple[Stack, ShiftedModel, FloatArray]:
+    """A stack without values, the model that its estimator is given, and the picture on that model's grid."""
     prior = {"kind": kind} | ({"correlation_length": "10 mm"} if kind == "exponential" else {})
-    described = scene(SHAPE, THREE, noise={"variance": NOISE}, prior=prior)
-    camera = derive(described)
+    # Footprints of 3.5 pixels show detail.
+    lenses = THREE if detail == 1 else (("2/7", [3, 3], [4, 4]), *THREE[1:])
+    described = scene(SHAPE, lenses, noise={"variance": NOISE}, prior=prior)
+    target = described.target.model_copy(update={"detail": detail})
+    described = with_tables(described, target=target)
+    setup = Setup.from_scene(described)
+    camera = setup.calibrated.camera
     exact = ideal_model(described, camera)
     matrix = ideal_matrix(camera)
     model = ShiftedModel(
@@ -81,9 +88,8 @@ def case(kind: str = "independent", shift: float = SHIFT) -> tuple[Stack, Shifte
         {**exact.record, "method": "transport"},
         shift=shift,
     )
-    setup = Setup.from_scene(described)
     zero = np.zeros(camera.measurements)
-    return Stack(described, camera, zero, zero, {}), model, setup.image.ravel()
+    return Stack(described, setup.camera, zero, zero, {}), model, setup.calibrated.image.ravel()
 
 
 def recorded(stack: Stack, model: ShiftedModel, image: FloatArray, rng: np.random.Generator) -> Stack:
@@ -257,6 +263,46 @@ def test_errors_without_effect_are_left_out_with_a_bound() -> None:
     errors = shared_errors(assumed.method.task, operators_of(assumed), picture)
     assert errors is not None
     assert float(errors.variance.mean()) < result.left_out
+
+
+def test_errors_act_on_detail_finer_than_f() -> None:
+    stack, model, world = case("exponential", detail=2)
+    choice = replace(choose_method(stack.scene, stack.camera, exact=False), method="detail")
+    assumed = assumptions_for(recorded(stack, model, world, np.random.default_rng(0)), model, choice, Execution())
+    result, operators, of_f = assumed.result(world), operators_of(assumed), assumed.method.task.model
+    assert isinstance(of_f, DetailedModel)
+    directions, rng = model.error_directions(world), np.random.default_rng(1)
+    assert directions is not None
+    shared: FloatArray = directions @ rng.normal(size=(directions.shape[1], DRAWS))
+    noise = NOISE**0.5 * rng.normal(size=shared.shape)
+    mean = assumed.prior.mean
+    light = model.forward(world) - of_f.light(np.full(of_f.unknowns, mean))
+    truth = averaged(world.reshape(model.camera.shape), 2).ravel() - mean
+    images = operators.gain(light[:, None] + shared + noise)
+    errors = np.square(images - truth[:, None]).mean(axis=0)
+    given, part = result.interval, result.expected.parts["calibration"]
+    assert given is not None
+    assert abs(errors.mean() - given.mse) < 4 * errors.std() / DRAWS**0.5 < part / 2
+    fourth = np.mean((errors - errors.mean()) ** 4) ** 0.5
+    assert abs(errors.var() - given.variance) < 4 * fourth / DRAWS**0.5
+
+
+@pytest.mark.parametrize("method", ["frame", "tiles"])
+def test_every_method_states_the_same_part(method: str) -> None:
+    stack, model, picture = case()
+    _, dense = prepared("independent")
+    estimator = stack.scene.estimator.model_copy(update={"method": method})
+    tiles = stack.scene.tiles.model_copy(update={"size": 15, "overlap": 4})
+    changed = with_tables(stack.scene, estimator=estimator, tiles=tiles)
+    recording = recorded(replace(stack, scene=changed), model, picture, np.random.default_rng(0))
+    found = restore(recording, replace(model, scene=changed), picture).result
+    # An iterative solution is accurate to some thousandths.
+    assert found.expected.parts["calibration"] == pytest.approx(dense.expected.parts["calibration"], rel=0.01)
+    if method == "frame":
+        assert found.interval is not None
+        assert dense.interval is not None
+        assert found.interval.mse == pytest.approx(dense.interval.mse, rel=0.01)
+        assert found.interval.variance == pytest.approx(dense.interval.variance, rel=0.05)
 
 
 def test_the_held_out_check_allows_for_errors_of_few_numbers() -> None:

@@ -65,6 +65,22 @@ class ShiftedModel(Model):
         ]
         return sparse.csc_array(sparse.block_diag(blocks, format="csc"))
 
+    def error_variance(self, image: FloatArray) -> FloatArray:
+        """Diagonal of L L^T, (M,)."""
+        return np.sum(np.square(self.changes(image.ravel())), axis=0)
+
+    def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """L xi, (M,)."""
+        shifts = rng.normal(size=(2, len(self.camera.sub_imagers)))
+        counts = [part.stop - part.start for part in self.camera.slices()]
+        return sum(
+            (
+                np.repeat(shift, counts) * change
+                for shift, change in zip(shifts, self.changes(image.ravel()), strict=True)
+            ),
+            np.zeros(self.measurements),
+        )
+
 
 @cache
 def case(kind: str = "independent", shift: float = SHIFT, detail: int = 1) -> tuple[Stack, ShiftedModel, FloatArray]:

@@ -17,27 +17,28 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .detail.detailed_model import CAUSE as DETAIL
-from .detail.detailed_model import DetailedModel, independent_detail, model_of_f
+from .detail.detailed_model import DetailedModel, model_of_f
 from .detail.world_fit import fit_world
 from .expected_error import interval
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
-from .methods.method import EstimationTask, Execution, Method, MethodResult, total_variance
+from .methods.method import Execution, Method, MethodResult, total_variance
+from .methods.observed_stack import ObservedStack
 from .model_error.attenuation import can_be_corrected, with_attenuation
-from .model_error.contrast import Contrast, true_contrast
+from .model_error.contrast import Contrast, true_contrast, without_noise
+from .model_error.shared_errors import NEGLIGIBLE as NEGLIGIBLE_PART
+from .model_error.shared_errors import bound, with_shared_errors
 from .noise import (
     CERTAIN,
-    SATURATION,
+    SHARED,
     Noise,
     UsablePixels,
     check_noise_fit,
     depends_on_light,
-    initial_noise,
-    noise_for_image,
     uniform,
     usable_pixels,
+    with_shared_noise,
 )
 from .saturation import ROUNDS, censored, has_converged
 
@@ -52,6 +53,7 @@ class Assumptions:
     """The prior, the noise by cause, (pixels used,) each, the fit of either, and the method that assumes them.
 
     contrast : of the true image, where the uncertainty of H depends on it
+    shared_image : (N,) on which errors of few numbers of H act, None where H has none
     """
 
     method: Method
@@ -60,23 +62,44 @@ class Assumptions:
     noise: Noise
     fit: PriorFit | None
     contrast: Contrast | None = None
+    shared_image: FloatArray | None = None
 
     def result(self, truth: FloatArray | None) -> MethodResult:
-        """Return the estimate and its error, with the attenuation by the errors of H where that matters.
+        """Return the estimate and its error, with what the errors of H do beyond noise where that matters.
 
         truth : (N,), or (pixels of the world,) for a method that takes detail into account
         """
-        method, result = self.method, self._without_attenuation(truth)
-        operators = None if self.contrast is None else method.operators()
-        if self.contrast is None or operators is None:
+        method, independent = self.method, self._independent_noise
+        needed = self.contrast is not None or self.shared_image is not None
+        operators = method.operators() if needed else None
+        if operators is None:
+            # Errors that measurements share count as independent ones of the same variance.
+            return self._without_attenuation(self._with_shared_as_independent, truth)
+        result, actual = self._without_attenuation(independent, truth), total_variance(independent)
+        if self.contrast is not None:
+            known = truth if truth is not None and truth.size == method.task.model.unknowns else None
+            result = with_attenuation(result, method, operators, self.contrast.image, known, actual)
+        if self.shared_image is None:
             return result
-        known = truth if truth is not None and truth.size == method.task.model.unknowns else None
-        actual = total_variance(self.noise)
-        return with_attenuation(result, method, operators, self.contrast.image, known, actual)
+        if SHARED not in self.noise:
+            most = bound(method.task, self.shared_image)
+            if most <= NEGLIGIBLE_PART * result.expected.mse:
+                return replace(result, left_out=most)
+        return with_shared_errors(result, method, operators, self.shared_image, truth, actual)
 
-    def _without_attenuation(self, truth: FloatArray | None) -> MethodResult:
+    @property
+    def _independent_noise(self) -> Noise:
+        return {name: values for name, values in self.noise.items() if name != SHARED}
+
+    @property
+    def _with_shared_as_independent(self) -> Noise:
+        if SHARED not in self.noise:
+            return self.noise
+        return self._independent_noise | {"calibration": self.noise[SHARED] + self.noise.get("calibration", 0.0)}
+
+    def _without_attenuation(self, noise: Noise, truth: FloatArray | None) -> MethodResult:
         """Return the result of the method, whose interval allows for what is not known of the rendering's variance."""
-        result = self.method.result(self.noise, truth)
+        result = self.method.result(noise, truth)
         unknown = RENDERING * result.expected.parts.get("rendering", 0.0)
         if result.interval is None or not unknown:
             return result
@@ -111,61 +134,6 @@ def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Res
         return work(replace(choice, method="tiles", why=str(error)))
 
 
-@dataclass(frozen=True)
-class _Observation:
-    """A stack with the prior of f, and the model that this prior makes of H where the world is finer than f."""
-
-    stack: Stack
-    model: Model
-    usable: UsablePixels
-    prior: PriorTable
-
-    def with_prior(self, prior: PriorTable, model: Model) -> _Observation:
-        """Return the same stack under another prior; model : as calibrated."""
-        return replace(self, prior=prior, model=model_of_f(model, self.stack.camera, prior))
-
-    def initial_noise(self) -> Noise:
-        """Return the noise before there is an estimate."""
-        return self.with_detail(initial_noise(self.stack, self.model, self.usable, self.prior))
-
-    def noise_for(self, image: FloatArray, noise: Noise) -> Noise:
-        """Return the noise with the parts that depend on the light for an estimate, (N,)."""
-        return self.with_detail(noise_for_image(image, self.stack, self.model, self.usable, noise))
-
-    def with_detail(self, noise: Noise) -> Noise:
-        """Add the variance of detail finer than f, unless the method knows its covariance."""
-        known = {name: values for name, values in noise.items() if name != DETAIL}
-        return known | independent_detail(self.model, self.usable.used)
-
-    @property
-    def detail_variance(self) -> FloatArray | float:
-        """Variance of detail on the pixels used, (pixels used,)."""
-        return self.model.detail_variance[self.usable.used] if isinstance(self.model, DetailedModel) else 0.0
-
-    def expected_noise(self, noise: Noise) -> FloatArray:
-        """Return the variance that the estimator assumes, (pixels used,)."""
-        setting = self.stack.scene.estimator.noise_variance
-        if not isinstance(setting, float):
-            return total_variance(noise)
-        return uniform(setting, int(self.usable.used.sum())) + noise.get(SATURATION, 0.0)
-
-    def task(self, expected_noise: FloatArray) -> EstimationTask:
-        """Return the task of an estimation method; the offset of detail's mean is taken off the measurements."""
-        scene, model, recorded = self.stack.scene, self.model, self.stack.values
-        if isinstance(model, DetailedModel):
-            recorded = recorded - model.offset
-        return EstimationTask(
-            model,
-            recorded,
-            self.usable.used,
-            expected_noise,
-            self.prior,
-            scene.estimator,
-            scene.tiles,
-            scene.prior_ratio,
-        )
-
-
 def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution: Execution) -> Assumptions:
     """Collect prior and noise as known or fitted, estimating the image beforehand only where they depend on it.
 
@@ -192,39 +160,59 @@ def _assumptions(
     prior = stack.scene.assumed_prior
     if prior.kind == "fit":
         prior = prior.model_copy(update={"kind": "independent"})
-    first = _Observation(stack, model_of_f(model, stack.camera, prior), usable, prior)
+    first = ObservedStack(stack, model_of_f(model, stack.camera, prior), usable, prior)
 
-    def method_with(observation: _Observation, noise: Noise) -> Method:
-        return METHODS[choice.method](observation.task(observation.expected_noise(noise)), execution)
+    def method_with(observation: ObservedStack, noise: Noise, image: FloatArray | None = None) -> Method:
+        shared = image if SHARED in noise and not observation.expects_fixed_noise else None
+        return METHODS[choice.method](observation.task(observation.expected_noise(noise), shared), execution)
 
-    def preliminary(observation: _Observation, noise: Noise) -> Method:
+    def preliminary(observation: ObservedStack, noise: Noise) -> Method:
         """Return a method for a first image, by the variances of detail alone where its covariance is known."""
         if choice.method != "detail":
             return method_with(observation, noise)
         expected = observation.expected_noise(noise) + observation.detail_variance
         return METHODS["dense"](observation.task(expected), execution)
 
-    observation, noise, method = first, first.initial_noise(), None
-    if depends_on_light(stack, model):
+    observation, noise, method, image = first, first.initial_noise(), None, None
+    if depends_on_light(stack, model) or SHARED in noise:
         method = preliminary(first, noise)
-        noise = first.noise_for(method.image, noise)
+        image = method.image
+        noise = first.noise_for(image, noise)
     fit = _fit(first, noise)
-    if fit is not None and model.variance.any():
+    if fit is not None and (model.variance.any() or SHARED in noise):
         # The uncertainty of H was taken at an image that the first prior had left noisy.
         better, fitted = _with_fit(first, model, noise, fit)
-        noise = first.with_detail(better.noise_for(preliminary(better, fitted).image, noise))
+        image = preliminary(better, fitted).image
+        noise = first.with_detail(better.noise_for(image, noise))
         fit = _fit(first, noise)
     if fit is not None:
         observation, noise = _with_fit(first, model, noise, fit)
-    fixed = isinstance(stack.scene.estimator.noise_variance, float)
+    fixed = observation.expects_fixed_noise
     if method is None or fit is not None or not fixed or choice.method == "detail":
-        method = method_with(observation, noise)
+        method = method_with(observation, noise, image)
     contrast = _true_contrast(method, noise)
     if contrast is not None:
-        noise = noise | {"calibration": contrast.calibration}
-        if not fixed:
-            method = method_with(observation, noise)
-    return Assumptions(method, observation.usable, observation.prior, noise, fit, contrast)
+        noise, image = noise | {"calibration": contrast.calibration}, contrast.image
+    shared = _shared_image(method, noise, image)
+    if shared is not None:
+        noise = with_shared_noise(shared, observation.model, usable, noise)
+    if not fixed and (contrast is not None or SHARED in noise):
+        method = method_with(observation, noise, shared)
+    return Assumptions(method, observation.usable, observation.prior, noise, fit, contrast, shared)
+
+
+def _shared_image(method: Method, noise: Noise, image: FloatArray | None) -> FloatArray | None:
+    """Return the image on which errors of few numbers of H act, (N,), None where H has none.
+
+    image : of which `noise` was taken, None where it is the same for all images
+    """
+    if SHARED not in noise:
+        return None if method.task.model.error_variance(method.image) is None else method.image
+    actual = total_variance(noise)
+    operators = method.operators()
+    if float(noise[SHARED].sum()) <= NEGLIGIBLE * float(actual.sum()) or operators is None:
+        return method.image if image is None else image
+    return without_noise(method, operators, actual)
 
 
 def _true_contrast(method: Method, noise: Noise) -> Contrast | None:
@@ -242,7 +230,7 @@ def _certain(noise: Noise) -> Noise:
     return {name: noise[name] for name in CERTAIN if name in noise}
 
 
-def _fit(observation: _Observation, noise: Noise) -> PriorFit | None:
+def _fit(observation: ObservedStack, noise: Noise) -> PriorFit | None:
     """Return prior and noise, as far as they are to be fitted, of largest evidence; None where neither is."""
     scene = observation.stack.scene
     prior_known, noise_known = scene.prior.kind != "fit", scene.estimator.noise_variance != "fit"
@@ -255,7 +243,7 @@ def _fit(observation: _Observation, noise: Noise) -> PriorFit | None:
     return fit_prior(*evidence_of(task, prior_known=prior_known, noise_known=noise_known))
 
 
-def _with_fit(observation: _Observation, model: Model, noise: Noise, fit: PriorFit) -> tuple[_Observation, Noise]:
+def _with_fit(observation: ObservedStack, model: Model, noise: Noise, fit: PriorFit) -> tuple[ObservedStack, Noise]:
     """Return prior and noise with the fitted values; a fitted noise replaces the noise that the scene describes.
 
     model : as calibrated

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import fft
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
@@ -18,11 +19,21 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import CAUSE as DETAIL
-from .methods.method import is_uniform
+from .methods.method import is_uniform, total_variance
+from .prior import spectrum_of
 
 Noise = dict[str, FloatArray]  # variances by cause
 SATURATION = "saturation"  # in the error budget
-CERTAIN = ("rendering", "calibration", DETAIL, SATURATION)  # noise that stays known when the rest of it is to be fitted
+SHARED = "shared calibration"  # by errors of few numbers of H, which many measurements share; "calibration" in budgets
+SHARED_NOTABLE = 1e-3  # of the other noise of a measurement, below which SHARED is left out
+SEED = 20260406  # of an image of the prior, different from those of data, calibration and the other analyses
+CERTAIN = (
+    "rendering",
+    "calibration",
+    SHARED,
+    DETAIL,
+    SATURATION,
+)  # noise that stays known when the rest of it is to be fitted
 
 
 @dataclass(frozen=True)
@@ -81,7 +92,7 @@ def initial_noise(stack: Stack, model: Model, usable: UsablePixels, prior: Prior
         noise["calibration"] = from_prior[usable.used]
     if usable.censoring is not None:
         noise[SATURATION] = usable.censoring[usable.used]
-    return noise
+    return noise | _shared_noise_of_prior(model, usable, prior, noise)
 
 
 def noise_for_image(image: FloatArray, stack: Stack, model: Model, usable: UsablePixels, noise: Noise) -> Noise:
@@ -92,13 +103,47 @@ def noise_for_image(image: FloatArray, stack: Stack, model: Model, usable: Usabl
         noise |= {name: at_used(variances, usable.used) for name, variances in recorded.items()}
     if model.variance.any():
         noise["calibration"] = model.variance_from_model(image)[usable.used]
-    return noise
+    return noise if SHARED not in noise else with_shared_noise(image, model, usable, noise)
+
+
+def with_shared_noise(image: FloatArray, model: Model, usable: UsablePixels, noise: Noise) -> Noise:
+    """Return the noise with the variance by errors of few numbers of H for an image, (N,), unless it is negligible.
+
+    The estimator takes these errors for independent, and `model_error.shared_errors` computes what they do together.
+    """
+    others = {name: values for name, values in noise.items() if name != SHARED}
+    variance = model.error_variance(image)
+    return others if variance is None else others | _notable(variance[usable.used], others)
+
+
+def _shared_noise_of_prior(model: Model, usable: UsablePixels, prior: PriorTable, noise: Noise) -> Noise:
+    """Return the same variance for an image drawn from the prior, averaged over each sub-imager; {} if negligible."""
+    camera = model.camera
+    if model.error_variance(np.full(camera.unknowns, prior.mean)) is None:
+        return {}
+    spectrum = spectrum_of(prior, camera.shape, camera.target_pitch, camera.detail)
+    random = np.random.default_rng(SEED).normal(size=camera.shape)
+    drawn = spectrum**0.5 * random
+    if not isinstance(spectrum, float):
+        drawn = np.asarray(fft.idctn(drawn, 2, norm="ortho"))
+    variance = model.error_variance(prior.mean + drawn.ravel())
+    if variance is None:
+        return {}
+    mean = np.concatenate([np.full(part.stop - part.start, variance[part].mean()) for part in camera.slices()])
+    return _notable(mean[usable.used], noise)
+
+
+def _notable(variance: FloatArray, others: Noise) -> Noise:
+    """Return a variance by its cause, {} where it is a thousandth of the other noise or less, on average."""
+    rest = total_variance(others)
+    share = np.divide(variance, rest, out=np.where(variance > 0, np.inf, 0.0), where=rest > 0)
+    return {SHARED: variance} if share.size and float(share.mean()) > SHARED_NOTABLE else {}
 
 
 def depends_on_light(stack: Stack, model: Model) -> bool:
     """Return True if some of the noise is only known once there is an estimate."""
     counted = stack.recording is not None and negligible_shot_noise(stack.scene, stack.camera) is None
-    return counted or bool(model.variance.any())
+    return counted or bool(model.variance.any())  # SHARED in the initial noise needs an estimate, too
 
 
 def check_noise_fit(stack: Stack) -> None:

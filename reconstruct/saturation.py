@@ -21,7 +21,7 @@ from ommatid.scenes.stack import Stack
 
 from .fitting.prior_fit import PriorFit
 from .methods.method import total_variance
-from .noise import CERTAIN, UsablePixels, known_noise, uniform
+from .noise import CERTAIN, SHARED, UsablePixels, known_noise, uniform
 
 ROUNDS = 6
 UNCHANGED = 0.05  # standard deviations of its noise: change of the light expected on a saturated pixel
@@ -61,6 +61,9 @@ def _variance(stack: Stack, model: Model, image: FloatArray, fit: PriorFit | Non
         noise |= stack.recording.noise(model.light(image))
     if model.variance.any():
         noise["calibration"] = model.variance_from_model(image)
+    shared = model.error_variance(image)
+    if shared is not None:
+        noise[SHARED] = shared
     if fit is not None and fit.noise_variance is not None:
         noise = {name: noise[name] for name in CERTAIN if name in noise}
         noise["noise"] = uniform(fit.noise_variance, stack.values.size)

@@ -59,14 +59,20 @@ class DetailMethod(Method):
             return white.multipliers(white.vector(values)[:, None])[:, 0]
 
         return PosteriorOperators(
-            lambda values: whitened.gain(white.vector(values)), whitened.posterior, weigh, whitened.hidden
+            lambda values: whitened.gain(white.vector(values)),
+            whitened.posterior,
+            weigh,
+            whitened.hidden,
+            white.vector,
         )
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error; truth : (N,), or better (pixels of the world,), whose detail is known."""
         white, solved = self._solved
         unit = np.ones(self.task.expected_noise.size)
-        expected = robust_error(solved.form, white, noise, CAUSE)
+        # Errors that measurements share are whitened as independent ones, but `noise` is without them.
+        excess = None if self.task.shared_image is None else self.task.shared_variance
+        expected = robust_error(solved.form, white, noise, CAUSE, excess)
         given = total_variance(noise if truth is None else self._noise_given(truth, noise))
         return MethodResult(
             solved.image,
@@ -74,9 +80,17 @@ class DetailMethod(Method):
             solved.solver,
             expected,
             None if truth is None else self._interval(truth, given),
-            lambda weights: variance_of_sum(solved.form, weights, unit),
+            lambda weights: variance_of_sum(solved.form, weights, unit) - self._variance_in_excess(weights, excess),
             self._residual_power(truth, given, expected.leverage),
         )
+
+    def _variance_in_excess(self, weights: FloatArray, excess: FloatArray | None) -> float:
+        """Return by how much w^T f^ varies less than what was whitened says; weights : (N,)."""
+        if excess is None:
+            return 0.0
+        operators = self.operators()
+        back = operators.weigh(self.task.observe(operators.posterior(weights)))
+        return float(excess @ np.square(back))
 
     def _noise_given(self, truth: FloatArray, noise: dict[str, FloatArray]) -> dict[str, FloatArray]:
         """Return the noise with the variance that the uncertainty of H adds for a world whose detail is known."""

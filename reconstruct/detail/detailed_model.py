@@ -98,15 +98,32 @@ class DetailedModel(Model):
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
         """Return L, (M, q), such that the error of H by that of few numbers adds L xi to the measurements of f."""
-        return self.fine.error_directions(self.world_given(image))
+        return self.fine.error_directions(self._world_with_detail(image))
 
     def error_variance(self, image: FloatArray) -> FloatArray | None:
         """Return the variance of each measurement by the errors of few numbers, (M,)."""
-        return self.fine.error_variance(self.world_given(image))
+        return self.fine.error_variance(self._world_with_detail(image))
 
     def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
         """Return a random error of the measurements of f by those of few numbers, (M,)."""
-        return self.fine.error_draw(self.world_given(image), rng)
+        return self.fine.error_draw(self._world_with_detail(image), rng)
+
+    def _world_with_detail(self, image: FloatArray) -> FloatArray:
+        """Return a world, (pixels of the world,), that averages to f, (N,), with random detail of the prior.
+
+        Errors of few numbers act on the detail that f leaves open, too. A world stays as it is.
+        """
+        if image.size == self.fine.unknowns:
+            return image
+        return self.world_given(image) + self._random_detail
+
+    @cached_property
+    def _random_detail(self) -> FloatArray:
+        """A draw of what the prior leaves open given f: (pixels of the world,)."""
+        if self.world is None:
+            return np.zeros(self.fine.unknowns)
+        world = self.world.draw(np.random.default_rng(SEED + 1))
+        return world - self.interpolation @ (averaging(self.camera.shape, self.camera.detail) @ world)
 
     @property
     def has_error_halves(self) -> bool:

@@ -12,7 +12,7 @@ from functools import cache
 from itertools import pairwise, product
 
 import numpy as np
-from scipy import sparse
+from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.pool import worker_pool
@@ -29,6 +29,7 @@ from .block_errors import block_errors
 MOST_WHOLE = 1700  # pixels of a target that is one window
 WINDOW, WIDEST_WINDOW = 32, 60  # pixels, largest side of a window of a frame: of narrow and of wide footprints
 REACHES = 3  # footprints that fit side by side into a window
+LEAST_NOISE = 1e-3  # share of the expected noise that is independent, at least
 MOST_WINDOWS = 8  # along each axis; of larger frames so many at equal distances
 
 Window = tuple[slice, slice]
@@ -117,8 +118,42 @@ def _sub_imager_of(camera: Camera, measurements: IntArray) -> IntArray:
 
 def _whole(task: EstimationTask) -> WindowProblem:
     camera, used = task.model.camera, np.flatnonzero(task.used)
-    problem = Problem(task.model.matrix[used], task.prior_on(task.shape), task.expected_noise)
+    shared = _SharedErrors(task)
+    matrix, noise = task.model.matrix[used], task.expected_noise
+    problem = shared.problem(matrix, task.prior_on(task.shape), noise, np.arange(used.size))
     return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
+
+
+class _SharedErrors:
+    """Errors of few numbers of H, which measurements of a sub-imager share: unknowns of variance 1 beside the pixels.
+
+    So a sub-imager whose readings are all off by what the numbers allow does not disagree with the others.
+    """
+
+    def __init__(self, task: EstimationTask) -> None:
+        directions = task.shared_directions
+        self._directions = None if directions is None else sparse.csr_array(directions)
+        self._independent = without_shared(task)
+
+    def problem(self, matrix: sparse.csr_array, prior: Prior, noise: FloatArray, index: IntArray) -> Problem:
+        """Return the problem of some measurements; index : of them among those used."""
+        if self._directions is None:
+            return Problem(matrix, prior, noise)
+        directions = sparse.csc_array(self._directions[index])
+        directions = directions[:, np.flatnonzero(np.diff(directions.indptr))]
+        count = directions.shape[1]
+        joined = sparse.csr_array(sparse.hstack([matrix, directions], format="csr"))
+        mean = np.concatenate([prior.mean, np.zeros(count)])
+        if prior.independent:
+            root: FloatArray = np.concatenate([prior.root, np.ones(count)])
+        else:
+            root = np.asarray(linalg.block_diag(prior.root, np.eye(count)))
+        return Problem(joined, Prior(mean, root, prior.rounding), self._independent[index])
+
+
+def without_shared(task: EstimationTask) -> FloatArray:
+    """Return the expected noise less the errors of few numbers that it holds: (measurements used,)."""
+    return np.maximum(task.expected_noise - task.shared_variance, LEAST_NOISE * task.expected_noise)
 
 
 def _knows_detail(task: EstimationTask) -> bool:
@@ -134,8 +169,12 @@ def _whole_detailed(task: EstimationTask) -> WindowProblem:
     prior, matrix = task.prior_on(task.shape), model.matrix[used]
     root: FloatArray = matrix @ (np.diag(prior.root) if prior.independent else prior.root)
     covariance = root @ root.T + model.detail_covariance[np.ix_(used, used)]
+    noise, directions = task.expected_noise, task.shared_directions
+    if directions is not None:
+        covariance += (directions @ directions.T).toarray()
+        noise = without_shared(task)
     light = Prior(matrix @ prior.mean, covariance_root(covariance))
-    problem = Problem(sparse.csr_array(sparse.eye_array(used.size)), light, task.expected_noise)
+    problem = Problem(sparse.csr_array(sparse.eye_array(used.size)), light, noise)
     return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
 
 
@@ -152,7 +191,7 @@ def _whole_robust(task: EstimationTask) -> WindowProblem:
 
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:
     """Yield the problem of every window, one at a time to bound memory."""
-    camera, index_among_used = task.model.camera, np.cumsum(task.used) - 1
+    camera, index_among_used, shared = task.model.camera, np.cumsum(task.used) - 1, _SharedErrors(task)
 
     @cache
     def prior_on(shape: tuple[int, int]) -> Prior:
@@ -164,7 +203,8 @@ def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProb
         matrix = task.model.submatrix(rows, columns)[kept]
         inside = inside[kept]
         noise = task.expected_noise[index_among_used[inside]]
-        problem = Problem(matrix, prior_on((rows.stop - rows.start, columns.stop - columns.start)), noise)
+        prior = prior_on((rows.stop - rows.start, columns.stop - columns.start))
+        problem = shared.problem(matrix, prior, noise, index_among_used[inside])
         yield WindowProblem(problem, task.recorded[inside], _sub_imager_of(camera, inside), len(camera.sub_imagers))
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from scipy import fft
+from scipy import fft, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.progress import Progress, no_progress
@@ -41,6 +41,7 @@ class EstimationTask:
 
     recorded : (M,) g;  used : (M,) True for measurements that are used
     expected_noise : (measurements used,) the noise variance that the estimator assumes, 0 allowed
+    shared_image : (N,) whose `error_directions` by few numbers of H are part of the expected noise; None: they are not
     prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
     """
 
@@ -52,6 +53,7 @@ class EstimationTask:
     settings: estimation.EstimatorTable
     tiles: estimation.TilesTable
     prior_ratio: float = 1.0
+    shared_image: FloatArray | None = None
 
     @cached_property
     def complete(self) -> bool:
@@ -97,6 +99,18 @@ class EstimationTask:
         readings = self.model.forward(image)
         return readings if self.complete else readings[self.used]
 
+    @cached_property
+    def shared_variance(self) -> FloatArray:
+        """Variance by errors of few numbers of H that is part of the expected noise: (measurements used,)."""
+        variance = None if self.shared_image is None else self.model.error_variance(self.shared_image)
+        return np.zeros(self.expected_noise.size) if variance is None else variance[self.used]
+
+    @cached_property
+    def shared_directions(self) -> sparse.csc_array | None:
+        """L of the errors that are part of the expected noise, (measurements used, q); None where there are none."""
+        directions = None if self.shared_image is None else self.model.error_directions(self.shared_image)
+        return None if directions is None else sparse.csc_array(sparse.csr_array(directions)[self.used])
+
     def on_all_measurements(self, values: FloatArray, fill: float) -> FloatArray:
         """Return values of the used measurements on all of them: (measurements used,) to (M,), else `fill`."""
         if self.complete:
@@ -116,6 +130,7 @@ class MethodResult:
     residual_power : expected squares of the residual, None where a measurement has no expected noise
     noise_difference : largest relative difference of the noise from that of the frame whose error bars these are; None
         where they were computed for this one
+    left_out : bound on what errors of few numbers of H add to Eq. 5, where that was left out; None where it was not
     """
 
     image: FloatArray
@@ -126,6 +141,7 @@ class MethodResult:
     variance_of_sum: Callable[[FloatArray], float]
     residual_power: ResidualPower | None
     noise_difference: float | None = None
+    left_out: float | None = None
 
 
 @dataclass(frozen=True)
@@ -134,12 +150,14 @@ class PosteriorOperators:
 
     gain : A, (measurements used,) to (N,);  posterior : C, (N,) to (N,);  weigh : Rv^-1 on (measurements used,)
     hidden : I - A H = C P0^-1, (N,) to (N,): what the estimate lacks of an image less its mean
+    whiten : K^-1 on (measurements used,), where K K^T = Rv is not diagonal; None: the root of `weigh`
     """
 
     gain: Callable[[FloatArray], FloatArray]
     posterior: Callable[[FloatArray], FloatArray]
     weigh: Callable[[FloatArray], FloatArray]
     hidden: Callable[[FloatArray], FloatArray]
+    whiten: Callable[[FloatArray], FloatArray] | None = None
 
 
 class Method(ABC):

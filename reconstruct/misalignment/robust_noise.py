@@ -169,11 +169,18 @@ def whitening(
     return Whitening(tuple(slices), tuple(factors))
 
 
-def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray], cause: str = CAUSE) -> ExpectedError:
+def robust_error(
+    form: Form,
+    white: Whitening,
+    noise: dict[str, FloatArray],
+    cause: str = CAUSE,
+    excess: FloatArray | None = None,
+) -> ExpectedError:
     """Return Eq. 5 of a form of the whitened problem, on average over images and what is correlated in their noise.
 
     noise : named (pixels used,) variances, together the independent part of what was whitened; the rest of the error
         that measurements bring is put down to `cause`
+    excess : (pixels used,) by which the independent part of what was whitened exceeds `noise`; absent: not at all
     """
     count = form.problem.unknowns
     by_column = sparse.csc_array(form.problem.matrix)
@@ -184,13 +191,16 @@ def robust_error(form: Form, white: Whitening, noise: dict[str, FloatArray], cau
         pixels = np.arange(start, min(start + CHUNK, count))
         u, negative = form.pixel_solutions(pixels)
         prior, noisy = np.square(u).sum(axis=0), np.square(negative).sum(axis=0)
+        gain = np.square(white.multipliers(negative))
+        if excess is not None:
+            noisy -= excess @ gain
         variance[pixels] = prior + noisy
         missing += float(prior.sum()) / count
         from_measurements += float(noisy.sum()) / count
         products = by_column[:, pixels].multiply(negative)
         resolved[pixels] = -np.asarray(products.sum(axis=0)).ravel()
         leverage -= np.asarray(products.sum(axis=1)).ravel()
-        weights += np.square(white.multipliers(negative)).sum(axis=1) / count
+        weights += gain.sum(axis=1) / count
     parts = {name: float(weights @ values) for name, values in noise.items()}
     rest = max(from_measurements - sum(parts.values()), 0.0)
     return ExpectedError(variance, missing, {**parts, cause: rest}, resolved, leverage)

@@ -77,6 +77,26 @@ def true_contrast(method: Method, operators: PosteriorOperators, by_cause: dict[
     return Contrast(image, noise, (1 - share) * first + share * second)
 
 
+def without_noise(method: Method, operators: PosteriorOperators, actual: FloatArray) -> FloatArray:
+    """Return an image with the contrast of the true one, (N,), for a model whose entries have no errors of their own.
+
+    actual : (measurements used,) noise variances
+    """
+    task, waves = method.task, Waves(method.task.shape)
+    rng, root = np.random.default_rng(SEED), np.sqrt(actual)
+    count = 1 if task.model.unknowns > MANY else 2 if task.model.unknowns > FEW else 4
+    noise = tuple(operators.gain(root * rng.normal(size=root.size)) for _ in range(count))
+    deviation = method.image - task.prior.mean
+    by_noise = np.mean([waves.power(image) for image in noise], axis=0)
+    excess = waves.power(deviation) - by_noise
+    determined = excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
+    image = _placed(waves, deviation, noise, continued(waves.frequencies, excess, determined))
+    whole, seen = waves.power(image), waves.power(image - operators.hidden(image))
+    transfer = np.divide(seen, whole, out=np.ones_like(whole), where=whole > FAINT * whole.max())
+    spectrum = continued(waves.frequencies, excess / np.clip(transfer, *TRANSFER), determined)
+    return task.prior.mean + _placed(waves, deviation, noise, spectrum)
+
+
 def _placements(
     model: Model, estimate: FloatArray, image: FloatArray, noise: tuple[FloatArray, ...]
 ) -> tuple[FloatArray, FloatArray]:

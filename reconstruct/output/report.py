@@ -60,7 +60,11 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
         model=_model(model, restoration.spurious_information),
         skipped=tuple(
             SkippedReport(**skipped.describe())
-            for skipped in (*skipped_effects(as_run, stack.camera), *_skipped_in_world(stack))
+            for skipped in (
+                *skipped_effects(as_run, stack.camera),
+                *_skipped_in_world(stack),
+                *_skipped_errors(restoration),
+            )
         ),
         assumes=assumptions(as_run, stack.camera),
         versions={
@@ -157,3 +161,15 @@ def _skipped_in_world(stack: Stack) -> tuple[SkippedEffect, ...]:
     if not stack.record.get(STRAIGHT):
         return ()
     return (SkippedEffect("interreflection", "nothing in the world reflects light: paths have one segment"),)
+
+
+def _skipped_errors(restoration: Reconstruction) -> tuple[SkippedEffect, ...]:
+    """Return the errors of few numbers of H if Eq. 5 is without them, with a bound on what they add to it."""
+    most = restoration.result.left_out
+    if most is None:
+        return ()
+    why = (
+        "they are a thousandth of the other noise or less, and add at most"
+        f" {100 * most / restoration.expected.mse:.2g} % to the expected error"
+    )
+    return (SkippedEffect("errors of the fitted numbers of H", why),)

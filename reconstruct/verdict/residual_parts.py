@@ -20,7 +20,7 @@ from scipy import special
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
 
-from .residual_power import ResidualPower
+from .residual_power import ResidualPower, SharedResidual
 
 Kind = Literal["all", "lens type", "sub-imager", "region"]
 
@@ -174,10 +174,14 @@ class _Sums:
         expected, variance = prior, self._variance(power.prior, of, prior)
         if power.samples is not None:
             variance = np.maximum(variance, self._variance_of_samples(power.samples, of))
+        if power.shared is not None:
+            variance = variance + self._variance_of_shared(power.shared, of)
         if power.bias is not None and power.noise is not None:
             bias, noise = of.sums(power.bias), of.sums(power.noise)
             given = bias + noise
             variance_given = self._variance(power.noise, of, noise) + 4 * residual.largest * bias
+            if power.shared_given is not None:
+                variance_given = variance_given + self._variance_of_shared(power.shared_given, of, bias)
             expected, variance = np.where(given > prior, [given, variance_given], [prior, variance])
         variance *= 1 + (1 / power.draws if power.draws else 0.0)
         p_values = _p_values(squares, expected, variance)
@@ -208,6 +212,18 @@ class _Sums:
             shared = both.sums(residual.shared * power).reshape(of.count, subs)
             variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance
+
+    def _variance_of_shared(
+        self, shared: SharedResidual, of: _Scattered | _Contiguous, bias: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Return what errors with the covariance W, of few degrees of freedom, add to the variance of the sums.
+
+        That is 2 tr W^2 and the products with the noise, 4 tr(W W'), and with the certain part, 4 b^T W b; half of the
+        former is counted as noise already. No eigenvalue of W is above the root of tr W^2.
+        """
+        squared = shared.squared_traces(of.labels, of.count)
+        products = self.residual.largest * of.sums(shared.power)
+        return 2 * squared + 2 * products + 4 * bias * np.sqrt(squared)
 
     def _variance_of_samples(self, samples: Float32Array, of: _Scattered | _Contiguous) -> FloatArray:
         """Return 2 tr W^2 of each part from pairs of draws, with a margin since they are few."""

@@ -10,12 +10,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from ommatid.runtime.arrays import Float32Array, FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 
 SEED = 20260402  # of random images and noise, different from those of data, calibration and error analysis
+
+
+@dataclass(frozen=True)
+class SharedResidual:
+    """Whitened residuals that few numbers cause in all measurements together, as a sum of `columns` times normal xi.
+
+    columns : (K, measurements used);  exact : False if they are random combinations, whose squares have the right mean
+    """
+
+    columns: Float32Array
+    exact: bool
+
+    @cached_property
+    def power(self) -> FloatArray:
+        """Mean squares, (measurements used,)."""
+        return np.square(self.columns, dtype=np.float64).sum(axis=0)
+
+    def squared_traces(self, labels: IntArray, count: int) -> FloatArray:
+        """Return tr W^2 of the covariance W of the measurements with each label from 0 to `count` - 1."""
+        traces = np.zeros(count)
+        for label in range(count):
+            part = self.columns[:, labels == label].astype(np.float64)
+            traces[label] = squared_trace(part @ part.T, self.exact)
+        return traces
+
+
+def squared_trace(gram: FloatArray, exact: bool) -> float:
+    """Return tr W^2 from the Gram matrix of vectors whose squares add up to W.
+
+    exact : False if W is only the mean over such random vectors: those are independent, and a product of two has the
+        right mean, but not a vector's square
+    """
+    whole = float(np.square(gram).sum())
+    if exact:
+        return whole
+    own, count = float(np.square(np.diagonal(gram)).sum()), len(gram)
+    return (whole - own) * count / (count - 1)
 
 
 @dataclass(frozen=True)
@@ -27,6 +65,7 @@ class ResidualPower:
     draws : number of random draws of which these are means, 0 where nothing was drawn
     samples : (draws, measurements used) whitened residuals of images drawn from the prior, by an estimate that is not
         optimal, such as that of tiles; None of one whose residual varies by no more than its measurements' noise
+    shared, shared_given : what few numbers cause, for images of the prior and for the true image; part of the squares
     """
 
     prior: FloatArray
@@ -34,6 +73,8 @@ class ResidualPower:
     noise: FloatArray | None
     draws: int
     samples: Float32Array | None = None
+    shared: SharedResidual | None = None
+    shared_given: SharedResidual | None = None
 
     def multiplied(self, ratio: float) -> ResidualPower:
         """Return the expected squares of residuals that are larger by the root of `ratio`."""

@@ -1,0 +1,220 @@
+"""What errors of few numbers of H do to the estimate: they are shared by many measurements and do not average out.
+
+Where the entries of H follow from few numbers, the error of H f is L xi with independent xi of variance 1, and the
+estimate errs by -A L xi. Beside the other noise, Rvm, Eq. 5 and the residual gain
+
+    Eq. 5: A L L^T A^T,    of the residual: (I - H A) L L^T (I - H A)^T,
+
+and with K = A L L^T A^T the squared error of one image, whose bias is b, gains the variance
+4 b^T K b + 2 tr K^2 + 4 tr(K A Rvm A^T). The columns of L pass through the estimator one by one where they and the
+pixels are few; else random combinations of them do, whose squares have the right mean (Hutchinson 1990).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage, sparse
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.formats.picture import averaged
+
+from ..expected_error import ExpectedError, Interval, interval
+from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
+from ..prior import spectrum_of
+from ..verdict.residual_power import ResidualPower, SharedResidual, squared_trace
+
+SEED = 20260407  # of random combinations, different from those of data, calibration and the other analyses
+FEW_PIXELS, FEW_COLUMNS = 4000, 1000  # up to which every column is taken
+DRAWS, FEW_DRAWS = 12, 4  # of combinations, otherwise
+MANY = 250_000  # pixels above which a combination takes long and few are enough
+CROSS_DRAWS = 8  # of combinations for the product with the noise
+MOST_STORED = 2**25  # entries of L that are kept for sums of pixels
+NEIGHBOURHOOD = 9  # pixels, over which the squares of few combinations are averaged for the map
+NEGLIGIBLE = 1e-3  # of the expected error, up to which a bound on the part makes its computation needless
+LEAST_LEFT = 0.05  # of an expected square of the residual
+
+
+@dataclass(frozen=True)
+class SharedErrors:
+    """Columns of L, or random combinations of them, before and after the estimator.
+
+    readings : (K, measurements used);  images : (K, N) A of each
+    exact : True if they are all columns of L, False if their squares have the right mean alone
+    directions : L, (measurements used, q), None where it is too large
+    """
+
+    readings: FloatArray
+    images: FloatArray
+    exact: bool
+    directions: sparse.csc_array | None
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """Diagonal of K, (N,)."""
+        return np.square(self.images).sum(axis=0)
+
+    def variance_of_sum(self, weights: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> float:
+        """Return w^T K w of (N,) weights."""
+        if self.exact or self.directions is None:
+            return float(np.square(self.images @ weights).sum())
+        back = operators.weigh(task.observe(operators.posterior(weights)))
+        return float(np.square(self.directions.T @ back).sum())
+
+    def residuals(self, task: EstimationTask, operators: PosteriorOperators) -> SharedResidual:
+        """Return their whitened residuals."""
+        white = [
+            whitened(reading - task.observe(image), task, operators)
+            for reading, image in zip(self.readings, self.images, strict=True)
+        ]
+        return SharedResidual(np.array(white, dtype=np.float32).reshape(len(white), -1), self.exact)
+
+    def variance_of_square(
+        self, bias: FloatArray, actual: FloatArray, task: EstimationTask, operators: PosteriorOperators
+    ) -> float:
+        """Return what K adds to the variance of the squared error of an image; actual : (M,) diagonal of Rvm."""
+        along = float(np.square(self.images @ bias).sum())
+        combined = self.images
+        if len(combined) > CROSS_DRAWS:
+            weights = np.random.default_rng(SEED + 1).normal(size=(CROSS_DRAWS, len(combined)))
+            combined = weights @ combined / CROSS_DRAWS**0.5
+        across = sum(
+            float(actual @ np.square(operators.weigh(task.observe(operators.posterior(image))))) for image in combined
+        )
+        return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
+
+
+def whitened(residual: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> FloatArray:
+    """Return K^-1 r with K K^T the expected covariance of the noise: (measurements used,)."""
+    return residual / np.sqrt(task.expected_noise) if operators.whiten is None else operators.whiten(residual)
+
+
+def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: FloatArray) -> SharedErrors | None:
+    """Return the errors of few numbers for an image, (N,); None where H has none."""
+    model, used, small = task.model, task.used, task.model.unknowns <= FEW_PIXELS
+    # A column has entries in one sub-imager alone, and a sub-imager has few.
+    stored = small or 6 * model.measurements <= MOST_STORED
+    directions = model.error_directions(image) if stored else None
+    if stored and directions is None:
+        return None
+    directions = None if directions is None else sparse.csc_array(sparse.csr_array(directions)[used])
+    exact = small and directions is not None and directions.shape[1] <= FEW_COLUMNS
+    if exact and directions is not None:
+        readings: FloatArray = directions.T.toarray()
+    else:
+        rng, count = np.random.default_rng(SEED), FEW_DRAWS if model.unknowns > MANY else DRAWS
+        draws: list[FloatArray] = []
+        for _ in range(count):
+            draw = model.error_draw(image, rng)
+            if draw is None:
+                return None
+            draws.append(draw[used] / count**0.5)
+        readings = np.array(draws)
+    images = np.array([operators.gain(reading) for reading in readings]).reshape(len(readings), model.unknowns)
+    return SharedErrors(readings, images, exact, directions)
+
+
+def bound(task: EstimationTask, image: FloatArray) -> float:
+    """Return a bound on what errors of few numbers add to the mean of Eq. 5 for an image, (N,); 0 where H has none.
+
+    A Rv^1/2 has no singular value above half the root of the largest eigenvalue p of P0, so that with variances d of
+    the errors it is p / 4 times the sum of d / Rv, over N.
+    """
+    variance = task.model.error_variance(image)
+    if variance is None or not variance.any():
+        return 0.0
+    camera = task.model.camera
+    largest = float(np.max(spectrum_of(task.prior, task.shape, camera.target_pitch, camera.detail)))
+    with np.errstate(divide="ignore"):
+        return largest / 4 * float(np.sum(variance[task.used] / task.expected_noise)) / task.model.unknowns
+
+
+def with_shared_errors(
+    result: MethodResult,
+    method: Method,
+    operators: PosteriorOperators,
+    image: FloatArray,
+    truth: FloatArray | None,
+    actual: FloatArray,
+) -> MethodResult:
+    """Return a result whose Eq. 5, interval, sums of pixels and residual hold the errors of few numbers of H.
+
+    image : (N,) with the contrast of the true one;  truth : (N,) or (pixels of the world,), or None
+    actual : (measurements used,) the variances that the result holds already
+    """
+    task = method.task
+    errors = shared_errors(task, operators, image)
+    if errors is None:
+        return result
+    given, before, power = errors, result.variance_of_sum, result.residual_power
+    if truth is not None and errors.exact:
+        given = shared_errors(task, operators, truth) or errors
+
+    def variance_of_sum(weights: FloatArray) -> float:
+        return before(weights) + errors.variance_of_sum(weights, task, operators)
+
+    if power is not None:
+        power = _with_residuals(power, errors, given, task, operators)
+    return replace(
+        result,
+        expected=_with_variance(result.expected, errors, task.shape),
+        interval=None
+        if result.interval is None or truth is None
+        else _wider(result.interval, given, truth, actual, task, operators),
+        variance_of_sum=variance_of_sum,
+        residual_power=power,
+    )
+
+
+def _with_variance(expected: ExpectedError, errors: SharedErrors, size: tuple[int, int]) -> ExpectedError:
+    variance, mean = errors.variance, float(errors.variance.mean())
+    if not errors.exact:
+        smooth = ndimage.uniform_filter(variance.reshape(size), NEIGHBOURHOOD, mode="nearest").ravel()
+        variance = smooth * (mean / (float(smooth.mean()) or 1.0))
+    parts = expected.parts | {"calibration": expected.parts.get("calibration", 0.0) + mean}
+    return replace(expected, variance=expected.variance + variance, parts=parts)
+
+
+def _wider(
+    without: Interval,
+    errors: SharedErrors,
+    truth: FloatArray,
+    actual: FloatArray,
+    task: EstimationTask,
+    operators: PosteriorOperators,
+) -> Interval:
+    count, camera = task.model.unknowns, task.model.camera
+    image = truth if truth.size == count else averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
+    bias = operators.hidden(image - task.prior.mean)
+    added = errors.variance_of_square(bias, actual, task, operators)
+    return interval(count * without.mse + float(errors.variance.sum()), count**2 * without.variance + added, count)
+
+
+def _with_residuals(
+    power: ResidualPower,
+    errors: SharedErrors,
+    given: SharedErrors,
+    task: EstimationTask,
+    operators: PosteriorOperators,
+) -> ResidualPower:
+    """Return the expected squares of the residual with those of the errors for the image and for the true one."""
+    prior = power.prior
+    if operators.whiten is not None and task.shared_image is not None:
+        # What was whitened held the errors as independent, and so does the expected residual.
+        prior = np.maximum(prior - _as_independent(task, operators), LEAST_LEFT * prior)
+    shared = errors.residuals(task, operators)
+    of_given = shared if given is errors else given.residuals(task, operators)
+    noise = None if power.noise is None else power.noise + of_given.power
+    return replace(power, prior=prior + shared.power, noise=noise, shared=shared, shared_given=of_given)
+
+
+def _as_independent(task: EstimationTask, operators: PosteriorOperators) -> FloatArray:
+    """Return the mean squares of whitened residuals of independent errors with the same variances."""
+    rng, root = np.random.default_rng(SEED + 2), np.sqrt(task.shared_variance)
+    total = np.zeros(root.size)
+    for _ in range(DRAWS):
+        draw = root * rng.normal(size=root.size)
+        total += np.square(whitened(draw - task.observe(operators.gain(draw)), task, operators))
+    return total / DRAWS

@@ -1,0 +1,1 @@
+"""H that follows from a few fitted numbers, applied without being stored."""

@@ -84,6 +84,7 @@ class KernelPlaces:
 
     @cached_property
     def scale(self) -> float:
+        """The largest distance from the axis along an axis."""
         return max(float(np.abs(beside).max()) for beside in self._beside)
 
     @property

@@ -16,7 +16,7 @@ from ommatid.scenes.lens_type import LensType
 
 from ..calibration.point_sources import Responses
 
-LEAST_RAYS = 0.5  # of all rays of the chart in a cell: the fewest that its weight assumes
+LEAST_RAYS = 20.0  # in a cell, of all pixels: the fewest that its weight assumes, since few rays are not Gaussian
 LEAST_SCATTER = 1e-3  # of independent rays' variance: the least that a weight assumes
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.fitted.kernels import basis, terms
+from ommatid.scenes.fitted.kernels import basis
 
 from .chart import Chart
 from .regression import Sums, chance, gram, residual, sums_of
@@ -40,12 +40,6 @@ class Candidate:
     chances: dict[str, float]
 
 
-def candidates(chart: Chart) -> list[tuple[int, bool]]:
-    """Return degrees, with or without the lens's symmetry."""
-    most = min(MOST_DEGREE, highest_degree(chart))
-    return [(degree, symmetric) for symmetric in (True, False) for degree in range(most + 1)]
-
-
 def highest_degree(chart: Chart) -> int:
     """Return the highest degree that the chart's pixels determine, with the terms that tests add."""
     fits = (degree for degree in range(MOST_DEGREE + HIGHER + 1) if _determined(chart, degree))
@@ -58,25 +52,34 @@ def _determined(chart: Chart, degree: int) -> bool:
 
 
 def choose(chart: Chart) -> tuple[Candidate, bool]:
-    """Return the candidate of the least expected error, and whether it passes all tests."""
+    """Return the polynomial of the least expected error, and whether it passes all tests.
+
+    That of a lens without symmetry is taken only if the symmetric one does not pass.
+    """
     highest = highest_degree(chart)
     sums = sums_of(chart, highest)
-    symmetric, wide, shown = sums.symmetric, sums.fitted(), _PictureOfChart(chart)
-    best: tuple[float, Sums, FloatArray, bool] | None = None
-    for degree, mirrored in candidates(chart):
-        own = (symmetric if mirrored else sums).up_to(degree)
+    reference, shown = sums.fitted(), _PictureOfChart(chart)
+    for symmetric in (True, False):
+        own = _best(sums.symmetric if symmetric else sums, reference, shown)
         coefficients = own.fitted()
-        padded = np.zeros_like(wide)
+        left = residual(sums.up_to(min(own.degree + HIGHER, highest)), coefficients)
+        chances = term_chances(chart, left) | residual_chances(chart, coefficients, own.degree)
+        single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
+        accepted = min(chances.values()) >= single
+        if accepted:
+            break
+    return Candidate(own.degree, symmetric, own, coefficients, chances), accepted
+
+
+def _best(sums: Sums, reference: FloatArray, shown: _PictureOfChart) -> Sums:
+    """Return the sums of the degree with the least expected loss."""
+    losses: list[float] = []
+    for degree in range(min(MOST_DEGREE, sums.degree) + 1):
+        coefficients = sums.up_to(degree).fitted()
+        padded = np.zeros_like(reference)
         padded[..., : coefficients.shape[-1]] = coefficients
-        loss = expected_loss(shown(wide - padded, highest), shown(padded, highest))
-        if best is None or loss < best[0]:
-            best = loss, own, coefficients, mirrored
-    assert best is not None
-    _, own, coefficients, mirrored = best
-    left = residual(sums.up_to(min(own.degree + HIGHER, highest)), coefficients)
-    chances = term_chances(chart, left) | residual_chances(chart, coefficients, own.degree)
-    single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
-    return Candidate(own.degree, mirrored, own, coefficients, chances), min(chances.values()) >= single
+        losses.append(expected_loss(shown(reference - padded, sums.degree), shown(padded, sums.degree)))
+    return sums.up_to(int(np.argmin(losses)))
 
 
 def expected_loss(dropped: FloatArray, kept: FloatArray) -> float:

@@ -26,9 +26,13 @@ from ommatid.runtime.processors import processors
 
 from ..camera import Camera
 from ..lens_type import LensType
+from .wide_correlation import WideCorrelation
 
 ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 PIXELS_AT_ONCE = 2**14
+WIDE = 24  # pixels of f of the narrowest kernels that Fourier transforms apply faster than sums
+
+_Tables = tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, IntArray, int, IntArray]
 
 
 def terms(degree: int) -> list[tuple[int, int]]:
@@ -140,12 +144,12 @@ class KernelFootprints:
     def _shape(self) -> tuple[int, int, int, int]:
         return (*self.places.lens_type.array, *self.places.lens_type.pixels)
 
-    def _tables(self, kernels: FloatArray, coefficients: FloatArray) -> tuple[Any, ...]:
+    def _tables(self, kernels: FloatArray, coefficients: FloatArray) -> _Tables:
         """Return the arguments of the compiled loops that do not depend on the image."""
         weights = np.zeros((len(kernels), self.degree + 1, self.degree + 1))
         for term, (a, b) in enumerate(terms(self.degree)):
             weights[:, a, b] = coefficients[:, term]
-        down, across = (legendre.legvander(axis, self.degree) for axis in self.places.field)
+        down, across = (np.asarray(legendre.legvander(axis, self.degree)) for axis in self.places.field)
         top, columns = self.places.starts
         left = int(columns.min())
         order = np.argsort(top, kind="stable")
@@ -159,8 +163,14 @@ class KernelFootprints:
         from .correlation_loops import correlate  # pyright: ignore[reportUnknownVariableType]
 
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.places.camera.shape)
+        if self.places.width >= WIDE:
+            return self._arranged(self._wide(kernels, coefficients).forward(grid))
         tables, out = self._tables(kernels, coefficients), np.empty(self._shape)
-        _by_rows(self.places.starts[0].size, lambda first, last: correlate(grid, *tables, out, first, last))
+
+        def work(first: int, last: int) -> None:
+            correlate(grid, *tables, out, first, last)
+
+        _by_rows(self.places.starts[0].size, work)
         return out.ravel()
 
     def adjoint(self, readings: FloatArray, out: FloatArray) -> None:
@@ -168,8 +178,26 @@ class KernelFootprints:
         from .correlation_loops import spread  # pyright: ignore[reportUnknownVariableType]
 
         source = np.ascontiguousarray(readings, dtype=np.float64).reshape(self._shape)
+        if self.places.width >= WIDE:
+            lines = source.swapaxes(1, 2).reshape(tuple(start.size for start in self.places.starts))
+            out += self._wide(self.kernels, self.coefficients).adjoint(lines)
+            return
         tables = self._tables(self.kernels, self.coefficients)
-        _by_rows(out.shape[0], lambda first, last: spread(source, *tables, out, first, last))
+
+        def work(first: int, last: int) -> None:
+            spread(source, *tables, out, first, last)
+
+        _by_rows(out.shape[0], work)
+
+    def _wide(self, kernels: FloatArray, coefficients: FloatArray) -> WideCorrelation:
+        _, weights, down, across, *_ = self._tables(kernels, coefficients)
+        shares: list[tuple[FloatArray, FloatArray]] = [(down @ weight, across) for weight in weights]
+        return WideCorrelation(self.places.camera.shape, kernels, *self.places.starts, shares)
+
+    def _arranged(self, lines: FloatArray) -> FloatArray:
+        """Return readings, (sensor rows, sensor columns), in the order of measurements."""
+        down, across, rows, columns = self._shape
+        return lines.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()
 
     def rows(self, pixels: IntArray) -> sparse.csr_array:
         """Return H of some pixels of the lens type: (n, N)."""

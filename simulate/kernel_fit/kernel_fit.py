@@ -2,7 +2,8 @@
 
 The entries of a chart of sensor pixels determine the kernels of `ommatid.scenes.fitted.kernels`: each cell is fitted by
 a polynomial of the field, whose degree F tests choose, and the variation over the field is reduced to its principal
-components. The explanation is rejected if the residuals scatter more than the batches say.
+components. The explanation is rejected if the residuals scatter more than the batches say: in any way that shows in a
+picture, or by more than a tenth of the entries' own variance.
 """
 
 from __future__ import annotations
@@ -22,17 +23,18 @@ from ommatid.scenes.optics.blur import blurs_of, entries
 from ..calibration.point_sources import Responses
 from ..ideal import ideal_matrix
 from .chart import Chart, chart_of
-from .regression import residual, sums_of
-from .selection import SIGNIFICANCE, Candidate, Components, choose, components, residual_chances, term_chances
+from .regression import chance, residual, sums_of
+from .selection import SIGNIFICANCE, Candidate, Components, choose, components, residual_sums, term_sums
 from .uncertainty import error_directions
 
+MOST_UNEXPLAINED = 0.1  # of the entries' variance, with which kernels are still far better than entries
 MOST_DESIGNED = 2**24  # entries of the H as designed that is compared
 DESIGNED_DEGREE = 2  # of polynomials that are looked for in the difference from the design
 
 
 @dataclass(frozen=True, eq=False)
 class KernelFit:
-    """Kernels of a lens type, if they explain the entries; `reason` says why not.
+    """Kernels of a lens type, if they explain the entries; `reason` names what they do not explain.
 
     designed : True if the entries do not differ from H as designed, None where they were not compared
     """
@@ -61,11 +63,13 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
     chart = chart_of(responses, camera, lens_type, pixels)
     if chart is None:
         return KernelFit(False, "some pixels of the chart are dark")
-    candidate, accepted = choose(chart)
-    details = _details(chart, candidate)
-    if not accepted:
-        worst = min(candidate.chances, key=candidate.chances.__getitem__)
-        reason = f"the entries scatter more about the kernels than rays do ({worst})"
+    candidate = choose(chart)
+    details, reason = _details(chart, candidate), ""
+    if candidate.rejected:
+        reason = f"the entries scatter more about the kernels than rays do ({', '.join(candidate.rejected)})"
+    if any(name.endswith("picture") for name in candidate.rejected) or (
+        candidate.rejected and candidate.unexplained > MOST_UNEXPLAINED
+    ):
         return KernelFit(False, reason, details=details)
     parts = components(chart, candidate)
     details["components"] = {
@@ -75,7 +79,7 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
     designed, chances = _as_designed(chart, camera, lens_type)
     if chances:
         details["designed_chances"] = chances
-    return KernelFit(True, "", _footprints(chart, candidate, parts), designed, details)
+    return KernelFit(True, reason, _footprints(chart, candidate, parts), designed, details)
 
 
 def refusal(camera: Camera, lens_type: LensType) -> str:
@@ -102,6 +106,7 @@ def _details(chart: Chart, candidate: Candidate) -> dict[str, Any]:
         "degree": candidate.degree,
         "symmetric": candidate.symmetric,
         "chances": candidate.chances,
+        "unexplained": candidate.unexplained,
     }
 
 
@@ -137,7 +142,8 @@ def _as_designed(chart: Chart, camera: Camera, lens_type: LensType) -> tuple[boo
     sums = sums_of(difference, degree)
     nothing = np.zeros((1 + len(chart.batches), values.shape[1], 1))
     left = residual(sums, nothing)
-    chances = term_chances(difference, left) | residual_chances(difference, nothing, 0)
+    tests = term_sums(difference, left) | residual_sums(difference, nothing, 0)
+    chances = {name: chance(products) for name, products in tests.items()}
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
     return min(chances.values()) >= single, chances
 

@@ -19,6 +19,8 @@ from ommatid.scenes.fitted.kernels import basis, terms
 
 from .chart import Chart
 
+Turn = tuple[bool, ...]  # mirrored down, mirrored across, transposed before
+
 SUPPORT = 0.01  # share of the chart's information on a term, below which a cell seen by few pixels does without it
 
 
@@ -108,7 +110,14 @@ def chance(products: FloatArray) -> float:
     return float(stats.f.sf(ratio, freedom, freedom * free))
 
 
-def _operations(degree: int) -> Iterator[tuple[IntArray, FloatArray, tuple[bool, bool, bool]]]:
+def excess(products: FloatArray) -> float:
+    """Return the part of a sum of squares that is not noise, in units of the noise; parameters as of `chance`."""
+    free = len(products) - 2
+    noise = float(np.trace(products[1:, 1:])) / (free * (free + 1))
+    return float(products[0, 0]) / noise - 1 if noise > 0 else 0.0
+
+
+def _operations(degree: int) -> Iterator[tuple[IntArray, FloatArray, Turn]]:
     """Yield the term and the sign that each term becomes, and the mirrorings down, across and the transposition."""
     pairs = terms(degree)
     for turn in product((False, True), repeat=3):
@@ -118,9 +127,9 @@ def _operations(degree: int) -> Iterator[tuple[IntArray, FloatArray, tuple[bool,
         yield index, sign, turn
 
 
-def _turned(grid: FloatArray, turn: tuple[bool, bool, bool], axes: tuple[int, int]) -> FloatArray:
+def _turned(grid: FloatArray, turn: Turn, axes: tuple[int, int]) -> FloatArray:
     """Transpose and then mirror the cells."""
     mirrored_down, mirrored_across, transposed = turn
     grid = grid.swapaxes(*axes) if transposed else grid
     mirrored = [axis for axis, wanted in zip(axes, (mirrored_down, mirrored_across), strict=True) if wanted]
-    return np.flip(grid, mirrored)
+    return np.flip(grid, tuple(mirrored))

@@ -16,7 +16,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.fitted.kernels import basis
 
 from .chart import Chart
-from .regression import Sums, chance, gram, residual, sums_of
+from .regression import Sums, chance, excess, gram, residual, sums_of
 from .typical_picture import seen
 
 SIGNIFICANCE = 0.01  # at which a correct model is rejected, by all tests together
@@ -31,6 +31,7 @@ class Candidate:
     """A polynomial for every cell.
 
     coefficients : (1 + B, C, P) of the mean and of the batches' deviations;  chances : of each test
+    unexplained : mean square of what it leaves of an entry beside noise, in units of the entry's variance
     """
 
     degree: int
@@ -38,6 +39,13 @@ class Candidate:
     sums: Sums
     coefficients: FloatArray
     chances: dict[str, float]
+    unexplained: float
+
+    @property
+    def rejected(self) -> list[str]:
+        """The tests that it does not pass."""
+        single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(self.chances))
+        return [name for name, value in self.chances.items() if value < single]
 
 
 def highest_degree(chart: Chart) -> int:
@@ -51,24 +59,27 @@ def _determined(chart: Chart, degree: int) -> bool:
     return len(x) >= PIXELS_PER_TERM * x.shape[1] and np.linalg.matrix_rank(x, tol=1e-6 * len(x) ** 0.5) == x.shape[1]
 
 
-def choose(chart: Chart) -> tuple[Candidate, bool]:
-    """Return the polynomial of the least expected error, and whether it passes all tests.
+def choose(chart: Chart) -> Candidate:
+    """Return the polynomial of the least expected error.
 
-    That of a lens without symmetry is taken only if the symmetric one does not pass.
+    That of a lens without symmetry is taken only if it passes all tests and the symmetric one does not.
     """
     highest = highest_degree(chart)
     sums = sums_of(chart, highest)
     reference, shown = sums.fitted(), _PictureOfChart(chart)
-    for symmetric in (True, False):
-        own = _best(sums.symmetric if symmetric else sums, reference, shown)
-        coefficients = own.fitted()
-        left = residual(sums.up_to(min(own.degree + HIGHER, highest)), coefficients)
-        chances = term_chances(chart, left) | residual_chances(chart, coefficients, own.degree)
-        single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
-        accepted = min(chances.values()) >= single
-        if accepted:
-            break
-    return Candidate(own.degree, symmetric, own, coefficients, chances), accepted
+    symmetric = _tested(chart, sums, _best(sums.symmetric, reference, shown), True)
+    if not symmetric.rejected:
+        return symmetric
+    general = _tested(chart, sums, _best(sums, reference, shown), False)
+    return symmetric if general.rejected else general
+
+
+def _tested(chart: Chart, sums: Sums, own: Sums, symmetric: bool) -> Candidate:
+    coefficients = own.fitted()
+    left = residual(sums.up_to(min(own.degree + HIGHER, sums.degree)), coefficients)
+    tests = term_sums(chart, left) | residual_sums(chart, coefficients, own.degree)
+    chances = {name: chance(products) for name, products in tests.items()}
+    return Candidate(own.degree, symmetric, own, coefficients, chances, excess(tests["all cells"]))
 
 
 def _best(sums: Sums, reference: FloatArray, shown: _PictureOfChart) -> Sums:
@@ -106,31 +117,34 @@ class _PictureOfChart:
         return np.array([seen((x @ each.T) * self._inside) for each in coefficients])
 
 
-def term_chances(chart: Chart, left: Sums) -> dict[str, float]:
-    """Return the chances of the polynomials that explain most of a residual: of all cells alike, and in a picture."""
+def term_sums(chart: Chart, left: Sums) -> dict[str, FloatArray]:
+    """Return the sums of squares of polynomials that explain most of a residual: of all cells, and in a picture."""
     fitted = left.fitted()
     shown = seen((fitted @ np.linalg.cholesky(left.whole)).swapaxes(1, 2) * chart.share**0.5)
     return {
-        "terms": chance(gram(fitted * chart.weights[:, None], left.entries)),
-        "terms in a picture": chance(gram(shown, shown)),
+        "terms": gram(fitted * chart.weights[:, None], left.entries),
+        "terms in a picture": gram(shown, shown),
     }
 
 
-def residual_chances(chart: Chart, coefficients: FloatArray, degree: int) -> dict[str, float]:
-    """Return the chances of the residuals of all cells, and of their means over each sub-imager."""
-    x, every, means, shown = basis(chart.field, degree), [], [], []
+def residual_sums(chart: Chart, coefficients: FloatArray, degree: int) -> dict[str, FloatArray]:
+    """Return the sums of squares of the residuals of all cells, and of their means over each sub-imager."""
+    x = basis(chart.field, degree)
+    every: list[FloatArray] = []
+    means: list[FloatArray] = []
+    shown: list[FloatArray] = []
     root = np.sqrt(chart.weights)
     counts = _by_sub_imager(chart, chart.inside.astype(np.float64))
     for entries, each in zip((chart.values, *chart.batches), coefficients, strict=True):
         left = np.where(chart.inside, entries - x @ each.T, 0.0)
-        every.append((left * root).astype(np.float32))
+        every.append(left * root)
         mean = _by_sub_imager(chart, left) / np.sqrt(np.maximum(counts, 1.0))
         means.append(mean * root)
         shown.append(seen(mean))
-    tests = {"all cells": chance(_gram(every))}
+    tests = {"all cells": _gram(every)}
     if len(counts) > 1:
-        tests["sub-imagers"] = chance(_gram(means))
-        tests["sub-imagers in a picture"] = chance(_gram(shown))
+        tests["sub-imagers"] = _gram(means)
+        tests["sub-imagers in a picture"] = _gram(shown)
     return tests
 
 
@@ -163,7 +177,7 @@ class Components:
 
 def components(chart: Chart, candidate: Candidate) -> Components:
     """Return the principal components of the variation over the field, as many as have the least expected loss."""
-    triangle = np.linalg.cholesky(candidate.sums.whole / len(chart.pixels))
+    triangle = np.linalg.cholesky(candidate.sums.whole / len(chart.pixels)).astype(np.float64)
     root = np.sqrt(chart.weights * chart.share)
     varying = (candidate.coefficients @ triangle)[..., 1:].swapaxes(1, 2) * root
     count = varying.shape[1]

@@ -7,7 +7,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 
 LEVEL = 3.0  # mean squared over variance of a picture whose values are uniform between 0 and 255
-CORRELATED = 10.0  # pixels of f over which a picture's correlation falls to 1/e
+CORRELATED = 3.0  # pixels of f over which a picture's correlation falls to 1/e
 
 
 def seen(errors: FloatArray) -> FloatArray:
@@ -16,7 +16,8 @@ def seen(errors: FloatArray) -> FloatArray:
     The picture has a variance of 1, and a correlation that falls exponentially down and across.
     """
     size = round(errors.shape[-1] ** 0.5)
-    apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    place = np.arange(size, dtype=np.float64)
+    apart = np.abs(place[:, None] - place)
     values, vectors = np.linalg.eigh(np.exp(-apart / CORRELATED))
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     varied = root @ errors.reshape(*errors.shape[:-1], size, size) @ root

@@ -18,9 +18,9 @@ from .selection import Candidate, Components
 from .typical_picture import seen
 
 DRAWS = 96
-SHARE = 0.95  # of the expected variance of H f that the directions describe; they are scaled to all of it
-KERNELS = 0.995  # of that variance that the common kernels of the directions describe
-MOST_DIRECTIONS, MOST_KERNELS = 12, 24
+SHARE = 0.99  # of the expected variance of H f that the directions describe; they are scaled to all of it
+KERNELS = 0.999  # of that variance that the common kernels of the directions describe
+MOST_DIRECTIONS, MOST_KERNELS = 16, 32
 
 
 def error_directions(chart: Chart, candidate: Candidate, parts: Components) -> tuple[FloatArray, FloatArray]:
@@ -34,13 +34,14 @@ def error_directions(chart: Chart, candidate: Candidate, parts: Components) -> t
         return np.zeros((0, cells)), np.zeros((0, 0, count))
     kept = _needed(values, SHARE, MOST_DIRECTIONS)
     scale = (total / values[-kept:].sum() / draws) ** 0.5
-    directions = np.tensordot(vectors[:, -kept:].T * scale, errors, axes=1)
+    directions = np.asarray(np.tensordot(vectors[:, -kept:].T * scale, errors, axes=1), dtype=np.float64)
     terms = directions.swapaxes(1, 2).reshape(-1, cells)
     shown = seen(terms * chart.share**0.5)
     values, vectors = np.linalg.eigh(shown @ shown.T)
     vectors = vectors[:, -_needed(values, KERNELS, MOST_KERNELS) :]
     shares = vectors.reshape(kept, count, -1).swapaxes(1, 2)
-    return vectors.T @ terms, shares @ np.linalg.inv(parts.triangle)
+    kernels: FloatArray = np.asarray(vectors.T @ terms, dtype=np.float64)
+    return kernels, np.asarray(shares @ np.linalg.inv(parts.triangle), dtype=np.float64)
 
 
 def _draws(chart: Chart, candidate: Candidate) -> FloatArray:
@@ -71,5 +72,5 @@ def _projected(chart: Chart, errors: FloatArray, parts: Components) -> FloatArra
 
 def _needed(values: FloatArray, share: float, most: int) -> int:
     """Return how many of the largest of rising values add up to a share of their sum."""
-    left = np.cumsum(values[::-1])
+    left = np.asarray(np.cumsum(values[::-1]))
     return min(int(np.searchsorted(left, share * left[-1])) + 1, most)

@@ -153,7 +153,12 @@ class KernelFootprints:
         top, columns = self.places.starts
         left = int(columns.min())
         order = np.argsort(top, kind="stable")
-        return np.ascontiguousarray(kernels), weights, down, across, order, top, left, columns - left
+        return (np.ascontiguousarray(kernels), weights, down.astype(np.float64), across.astype(np.float64)) + (
+            order,
+            top,
+            left,
+            columns - left,
+        )
 
     def forward(self, image: FloatArray) -> FloatArray:
         """H f: (N,) or (rows, columns) to (measurements of the type,)."""

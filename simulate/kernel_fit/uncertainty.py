@@ -72,5 +72,5 @@ def _projected(chart: Chart, errors: FloatArray, parts: Components) -> FloatArra
 
 def _needed(values: FloatArray, share: float, most: int) -> int:
     """Return how many of the largest of rising values add up to a share of their sum."""
-    left = np.asarray(np.cumsum(values[::-1]))
-    return min(int(np.searchsorted(left, share * left[-1])) + 1, most)
+    left: FloatArray = np.cumsum(values[::-1], dtype=np.float64)
+    return min(int(np.searchsorted(left, share * float(left[-1]))) + 1, most)

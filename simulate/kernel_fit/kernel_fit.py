@@ -145,7 +145,7 @@ def _as_designed(chart: Chart, camera: Camera, lens_type: LensType) -> tuple[boo
     tests = term_sums(difference, left) | residual_sums(difference, nothing, 0)
     chances = {name: chance(products) for name, products in tests.items()}
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
-    return min(chances.values()) >= single, chances
+    return bool(min(chances.values()) >= single), chances
 
 
 def designed_values(chart: Chart, camera: Camera, lens_type: LensType) -> FloatArray | None:

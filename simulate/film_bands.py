@@ -32,7 +32,8 @@ def render_bands(
         state = State()  # the other bands have not begun
         for index in range(tally.count, work.passes):
             seeds = sampler_seeds(seed, "data", index, work.passes)
-            tally.add(np.concatenate([renderer.expose(group, work.samples, seeds, block=part)[0] for group, part in band]))
+            parts = [renderer.expose(group, work.samples, seeds, block=part)[0] for group, part in band]
+            tally.add(np.concatenate(parts))
             if checkpoint is not None:
                 done = {"mean": mean, "variance": variance, "band": np.array(number)}
                 checkpoint.offer(lambda done=done, tally=tally: {**done, **tally.state("light")})

@@ -1,1 +1,1 @@
-"""H by few numbers: views, and what follows from them."""
+"""H by few numbers: views of sharp lens types, kernels of blurred ones, and the errors of both."""

@@ -1,10 +1,10 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
 `python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`,
-`frames`, `film`, which takes ten minutes, and `nasty`, which takes half an hour. No speed is asserted. `coverage`, which
-measures error bars for hours, and `chain`, the time, memory and files of every stage of a run from 239 x 239 pixels on,
-are run by themselves (`coverage --help`). Other load slows both sides of a ratio alike, so compare ratios rather than
-times.
+`frames`, `film`, which takes ten minutes, and `nasty`, which takes half an hour. No speed is asserted. `coverage`,
+which measures error bars for hours, and `chain`, the time, memory and files of every stage of a run from 239 x 239
+pixels on, are run by themselves (`coverage --help`). Other load slows both sides of a ratio alike, so compare ratios
+rather than times.
 """
 
 from __future__ import annotations

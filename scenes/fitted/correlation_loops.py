@@ -1,0 +1,130 @@
+"""Correlations of an image with kernels that vary over the field, and their adjoint, compiled.
+
+Work is divided into ranges of rows that do not depend on the number of threads, so neither do the results.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+UNROLLED = 4
+
+
+@numba.njit(cache=True, nogil=True)
+def correlate_line(image, kernels, top, left, length, source, lines):
+    """Fill `lines`, (S, length), with sums of kernels * image at row `top` and columns left, left + 1, ... of f.
+
+    Pixels beside the image are 0.  source : buffer of length + W
+    """
+    rows, columns = image.shape
+    count, tall, wide = kernels.shape
+    lines[:] = 0.0
+    begin, end = max(left, 0), min(left + source.size, columns)
+    for dy in range(tall):
+        y = top + dy
+        if y < 0 or y >= rows:
+            continue
+        source[:] = 0.0
+        source[begin - left : end - left] = image[y, begin:end]
+        for s in range(count):
+            line = lines[s]
+            for dx in range(0, wide - wide % UNROLLED, UNROLLED):
+                a, b, c, d = kernels[s, dy, dx], kernels[s, dy, dx + 1], kernels[s, dy, dx + 2], kernels[s, dy, dx + 3]
+                for x in range(length):
+                    line[x] += (a * source[x + dx] + b * source[x + dx + 1]) + (
+                        c * source[x + dx + 2] + d * source[x + dx + 3]
+                    )
+            for dx in range(wide - wide % UNROLLED, wide):
+                a = kernels[s, dy, dx]
+                for x in range(length):
+                    line[x] += a * source[x + dx]
+
+
+@numba.njit(cache=True, nogil=True)
+def spread_line(lines, kernels, top, left, source, first, last, out):
+    """Add the adjoint of `correlate_line`, applied to `lines`, to rows first to last of `out`."""
+    columns = out.shape[1]
+    count, length = lines.shape
+    tall, wide = kernels.shape[1:]
+    begin, end = max(left, 0), min(left + source.size, columns)
+    for dy in range(tall):
+        y = top + dy
+        if y < first or y >= last:
+            continue
+        source[:] = 0.0
+        for s in range(count):
+            line = lines[s]
+            for dx in range(wide):
+                share = kernels[s, dy, dx]
+                for x in range(length):
+                    source[x + dx] += share * line[x]
+        target = out[y]
+        for x in range(begin, end):
+            target[x] += source[x - left]
+
+
+@numba.njit(cache=True, nogil=True)
+def correlate(image, kernels, weights, down, across, order, top, left, columns_at, out, first, last):
+    """Fill `out`, (K, L, rows, columns), for sensor rows order[first:last].
+
+    weights : (S, P, P) of products of polynomials down and across, (sensor rows, P) and (sensor columns, P)
+    top, left : first row and column of f of each sensor row and of all columns;  columns_at : (sensor columns,) - left
+    """
+    count, powers = weights.shape[0], weights.shape[1]
+    length, wide = columns_at.max() + 1, kernels.shape[2]
+    lines, source = np.empty((count, length)), np.empty(length + wide - 1)
+    factors = np.empty((count, powers))
+    before = -(1 << 60)
+    for position in range(first, last):
+        row = order[position]
+        if top[row] != before:
+            before = top[row]
+            correlate_line(image, kernels, before, left, length, source, lines)
+        _factors(weights, down[row], factors)
+        k, i = row // out.shape[2], row % out.shape[2]
+        for column in range(columns_at.size):
+            total, x = 0.0, columns_at[column]
+            for s in range(count):
+                share = 0.0
+                for b in range(powers):
+                    share += factors[s, b] * across[column, b]
+                total += share * lines[s, x]
+            out[k, column // out.shape[3], i, column % out.shape[3]] = total
+
+
+@numba.njit(cache=True, nogil=True)
+def spread(readings, kernels, weights, down, across, order, top, left, columns_at, out, first, last):
+    """Add the adjoint of `correlate`, applied to `readings`, to rows first to last of `out`."""
+    count, powers = weights.shape[0], weights.shape[1]
+    length, tall, wide = columns_at.max() + 1, kernels.shape[1], kernels.shape[2]
+    lines, source = np.zeros((count, length)), np.empty(length + wide - 1)
+    factors = np.empty((count, powers))
+    for position in range(order.size):
+        row = order[position]
+        if top[row] + tall <= first or top[row] >= last:
+            continue
+        _factors(weights, down[row], factors)
+        k, i = row // readings.shape[2], row % readings.shape[2]
+        for column in range(columns_at.size):
+            value, x = readings[k, column // readings.shape[3], i, column % readings.shape[3]], columns_at[column]
+            for s in range(count):
+                share = 0.0
+                for b in range(powers):
+                    share += factors[s, b] * across[column, b]
+                lines[s, x] += share * value
+        if position + 1 == order.size or top[order[position + 1]] != top[row]:
+            spread_line(lines, kernels, top[row], left, source, first, last, out)
+            lines[:] = 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _factors(weights, down, factors):
+    """Fill `factors`, (S, P), with the weights of the polynomials across at one sensor row."""
+    for s in range(weights.shape[0]):
+        for b in range(weights.shape[2]):
+            total = 0.0
+            for a in range(weights.shape[1]):
+                total += weights[s, a, b] * down[a]
+            factors[s, b] = total

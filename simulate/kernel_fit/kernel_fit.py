@@ -1,0 +1,171 @@
+"""H of a blurred lens type from learnt kernels instead of noisy entries.
+
+The entries of a chart of sensor pixels determine the kernels of `ommatid.scenes.fitted.kernels`: each cell is fitted by
+a polynomial of the field, whose degree F tests choose, and the variation over the field is reduced to its principal
+components. The explanation is rejected if the residuals scatter more than the batches say: in any way that shows in a
+picture, or by more than a tenth of the entries' own variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.kernels import KernelFootprints
+from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics.blur import blurs_of, entries
+
+from ..calibration.point_sources import Responses
+from ..ideal import ideal_matrix
+from .chart import Chart, chart_of
+from .regression import chance, residual, sums_of
+from .selection import SIGNIFICANCE, Candidate, Components, choose, components, residual_sums, term_sums
+from .uncertainty import error_directions
+
+MOST_UNEXPLAINED = 0.1  # of the entries' variance, with which kernels are still far better than entries
+MOST_DESIGNED = 2**24  # entries of the H as designed that is compared
+DESIGNED_DEGREE = 2  # of polynomials that are looked for in the difference from the design
+
+
+@dataclass(frozen=True, eq=False)
+class KernelFit:
+    """Kernels of a lens type, if they explain the entries; `reason` names what they do not explain.
+
+    designed : True if the entries do not differ from H as designed, None where they were not compared
+    """
+
+    accepted: bool
+    reason: str
+    footprints: KernelFootprints | None = None
+    designed: bool | None = None
+    details: dict[str, Any] = field(default_factory=dict[str, Any])
+
+    def record(self) -> dict[str, Any]:
+        """Return the entry of a model's record, in JSON's types."""
+        return {"kind": "kernels", "accepted": self.accepted, "reason": self.reason, "designed": self.designed} | (
+            self.details
+        )
+
+
+def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixels: IntArray | None = None) -> KernelFit:
+    """Learn the kernels of a lens type from the rows of H of some of its pixels.
+
+    pixels : of the type, (n,), whose rows were measured; None: those that have entries
+    """
+    obstacle = refusal(camera, lens_type)
+    if obstacle:
+        return KernelFit(False, obstacle)
+    chart = chart_of(responses, camera, lens_type, pixels)
+    if chart is None:
+        return KernelFit(False, "some pixels of the chart are dark")
+    candidate = choose(chart)
+    details, reason = _details(chart, candidate), ""
+    if candidate.rejected:
+        reason = f"the entries scatter more about the kernels than rays do ({', '.join(candidate.rejected)})"
+    if any(name.endswith("picture") for name in candidate.rejected) or (
+        candidate.rejected and candidate.unexplained > MOST_UNEXPLAINED
+    ):
+        return KernelFit(False, reason, details=details)
+    parts = components(chart, candidate)
+    details["components"] = {
+        "count": len(parts.strengths),
+        "strengths": [float(each) for each in parts.strengths],
+    }
+    designed, chances = _as_designed(chart, camera, lens_type)
+    if chances:
+        details["designed_chances"] = chances
+    return KernelFit(True, reason, _footprints(chart, candidate, parts), designed, details)
+
+
+def refusal(camera: Camera, lens_type: LensType) -> str:
+    """Return why kernels cannot describe a lens type, empty if they can."""
+    if not camera.walls:
+        return "without walls, light of other lenses reaches its pixels"
+    if lens_type.optics.distortion is not None:
+        return "its images are distorted"
+    if camera.tolerance is not None:
+        return "its sub-imagers are misaligned"
+    if lens_type.steered:
+        return "some of its sub-imagers are off the grid"
+    if not lens_type.covers_whole_pixels:
+        return "its footprints are not whole pixels of f"
+    return ""
+
+
+def _details(chart: Chart, candidate: Candidate) -> dict[str, Any]:
+    return {
+        "lens": chart.places.lens_type.name,
+        "pixels": len(chart.pixels),
+        "rays_per_pixel": chart.rays,
+        "width": chart.places.width,
+        "degree": candidate.degree,
+        "symmetric": candidate.symmetric,
+        "chances": candidate.chances,
+        "unexplained": candidate.unexplained,
+    }
+
+
+def _footprints(chart: Chart, candidate: Candidate, parts: Components) -> KernelFootprints:
+    """Return H from the mean kernel and the components."""
+    size, root = chart.places.width, np.sqrt(chart.weights * chart.share)
+    orthonormal = candidate.coefficients[0] @ parts.triangle
+    back = np.linalg.inv(parts.triangle)
+    varying = np.divide(parts.cells, root, out=np.zeros_like(parts.cells), where=root > 0)
+    shares = np.concatenate(
+        [np.zeros((1, len(parts.strengths))), parts.field * (parts.strengths / len(chart.pixels) ** 0.5)]
+    )
+    kernels = np.concatenate([orthonormal[None, :, 0], varying])
+    coefficients = np.concatenate([np.eye(1, len(back)), shares.T]) @ back
+    error_kernels, error_coefficients = error_directions(chart, candidate, parts)
+    return KernelFootprints(
+        chart.places,
+        candidate.degree,
+        kernels.reshape(-1, size, size),
+        coefficients,
+        error_kernels.reshape(-1, size, size),
+        error_coefficients,
+    )
+
+
+def _as_designed(chart: Chart, camera: Camera, lens_type: LensType) -> tuple[bool | None, dict[str, float]]:
+    """Return whether the entries agree with H as designed, and the chances of the tests; None if it is too large."""
+    values = designed_values(chart, camera, lens_type)
+    if values is None:
+        return None, {}
+    difference = replace(chart, values=chart.values - values)
+    degree = DESIGNED_DEGREE if len(chart.pixels) > 20 else 0
+    sums = sums_of(difference, degree)
+    nothing = np.zeros((1 + len(chart.batches), values.shape[1], 1))
+    left = residual(sums, nothing)
+    tests = term_sums(difference, left) | residual_sums(difference, nothing, 0)
+    chances = {name: chance(products) for name, products in tests.items()}
+    single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
+    return bool(min(chances.values()) >= single), chances
+
+
+def designed_values(chart: Chart, camera: Camera, lens_type: LensType) -> FloatArray | None:
+    """Return H as designed of the chart's pixels, (n, C), None if it cannot be computed or is too large."""
+    places, alone = chart.places, replace(camera, types=(lens_type,))
+    if lens_type.measurements * places.width**2 > MOST_DESIGNED:
+        return None
+    if lens_type.optics.surfaces is None:
+        reach = max(blur.reach for blur, _ in blurs_of(camera, lens_type))
+        if entries(alone, lens_type, reach) > MOST_DESIGNED:
+            return None
+    try:
+        matrix = ideal_matrix(alone)[chart.pixels]
+    except InputError:
+        return None
+    down, across = places.cells(chart.pixels)
+    values = np.zeros(chart.values.shape)
+    for number in range(len(values)):
+        row = matrix[[number]].toarray().reshape(camera.shape)
+        padded = np.pad(row, places.width)
+        block = padded[np.ix_(down[number] + places.width, across[number] + places.width)]
+        values[number] = block.ravel()
+    return values

@@ -1,0 +1,135 @@
+"""Least squares of every cell of the kernels on polynomials of the field, from sums over the pixels of a chart.
+
+A lens that is symmetric about its axis shows the same picture mirrored at mirrored positions of the field, and
+transposed at transposed ones, on a grid of squares exactly. Averaging the sums over these eight operations gives the
+fit of all pixels and their images at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy import stats
+
+from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.scenes.fitted.kernels import basis, terms
+
+from .chart import Chart
+
+Turn = tuple[bool, ...]  # mirrored down, mirrored across, transposed before
+
+SUPPORT = 0.01  # share of the chart's information on a term, below which a cell seen by few pixels does without it
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Sums over the pixels of a chart, with P terms of a polynomial.
+
+    products : (C, P, P) of two terms over the pixels that see a cell;  entries : (k, C, P) of terms and entries, those
+    of the mean first, then those of the batches' deviations;  whole : (P, P) of two terms over all pixels
+    """
+
+    products: FloatArray
+    entries: FloatArray
+    whole: FloatArray
+    degree: int
+
+    @property
+    def symmetric(self) -> Sums:
+        """The mean over the chart and its seven images."""
+        size = round(len(self.products) ** 0.5)
+        products, entries, whole = (np.zeros_like(each) for each in (self.products, self.entries, self.whole))
+        for index, sign, turn in _operations(self.degree):
+            signs = sign[:, None] * sign
+            turned = _turned(self.products.reshape(size, size, *self.whole.shape), turn, (0, 1))
+            products += turned.reshape(self.products.shape)[:, index[:, None], index] * signs
+            grid = self.entries.reshape(-1, size, size, index.size)
+            entries += _turned(grid, turn, (1, 2)).reshape(self.entries.shape)[..., index] * sign
+            whole += self.whole[index[:, None], index] * signs
+        return Sums(products / 8, entries / 8, whole / 8, self.degree)
+
+    def up_to(self, degree: int) -> Sums:
+        """The sums of the terms up to a lower degree."""
+        count = len(terms(degree))
+        return Sums(self.products[:, :count, :count], self.entries[..., :count], self.whole[:count, :count], degree)
+
+    @property
+    def inverses(self) -> FloatArray:
+        """Pseudo-inverses of `products`, (C, P, P), without what the pixels that see a cell say little about."""
+        values, vectors = np.linalg.eigh(self.whole)
+        kept = values > 1e-9 * values[-1]
+        root = vectors[:, kept] / np.sqrt(values[kept])
+        values, vectors = np.linalg.eigh(root.T @ self.products @ root)
+        inverse = np.divide(1.0, values, out=np.zeros_like(values), where=values > SUPPORT)
+        back = root @ vectors
+        return np.asarray((back * inverse[:, None, :]) @ back.swapaxes(1, 2))
+
+    def fitted(self) -> FloatArray:
+        """Coefficients of all cells: (k, C, P)."""
+        return np.einsum("kcp,cpq->kcq", self.entries, self.inverses, optimize=True)
+
+
+def sums_of(chart: Chart, degree: int) -> Sums:
+    """Return the sums of a chart for polynomials up to a degree."""
+    x = basis(chart.field, degree)
+    count, (pixels, cells) = x.shape[1], chart.inside.shape
+    pairs = (x[:, :, None] * x[:, None]).reshape(pixels, -1)
+    products = (pairs.T @ chart.inside.astype(np.float64)).T.reshape(cells, count, count)
+    entries = [(x.T @ each).T for each in (chart.values, *chart.batches)]
+    return Sums(products, np.array(entries), x.T @ x, degree)
+
+
+def residual(sums: Sums, coefficients: FloatArray) -> Sums:
+    """Return the sums of what coefficients of a lower degree, (k, C, P'), leave."""
+    count = coefficients.shape[-1]
+    explained = np.einsum("cpq,kcq->kcp", sums.products[:, :, :count], coefficients, optimize=True)
+    return Sums(sums.products, sums.entries - explained, sums.whole, sums.degree)
+
+
+def gram(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the products of (k, ...) arrays, summed over all but the first axis: (k, k)."""
+    return left.reshape(len(left), -1) @ right.reshape(len(right), -1).T
+
+
+def chance(products: FloatArray) -> float:
+    """Return the probability of a sum of squares at least as large as that of the mean if only noise is in it.
+
+    products : (1 + B, 1 + B) of the mean and of the deviations of the batches, as of `gram`
+    An F test with the effective degrees of freedom (tr S)^2 / tr S^2 (Bai and Saranadasa 1996, Statistica Sinica 6).
+    """
+    noise, free = products[1:, 1:], len(products) - 2
+    trace, square = float(np.trace(noise)) / free, float(np.square(noise).sum()) / free**2
+    if trace <= 0:
+        return 1.0
+    squares = free**2 / ((free - 1) * (free + 2)) * (square - trace**2 / free)
+    freedom = max(1.0, trace**2 / max(squares, trace**2 * 1e-9))
+    ratio = float(products[0, 0]) / (trace / (free + 1))
+    return float(stats.f.sf(ratio, freedom, freedom * free))
+
+
+def excess(products: FloatArray) -> float:
+    """Return the part of a sum of squares that is not noise, in units of the noise; parameters as of `chance`."""
+    free = len(products) - 2
+    noise = float(np.trace(products[1:, 1:])) / (free * (free + 1))
+    return float(products[0, 0]) / noise - 1 if noise > 0 else 0.0
+
+
+def _operations(degree: int) -> Iterator[tuple[IntArray, FloatArray, Turn]]:
+    """Yield the term and the sign that each term becomes, and the mirrorings down, across and the transposition."""
+    pairs = terms(degree)
+    for turn in product((False, True), repeat=3):
+        mirrored_down, mirrored_across, transposed = turn
+        index = np.array([pairs.index((b, a) if transposed else (a, b)) for a, b in pairs])
+        sign = np.array([(-1.0) ** (a * mirrored_down + b * mirrored_across) for a, b in pairs])
+        yield index, sign, turn
+
+
+def _turned(grid: FloatArray, turn: Turn, axes: tuple[int, int]) -> FloatArray:
+    """Transpose and then mirror the cells."""
+    mirrored_down, mirrored_across, transposed = turn
+    grid = grid.swapaxes(*axes) if transposed else grid
+    mirrored = [axis for axis, wanted in zip(axes, (mirrored_down, mirrored_across), strict=True) if wanted]
+    return np.flip(grid, tuple(mirrored))

@@ -1,0 +1,122 @@
+"""H by kernels: against closed forms, its own matrix, and the dot test."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ommatid.scenes.fitted import kernels as module
+from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
+from ommatid.simulate.ideal import ideal_matrix
+from tests.examples import camera
+
+CAMERA = camera()
+METHODS = pytest.mark.parametrize("widest_sum", [0, 1000], ids=["transforms", "sums"])
+
+
+def random_kernels(margin: int, degree: int = 2, index: int = 1) -> KernelFootprints:
+    """Kernels without any symmetry."""
+    places, rng = KernelPlaces(CAMERA, CAMERA.types[index], margin), np.random.default_rng(0)
+    shape, count = (places.width, places.width), len(terms(degree))
+    return KernelFootprints(
+        places,
+        degree,
+        rng.normal(size=(3, *shape)),
+        rng.normal(size=(3, count)),
+        rng.normal(size=(2, *shape)),
+        rng.normal(size=(4, 2, count)),
+    )
+
+
+@METHODS
+@pytest.mark.parametrize("margin", [0, 3])
+def test_a_box_is_the_kernel_of_an_ideal_pinhole(margin: int, widest_sum: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "WIDE", widest_sum)
+    image = np.random.default_rng(1).normal(size=CAMERA.shape)
+    expected = ideal_matrix(CAMERA)
+    for lens_type, pixels in zip(CAMERA.types, CAMERA.type_slices(), strict=True):
+        places = KernelPlaces(CAMERA, lens_type, margin)
+        box = np.pad(np.full((1, int(lens_type.ratio), int(lens_type.ratio)), float(lens_type.ratio) ** -2), margin)
+        box = box[margin : margin + 1]
+        footprints = KernelFootprints(places, 0, box, np.ones((1, 1)), box[:0], np.zeros((0, 0, 1)))
+        assert abs(footprints.to_sparse() - expected[pixels]).max() < 1e-15
+        assert footprints.forward(image) == pytest.approx(expected[pixels] @ image.ravel(), abs=1e-13)
+
+
+@METHODS
+@pytest.mark.parametrize("margin", [0, 2, 18])
+def test_forward_and_adjoint_are_those_of_the_matrix(
+    margin: int, widest_sum: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "WIDE", widest_sum)
+    footprints, rng = random_kernels(margin), np.random.default_rng(2)
+    image, readings = rng.normal(size=CAMERA.shape), rng.normal(size=CAMERA.types[1].measurements)
+    matrix, out = footprints.to_sparse(), np.ones(CAMERA.shape)
+    footprints.adjoint(readings, out)
+    assert footprints.forward(image) == pytest.approx(matrix @ image.ravel(), abs=1e-11)
+    assert out.ravel() - 1 == pytest.approx(matrix.T @ readings, abs=1e-11)
+    assert matrix.nnz == footprints.entries
+
+
+def test_the_field_is_measured_from_the_lens_s_axis() -> None:
+    lens_type = CAMERA.types[0]
+    places = KernelPlaces(CAMERA, lens_type, 2)
+    field = places.positions(np.arange(lens_type.measurements)) * places.scale * CAMERA.target_pitch
+    subs = [sub for sub in CAMERA.sub_imagers if sub.type == lens_type]
+    rows, columns = lens_type.pixels
+    for number, sub in enumerate(subs):
+        for i, j in ((0, 0), (rows - 1, 1)):
+            x, y = CAMERA.position(
+                float(sub.window[0]) + float(lens_type.ratio) * (i + 0.5),
+                float(sub.window[1]) + float(lens_type.ratio) * (j + 0.5),
+            )
+            down, across = field[(number * rows + i) * columns + j]
+            assert (down, across) == pytest.approx((sub.lens[1] - y, sub.lens[0] - x))
+    assert np.abs(field).max() == pytest.approx(places.scale * CAMERA.target_pitch)
+
+
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ROWS_AT_ONCE", 3)
+    footprints, rng = random_kernels(2), np.random.default_rng(3)
+    image, readings = rng.normal(size=CAMERA.shape), rng.normal(size=CAMERA.types[1].measurements)
+    results: list[tuple[bytes, bytes]] = []
+    for threads in (1, 4):
+        monkeypatch.setattr(module, "processors", lambda threads=threads: threads)
+        out = np.zeros(CAMERA.shape)
+        footprints.adjoint(readings, out)
+        results.append((footprints.forward(image).tobytes(), out.tobytes()))
+    assert results[0] == results[1]
+
+
+def test_directions_of_the_error_are_what_changed_kernels_read() -> None:
+    footprints = random_kernels(2)
+    image = np.random.default_rng(4).normal(size=CAMERA.shape)
+    directions = footprints.error_directions(image).toarray()
+    assert directions.shape == (CAMERA.types[1].measurements, 4)
+    for column, coefficients in zip(directions.T, footprints.error_coefficients, strict=True):
+        changed = replace(footprints, kernels=footprints.error_kernels, coefficients=coefficients)
+        assert column == pytest.approx(changed.to_sparse() @ image.ravel(), abs=1e-11)
+    alone = replace(footprints, error_coefficients=footprints.error_coefficients[:1])
+    assert np.abs(alone.error_directions(image).toarray()).max() > 0
+
+
+def test_a_window_has_the_rows_that_see_nothing_outside_it() -> None:
+    footprints = random_kernels(1)
+    rows, columns = slice(3, 14), slice(2, 17)
+    matrix = footprints.to_sparse().toarray().reshape(-1, *CAMERA.shape)
+    outside = matrix.copy()
+    outside[:, rows, columns] = 0
+    inside = np.flatnonzero(~outside.any(axis=(1, 2)))
+    assert 0 < inside.size < len(matrix)
+    assert np.array_equal(footprints.measurements_inside(rows, columns), inside)
+    expected = matrix[inside][:, rows, columns].reshape(inside.size, -1)
+    assert footprints.submatrix(rows, columns).toarray() == pytest.approx(expected, abs=0)
+
+
+def test_kernels_are_read_as_they_were_described() -> None:
+    footprints = random_kernels(2)
+    again = read_kernels(CAMERA, footprints.description, footprints.arrays)
+    assert abs(again.to_sparse() - footprints.to_sparse()).max() == 0
+    assert again.error_coefficients.shape == footprints.error_coefficients.shape

@@ -1,0 +1,174 @@
+"""Kernels of blurred lens types, learnt from entries that are drawn from a known H."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from scipy import sparse, stats
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces
+from ommatid.scenes.tables.camera import ToleranceTable
+from ommatid.simulate.calibration.point_sources import Responses
+from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.kernel_fit.kernel_fit import KernelFit, fit_kernels, refusal
+from tests.examples import with_optics
+
+PASSES, RAYS = 16, 256
+ONE = (("1/3", [3, 3], [5, 5]),)
+
+
+def drawn(matrix: sparse.csr_array, rng: np.random.Generator, rays: int = RAYS) -> Responses:
+    """Entries from independent rays: a multinomial draw for each row and pass, with the light beside the target."""
+    rows, columns = matrix.shape
+    shares = np.maximum(matrix.toarray(), 0.0)
+    shares = np.concatenate([shares, np.maximum(1 - shares.sum(axis=1, keepdims=True), 0.0)], axis=1)
+    shares /= shares.sum(axis=1, keepdims=True)
+    passes = rng.multinomial(rays, shares, size=(PASSES, rows))[..., :columns] / rays
+    mean = sparse.csr_array(passes.mean(axis=0))
+    at = np.repeat(np.arange(rows), np.diff(mean.indptr)), mean.indices
+    batches = passes.reshape(2, 8, rows, columns).mean(axis=0)[:, *at] - mean.data
+    variance = passes[:, *at].var(axis=0, ddof=1) / PASSES
+    return Responses(PASSES, rays, "llvm_ad_mono", 0, mean, variance, batches.astype(np.float32))
+
+
+def defocused(lenses: tuple[tuple[object, object, object], ...] = ONE) -> Camera:
+    """A camera of thin lenses that are out of focus, of rays."""
+    optics = {"aperture": "0.4 mm", "focus": "900 mm"}
+    return with_optics(optics, {"wavelength": "none"}, lenses)[1]  # pyright: ignore[reportArgumentType]
+
+
+def accepted(fit: KernelFit) -> KernelFootprints:
+    """The footprints of an accepted fit."""
+    assert fit.accepted, fit.reason
+    assert fit.footprints is not None
+    return fit.footprints
+
+
+def varying(camera: Camera) -> KernelFootprints:
+    """Kernels that are wider, and asymmetric, off the axis of a lens with rotational symmetry."""
+    places = KernelPlaces(camera, camera.types[0], 2)
+    offset = np.arange(places.width) - (places.width - 1) / 2
+    y, x = np.meshgrid(offset, offset, indexing="ij")
+    bell = np.exp(-(x**2 + y**2) / 6)
+    bell /= bell.sum()
+    coma, wide = (x**2 + y**2 - 12) * bell, (x**2 + y**2 - 6) * bell
+    wide -= bell * wide.sum()
+    kernels = np.array([bell, y * coma, x * coma, wide])
+    coefficients = np.zeros((4, 6))  # of 1, u, v, P2(u), u v, P2(v)
+    coefficients[0, 0] = 1
+    coefficients[1, 1] = coefficients[2, 2] = 0.03
+    coefficients[3, [3, 5]] = 0.03
+    return KernelFootprints(places, 2, kernels, coefficients, kernels[:0], np.zeros((0, 0, 6)))
+
+
+def rms(difference: sparse.csr_array, entries: int) -> float:
+    """The root mean square over the entries of H."""
+    return float(np.sqrt(np.square(difference.data).sum() / entries))
+
+
+def test_h_of_a_defocused_lens_is_ten_times_better_known_than_its_entries() -> None:
+    camera = defocused()
+    truth, rng = ideal_matrix(camera), np.random.default_rng(0)
+    responses = drawn(truth, rng)
+    fit = fit_kernels(responses, camera, camera.types[0])
+    assert fit.designed
+    learnt = accepted(fit).to_sparse()
+    assert rms(learnt - truth, truth.nnz) < 0.1 * rms(responses.matrix - truth, truth.nnz)
+    assert not fit_kernels(drawn(varying(camera).to_sparse(), rng), camera, camera.types[0]).designed
+
+
+def test_errors_of_h_f_are_as_large_as_promised() -> None:
+    camera, rng = defocused(), np.random.default_rng(1)
+    truth, image = ideal_matrix(camera), np.random.default_rng(2).normal(127, 74, camera.unknowns)
+    ratios: list[float] = []
+    for _ in range(16):
+        footprints = accepted(fit_kernels(drawn(truth, rng), camera, camera.types[0]))
+        error = footprints.forward(image) - truth @ image
+        promised = np.square(footprints.error_directions(image).toarray()).sum(axis=1)
+        ratios.append(float(np.square(error).mean() / promised.mean()))
+    assert np.mean(ratios) == pytest.approx(1, abs=3 * float(np.std(ratios, ddof=1)) / len(ratios) ** 0.5)
+
+
+def test_components_of_a_varying_blur_are_learnt() -> None:
+    camera = defocused()
+    truth = varying(camera).to_sparse()
+    responses = drawn(truth, np.random.default_rng(3), 4096)
+    fit = fit_kernels(responses, camera, camera.types[0])
+    record = json.loads(json.dumps(fit.record()))
+    assert record["degree"] == 2
+    assert record["components"]["count"] >= 3
+    assert not fit.designed
+    learnt = accepted(fit).to_sparse()
+    mean = replace(varying(camera), kernels=varying(camera).kernels[:1], coefficients=np.eye(1, 6)).to_sparse()
+    assert rms(learnt - truth, truth.nnz) < 0.1 * rms(mean - truth, truth.nnz)
+    assert rms(learnt - truth, truth.nnz) < 0.4 * rms(responses.matrix - truth, truth.nnz)
+
+
+def test_some_pixels_are_enough() -> None:
+    camera = defocused((("1/3", [3, 3], [5, 5]), ("1/4", [4, 4], [4, 4])))
+    truth, rng = ideal_matrix(camera), np.random.default_rng(4)
+    lens_type, rows = camera.types[1], camera.type_slices()[1]
+    chart = np.flatnonzero(rng.random(lens_type.measurements) < 0.4)
+    kept = np.zeros((truth.shape[0], 1))
+    kept[rows.start + chart] = 1
+    fit = fit_kernels(drawn(sparse.csr_array(truth * kept), rng), camera, lens_type, chart)
+    assert fit.record()["pixels"] == chart.size
+    learnt = accepted(fit).to_sparse()
+    assert rms(learnt - truth[rows], truth[rows].nnz) < 0.5 / (RAYS * PASSES) ** 0.5 / 4
+
+
+def test_correct_explanations_are_rarely_rejected() -> None:
+    camera, rng = defocused(), np.random.default_rng(5)
+    truth = ideal_matrix(camera)
+    fits = [fit_kernels(drawn(truth, rng, 64), camera, camera.types[0]) for _ in range(12)]
+    rejected = sum(not fit.accepted or bool(fit.reason) for fit in fits)
+    assert stats.binom.sf(rejected - 1, len(fits), 0.01) > 1e-3
+
+
+def test_sub_imagers_with_a_blur_of_their_own_are_rejected() -> None:
+    camera = defocused()
+    truth, other = ideal_matrix(camera), ideal_matrix(replace(camera, distance=0.97 * camera.distance))
+    sub = camera.slices()[4]
+    mixed = sparse.csr_array(sparse.vstack([truth[: sub.start], other[sub], truth[sub.stop :]]))
+    fit = fit_kernels(drawn(mixed, np.random.default_rng(6), 4096), camera, camera.types[0])
+    assert not fit.accepted
+    assert "sub-imagers" in fit.reason
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"ratio": Fraction(7, 2)}, "whole"),
+        ({"rotation": 0.01}, "whole"),
+        ({"distortion": (0.01, 0.0)}, "distorted"),
+    ],
+)
+def test_lens_types_that_kernels_do_not_describe_keep_their_entries(change: dict[str, object], word: str) -> None:
+    camera = defocused()
+    (lens_type,) = camera.types
+    if "distortion" in change:
+        changed = replace(lens_type, optics=replace(lens_type.optics, distortion=(0.01, 0.0)))
+    else:
+        changed = replace(lens_type, **change)  # pyright: ignore[reportArgumentType]
+    camera = replace(camera, types=(changed,))
+    assert word in refusal(camera, changed)
+
+
+def test_misaligned_cameras_and_dark_pixels_keep_their_entries() -> None:
+    camera = defocused()
+    tolerance = ToleranceTable.model_validate({"rotation": "1 mrad"})
+    assert "misaligned" in refusal(replace(camera, tolerance=tolerance), camera.types[0])
+    assert "walls" in refusal(replace(camera, walls=False), camera.types[0])
+    truth = ideal_matrix(camera)
+    lit: FloatArray = np.ones((truth.shape[0], 1))
+    lit[7] = 0
+    responses = drawn(sparse.csr_array(truth * lit), np.random.default_rng(7))
+    fit = fit_kernels(responses, camera, camera.types[0], np.arange(truth.shape[0]))
+    assert not fit.accepted
+    assert "dark" in fit.reason

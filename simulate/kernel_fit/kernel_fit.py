@@ -161,11 +161,11 @@ def designed_values(chart: Chart, camera: Camera, lens_type: LensType) -> FloatA
         matrix = ideal_matrix(alone)[chart.pixels]
     except InputError:
         return None
-    down, across = places.cells(chart.pixels)
+    row = np.repeat(np.arange(chart.pixels.size), np.diff(matrix.indptr))
+    down, across = np.divmod(matrix.indices.astype(np.int64), camera.columns)
+    first = [start[line][row] for start, line in zip(places.starts, places.lines(chart.pixels), strict=True)]
+    down, across = down - first[0], across - first[1]
+    reached = (down >= 0) & (down < places.width) & (across >= 0) & (across < places.width)
     values = np.zeros(chart.values.shape)
-    for number in range(len(values)):
-        row = matrix[[number]].toarray().reshape(camera.shape)
-        padded = np.pad(row, places.width)
-        block = padded[np.ix_(down[number] + places.width, across[number] + places.width)]
-        values[number] = block.ravel()
+    values[row[reached], (down * places.width + across)[reached]] = matrix.data[reached]
     return values

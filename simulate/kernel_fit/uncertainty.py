@@ -17,7 +17,7 @@ from .regression import Sums
 from .selection import Candidate, Components
 from .typical_picture import seen
 
-DRAWS = 96
+DRAWS = 64
 SHARE = 0.99  # of the expected variance of H f that the directions describe; they are scaled to all of it
 KERNELS = 0.999  # of that variance that the common kernels of the directions describe
 MOST_DIRECTIONS, MOST_KERNELS = 16, 32

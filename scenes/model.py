@@ -182,15 +182,15 @@ class Model:
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
         """L, (M, q), such that the error of H f by that of few numbers is L xi with independent xi of variance 1."""
-        return None if self.fitted is None else self.fitted.directions(self._gradients(image))
+        return None if self.fitted is None else self.fitted.directions(image, self._gradients(image))
 
     def error_variance(self, image: FloatArray) -> FloatArray | None:
         """Variance of each measurement by the errors of few numbers, (M,): the diagonal of L L^T."""
-        return None if self.fitted is None else self.fitted.error_variance(self._gradients(image))
+        return None if self.fitted is None else self.fitted.error_variance(image, self._gradients(image))
 
     def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
         """A random error of H f by those of few numbers, L xi: (M,)."""
-        return None if self.fitted is None else self.fitted.error_draw(self._gradients(image), rng)
+        return None if self.fitted is None else self.fitted.error_draw(image, self._gradients(image), rng)
 
     def _gradients(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """H applied to the gradient of f, (N,), down and across: (M,) each."""

@@ -23,6 +23,7 @@ from ommatid.runtime.files import digest, write_whole
 from .camera import Camera, derive
 from .fitted.fitted_matrix import FittedMatrix, Views
 from .fitted.fitted_model import MeasuredRows, fitted_model, measured_rows
+from .fitted.kernels import KernelFootprints, read_kernels
 from .formats import npz
 from .formats.provenance import checked
 from .model import Model
@@ -32,7 +33,7 @@ from .tables.table import LARGEST
 
 ENTRIES = ("indices", "indptr", "data")
 CSR, BOXES, VIEWS = b"csr", b"boxes", b"views 1"
-PREFIX = "views."
+PREFIX, KERNELS, DESCRIPTION = "views.", "kernels.", "description"
 
 
 def write(path: Path, model: Model) -> None:
@@ -47,6 +48,9 @@ def write(path: Path, model: Model) -> None:
         arrays["variance"], arrays["batches"] = none if rest is None else (rest.variance, rest.batches)
         for name, views in model.fitted.views.items():
             arrays |= views.arrays(f"{PREFIX}{name}")
+        for name, kernels in model.fitted.kernels.items():
+            arrays |= {f"{KERNELS}{name}.{key}": each for key, each in kernels.arrays.items()}
+            arrays[f"{KERNELS}{name}.{DESCRIPTION}"] = np.array(json.dumps(kernels.description))
     if stored is not None:
         arrays |= {name: getattr(stored, name) for name in ENTRIES}
     description = json.dumps({"scene": model.scene.plain(), "record": model.record})
@@ -95,14 +99,26 @@ def read(path: Path) -> Model:
 
 
 def _fitted(arrays: dict[str, NDArray[Any]], camera: Camera) -> FittedMatrix | None:
-    """The few numbers of a file, None where it has none. Raises ValueError or KeyError if they are not the camera's."""
+    """The few numbers of a file, None where it has none. Raises ValueError or KeyError for others."""
     if not any(name.startswith(PREFIX) for name in arrays):
         return None
     views = {lens.name: Views.from_arrays(arrays, f"{PREFIX}{lens.name}") for lens in camera.types}
     for lens in camera.types:
         if len(views[lens.name].numbers) != lens.count:
             raise ValueError(f"lens type {lens.name} has {len(views[lens.name].numbers)} views, expected {lens.count}")
-    return FittedMatrix(camera, views)
+    kernels = {lens.name: _kernels(arrays, camera, f"{KERNELS}{lens.name}.") for lens in camera.types}
+    return FittedMatrix(camera, views, {name: each for name, each in kernels.items() if each is not None})
+
+
+def _kernels(arrays: dict[str, NDArray[Any]], camera: Camera, prefix: str) -> KernelFootprints | None:
+    """The kernels of a lens type, None where it has none. Raises ValueError or KeyError for others."""
+    own = {name.removeprefix(prefix): each for name, each in arrays.items() if name.startswith(prefix)}
+    if not own:
+        return None
+    description = json.loads(str(own.pop(DESCRIPTION)[()]))
+    if not all(each.dtype.kind == "f" and np.isfinite(each).all() for each in own.values()):
+        raise ValueError(f"{prefix} has numbers that are not finite")
+    return read_kernels(camera, description, own)
 
 
 def _matrix(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
@@ -131,7 +147,7 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         names = ["shape", "variance", "batches"]
         if layout == CSR or (layout == VIEWS and "data" in content):
             names += ENTRIES
-        names += [name for name in content if name.startswith(PREFIX)] if layout == VIEWS else []
+        names += [name for name in content if name.startswith((PREFIX, KERNELS))] if layout == VIEWS else []
         arrays = {name: content[name] for name in names}
         record = json.loads(str(content["ommatid"][()]))
         description, seal = record["description"], record["sha256"]

@@ -7,7 +7,7 @@ over pixels. To first order a displaced view reads H f' along the displacement, 
 from __future__ import annotations
 
 from collections.abc import Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 from typing import Any
@@ -19,6 +19,7 @@ from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 
 from ..camera import Camera
 from ..lens_type import LensType, SubImager
+from .kernels import KernelFootprints
 from .real_boxes import RealBoxes, real_box
 from .view import COUNT, K1, ROTATION, designed, displacements, entries
 
@@ -75,13 +76,14 @@ class Views:
 
 @dataclass(frozen=True)
 class FittedMatrix:
-    """H, (M, N), of which each lens type is described by its views.
+    """H, (M, N), of which each lens type is described by its views, or by kernels.
 
-    views : by the name of a lens type
+    views : by the name of a lens type, those as designed for one with kernels;  kernels : likewise
     """
 
     camera: Camera
     views: dict[str, Views]
+    kernels: dict[str, KernelFootprints] = field(default_factory=dict[str, "KernelFootprints"])
 
     @cached_property
     def _types(self) -> list[tuple[LensType, Views, list[SubImager], list[slice]]]:
@@ -99,7 +101,7 @@ class FittedMatrix:
     @cached_property
     def is_as_designed(self) -> bool:
         """True if H is that of the design."""
-        return all(self.views[lens.name].is_as_designed for lens in self.camera.types)
+        return not self.kernels and all(self.views[lens.name].is_as_designed for lens in self.camera.types)
 
     @cached_property
     def is_boxes(self) -> bool:
@@ -107,7 +109,7 @@ class FittedMatrix:
         straight = all(
             views.explained.all() and not views.numbers[:, [ROTATION, K1]].any() for _, views, _, _ in self._types
         )
-        return straight and self.camera.has_box_footprints
+        return straight and not self.kernels and self.camera.has_box_footprints
 
     @cached_property
     def is_nearly_designed(self) -> bool:
@@ -142,7 +144,10 @@ class FittedMatrix:
     def to_sparse(self) -> sparse.csr_array:
         """Return H, (M, N); rows of sub-imagers that are not explained are empty."""
         parts: list[sparse.csr_array] = []
-        for _, views, subs, _ in self._types:
+        for lens, views, subs, _ in self._types:
+            if lens.name in self.kernels:
+                parts.append(self.kernels[lens.name].to_sparse())
+                continue
             for sub, numbers, explained in zip(subs, views.numbers, views.explained, strict=True):
                 parts.append(self._rows(sub, numbers) if explained else self._no_rows(sub))
         return sparse.csr_array(sparse.vstack(parts, format="csr"))
@@ -168,7 +173,9 @@ class FittedMatrix:
 
     def restrict(self, camera: Camera) -> FittedMatrix:
         """Return H of a camera with some of the lens types."""
-        return FittedMatrix(camera, {lens.name: self.views[lens.name] for lens in camera.types})
+        names = [lens.name for lens in camera.types]
+        kernels = {name: each for name, each in self.kernels.items() if name in names}
+        return FittedMatrix(camera, {name: self.views[name] for name in names}, kernels)
 
     @property
     def without_errors(self) -> FittedMatrix:
@@ -177,12 +184,15 @@ class FittedMatrix:
             name: replace(each, own=each.own[:, :, :0], shared=each.shared[:, :, :0])
             for name, each in self.views.items()
         }
-        return FittedMatrix(self.camera, views)
+        return FittedMatrix(self.camera, views, {name: each.without_errors for name, each in self.kernels.items()})
 
-    def directions(self, gradients: tuple[FloatArray, FloatArray]) -> sparse.csc_array:
+    def directions(self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]) -> sparse.csc_array:
         """Return L, (M, q), such that the error of H f is L xi; gradients : H f' down and across, (M,) each."""
         blocks: list[sparse.csc_array] = []
         for lens, views, subs, slices in self._types:
+            if lens.name in self.kernels:
+                blocks.append(self.kernels[lens.name].error_directions(image))
+                continue
             own, shared = views.own.shape[2], views.shared.shape[2]
             parts, common = list[FloatArray](), list[FloatArray]()
             for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
@@ -195,20 +205,30 @@ class FittedMatrix:
             blocks.append(sparse.csc_array(sparse.hstack(columns)) if columns else sparse.csc_array((size, 0)))
         return sparse.csc_array(sparse.block_diag(blocks, format="csc"))
 
-    def error_variance(self, gradients: tuple[FloatArray, FloatArray]) -> FloatArray:
+    def error_variance(self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]) -> FloatArray:
         """Return the variance of each measurement by the errors of the numbers, (M,): the diagonal of L L^T."""
         variance = np.zeros(self.camera.measurements)
-        for _, views, subs, slices in self._types:
+        for lens, views, subs, slices in self._types:
+            if lens.name in self.kernels:
+                directions = self.kernels[lens.name].error_directions(image)
+                variance[slices[0].start : slices[-1].stop] = np.asarray(directions.power(2).sum(axis=1)).ravel()
+                continue
             for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
                 moves = self._moves(sub, gradients, place)
                 for factor in (views.own[number], views.shared[number]):
                     variance[place] += np.square(moves @ factor).sum(axis=1)
         return variance
 
-    def error_draw(self, gradients: tuple[FloatArray, FloatArray], rng: np.random.Generator) -> FloatArray:
+    def error_draw(
+        self, image: FloatArray, gradients: tuple[FloatArray, FloatArray], rng: np.random.Generator
+    ) -> FloatArray:
         """Return a random error of H f, L xi: (M,)."""
         drawn = np.zeros(self.camera.measurements)
-        for _, views, subs, slices in self._types:
+        for lens, views, subs, slices in self._types:
+            if lens.name in self.kernels:
+                directions = self.kernels[lens.name].error_directions(image)
+                drawn[slices[0].start : slices[-1].stop] = directions @ rng.normal(size=directions.shape[1])
+                continue
             common = rng.normal(size=views.shared.shape[2])
             for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
                 error = views.own[number] @ rng.normal(size=views.own.shape[2]) + views.shared[number] @ common

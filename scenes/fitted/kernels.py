@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -131,6 +131,21 @@ class KernelFootprints:
     error_kernels: FloatArray
     error_coefficients: FloatArray
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for arrays that do not belong together."""
+        terms_of, width = len(terms(self.degree)), self.places.width
+        lines = self.kernels.shape, self.error_kernels.shape
+        if any(len(shape) != 3 or shape[1:] != (width, width) for shape in lines):
+            raise ValueError(f"expected kernels of {width} x {width} pixels of f, got {lines}")
+        count = len(self.error_coefficients), len(self.error_kernels), terms_of
+        if self.coefficients.shape != (len(self.kernels), terms_of) or self.error_coefficients.shape != count:
+            raise ValueError("the coefficients of kernels do not belong to these")
+
+    @property
+    def without_errors(self) -> KernelFootprints:
+        """The same H, taken for exact."""
+        return replace(self, error_coefficients=self.error_coefficients[:0])
+
     @property
     def entries(self) -> int:
         """Number of entries of H, if it were stored."""
@@ -153,12 +168,8 @@ class KernelFootprints:
         top, columns = self.places.starts
         left = int(columns.min())
         order = np.argsort(top, kind="stable")
-        return (np.ascontiguousarray(kernels), weights, down.astype(np.float64), across.astype(np.float64)) + (
-            order,
-            top,
-            left,
-            columns - left,
-        )
+        lines = down.astype(np.float64), across.astype(np.float64)
+        return np.ascontiguousarray(kernels), weights, *lines, order, top, left, columns - left
 
     def forward(self, image: FloatArray) -> FloatArray:
         """H f: (N,) or (rows, columns) to (measurements of the type,)."""

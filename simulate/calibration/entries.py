@@ -52,7 +52,10 @@ def rendered_model(
 
         one = plan(scene.calibration.sample_count, scene.render.sampler) if plans is None else None
         rays = {lens.name: (one or plans[lens.name]).total for lens in camera.types}
-        fit = calibrate_by_fit(setup.simulated, measure, lambda responses: entry_variances(responses, camera), rays)
+        views_alone = scene.calibration.fit == "geometry"
+        fit = calibrate_by_fit(
+            setup.simulated, measure, lambda each: entry_variances(each, camera), rays, with_kernels=not views_alone
+        )
         record |= {"fit": fit.record, **fit.responses.record()}
         model = fitted_model(setup.resolved, camera, fit.matrix, fit.rest, record)
     else:
@@ -83,7 +86,7 @@ def _compared(model: Model, camera: Camera, passes: int) -> dict[str, Any]:
     if model.fitted is None:
         return {"agreement": agreement(model.matrix, model.variance, camera, passes)}
     largest, count = model.fitted.largest_deviation
-    chance = -np.expm1(count * np.log1p(-2 * stats.norm.sf(largest))) if largest else 1.0
+    chance = -np.expm1(count * np.log1p(-2 * special.ndtr(-largest))) if largest else 1.0
     compared = {"max_z": largest, "p_value": float(chance)}
     if model.is_exact:
         return {"agreement": {"rms_difference_from_ideal": 0.0, **compared}}
@@ -128,7 +131,10 @@ def agreement(matrix: sparse.csr_array, variance: FloatArray, camera: Camera, pa
 
 
 def explains(setup: Setup) -> bool:
-    """Return True if few numbers are expected to explain all of H: the views of sharp lens types."""
-    from .fit.fit import is_sharp
+    """Return True if few numbers are expected to explain all of H."""
+    if not fits(setup):
+        return False
+    from .fit.fit import has_chart
 
-    return fits(setup) and all(is_sharp(setup.simulated, lens) for lens in setup.simulated.types)
+    with_kernels = setup.scene.calibration.fit != "geometry"
+    return all(has_chart(setup.simulated, lens, with_kernels) for lens in setup.simulated.types)

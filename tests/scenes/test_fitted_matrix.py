@@ -114,7 +114,7 @@ def test_the_errors_of_numbers_are_differences_of_h() -> None:
     own = np.diag([1.0, 1.0, 0.0, 0.0, 0.0])[:, :2]
     fitted, f = with_numbers(cam, np.zeros(COUNT), own), rng.normal(127, 50, cam.unknowns)
     gradients = tuple(fitted.boxes.forward(each) for each in gradient(f, cam.shape))
-    directions = fitted.directions((gradients[0], gradients[1])).toarray()
+    directions = fitted.directions(f, (gradients[0], gradients[1])).toarray()
     assert directions.shape == (cam.measurements, 8)
     for axis in (ROW, COLUMN):
         step = 1e-3 * (np.arange(COUNT) == axis)
@@ -124,9 +124,9 @@ def test_the_errors_of_numbers_are_differences_of_h() -> None:
             np.testing.assert_allclose(directions[place, 2 * sub + axis], expected[place], atol=1e-8)
             assert not np.delete(directions[:, 2 * sub + axis], np.r_[place]).any()
     np.testing.assert_allclose(
-        fitted.error_variance((gradients[0], gradients[1])), np.square(directions).sum(axis=1), rtol=1e-12
+        fitted.error_variance(f, (gradients[0], gradients[1])), np.square(directions).sum(axis=1), rtol=1e-12
     )
-    draws = [fitted.error_draw((gradients[0], gradients[1]), np.random.default_rng(seed)) for seed in range(400)]
+    draws = [fitted.error_draw(f, (gradients[0], gradients[1]), np.random.default_rng(seed)) for seed in range(400)]
     ratio = np.square(draws).mean(axis=0).sum() / np.square(directions).sum()
     assert abs(ratio - 1) < 4 * (2 / (400 * 8)) ** 0.5
 

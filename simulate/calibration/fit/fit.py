@@ -1,7 +1,7 @@
 """Calibration by few numbers: a chart of sensor pixels is measured, and H follows from what explains its rows.
 
-Sub-imagers with sharp footprints are explained by their views. What an F test leaves unexplained is measured entry by
-entry, pixel by pixel, and named in the record.
+Sub-imagers with sharp footprints are explained by their views, lens types with blur by kernels. What F tests leave
+unexplained is measured entry by entry, pixel by pixel, and named in the record.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -20,6 +21,7 @@ from ommatid.scenes.fitted.fitted_model import MeasuredRows
 from ommatid.scenes.fitted.view import COUNT, UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 
+from ...kernel_fit.kernel_fit import KernelFit, fit_kernels, refusal
 from ..point_sources import Responses, Subsets
 from .chart import chart_of, chart_rows
 from .explanation import Explanation, explanation
@@ -46,6 +48,7 @@ class _TypeFit:
     views: Views
     fit: ViewFit | None
     explanations: list[Explanation]
+    kernels: KernelFit | None = None
 
 
 def is_sharp(camera: Camera, lens_type: LensType) -> bool:
@@ -53,27 +56,41 @@ def is_sharp(camera: Camera, lens_type: LensType) -> bool:
     return camera.walls and not camera.is_blurred(lens_type)
 
 
-def calibrate_by_fit(camera: Camera, measure: Measure, variances: Variances, rays: Rays) -> FittedCalibration:
+def has_chart(camera: Camera, lens_type: LensType, with_kernels: bool = True) -> bool:
+    """Return True if few numbers may explain a lens type, so that a chart of its pixels is measured first."""
+    return is_sharp(camera, lens_type) or (with_kernels and not refusal(camera, lens_type))
+
+
+def calibrate_by_fit(
+    camera: Camera, measure: Measure, variances: Variances, rays: Rays, with_kernels: bool = True
+) -> FittedCalibration:
     """Measure a chart and fit it; then measure all pixels of what it does not explain.
 
     measure : yields the responses of some pixels of each lens type;  variances : of their entries
-    rays : per pixel of each lens type, of all passes
+    rays : per pixel of each lens type, of all passes;  with_kernels : True if kernels may explain blur
     """
-    subsets: Subsets = {lens.name: chart_of(lens) if is_sharp(camera, lens) else None for lens in camera.types}
+    charted = {lens.name: has_chart(camera, lens, with_kernels) for lens in camera.types}
+    subsets: Subsets = {lens.name: chart_of(lens) if charted[lens.name] else None for lens in camera.types}
     responses = measure(subsets)
     fits = {
-        lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name])
+        lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], charted[lens.name])
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
     unexplained: Subsets = {
         lens.name: chart_of(lens, ~fits[lens.name].views.explained)
         for lens in camera.types
-        if is_sharp(camera, lens) and not fits[lens.name].views.explained.all()
+        if charted[lens.name] and not fits[lens.name].views.explained.all()
     }
     rest = None
-    if unexplained or not all(is_sharp(camera, lens) for lens in camera.types):
-        rest = _rest(camera, fits, responses, measure(unexplained) if unexplained else None, variances)
-    fitted = FittedMatrix(camera, {name: each.views for name, each in fits.items()})
+    if unexplained or not all(charted.values()):
+        more = measure(unexplained) if unexplained else None
+        rest = _rest(camera, fits, charted, (responses, more), variances)
+    kernels = {name: each.kernels.footprints for name, each in fits.items() if each.kernels is not None}
+    fitted = FittedMatrix(
+        camera,
+        {name: each.views for name, each in fits.items()},
+        {name: each for name, each in kernels.items() if each is not None},
+    )
     return FittedCalibration(fitted, rest, responses, _record(camera, fits, subsets))
 
 
@@ -83,17 +100,26 @@ def _by_type(camera: Camera) -> list[list[SubImager]]:
 
 
 def _fit_type(
-    camera: Camera, lens: LensType, subs: list[SubImager], responses: Responses, rows: slice, rays: int
+    camera: Camera,
+    lens: LensType,
+    subs: list[SubImager],
+    responses: Responses,
+    rows: slice,
+    rays: int,
+    charted: bool,
 ) -> _TypeFit:
+    if not charted:
+        return _TypeFit(_views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
-        return _TypeFit(_unexplained(subs), None, [])
+        kernels = fit_kernels(responses, camera, lens, chart_of(lens))
+        return _TypeFit(_views_as_designed(subs, kernels.accepted), None, [], kernels)
     pointers = responses.matrix.indptr
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]
     charts = chart_rows(camera, lens, responses.matrix[rows], batches)
     try:
         fit = fit_views(camera, subs, charts, rays)
     except InputError:  # rows that no view has led to a distortion that folds the image
-        return _TypeFit(_unexplained(subs), None, [])
+        return _TypeFit(_views_as_designed(subs, explained=False), None, [])
     models = [predicted(camera, sub, fit.numbers[n], charts[n]) for n, sub in enumerate(subs)]
     explanations = [explanation(chart, model, rays) for chart, model in zip(charts, models, strict=True)]
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(camera.sub_imagers))
@@ -102,28 +128,28 @@ def _fit_type(
     return _TypeFit(Views(numbers, explained, fit.own, fit.shared, fit.structure), fit, explanations)
 
 
-def _unexplained(subs: list[SubImager]) -> Views:
+def _views_as_designed(subs: list[SubImager], explained: bool) -> Views:
     nothing = np.zeros((len(subs), COUNT, 0))
-    explained = np.zeros(len(subs), dtype=np.bool_)
-    return Views(designed_views(subs), explained, nothing, nothing, ("designed",) * COUNT)
+    return Views(designed_views(subs), np.full(len(subs), explained), nothing, nothing, ("designed",) * COUNT)
 
 
 def _rest(
     camera: Camera,
     fits: dict[str, _TypeFit],
-    chart: Responses,
-    more: Responses | None,
+    charted: dict[str, bool],
+    measured: tuple[Responses, Responses | None],
     variances: Variances,
 ) -> MeasuredRows:
-    """Return the rows of H that are measured entry by entry, from the responses that hold all of them."""
-    import scipy.sparse as sparse
+    """Return the rows of H that are measured entry by entry.
 
+    measured : responses of the charts and of lens types without one, and of all pixels of what charts do not explain
+    """
     matrices: list[sparse.csr_array] = []
     kept_variances: list[FloatArray] = []
     kept_batches: list[FloatArray] = []
-    sources = [(each, variances(each)) for each in (chart, more) if each is not None]
+    sources = [(each, variances(each)) for each in measured if each is not None]
     for lens, rows in zip(camera.types, camera.type_slices(), strict=True):
-        responses, variance = sources[-1] if is_sharp(camera, lens) else sources[0]
+        responses, variance = sources[-1] if charted[lens.name] else sources[0]
         pointers = responses.matrix.indptr
         stored = slice(int(pointers[rows.start]), int(pointers[rows.stop]))
         if fits[lens.name].views.explained.all():
@@ -152,8 +178,9 @@ def _record(camera: Camera, fits: dict[str, _TypeFit], subsets: Subsets) -> dict
         "parameters": {
             name: _statistics(fit, subs)
             for (name, fit), subs in zip(fits.items(), _by_type(camera), strict=True)
-            if fit.views.explained.any()
+            if fit.fit is not None and fit.views.explained.any()
         },
+        "kernels": {name: fit.kernels.record() for name, fit in fits.items() if fit.kernels is not None},
         "units": UNITS,
         "chart": {name: int(pixels.size) for name, pixels in subsets.items() if pixels is not None},
         "chi_squared": left / expected if expected else None,

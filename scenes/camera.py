@@ -116,7 +116,7 @@ class Camera:
     @property
     def has_width(self) -> bool:
         """True if a lens type has an aperture or surfaces: not all are pinholes."""
-        return any(lens.optics.aperture is not None or lens.optics.surfaces is not None for lens in self.types)
+        return any(lens.optics.has_width for lens in self.types)
 
     @property
     def half_diagonal(self) -> float:

@@ -42,6 +42,11 @@ class LensOptics:
         """True for a pinhole without distortion."""
         return self == LensOptics()
 
+    @property
+    def has_width(self) -> bool:
+        """True if it has an aperture or surfaces: light of a point reaches it at more than one point."""
+        return self.aperture is not None or self.surfaces is not None
+
     def describe(self) -> dict[str, Any]:
         """The effects present, in JSON's types; part of fingerprints."""
         surfaces = None if self.surfaces is None else [surface.model_dump(mode="json") for surface in self.surfaces]

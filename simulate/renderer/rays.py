@@ -22,8 +22,9 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Sampler
 
 from ..sampling.samplers import RELATED_DRAWS, fitting
-from .grid import Grid
 from .lens import Distance, LensModel, ThinLens
+from .points.grid import Grid
+from .points.sobol import SobolDraws
 from .reseeded_sampler import ReseededSampler
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
@@ -90,7 +91,6 @@ class RayGenerator:
         since Mitsuba seeds by the first lane of each wavefront. The passes of one pixel are adjacent.
         subset : pixels that the block selects from; None: all
         """
-
         samples = fitting(self._sampler_name, samples)
         self.sampler.set_sample_count(samples)
         self.sampler.set_samples_per_wavefront(samples)
@@ -102,6 +102,15 @@ class RayGenerator:
         if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
             draws.reseeded()
         return Rays(ray, weight, samples)
+
+    def sobol_rays(self, samples: int, seed: int, block: slice, passes: int, subset: IntArray) -> Rays:
+        """Start rays as `rays` does, a power of two per pixel and pass, at Sobol's points of pixel and pupil together.
+
+        Mitsuba's sampler is not ready for what the rays meet.
+        """
+        lanes = (block.stop - block.start) * passes * samples
+        draws, places = SobolDraws(seed, lanes, samples), self._load(block, subset)
+        return Rays(*self._emit(places, passes * samples, lanes, draws.next_2d(), draws), samples)
 
     def grid_rays(self, grid: Grid, passes: int, keys: IntArray, pixels: IntArray) -> Rays:
         """Start one ray per cell of a grid over each pixel and pass, of pinholes, by random numbers of each pixel.

@@ -25,8 +25,8 @@ from ommatid.scenes.scene import Sampler, Scene
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting
 from ..sampling.seeds import seed_of
-from .grid import Grid
 from .plugins import BLOCK, scene_of, stock_sensor, stock_sensors, target_of, texture_of
+from .points.grid import Grid
 from .variant import activate, check_fast_variant
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ class Renderer:
     groups : lens types that are rendered together, by a name: "camera" if all are pinholes, else each lens type alone
     channels : number of pictures that can be on the target at once, as its colours
     exact_below : limit below which sums of whole numbers are exact
+    is_fast : True on the backends where the rays of many pixels start together
     direct_only : True if interreflections in a world are left out, since nothing there reflects
     """
 
@@ -66,7 +67,7 @@ class Renderer:
 
         self._sampler: Sampler = sampler
         self.camera = camera
-        fast = not variant.startswith("scalar")
+        self.is_fast = fast = not variant.startswith("scalar")
         self.groups: dict[str, tuple[LensType, ...]] = {lens_type.name: (lens_type,) for lens_type in camera.types}
         if fast and together and all(lens_type.optics.is_pinhole for lens_type in camera.types):
             self.groups = {"camera": camera.types}
@@ -97,11 +98,6 @@ class Renderer:
         else:
             self._build_world(world, variant)
         self._parameters = mi.traverse(self._scene)
-
-    @property
-    def is_fast(self) -> bool:
-        """True on the backends where the rays of many pixels start together."""
-        return bool(self._generators)
 
     @property
     def has_equal_weights(self) -> bool:
@@ -160,12 +156,15 @@ class Renderer:
         rendered: Any = mi.render(self._scene, **choices)
         return np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1)
 
-    def expose_alone(self, index: int, pixels: IntArray, work: Plan, seed: Callable[[int], int]) -> FloatArray:
+    def expose_alone(
+        self, index: int, pixels: IntArray, work: Plan, seed: Callable[[int], int], sobol: bool = False
+    ) -> FloatArray:
         """Return the readings of some pixels of one sub-imager in each of several passes, (passes, pixels).
 
         index : of the sub-imager in the camera;  pixels : of it; on the scalar backend the others cost as much
         seed : the sampler's seed by the number of a pass. Seeds differ between sub-imagers, so that the values do not
             depend on which others are rendered; on the fast backends, where the passes start together, the first counts
+        sobol : True takes Sobol's points of pixel and pupil; on the fast backends, without a world
         """
         sub, rows = self.camera.sub_imagers[index], self.camera.slices()[index]
         group = next(name for name, types in self.groups.items() if sub.type in types)
@@ -174,9 +173,9 @@ class Renderer:
             films = [self._film(sensor, work.samples, seed(number))[0, pixels] for number in range(work.passes)]
             return np.stack(films) / self._unit
         generator, subset = self._generators[group], pixels + (rows.start - self.rows(group).start)
-        parts: list[FloatArray] = []
+        parts, start = list[FloatArray](), generator.sobol_rays if sobol else generator.rays
         for block in generator.blocks(work.total, pixels.size):
-            rays = generator.rays(work.samples, seed_of(seed(0), block.start), block, work.passes, subset)
+            rays = start(work.samples, seed_of(seed(0), block.start), block, work.passes, subset)
             parts.append(self._readings(group, rays).reshape(-1, work.passes).T)
         return np.concatenate(parts, axis=1)
 

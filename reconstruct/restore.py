@@ -27,6 +27,7 @@ from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import EstimationTask, Execution, MethodResult, total_variance
+from .methods.prepared import Prepared
 from .noise import Noise, UsablePixels
 from .run_verdict import verdict_of
 from .verdict.residual_parts import ResidualPart
@@ -121,14 +122,19 @@ def check_region(corner: tuple[int, int], size: tuple[int, int], shape: tuple[in
 
 def check_match(stack: Stack, model: Model, names: tuple[Path | str, Path | str]) -> None:
     """Raise InputError, naming the first difference, unless a stack and a model are of one camera and target grid."""
-    rows, columns = stack.camera.with_grid_of_matrix.shape
-    if stack.camera.has_detail and model.camera.shape != (rows, columns):
+    check_camera(stack.camera, model, names)
+
+
+def check_camera(camera: Camera, model: Model, names: tuple[Path | str, Path | str]) -> None:
+    """Raise InputError, naming the first difference, unless a stack's camera is the model's."""
+    rows, columns = camera.with_grid_of_matrix.shape
+    if camera.has_detail and model.camera.shape != (rows, columns):
         raise InputError(
-            f"{names[0]} and {names[1]} do not belong together: target.shape {list(stack.camera.shape)} and"
-            f" target.detail {stack.camera.detail} of the stack need H on {rows} x {columns} pixels, the model has"
+            f"{names[0]} and {names[1]} do not belong together: target.shape {list(camera.shape)} and"
+            f" target.detail {camera.detail} of the stack need H on {rows} x {columns} pixels, the model has"
             f" {model.camera.rows} x {model.camera.columns}; calibrate with the stack's scene"
         )
-    recorded, calibrated = stack.camera.with_grid_of_matrix.describe(), model.camera.describe()
+    recorded, calibrated = camera.with_grid_of_matrix.describe(), model.camera.describe()
     for key in [*recorded, *(key for key in calibrated if key not in recorded)]:
         if recorded.get(key) != calibrated.get(key):
             raise InputError(
@@ -144,14 +150,16 @@ def restore(
     truth: FloatArray | None = None,
     workers: Workers | None = None,
     progress: Progress = no_progress,
+    prepared: Prepared | None = None,
 ) -> Reconstruction:
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 
     truth : (N,) or (pixels of the world,), or None;  workers : for tiles, absent: threads of this process
+    prepared : what frames of this model share, None for a frame by itself
     Raises InputError if memory does not suffice, if no method reaches the tolerance of the scene, or if the noise of a
     [sensor] is to be fitted.
     """
-    execution = Execution(workers, progress)
+    execution = Execution(workers, progress, prepared)
     return with_fallback(stack, model, lambda choice: _restored(stack, model, truth, choice, execution))
 
 

@@ -84,6 +84,7 @@ class Estimate:
     """The image f^, (N,), the multipliers l = Rv^-1 (g - H f^), (M,), and the form that computed them.
 
     coefficients : (K,) u of f^ = f0 + L u, which keeps digits that f^ loses if L u is far below f0
+    residuals : of the problem, for the next estimate with the same form
     """
 
     image: FloatArray
@@ -91,6 +92,7 @@ class Estimate:
     multipliers: FloatArray
     form: Form
     solver: Solver
+    residuals: ExactResiduals
 
 
 def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, Solver]:
@@ -99,18 +101,27 @@ def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERAN
     return form, solver
 
 
-def estimate(problem: Problem, recorded: FloatArray, method: str = "auto", tolerance: float = TOLERANCE) -> Estimate:
+def estimate(
+    problem: Problem,
+    recorded: FloatArray,
+    method: str = "auto",
+    tolerance: float = TOLERANCE,
+    before: Estimate | None = None,
+) -> Estimate:
     """Reconstruct the image with the least mean squared error of any linear estimator (Eq. 4).
 
     recorded : (M,) g, in the units of f
+    before : an estimate from other measurements with the same H, prior and noise, whose form is tried first
     Raises InputError for values that are not finite, if memory does not suffice, or if no form reaches `tolerance`.
     """
     if recorded.shape != (problem.measurements,) or not np.isfinite(recorded).all():
         raise InputError(
             f"expected {problem.measurements} finite measurements, got others; leave dead pixels out first"
         )
-    residuals = ExactResiduals(problem)
-    form, solver, refined = _first_accepted(residuals, method, tolerance, recorded)
+    residuals = ExactResiduals(problem) if before is None else before.residuals
+    form, solver, refined = _by_form_of(before, tolerance, recorded) or _first_accepted(
+        residuals, method, tolerance, recorded
+    )
     if refined is None:
         raise RuntimeError("measurements were given, but no estimate was computed")
     multipliers = refined.multipliers[:, 0]
@@ -121,7 +132,18 @@ def estimate(problem: Problem, recorded: FloatArray, method: str = "auto", toler
             "the estimate or its multipliers leave the range of double precision; scale H, or raise"
             " estimator.noise_variance"
         )
-    return Estimate(image, refined.coefficients[:, 0], multipliers, form, solver)
+    return Estimate(image, refined.coefficients[:, 0], multipliers, form, solver, residuals)
+
+
+def _by_form_of(
+    before: Estimate | None, tolerance: float, recorded: FloatArray
+) -> tuple[Form, Solver, RefinedSolution | None] | None:
+    """Return the estimate by the form of another one, None where that form does not reach the tolerance by itself."""
+    if before is None or before.solver.method not in FORMS:
+        return None
+    reference = _exact_solution(before.residuals, recorded)
+    solver, refined = _with_estimate(before.solver, before.form, before.residuals, recorded, reference)
+    return (before.form, solver, refined) if _accepted(solver, tolerance, []) else None
 
 
 def _candidates(problem: Problem, method: str) -> tuple[list[str], str]:

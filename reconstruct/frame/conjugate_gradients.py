@@ -9,7 +9,7 @@ K >= P0^-1, r^T K^-1 r is at most |r|^2 over the least eigenvalue of P0^-1, for 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -67,12 +67,14 @@ class FrameSystem:
 
     weights : (M,) 1 / Rv, 0 for sensor pixels that are not used
     prior : 1 / P0 of independent pixels, or 1 / its spectrum, (rows, columns), under the DCT-II
+    similar : the preconditioner of the same prior and similar weights, None to make one of these
     """
 
     camera: Camera
     observation: Observation
     weights: FloatArray
     prior: float | FloatArray
+    similar: Preconditioner | None = field(default=None, kw_only=True)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -100,8 +102,12 @@ class FrameSystem:
     @cached_property
     def preconditioner(self) -> Preconditioner:
         """P: the shift-invariant camera with the mean weight of each lens type."""
-        means = tuple(float(self.weights[part].mean()) for part in self.camera.type_slices())
-        return preconditioner_for(self.camera, means, self.prior)
+        return preconditioner_for(self.camera, self.mean_weights, self.prior) if self.similar is None else self.similar
+
+    @property
+    def mean_weights(self) -> tuple[float, ...]:
+        """Mean weight of each lens type."""
+        return tuple(float(self.weights[part].mean()) for part in self.camera.type_slices())
 
     def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.

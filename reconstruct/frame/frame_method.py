@@ -6,7 +6,8 @@ Shares of the mean error come from random noise images, whose squares have the r
 
 from __future__ import annotations
 
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -26,16 +27,32 @@ from ..methods.method import (
     residual_multipliers,
     total_variance,
 )
+from ..methods.prepared import SAME_NOISE
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .banded_system import BandedSystem, serves
 from .conjugate_gradients import FrameSystem, Solution, posterior_operators
 from .error_map import MANY, ErrorMap
+from .map_check import MapCheck
 from .preconditioner import is_sliding
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 SEED = 20260401  # of random images of the error analysis, different from those of data and calibration
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
+SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
+ERRORS = "errors"  # name of a FrameError among what frames share
 DRAWS = 2  # of images and noise for the expected residual
+
+
+@dataclass(frozen=True)
+class FrameError:
+    """The expected error of every frame of the same noise.
+
+    check : of the map of variances;  power : expected squares of the residual, `bias` that of an image equal to f0
+    """
+
+    expected: ExpectedError
+    check: MapCheck
+    power: ResidualPower
 
 
 class FrameMethod(Method):
@@ -67,8 +84,13 @@ class FrameMethod(Method):
             weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
         camera, prior, observation = task.model.camera, task.precision_on(task.shape), _without_matrix(task.model)
         if self._banded:
-            return BandedSystem(camera, observation, weights, prior, task.model.matrix)
-        return FrameSystem(camera, observation, weights, prior)
+            banded = BandedSystem(camera, observation, weights, prior, task.model.matrix)
+            return self.shared("system", self.conditions(), lambda: banded)[0]
+        system = FrameSystem(camera, observation, weights, prior)
+        variances = np.divide(1, system.mean_weights, dtype=np.float64)
+        conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
+        similar, difference = self.shared("preconditioner", conditions, lambda: system.preconditioner, SIMILAR)
+        return system if difference is None else replace(system, similar=similar)
 
     @cached_property
     def solution(self) -> Solution:
@@ -91,53 +113,73 @@ class FrameMethod(Method):
         """Return the estimate and its error for the actual noise."""
         task, actual = self.task, total_variance(noise)
         solution = self.solution
-        errors, check = ErrorMap.of(task, self.system, actual)
-        variances, variance = errors.maps, errors.variance
-        self.execution.progress(0.7)
-        resolved = 1 - variances.posterior.ravel() / task.prior.variance
-        self.execution.progress(0.8)
-        parts = self._parts(noise, float(variances.noisy.mean()))
+        make = partial(self._frame_error, noise, actual)
+        errors, difference = self.shared(ERRORS, self.conditions(noise), make, SAME_NOISE)
         self.execution.progress(0.9)
-        expected = ExpectedError(variance, float(variances.missing.mean()), parts, resolved)
-        given = None if truth is None else self._interval(truth - task.prior.mean, actual, expected, check.mean)
+        expected, check = errors.expected, errors.check
+        deviation = None if truth is None else truth - task.prior.mean
+        given = None if deviation is None else self._interval(deviation, actual, expected, check.mean)
         solver = Solver(
             method="frame",
             why=NULL_SPACE if self._banded else "every lens type is shift-invariant except at the edges",
             condition=solution.condition,
-            variance_bound=check.worst,
+            variance_bound=check.worst + (difference or 0.0),
             bound=solution.bound,
             refinements=solution.steps,
             unit="posterior standard deviation",
         )
-        multipliers = residual_multipliers(task, self.image)
         return MethodResult(
             self.image,
-            multipliers,
+            residual_multipliers(task, self.image),
             solver,
             expected,
             given,
             lambda weights: self._variance_of_sum(weights, actual),
-            self._residual_power(actual, truth, expected.degrees_of_freedom),
+            self._residual_power(errors.power, deviation),
+            difference,
         )
 
-    def _residual_power(self, actual: FloatArray, truth: FloatArray | None, freedoms: float) -> ResidualPower:
-        """Return the expected squares of the residual, by solutions for random images and noise.
+    def _frame_error(self, noise: dict[str, FloatArray], actual: FloatArray) -> FrameError:
+        """Return the expected error, which depends on the noise and not on what is recorded."""
+        task, system = self.task, self.system
+        if system.similar is not None:  # maps take the mean weights from the preconditioner
+            system = replace(system, similar=None)
+        errors, check = ErrorMap.of(task, system, actual)
+        variances, variance = errors.maps, errors.variance
+        self.execution.progress(0.7)
+        resolved = 1 - variances.posterior.ravel() / task.prior.variance
+        parts = self._parts(noise, float(variances.noisy.mean()))
+        self.execution.progress(0.8)
+        expected = ExpectedError(variance, float(variances.missing.mean()), parts, resolved)
+        return FrameError(expected, check, self._random_power(actual, expected.degrees_of_freedom))
+
+    def _random_power(self, actual: FloatArray, freedoms: float) -> ResidualPower:
+        """Return the expected squares of the residual, by solutions for random images and noise, of f0 as true image.
 
         freedoms : trace of A H of independent pixels
         """
-        task, system = self.task, self.system
-        deviation = None if truth is None else truth - task.prior.mean
+        task = self.task
         draws = DRAWS if task.model.unknowns <= MANY else 1
         total = None
         as_expected = task.prior.kind == "independent" and np.allclose(actual, task.expected_noise, rtol=1e-9)
         if as_expected and actual.size > freedoms:
             total = actual.size - freedoms
-        inputs = ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws, total=total)
-        residuals = (
-            column - task.observe(self._solve(system.right_hand_side(task.on_all_measurements(column, 0.0))))
-            for column in inputs.columns()
-        )
-        return inputs.power(residuals, task.expected_noise)
+        mean = np.zeros(task.model.unknowns)
+        inputs = ResidualInputs(task.observe, task.draw_deviation, actual, mean, draws, total=total)
+        return inputs.power(map(self._residual, inputs.columns()), task.expected_noise)
+
+    def _residual_power(self, power: ResidualPower, deviation: FloatArray | None) -> ResidualPower:
+        """Return the expected squares of the residual for the true image f0 + `deviation`, (N,), if it is known."""
+        if deviation is None:
+            return replace(power, bias=None, noise=None)
+        white = 1 / np.sqrt(self.task.expected_noise)
+        return replace(power, bias=np.square(white * self._residual(self.task.observe(deviation))))
+
+    def _residual(self, column: FloatArray) -> FloatArray:
+        """Return (I - H A) x: (measurements used,)."""
+        task = self.task
+        right = self.system.right_hand_side(task.on_all_measurements(column, 0.0))
+        return column - task.observe(self._solve(right))
 
     def _solve(self, right: FloatArray) -> FloatArray:
         return self.system.solve(right, self.task.settings.accuracy).image

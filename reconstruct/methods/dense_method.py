@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from ..forms.form import Form
 from ..problem import Problem
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .method import Method, MethodResult, PosteriorOperators, total_variance
+from .prepared import SAME_NOISE
 
 DRAWS = 32  # of images and noise for the expected residual
 
@@ -26,8 +28,14 @@ class DenseMethod(Method):
     def estimate(self) -> Estimate:
         """Image, multipliers and the form that computed them."""
         task = self.task
-        problem = Problem(task.model.matrix[task.used], task.prior_on(task.shape), task.expected_noise)
-        return estimate(problem, task.recorded[task.used], task.settings.method, task.settings.tolerance)
+        arguments = task.recorded[task.used], task.settings.method, task.settings.tolerance
+
+        def first() -> Estimate:
+            problem = Problem(task.model.matrix[task.used], task.prior_on(task.shape), task.expected_noise)
+            return estimate(problem, *arguments)
+
+        made, difference = self.shared("form", self.conditions(), first)
+        return made if difference is None else estimate(made.form.problem, *arguments, before=made)
 
     def estimate_image(self) -> FloatArray:
         """Compute f^ without its error: (N,)."""
@@ -41,15 +49,18 @@ class DenseMethod(Method):
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
         solution, actual = self.estimate, total_variance(noise)
-        expected = expected_error(solution.form, noise)
+        make = partial(expected_error, solution.form, noise)
+        expected, difference = self.shared("errors", self.conditions(noise), make, SAME_NOISE)
+        solver = solution.solver
         return MethodResult(
             solution.image,
             solution.multipliers,
-            solution.solver,
+            replace(solver, variance_bound=solver.variance_bound + difference) if difference else solver,
             expected,
             None if truth is None else expected_given(solution.form, truth, actual),
             lambda weights: variance_of_sum(solution.form, weights, actual),
             residual_power(solution.form, actual, expected.leverage, truth),
+            difference,
         )
 
 

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from scipy import fft
@@ -20,14 +21,18 @@ from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval
 from ..prior import Prior, prior_of, spectrum_of
 from ..verdict.residual_power import ResidualPower
+from .prepared import Conditions, Prepared
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
 class Execution:
-    """Workers for parallel tasks (default: threads of this process) and a callback for progress."""
+    """Workers for parallel tasks (default: threads of this process), a callback for progress, and what frames share."""
 
     workers: Workers | None = None
     progress: Progress = no_progress
+    prepared: Prepared | None = None
 
 
 @dataclass(frozen=True)
@@ -109,6 +114,8 @@ class MethodResult:
     expected : Eq. 5 with the actual noise;  interval : for the true image, if it is known
     variance_of_sum : expected squared error of a weighted sum of pixels, as a function of (N,) weights
     residual_power : expected squares of the residual, None where a measurement has no expected noise
+    noise_difference : largest relative difference of the noise from that of the frame whose error bars these are; None
+        where they were computed for this one
     """
 
     image: FloatArray
@@ -118,6 +125,7 @@ class MethodResult:
     interval: Interval | None
     variance_of_sum: Callable[[FloatArray], float]
     residual_power: ResidualPower | None
+    noise_difference: float | None = None
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,21 @@ class Method(ABC):
         """Create the method for `task`, run by `execution`."""
         self.task = task
         self.execution = execution
+
+    def conditions(self, noise: dict[str, FloatArray] | None = None) -> Conditions:
+        """Return what results of this method depend on; noise : actual, where they depend on it."""
+        task = self.task
+        settings = task.prior, task.settings, task.tiles, task.prior_ratio
+        return Conditions(settings, task.used, task.expected_noise, noise or {})
+
+    def shared(
+        self, name: str, conditions: Conditions, make: Callable[[], Value], tolerance: float = 0.0
+    ) -> tuple[Value, float | None]:
+        """Return a result that frames of one camera share, as `Prepared.shared`; made here for a frame by itself."""
+        prepared = self.execution.prepared
+        if prepared is None or prepared.model is not self.task.model:
+            return make(), None
+        return prepared.shared(f"{type(self).__name__} {name}", conditions, make, tolerance)
 
     @cached_property
     def image(self) -> FloatArray:

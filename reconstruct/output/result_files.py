@@ -19,6 +19,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, with_changes
 from ommatid.scenes.stack import Stack
 
+from ..methods.prepared import Prepared
 from ..restore import Reconstruction, check_match, restore
 from . import figures, run_json
 from .report import report_of
@@ -75,14 +76,15 @@ def reconstruct(
     names: tuple[Path, Path],
     workers: Workers | None = None,
     progress: Progress = no_progress,
+    prepared: Prepared | None = None,
 ) -> tuple[Reconstruction, RunReport]:
     """Return the reconstruction and the content of run.json.
 
-    names : of the files of stack and model, for error messages
+    names : of the files of stack and model, for error messages;  prepared : what frames of this model share
     Raises InputError if stack and model do not belong together.
     """
     check_match(stack, model, names)
-    restoration = restore(stack, model, truth, workers, progress)
+    restoration = restore(stack, model, truth, workers, progress, prepared)
     return restoration, report_of(stack, model, restoration)
 
 

@@ -10,11 +10,12 @@ any target of values from 0 to 255. `render.complete` skips nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from math import ceil, floor, hypot
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse, special
 
 from ..camera import Camera
 from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
@@ -184,13 +185,14 @@ def _change(camera: Camera, lens_type: LensType, reduced: Blur, prior: PriorTabl
     return largest, mean_square
 
 
+@cache
 def light_kept_in_focus(side: float) -> float:
     """Share of the light of a sensor pixel's square that stays in it behind a circular aperture in focus.
 
     side : of the square, in wavelengths times the f-number
     """
     # By Parseval: the square's autocorrelation, transformed, times the transfer function, in polar coordinates.
-    nodes, weights = np.polynomial.legendre.leggauss(200 + ceil(4 * side))
+    nodes, weights = special.roots_legendre(200 + ceil(4 * side))
     q, turn = (1 + nodes[:, None]) / 2, np.pi / 8 * (1 + nodes)
     transfer = 2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q**2))
     square = np.sinc(side * q * np.cos(turn)) ** 2 * np.sinc(side * q * np.sin(turn)) ** 2

@@ -62,7 +62,7 @@ def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
 
 def known_noise(stack: Stack) -> Noise:
     """Return the variances, (M,), known before anything is estimated; absent effects have no entry."""
-    noise = {"rendering": stack.variance}
+    noise = {"rendering": stack.variance if stack.variance.any() else uniform(0.0, stack.values.size)}
     if stack.recording is not None:
         return noise | stack.recording.noise(stack.recording.smoothed_light(stack.camera))
     table = stack.scene.noise

@@ -11,8 +11,9 @@ from ommatid.scenes.stack import Stack
 from .assumptions import Assumptions
 from .expected_error import ExpectedError
 from .measured_error import MeasuredError
-from .methods.method import MethodResult, total_variance
+from .methods.method import MethodResult, is_uniform, total_variance
 from .misalignment.robust_noise import CAUSE
+from .noise import uniform
 from .verdict.causes import evidence_of, without_pixels
 from .verdict.residual_parts import ResidualPart, WhitenedResidual, residual_parts
 from .verdict.verdict import ErrorCheck, Verdict, judge
@@ -76,7 +77,7 @@ def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResul
         used=assumed.usable.used,
         spread=_spread(stack, assumed, total),
         shared=_shared(model, assumed, total, result),
-        largest=max(1.0, float((total / expected_noise).max()), assumed.method.task.prior_ratio),
+        largest=max(1.0, _largest_ratio(total, expected_noise), assumed.method.task.prior_ratio),
     )
     return residual_parts(residual, stack.camera)
 
@@ -84,8 +85,17 @@ def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResul
 def _spread(stack: Stack, assumed: Assumptions, total: FloatArray) -> FloatArray:
     """Return the relative variance of the noise variances, which the rendering estimates from few passes."""
     freedoms = max(int(stack.record.get("passes") or 0) - 1, LEAST_FREEDOMS)
+    if not assumed.noise["rendering"].any():
+        return uniform(0.0, total.size)
     share = np.divide(assumed.noise["rendering"], total, out=np.zeros(total.size), where=total > 0)
     return np.square(share) * 2 / (freedoms - 4)
+
+
+def _largest_ratio(total: FloatArray, expected: FloatArray) -> float:
+    """Return the largest ratio of the actual to the expected noise variance."""
+    if is_uniform(total) and is_uniform(expected):
+        total, expected = total[:1], expected[:1]
+    return float((total / expected).max())
 
 
 def _shared(model: Model, assumed: Assumptions, total: FloatArray, result: MethodResult) -> FloatArray:
@@ -93,5 +103,5 @@ def _shared(model: Model, assumed: Assumptions, total: FloatArray, result: Metho
     if CAUSE in result.expected.parts and result.interval is None:
         return np.ones(total.size)
     if not model.record.get("fit") or "calibration" not in assumed.noise:
-        return np.zeros(total.size)
+        return uniform(0.0, total.size)
     return np.divide(assumed.noise["calibration"], total, out=np.zeros(total.size), where=total > 0)

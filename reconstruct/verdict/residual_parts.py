@@ -9,6 +9,7 @@ Noise variances that are themselves estimates make the tails heavier; `spread` h
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -83,15 +84,15 @@ def residual_parts(residual: WhitenedResidual, camera: Camera) -> list[ResidualP
     Lens types are left out where there is one, and sub-imagers where each is a lens type.
     """
     sums = _Sums(residual, camera)
-    subs = np.repeat(np.arange(len(camera.sub_imagers)), [part.stop - part.start for part in camera.slices()])
-    types = np.repeat(np.arange(len(camera.types)), [part.stop - part.start for part in camera.type_slices()])
-    parts = sums.parts("all", ["all"], np.zeros(camera.measurements, dtype=np.intp))
+    parts = sums.parts("all", ["all"], sums.slices_of((camera.slices()[0].start,)))
     if len(camera.types) > 1:
-        parts += sums.parts("lens type", [lens_type.name for lens_type in camera.types], types)
+        starts = [part.start for part in camera.type_slices()]
+        parts += sums.parts("lens type", [lens_type.name for lens_type in camera.types], sums.slices_of(starts))
     if len(camera.sub_imagers) > len(camera.types):
-        parts += sums.parts("sub-imager", [sub.name for sub in camera.sub_imagers], subs)
+        parts += sums.parts("sub-imager", [sub.name for sub in camera.sub_imagers], sums.subs)
     if camera.measurements >= LEAST_IN_REGION * REGIONS**2:
-        parts += sums.parts("region", [name for row in PLACES for name in row], regions(camera))
+        names = [name for row in PLACES for name in row]
+        parts += sums.parts("region", names, _Scattered(regions(camera)[residual.used], len(names)))
     return parts
 
 
@@ -108,29 +109,75 @@ def regions(camera: Camera) -> IntArray:
     return numbers
 
 
+@dataclass(frozen=True)
+class _Scattered:
+    """Parts of the measurements used, by the index of the part of each: (measurements used,)."""
+
+    labels: IntArray
+    count: int
+
+    def sums(self, values: FloatArray | Float32Array) -> FloatArray:
+        """Return the sum of the values of each part: (count,)."""
+        return np.bincount(self.labels, values, self.count).astype(np.float64)
+
+    @property
+    def sizes(self) -> IntArray:
+        """Number of measurements of each part: (count,)."""
+        return np.bincount(self.labels, minlength=self.count)
+
+
+@dataclass(frozen=True)
+class _Contiguous:
+    """Parts that lie one after the other in the order of measurements; `sizes` of them, (count,), may be 0."""
+
+    sizes: IntArray
+
+    @property
+    def count(self) -> int:
+        """Number of parts."""
+        return self.sizes.size
+
+    def sums(self, values: FloatArray | Float32Array) -> FloatArray:
+        """Return the sum of the values of each part: (count,)."""
+        if values.strides == (0,):
+            return self.sizes * np.float64(values[0] if values.size else 0.0)
+        total, some = np.zeros(self.count), self.sizes > 0
+        if some.any():
+            total[some] = np.add.reduceat(values, (np.cumsum(self.sizes) - self.sizes)[some], dtype=np.float64)
+        return total
+
+    @property
+    def labels(self) -> IntArray:
+        """Index of the part of each measurement: (measurements used,)."""
+        return np.repeat(np.arange(self.count), self.sizes)
+
+
 class _Sums:
     """Sums over the measurements of any part."""
 
     def __init__(self, residual: WhitenedResidual, camera: Camera) -> None:
         self.residual = residual
-        self.subs = np.repeat(np.arange(len(camera.sub_imagers)), [part.stop - part.start for part in camera.slices()])[
-            residual.used
-        ]
+        self.subs = self.slices_of([part.start for part in camera.slices()])
 
-    def parts(self, kind: Kind, names: list[str], labels: IntArray) -> list[ResidualPart]:
-        """Return the parts with these names from the (M,) index of each measurement's name."""
-        labels = labels[self.residual.used]
-        residual, count = self.residual, len(names)
-        power = residual.power
-        sizes = np.bincount(labels, minlength=count)
-        squares, prior = _sums(labels, residual.squares, count), _sums(labels, power.prior, count)
-        expected, variance = prior, self._variance(power.prior, labels, count)
+    def slices_of(self, starts: Sequence[int]) -> _Contiguous:
+        """Return the parts of the measurements that begin at these ones, of all."""
+        used = self.residual.used
+        if used.all():
+            return _Contiguous(np.diff([*starts, used.size]))
+        return _Contiguous(np.add.reduceat(used.astype(np.intp), starts))
+
+    def parts(self, kind: Kind, names: list[str], of: _Scattered | _Contiguous) -> list[ResidualPart]:
+        """Return the parts with these names."""
+        residual, power = self.residual, self.residual.power
+        sizes = of.sizes
+        squares, prior = of.sums(residual.squares), of.sums(power.prior)
+        expected, variance = prior, self._variance(power.prior, of, prior)
         if power.samples is not None:
-            variance = np.maximum(variance, self._variance_of_samples(power.samples, labels, count))
+            variance = np.maximum(variance, self._variance_of_samples(power.samples, of))
         if power.bias is not None and power.noise is not None:
-            bias = _sums(labels, power.bias, count)
-            given = bias + _sums(labels, power.noise, count)
-            variance_given = self._variance(power.noise, labels, count) + 4 * residual.largest * bias
+            bias, noise = of.sums(power.bias), of.sums(power.noise)
+            given = bias + noise
+            variance_given = self._variance(power.noise, of, noise) + 4 * residual.largest * bias
             expected, variance = np.where(given > prior, [given, variance_given], [prior, variance])
         variance *= 1 + (1 / power.draws if power.draws else 0.0)
         p_values = _p_values(squares, expected, variance)
@@ -149,27 +196,24 @@ class _Sums:
             if sizes[number]
         ]
 
-    def _variance(self, power: FloatArray, labels: IntArray, count: int) -> FloatArray:
-        """Return the variance of the sums of squares with these means."""
+    def _variance(self, power: FloatArray, of: _Scattered | _Contiguous, sums: FloatArray) -> FloatArray:
+        """Return the variance of the sums of squares with these means, and `sums` of them."""
         residual = self.residual
-        variance = 2 * residual.largest * _sums(labels, power, count)
-        variance += 3 * _sums(labels, residual.spread * power**2, count)
+        variance = 2 * residual.largest * sums
+        if residual.spread.any():
+            variance += 3 * of.sums(residual.spread * power**2)
         if residual.shared.any():
-            subs = int(self.subs.max()) + 1
-            shared = _sums(self.subs + subs * labels, residual.shared * power, subs * count).reshape(count, subs)
+            subs = self.subs.count
+            both = _Scattered(self.subs.labels + subs * of.labels, subs * of.count)
+            shared = both.sums(residual.shared * power).reshape(of.count, subs)
             variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance
 
-    def _variance_of_samples(self, samples: Float32Array, labels: IntArray, count: int) -> FloatArray:
+    def _variance_of_samples(self, samples: Float32Array, of: _Scattered | _Contiguous) -> FloatArray:
         """Return 2 tr W^2 of each part from pairs of draws, with a margin since they are few."""
         pairs = list(combinations(samples, 2))
-        squares = sum((np.square(_sums(labels, one * other, count)) for one, other in pairs), np.zeros(count))
+        squares = sum((np.square(of.sums(one * other)) for one, other in pairs), np.zeros(of.count))
         return SAMPLES_MARGIN * 2 * squares / len(pairs)
-
-
-def _sums(labels: IntArray, values: FloatArray | Float32Array, count: int) -> FloatArray:
-    """Return the sum of the values with each label from 0 to `count` - 1."""
-    return np.bincount(labels, values, count).astype(np.float64)
 
 
 def _p_values(values: FloatArray, means: FloatArray, variances: FloatArray) -> FloatArray:

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,109 +19,23 @@ from ommatid.batch.remote import RunObserver
 from ommatid.pipeline import stages
 from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.held_out_report import HeldOutReport
-from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.prediction import Prediction
-from ommatid.reconstruct.restore import Reconstruction
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError, MachineError, naming_source, shortened_repr
+from ommatid.runtime.errors import InputError, MachineError, naming_source
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file
 from ommatid.scenes import scene as scene_file
 from ommatid.scenes import stack as stack_file
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 
 from . import notebook
+from .reconstructor import Reconstructor
+from .result import Result, check_type, flat_truth, result_of
 
-if TYPE_CHECKING:
-    import xarray
-
-__all__ = ["InputError", "MachineError", "Model", "Scene", "Stack"]
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """A reconstructed image with its posterior standard deviation.
-
-    image, deviation : (rows, columns);  truth : (rows, columns), None where it is not known
-    summary : the content of run.json
-    reconstruction : the estimator's own record, with its budget of errors and `region`; None for a run read from files
-    """
-
-    stack: Stack
-    model: Model
-    image: FloatArray
-    deviation: FloatArray
-    truth: FloatArray | None
-    summary: RunReport
-    reconstruction: Reconstruction | None = None
-
-    @property
-    def expected_mse(self) -> float:
-        """Expected mean squared error per pixel (Wood et al. 2005, Eq. 5), in squared units of the target."""
-        return self.summary.error.predicted_mse
-
-    @property
-    def mse(self) -> float | None:
-        """Measured mean squared error per pixel, None without the truth."""
-        return self.summary.error.mse
-
-    @property
-    def trusted(self) -> bool | None:
-        """The verdict on the error bars, with reasons in `summary.verdict`; None for runs of earlier versions."""
-        return None if self.summary.verdict is None else self.summary.verdict.trusted
-
-    def report(self, path: str | Path) -> Path:
-        """Write the report as one HTML page, and return its path. Raises InputError or MachineError."""
-        from ommatid.page.data import Run
-        from ommatid.page.document import page
-        from ommatid.runtime.files import write_text
-        from ommatid.simulate.ideal import matrix_as_designed
-
-        run = Run(
-            folder=Path(path).parent,
-            report=self.summary,
-            stack=self.stack,
-            model=self.model,
-            estimate=self.image.astype(np.float32),
-            variance=np.square(self.deviation).astype(np.float32),
-            truth=None if self.truth is None else self.truth.astype(np.float32),
-        )
-        ideal = partial(matrix_as_designed, self.stack.camera)
-        write_text(Path(path), page(run, ideal, None, self.summary.fingerprint))
-        return Path(path)
-
-    def to_xarray(self) -> xarray.Dataset:
-        """Convert to an xarray.Dataset of image, deviation and, where it is known, truth, over (row, column).
-
-        Coordinates are millimetres on the target: heights above the camera's axis, and distances to its right in the
-        image. Raises ImportError if xarray is not installed.
-        """
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError(
-                "to_xarray needs xarray, which is not installed; run: pip install 'ommatid[notebook]'"
-            ) from error
-        camera = self.stack.camera
-        heights = [camera.position(row + 0.5, 0)[1] for row in range(camera.rows)]
-        widths = [-camera.position(0, column + 0.5)[0] for column in range(camera.columns)]
-        images = {"image": self.image, "deviation": self.deviation}
-        images |= {} if self.truth is None else {"truth": self.truth}
-        return xarray.Dataset(
-            {name: (("row", "column"), image) for name, image in images.items()},
-            coords={
-                "row": ("row", heights, {"units": "mm", "long_name": "height above the axis"}),
-                "column": ("column", widths, {"units": "mm", "long_name": "distance to the right of the axis"}),
-            },
-            attrs={"title": self.stack.scene.title, "expected_mse": self.expected_mse},
-        )
-
-    def _repr_html_(self) -> str:
-        return notebook.result_html(self.stack.scene.title, self.image, self.deviation, self.truth, self.summary)
+__all__ = ["InputError", "MachineError", "Model", "Reconstructor", "Result", "Scene", "Stack"]
 
 
 def read_scene(path: str | Path, set: str | Sequence[str] = (), lens: str | Sequence[str] = ()) -> Scene:
@@ -217,7 +129,7 @@ def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
         if stack is None:
             model, _ = stages.calibrated_model(setup, path, no_progress)
         else:
-            _check_type("stack", stack, Stack, "read_stack")
+            check_type("stack", stack, Stack, "read_stack")
             check_scene(setup)
             if stack.camera.describe() != setup.camera.describe():
                 raise InputError(f"{setup.scene.source}: expected a stack of this scene's camera, got one of another")
@@ -231,15 +143,26 @@ def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> 
     truth : with which the estimate is compared, (rows, columns) or (N,), of f or of a world finer than f
     Raises InputError if stack and model are of different cameras, or if memory does not suffice.
     """
-    _check_type("stack", stack, Stack, "read_stack")
-    _check_type("model", model, Model, "read_model")
-    flat = None if truth is None else _flat_truth(truth, stack.camera)
+    check_type("stack", stack, Stack, "read_stack")
+    check_type("model", model, Model, "read_model")
+    flat = None if truth is None else flat_truth(truth, stack.camera)
     names = Path("the stack"), Path("the model")
     outcome, report = result_files.reconstruct(stack, model, flat, names)
     report = report.with_changes(fingerprint=result_files.fingerprint_of(stack, model))
-    image, deviation = outcome.estimate.reshape(outcome.shape), np.sqrt(outcome.expected.variance)
-    shaped = None if outcome.truth is None else outcome.truth.reshape(outcome.shape)
-    return Result(stack, model, image, deviation.reshape(outcome.shape), shaped, report, outcome)
+    return result_of(stack, model, outcome, report)
+
+
+def prepare(model: Model, scene: Scene | str | Path | None = None) -> Reconstructor:
+    """Prepare the reconstruction of many stacks with one model: `reconstructor = prepare(model, scene)`.
+
+    Then `reconstructor(stack)` returns what `reconstruct(stack, model)` does. Preconditioner, factorisation and error
+    bars are computed for the first stack, and again only for one whose noise differs.
+
+    scene : whose [prior], [estimator] and [tiles] apply to every stack; None: those of each stack's own scene
+    Raises InputError if scene and model are of different cameras.
+    """
+    check_type("model", model, Model, "read_model")
+    return Reconstructor(model, None if scene is None else _scene(scene))
 
 
 def check(stack: Stack, model: Model, *, fitted: bool = True) -> HeldOutReport:
@@ -252,8 +175,8 @@ def check(stack: Stack, model: Model, *, fitted: bool = True) -> HeldOutReport:
     from ommatid.reconstruct.output.held_out_report import held_out_report
     from ommatid.reconstruct.restore import check_match
 
-    _check_type("stack", stack, Stack, "read_stack")
-    _check_type("model", model, Model, "read_model")
+    check_type("stack", stack, Stack, "read_stack")
+    check_type("model", model, Model, "read_model")
     check_match(stack, model, ("the stack", "the model"))
     return held_out_report(check_held_out(stack, model, fitted=fitted))
 
@@ -265,28 +188,6 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
     """
     stages.run(_setup(scene), Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
     return read_run(folder)
-
-
-def _check_type(name: str, value: object, expected: type, reader: str) -> None:
-    """Raise InputError for an argument of another type, such as a path."""
-    if not isinstance(value, expected):
-        raise InputError(
-            f"{name}: expected a {expected.__name__}, got {shortened_repr(value)}; read files with ommatid.{reader}"
-        )
-
-
-def _flat_truth(truth: FloatArray, camera: Camera) -> FloatArray:
-    """Return the truth flattened. Raises InputError for another shape, and for values that are not finite numbers."""
-    world = camera.world
-    try:
-        image = np.asarray(truth, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"truth: expected an array of numbers, got {shortened_repr(truth)}") from error
-    if image.shape not in (camera.shape, (camera.unknowns,), world.shape, (world.unknowns,)):
-        raise InputError(f"truth: expected {camera.rows} x {camera.columns} pixels, got an array of {image.shape}")
-    if not np.isfinite(image).all():
-        raise InputError("truth: expected finite values, got NaN or infinity; leave out a truth that is not known")
-    return image.ravel()
 
 
 def _scene(scene: Scene | str | Path) -> Scene:

@@ -129,6 +129,8 @@ def _diagnostics(restoration: Reconstruction) -> DiagnosticsReport:
             "fit_measurements": fit.measurements,
             "fit_doubtful": fit.doubtful,
         }
+    if restoration.result.noise_difference is not None:
+        fitted["noise_difference"] = restoration.result.noise_difference
     return DiagnosticsReport(
         pixels_used=int(restoration.usable.used.sum()),
         pixels_dead=restoration.usable.dead,

@@ -126,7 +126,11 @@ class FittedNumber(Record):
 
 
 class DiagnosticsReport(Record):
-    """Numbers that assess an estimate."""
+    """Numbers that assess an estimate.
+
+    noise_difference : largest relative difference of the noise variances from those of the frame whose error bars
+        these are; absent where they were computed for this one
+    """
 
     pixels_used: int
     pixels_dead: int
@@ -137,6 +141,7 @@ class DiagnosticsReport(Record):
     fit: dict[str, FittedNumber] = Field(default_factory=dict[str, FittedNumber])
     fit_measurements: int | None = None
     fit_doubtful: bool = False
+    noise_difference: float | None = None
 
 
 class ModelReport(Record):

@@ -1,0 +1,134 @@
+"""The result of a reconstruction, as the Python interface returns it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.restore import Reconstruction
+from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError, shortened_repr
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.model import Model
+from ommatid.scenes.stack import Stack
+
+from . import notebook
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A reconstructed image with its posterior standard deviation.
+
+    image, deviation : (rows, columns);  truth : (rows, columns), None where it is not known
+    summary : the content of run.json
+    reconstruction : the estimator's own record, with its budget of errors and `region`; None for a run read from files
+    """
+
+    stack: Stack
+    model: Model
+    image: FloatArray
+    deviation: FloatArray
+    truth: FloatArray | None
+    summary: RunReport
+    reconstruction: Reconstruction | None = None
+
+    @property
+    def expected_mse(self) -> float:
+        """Expected mean squared error per pixel (Wood et al. 2005, Eq. 5), in squared units of the target."""
+        return self.summary.error.predicted_mse
+
+    @property
+    def mse(self) -> float | None:
+        """Measured mean squared error per pixel, None without the truth."""
+        return self.summary.error.mse
+
+    @property
+    def trusted(self) -> bool | None:
+        """The verdict on the error bars, with reasons in `summary.verdict`; None for runs of earlier versions."""
+        return None if self.summary.verdict is None else self.summary.verdict.trusted
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report as one HTML page, and return its path. Raises InputError or MachineError."""
+        from ommatid.page.data import Run
+        from ommatid.page.document import page
+        from ommatid.runtime.files import write_text
+        from ommatid.simulate.ideal import matrix_as_designed
+
+        run = Run(
+            folder=Path(path).parent,
+            report=self.summary,
+            stack=self.stack,
+            model=self.model,
+            estimate=self.image.astype(np.float32),
+            variance=np.square(self.deviation).astype(np.float32),
+            truth=None if self.truth is None else self.truth.astype(np.float32),
+        )
+        ideal = partial(matrix_as_designed, self.stack.camera)
+        write_text(Path(path), page(run, ideal, None, self.summary.fingerprint))
+        return Path(path)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Convert to an xarray.Dataset of image, deviation and, where it is known, truth, over (row, column).
+
+        Coordinates are millimetres on the target: heights above the camera's axis, and distances to its right in the
+        image. Raises ImportError if xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError(
+                "to_xarray needs xarray, which is not installed; run: pip install 'ommatid[notebook]'"
+            ) from error
+        camera = self.stack.camera
+        heights = [camera.position(row + 0.5, 0)[1] for row in range(camera.rows)]
+        widths = [-camera.position(0, column + 0.5)[0] for column in range(camera.columns)]
+        images = {"image": self.image, "deviation": self.deviation}
+        images |= {} if self.truth is None else {"truth": self.truth}
+        return xarray.Dataset(
+            {name: (("row", "column"), image) for name, image in images.items()},
+            coords={
+                "row": ("row", heights, {"units": "mm", "long_name": "height above the axis"}),
+                "column": ("column", widths, {"units": "mm", "long_name": "distance to the right of the axis"}),
+            },
+            attrs={"title": self.stack.scene.title, "expected_mse": self.expected_mse},
+        )
+
+    def _repr_html_(self) -> str:
+        return notebook.result_html(self.stack.scene.title, self.image, self.deviation, self.truth, self.summary)
+
+
+def result_of(stack: Stack, model: Model, outcome: Reconstruction, report: RunReport) -> Result:
+    """Return the result of a reconstruction; report : the content of its run.json."""
+    image, deviation = outcome.estimate.reshape(outcome.shape), np.sqrt(outcome.expected.variance)
+    truth = None if outcome.truth is None else outcome.truth.reshape(outcome.shape)
+    return Result(stack, model, image, deviation.reshape(outcome.shape), truth, report, outcome)
+
+
+def check_type(name: str, value: object, expected: type, reader: str) -> None:
+    """Raise InputError for an argument of another type, such as a path."""
+    if not isinstance(value, expected):
+        raise InputError(
+            f"{name}: expected a {expected.__name__}, got {shortened_repr(value)}; read files with ommatid.{reader}"
+        )
+
+
+def flat_truth(truth: FloatArray, camera: Camera) -> FloatArray:
+    """Return the truth flattened. Raises InputError for another shape, and for values that are not finite numbers."""
+    world = camera.world
+    try:
+        image = np.asarray(truth, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"truth: expected an array of numbers, got {shortened_repr(truth)}") from error
+    if image.shape not in (camera.shape, (camera.unknowns,), world.shape, (world.unknowns,)):
+        raise InputError(f"truth: expected {camera.rows} x {camera.columns} pixels, got an array of {image.shape}")
+    if not np.isfinite(image).all():
+        raise InputError("truth: expected finite values, got NaN or infinity; leave out a truth that is not known")
+    return image.ravel()

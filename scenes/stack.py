@@ -101,15 +101,7 @@ def write(path: Path, stack: Stack) -> None:
 def read(path: Path) -> Stack:
     """Read a stack. Raises InputError if it is missing, cut short, altered or another kind of file."""
     parts = exr.read(path)
-    first = parts[0].record
-    if "scene" not in first or "record" not in first:
-        raise InputError(f"{path}: expected a stack of sub-images, got another kind of OpenEXR file")
-    try:
-        record = checked(first["record"])
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; make it again") from error
-    scene = parse(first["scene"], path)
-    camera = derive(scene)
+    scene, camera, record = _described(path, parts[0].record)
     if [part.name for part in parts] != [sub.name for sub in camera.sub_imagers]:
         raise InputError(f"{path}: its parts are not the sub-images that its scene describes; make it again")
     names = CHANNELS if scene.sensor is None else CHANNELS + SENSOR_CHANNELS
@@ -128,6 +120,23 @@ def read(path: Path) -> Stack:
     digital, dark, flat = (_joined(parts, name) for name in ("Y", *SENSOR_CHANNELS))
     recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts))
     return stack_from_recording(scene, camera, recording, variance, record)
+
+
+def read_header(path: Path) -> tuple[Scene, Camera]:
+    """Read the scene and the camera of a stack without its pixels. Raises InputError as `read` does for these."""
+    return _described(path, exr.read_first_record(path))[:2]
+
+
+def _described(path: Path, first: dict[str, Any]) -> tuple[Scene, Camera, dict[str, Any]]:
+    """Return scene, camera and record from the record of the first part."""
+    if "scene" not in first or "record" not in first:
+        raise InputError(f"{path}: expected a stack of sub-images, got another kind of OpenEXR file")
+    try:
+        record = checked(first["record"])
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; make it again") from error
+    scene = parse(first["scene"], path)
+    return scene, derive(scene), record
 
 
 def _joined(parts: list[exr.Part], channel: str) -> FloatArray:

@@ -42,6 +42,19 @@ def rows(report: RunReport) -> list[Row]:
     ]
 
 
+def frame_row(name: str, report: RunReport) -> Row:
+    """Return the name of a frame of many, and its verdict, error and time in words."""
+    error, difference = report.error, report.diagnostics.noise_difference
+    words = [heading(report), f"expected error {error.predicted_mse:.4g}"]
+    words += [] if error.mse is None else [f"measured {error.mse:.4g}"]
+    words.append(f"{report.stages['reconstruct'].seconds:.2f} s")
+    if difference is None:
+        words.append("error bars computed")
+    else:
+        words.append("error bars of an earlier frame" + (f", noise within {difference:.1g}" if difference else ""))
+    return name, ", ".join(words)
+
+
 def _verdict_rows(report: RunReport) -> list[Row]:
     notes = () if report.verdict is None else report.verdict.notes
     return [(VERDICT, f"{heading(report)}: {grounds(report)}"), *(("  note", note) for note in notes)]

@@ -7,9 +7,20 @@ from typing import Annotated
 
 import typer
 
-from . import failures, options, output
-from .options import Json, Lenses, Output, Sets, Strict
+from . import failures, frames, options, output
+from .options import Json, Lenses, Sets, Strict
 
+StackAndModel = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="STACK... MODEL",
+        help="Recorded sub-images, stack.exr, of one frame or several, then their observation model, model.npz.",
+    ),
+]
+Estimates = Annotated[
+    Path,
+    typer.Option("-o", "--output", metavar="FILE", help="File to write; of several stacks the folder of their files."),
+]
 StackFile = Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")]
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Their observation model, model.npz.")]
 Regions = Annotated[
@@ -26,7 +37,9 @@ TileScheduler = Annotated[
 ]
 TileWorkers = Annotated[
     int | None,
-    typer.Option("--workers", metavar="N", min=1, help="Distribute the tiles of a frame over N processes."),
+    typer.Option(
+        "--workers", metavar="N", min=1, help="Distribute several stacks, or the tiles of one, over N processes."
+    ),
 ]
 ScenePrior = Annotated[
     bool,
@@ -38,9 +51,8 @@ StrictCheck = Annotated[bool, typer.Option("--strict", help="Exit with code 3 if
 
 
 def reconstruct(
-    stack: StackFile,
-    model: ModelFile,
-    file: Output,
+    files: StackAndModel,
+    file: Estimates,
     sets: Sets = None,
     lens: Lenses = "",
     region: Regions = None,
@@ -49,12 +61,17 @@ def reconstruct(
     strict: Strict = False,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct from files alone."""
+    """Reconstruct from files alone: one frame, or several of one camera."""
     from ommatid.analysis import run_table
     from ommatid.pipeline.reconstruction import reconstruct_files
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
+    *stacks, model = files
     asked = options.changes(sets), options.lens_names(lens), options.regions(region)
+    if len(stacks) != 1 or file.is_dir():
+        frames.reconstruct(stacks, model, file, *asked, scheduler, workers, strict, as_json)
+        return
+    stack = stacks[0]
     with output.progress_bar("reconstruct") as progress:
         report = reconstruct_files(stack, model, file, *asked, progress, scheduler, workers)
     output.print_result({"file": str(file), **report.plain()}, [(str(file), run_table.rows(report))], as_json)

@@ -119,6 +119,15 @@ def digest(*arrays: NDArray[Any]) -> str:
     return total.hexdigest()
 
 
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's bytes, as hexadecimal text. Raises InputError if it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: could not be read ({error.strerror or error})") from error
+
+
 def fingerprint(description: object) -> str:
     """SHA-256 of a JSON description; results with equal fingerprints were made from the same."""
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()

@@ -81,6 +81,17 @@ def read(path: Path) -> list[Part]:
     return parts
 
 
+def read_first_record(path: Path) -> dict[str, Any]:
+    """Return the record of the first part, without its pixels. Raises InputError for a file that `write` did not make.
+
+    Whether the pixels are whole is not checked.
+    """
+    parts = _open(path, header_only=True)
+    if not parts:
+        raise InputError(f"{path}: expected an OpenEXR file that ommatid wrote, got one without parts")
+    return _checked_record(path, parts[0][0], parts[0][2])[0]
+
+
 def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
     """The channels of the first part of any OpenEXR picture. Raises InputError if it cannot be read."""
     parts = _open(path)
@@ -89,7 +100,7 @@ def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
     return parts[0][1]
 
 
-def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | None]]:
+def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, NDArray[np.float32]], str | None]]:
     """Name, channels and JSON attribute of each part. Raises InputError if the file cannot be read."""
     import OpenEXR
 
@@ -97,12 +108,15 @@ def _open(path: Path) -> list[tuple[str, dict[str, NDArray[np.float32]], str | N
         raise InputError(f"{path}: no such file")
     try:
         with _silenced():
-            check_memory(_declared_size(path), f"{path}: to read it", "take a smaller one, or free some memory")
-            file = OpenEXR.File(str(path), separate_channels=True)
+            if not header_only:
+                check_memory(_declared_size(path), f"{path}: to read it", "take a smaller one, or free some memory")
+            file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
         return [
             (
                 str(part.header.get("name", "")),
-                {name: np.asarray(channel.pixels, dtype=np.float32) for name, channel in part.channels.items()},
+                {}
+                if header_only
+                else {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()},
                 part.header.get(ATTRIBUTE),
             )
             for part in file.parts
@@ -126,6 +140,14 @@ def _declared_size(path: Path) -> int:
 
 
 def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], attribute: str | None) -> Part:
+    record, pixels = _checked_record(path, name, attribute)
+    if not channels or _seal(channels) != pixels:
+        raise InputError(_altered(path, name))
+    return Part(name, channels, record)
+
+
+def _checked_record(path: Path, name: str, attribute: str | None) -> tuple[dict[str, Any], str]:
+    """Return the record of a part and the SHA-256 of its pixels."""
     where = f"{path}: part '{name}'"
     if not isinstance(attribute, str):
         raise InputError(f"{where} has no attribute '{ATTRIBUTE}'; expected a file that ommatid wrote")
@@ -136,9 +158,13 @@ def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], at
         pixels = record.pop("sha256")
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise InputError(f"{where} has a damaged attribute '{ATTRIBUTE}'; make the file again") from error
-    if not intact or not channels or _seal(channels) != pixels:
-        raise InputError(f"{where} does not match its checksum; the file is cut short or altered, make it again")
-    return Part(name, channels, record)
+    if not intact:
+        raise InputError(_altered(path, name))
+    return record, pixels
+
+
+def _altered(path: Path, name: str) -> str:
+    return f"{path}: part '{name}' does not match its checksum; the file is cut short or altered, make it again"
 
 
 def _seal(channels: dict[str, NDArray[np.float32]]) -> str:

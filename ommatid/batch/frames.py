@@ -1,0 +1,229 @@
+"""Many frames of one camera: each stack reconstructed with the same model, which is prepared once.
+
+The first frame is reconstructed in this process. What it prepared then serves the others, here or in other processes.
+A frame's EXR file holds its run.json, and the fingerprint of everything that it was made from.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from ommatid.reconstruct.methods.prepared import Prepared
+from ommatid.reconstruct.output import figures, result_files
+from ommatid.reconstruct.output.run_json import RegionReport, RunReport
+from ommatid.reconstruct.restore import Reconstruction, check_camera, check_region
+from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, make_folder
+from ommatid.runtime.pool import worker_pool
+from ommatid.runtime.progress import Progress
+from ommatid.scenes import model_file
+from ommatid.scenes import stack as stack_file
+from ommatid.scenes.formats import exr
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import TRUTH, WORLD_PICTURE
+from ommatid.scenes.stack import Stack
+
+Region = tuple[tuple[int, int], tuple[int, int]]
+
+SENT = "preconditioner", "errors"  # what the first frame prepared and other processes take over; they make the rest
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """What the frames have in common: the file of H, changes (KEY=VALUE), names of lens types, and regions."""
+
+    model: Path
+    changes: tuple[str, ...] = ()
+    lenses: tuple[str, ...] = ()
+    regions: tuple[Region, ...] = ()
+
+    def read_model(self) -> Model:
+        """Read H of the lens types."""
+        model = model_file.read(self.model)
+        return model.restrict(self.lenses) if self.lenses else model
+
+    def applied(self, stack: Stack, path: Path) -> Stack:
+        """Return a stack of the lens types, with the changes."""
+        stack = stack.restrict(self.lenses) if self.lenses else stack
+        return result_files.with_estimator_changes(stack, list(self.changes), path)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A stack's file and the file of its estimate, with the fingerprint of everything that the estimate depends on."""
+
+    stack: Path
+    output: Path
+    fingerprint: str
+
+    def finished(self) -> RunReport | None:
+        """Return the report of an estimate that is there and up to date, else None."""
+        with suppress(OSError, ValueError, KeyError, TypeError, InputError):
+            record = exr.read(self.output)[0].record
+            if record["fingerprint"] == self.fingerprint and self.output.with_suffix(".png").is_file():
+                return RunReport.model_validate(record["report"])
+        return None
+
+
+# Each frame with a function that returns its report and True if it was made, or raises its error.
+Reports = Iterator[tuple[Frame, Callable[[], tuple[RunReport, bool]]]]
+
+
+def reconstruct_frames(
+    stacks: Sequence[Path], folder: Path, options: FrameOptions, workers: int | None, progress: Progress
+) -> Reports:
+    """Yield the frames as they end; estimates and pictures are in `folder` under the names of the stacks.
+
+    workers : processes that share the frames, None for this one
+    Raises InputError, before anything is written, if two stacks have one name, or if one is not of the model's camera.
+    """
+    outputs = _outputs(stacks, folder, options.model)
+    model = options.read_model()
+    for stack in stacks:
+        _check(stack, model, options)
+    make_folder(folder)
+    clear_abandoned(folder)
+    common = [file_digest(options.model), options.changes, options.lenses, options.regions]
+    pairs = zip(stacks, outputs, strict=True)
+    frames = [Frame(stack, output, _made_from(stack, common)) for stack, output in pairs]
+    return _reports(frames, Prepared(model), options, workers, progress)
+
+
+def _outputs(stacks: Sequence[Path], folder: Path, model: Path) -> list[Path]:
+    """Return the file of each estimate. Raises InputError for equal names, and where a file that is read is in the way.
+
+    A folder that does not exist is made later.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder for the estimates of {len(stacks)} stacks, got a file")
+    first: dict[str, Path] = {}
+    for stack in stacks:
+        if stack.stem in first:
+            raise InputError(
+                f"{first[stack.stem]} and {stack}: expected stacks of different names, got two '{stack.stem}', whose"
+                " estimates would be one file; rename one of them"
+            )
+        first[stack.stem] = stack
+    outputs = [folder / f"{stack.stem}.exr" for stack in stacks]
+    read = {path.resolve() for stack in stacks for path in (stack, stack.parent / TRUTH)} | {model.resolve()}
+    for output in outputs:
+        if output.resolve() in read:
+            raise InputError(f"{output}: would replace a file that is read; choose another folder with -o")
+    return outputs
+
+
+def _check(path: Path, model: Model, options: FrameOptions) -> None:
+    """Raise InputError unless a stack, by its header, is one that `options` can be applied to and of the model."""
+    scene, camera = stack_file.read_header(path)
+    if options.lenses:
+        camera = camera.restrict(options.lenses)[0]
+    check_camera(camera, model, (path, options.model))
+    nothing = Stack(scene, camera, np.zeros(0), np.zeros(0), {})
+    result_files.with_estimator_changes(nothing, list(options.changes), path)
+    for region in options.regions:
+        check_region(*region, camera.shape)
+
+
+def _made_from(stack: Path, common: list[Any]) -> str:
+    beside = [stack.parent / name for name in (TRUTH, WORLD_PICTURE)]
+    return fingerprint([*common, file_digest(stack), *(file_digest(path) for path in beside if path.is_file())])
+
+
+def _reports(
+    frames: Sequence[Frame], prepared: Prepared, options: FrameOptions, workers: int | None, progress: Progress
+) -> Reports:
+    """Yield the frames that are up to date, then the others as they end."""
+    missing: list[Frame] = []
+    for frame in frames:
+        report = frame.finished()
+        if report is None:
+            missing.append(frame)
+        else:
+            yield frame, partial(_returned, (report, False))
+    shared = _here(missing, prepared, options)
+    if workers is not None and workers > 1:
+        shared = _in_processes(missing, prepared, options, workers)
+    for number, (frame, work) in enumerate(shared, 1):
+        yield frame, work
+        progress(number / len(missing))
+
+
+def _here(frames: Sequence[Frame], prepared: Prepared, options: FrameOptions) -> Reports:
+    for frame in frames:
+        yield frame, partial(_made, frame, prepared, options)
+
+
+def _in_processes(frames: Sequence[Frame], prepared: Prepared, options: FrameOptions, workers: int) -> Reports:
+    """Yield the first frame, made here, then the others as processes make them."""
+    for frame in frames[:1]:
+        yield frame, partial(_returned, _outcome(frame, prepared, options))
+    others = frames[1:]
+    if not others:
+        return
+    with TemporaryDirectory(prefix="ommatid-") as scratch:
+        contents = Path(scratch) / "prepared"
+        contents.write_bytes(pickle.dumps(prepared.contents(*SENT)))
+        with worker_pool(count=min(workers, len(others))) as pool:
+            for task in pool.each(partial(_made_in_process, options, contents), others):
+                yield others[task.index], partial(_collected, task.result)
+
+
+def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunReport, bool]:
+    """Reconstruct a frame and write its files, the EXR file last: where it is, both are there."""
+    stack = options.applied(stack_file.read(frame.stack), frame.stack)
+    truth = result_files.truth_beside(frame.stack, stack)
+    names = frame.stack, options.model
+    outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, prepared=prepared)
+    report = report.with_changes(fingerprint=frame.fingerprint, **_region_reports(outcome, options.regions))
+    figures.write_estimate(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
+    record = {"title": stack.scene.title, "fingerprint": frame.fingerprint, "report": report.plain()}
+    result_files.write_estimate(frame.output, outcome, record)
+    return report, True
+
+
+def _region_reports(outcome: Reconstruction, regions: Sequence[Region]) -> dict[str, Any]:
+    reports = tuple(
+        RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
+        for corner, size in regions
+        for mean, deviation in [outcome.region(corner, size)]
+    )
+    return {"region": reports[0], "regions": reports} if reports else {}
+
+
+Outcome = tuple[RunReport, bool] | Exception
+
+
+def _outcome(frame: Frame, prepared: Prepared, options: FrameOptions) -> Outcome:
+    try:
+        return _made(frame, prepared, options)
+    except (InputError, MachineError, OSError, MemoryError) as error:
+        return error
+
+
+def _made_in_process(options: FrameOptions, contents: Path, frame: Frame) -> Outcome:
+    return _outcome(frame, _prepared(options, contents), options)
+
+
+@lru_cache(maxsize=1)
+def _prepared(options: FrameOptions, contents: Path) -> Prepared:
+    """Return what the first frame prepared, once per process."""
+    return Prepared(options.read_model()).with_contents(pickle.loads(contents.read_bytes()))
+
+
+def _collected(result: Callable[[], Outcome]) -> tuple[RunReport, bool]:
+    return _returned(result())
+
+
+def _returned(outcome: Outcome) -> tuple[RunReport, bool]:
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,37 @@ def test_it_yields_the_numbers_of_the_commands(
     assert finished.summary.error == result.summary.error
     np.testing.assert_array_equal(finished.image, result.image.astype(np.float32))
     np.testing.assert_array_equal(finished.truth, result.truth)
+
+
+def test_a_prepared_model_gives_the_same_results(
+    scene: ommatid.Scene, stack: ommatid.Stack, model: ommatid.Model, result: ommatid.Result
+) -> None:
+    reconstructor = ommatid.prepare(model, scene)
+    for _ in range(2):
+        again = reconstructor(stack, ommatid.target_image(scene))
+        np.testing.assert_array_equal(again.image, result.image)
+        np.testing.assert_array_equal(again.deviation, result.deviation)
+        np.testing.assert_array_equal(again.truth, result.truth)
+        assert (again.summary.error, again.summary.verdict) == (result.summary.error, result.summary.verdict)
+        assert again.reconstruction is not None
+    other = ommatid.prepare(model, ommatid.read_scene("tile19", set=[*FEW, "prior.variance=1000"]))(stack)
+    changed = stack.scene.model_copy(update={"prior": scene.prior.model_copy(update={"variance": 1000.0})})
+    alone = ommatid.reconstruct(replace(stack, scene=changed), model)
+    np.testing.assert_array_equal(other.image, alone.image)
+    assert np.abs(other.deviation / result.deviation - 1).max() > 0.01
+    np.testing.assert_array_equal(ommatid.prepare(model)(stack).image, result.image)
+
+
+def test_a_model_of_another_camera_is_not_prepared(model: ommatid.Model, stack: ommatid.Stack) -> None:
+    with pytest.raises(ommatid.InputError, match=r"tile35.*do not belong together"):
+        ommatid.prepare(model, "tile35")
+    with pytest.raises(ommatid.InputError, match="expected a Model"):
+        ommatid.prepare("model.npz")  # pyright: ignore[reportArgumentType]
+    moved = replace(stack, camera=replace(stack.camera, distance=2 * stack.camera.distance))
+    with pytest.raises(ommatid.InputError, match=r"the stack and the model do not belong together: target\.distance"):
+        ommatid.prepare(model)(moved)
+    with pytest.raises(ommatid.InputError, match="expected a Stack"):
+        ommatid.prepare(model)("stack.exr")  # pyright: ignore[reportArgumentType]
 
 
 def test_a_run_is_not_repeated(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`, `frames`
-and `nasty`, which takes half an hour. No speed is asserted. `python -m tests.benchmarks coverage` measures error bars
+`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`, `frames`,
+`film` and `nasty`, which takes half an hour. No speed is asserted. `python -m tests.benchmarks coverage` measures error bars
 instead, for hours, and is run by itself (`coverage --help`). Other load slows both sides of a ratio alike, so compare
 ratios rather than times.
 """
@@ -27,6 +27,7 @@ from .alternation import VARIANTS, Row
 from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
 from .coverage.command import command as coverage
+from .film import film_table
 from .forms import NOISE, form_rows
 from .frame_tables import bandwidth_table, frames_table, growth_table
 from .leaving_out import SAMPLES as LEAVING_OUT_SAMPLES
@@ -111,6 +112,10 @@ def _frames() -> Iterator[Table]:
         yield table()
 
 
+def _film() -> Iterator[Table]:
+    yield film_table()
+
+
 def _nasty() -> Iterator[Table]:
     yield nasty_table()
 
@@ -148,6 +153,7 @@ PARTS: dict[str, Callable[[], Iterator[Table]]] = {
     "leaving-out": _leaving_out,
     "forms": _forms,
     "frames": _frames,
+    "film": _film,
     "nasty": _nasty,
 }
 

@@ -1,9 +1,9 @@
 """Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`, `frames`,
-`film` and `nasty`, which takes half an hour. No speed is asserted. `python -m tests.benchmarks coverage` measures error bars
-instead, for hours, and is run by itself (`coverage --help`). Other load slows both sides of a ratio alike, so compare
-ratios rather than times.
+`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`,
+`frames`, `film`, which takes ten minutes, and `nasty`, which takes half an hour. No speed is asserted.
+`python -m tests.benchmarks coverage` measures error bars instead, for hours, and is run by itself (`coverage --help`).
+Other load slows both sides of a ratio alike, so compare ratios rather than times.
 """
 
 from __future__ import annotations

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
+from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.model import Model
@@ -46,6 +48,23 @@ def recorded(
     light = (ideal_matrix(camera) if matrix is None else matrix) @ truth
     values = light + rng.normal(size=light.size) * np.sqrt(variance)
     return Stack(described, camera, values, np.zeros(light.size), {"seed": seed, "first_seed": seed})
+
+
+def assert_methods_agree(described: Callable[[str], Scene], methods: Sequence[str], tolerance: float) -> None:
+    """Estimates and error bars by each method are those of the dense one; described : the scene with a method."""
+
+    def estimated(method: str) -> tuple[FloatArray, FloatArray]:
+        chosen = described(method)
+        camera = derive(chosen)
+        image = 127.5 + np.random.default_rng(0).normal(0, 70, camera.unknowns)
+        done = restore(recorded(chosen, image, 1e-2), ideal_model(chosen, camera), image)
+        return done.estimate, done.expected.variance
+
+    dense, variance = estimated("information")
+    for method in methods:
+        image, error = estimated(method)
+        np.testing.assert_allclose(error, variance, rtol=1e-4)
+        np.testing.assert_allclose(image, dense, atol=tolerance)
 
 
 def blurred(described: Scene, spread: float, seed: int = 5) -> tuple[Model, sparse.csr_array]:

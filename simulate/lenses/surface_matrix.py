@@ -55,18 +55,23 @@ def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     variation of the blur within a pixel.
     Raises InputError if the surfaces form no image, or aberrations of too many waves.
     """
-    found: sparse.csr_array | None = None
-    total = np.zeros(lens_type.measurements)
-    for wavelength, weight in bands(camera):
-        field = field_of(camera, lens_type, wavelength)
-        check_waves(lens_type, field)
-        pixels = _pixels(camera, lens_type, field)
-        light = weight * field.brightness(np.hypot(pixels.x, pixels.y))
-        part = sparse.csr_array(sparse.diags_array(light) @ _rows(camera, field, pixels))
-        found, total = part if found is None else sparse.csr_array(found + part), total + light
-    assert found is not None
+    parts = (_band(camera, lens_type, wavelength, weight) for wavelength, weight in bands(camera))
+    entries, total = next(parts)
+    for more, light in parts:
+        entries, total = sparse.csr_array(entries + more), total + light
     scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
-    return sparse.csr_array(sparse.diags_array(scale) @ found)
+    return sparse.csr_array(sparse.diags_array(scale) @ entries)
+
+
+def _band(
+    camera: Camera, lens_type: LensType, wavelength: float | None, weight: float
+) -> tuple[sparse.csr_array, FloatArray]:
+    """Return H at one wavelength times the light of each pixel, and this light, whose share in all is `weight`."""
+    field = field_of(camera, lens_type, wavelength)
+    check_waves(lens_type, field)
+    pixels = _pixels(camera, lens_type, field)
+    light = weight * field.brightness(np.hypot(pixels.x, pixels.y))
+    return sparse.csr_array(sparse.diags_array(light) @ _rows(camera, field, pixels)), light
 
 
 def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFootprints:

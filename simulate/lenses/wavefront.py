@@ -162,11 +162,24 @@ def wavefront_of(
     middle = _middle(prescription, disk, depth, height)
     if middle is None:
         return None
-    rays = _traced(prescription, disk, depth, height, distance, None, middle, RAY_NODES)
+    pencil = _Pencil(prescription, disk, depth, height, distance, middle)
+    rays = _traced(pencil, None, RAY_NODES)
     if wavelength is None:
         return rays
     phase = 2 * pi / wavelength * rays.half_width * 2 * rays.spot_radius + pi * reach
-    return _traced(prescription, disk, depth, height, distance, wavelength, middle, node_counts(phase))
+    return _traced(pencil, wavelength, node_counts(phase))
+
+
+@dataclass(frozen=True)
+class _Pencil:
+    """The light of a sensor point, (0, height), as `wavefront_of` takes it; middle : on the exit disk, of its area."""
+
+    prescription: Prescription
+    disk: Disk
+    depth: float
+    height: float
+    distance: float
+    middle: FloatArray
 
 
 def _middle(prescription: Prescription, disk: Disk, depth: float, height: float) -> FloatArray | None:
@@ -177,19 +190,12 @@ def _middle(prescription: Prescription, disk: Disk, depth: float, height: float)
     return points @ weight / total if total > 0 else None
 
 
-def _traced(
-    prescription: Prescription,
-    disk: Disk,
-    depth: float,
-    height: float,
-    distance: float,
-    wavelength: float | None,
-    middle: FloatArray,
-    counts: tuple[int, int],
-) -> Wavefront:
+def _traced(pencil: _Pencil, wavelength: float | None, counts: tuple[int, int]) -> Wavefront:
+    prescription, disk, depth, height = pencil.prescription, pencil.disk, pencil.depth, pencil.height
+    distance, middle = pencil.distance, pencil.middle
     radius, angle, area = polar_nodes(counts)
     direction = np.stack([np.cos(angle), np.sin(angle)])
-    edge = _edge(prescription, disk, depth, height, middle, direction[:, 0])
+    edge = _edge(pencil, direction[:, 0])
     at = (middle[:, None, None] + radius * edge * direction).reshape(2, -1)
     # All nodes are known to pass the rims; the differences may step over these.
     open_lens = replace(prescription, semi_diameter=BESIDE_RIM * prescription.semi_diameter)
@@ -244,16 +250,14 @@ def _rays(numbers: LensPath, height: float, at: FloatArray, depth: float) -> tup
     return np.stack([x, y]), np.stack([u / w, v / w])
 
 
-def _edge(
-    prescription: Prescription, disk: Disk, depth: float, height: float, middle: FloatArray, direction: FloatArray
-) -> FloatArray:
+def _edge(pencil: _Pencil, direction: FloatArray) -> FloatArray:
     """Return the distance from the middle to the edge of the light along directions, (2, n): (1, n)."""
-    numbers = path(prescription, disk)
+    numbers = path(pencil.prescription, pencil.disk)
     low, width = np.zeros(direction.shape[1]), 2.0  # across the unit disk, wherever the middle lies
     for _ in range(EDGE_STEPS):
         width /= PARTS
         tried = low + width * np.arange(1, PARTS)[:, None]
-        at = middle[:, None, None] + tried * direction[:, None]
-        lit = trace(numbers, 0.0, height, at[0], at[1], depth)[2] > 0
+        at = pencil.middle[:, None, None] + tried * direction[:, None]
+        lit = trace(numbers, 0.0, pencil.height, at[0], at[1], pencil.depth)[2] > 0
         low = low + width * np.logical_and.accumulate(lit).sum(axis=0)
     return low[None, :]

@@ -100,7 +100,7 @@ class WaveLens(RealLens):
         drawn, vergence, ray = 0.0 if band else sampler.next_1d(), self._vergence, None
         if self._distance is not None:
             ray = super().emit(x, y, depth, sampler, lens)
-            vergence = self._met(ray, x, y, depth, lens)
+            vergence = self._met(self._distance, ray, x, y, depth, lens)
         vergence += 1 / depth - 1 / self._depth
         across, up, weight = self._bands[0].emit(x, y, self._depth / depth, vergence, sample, ray is not None)
         begin = self._bands[0].share
@@ -118,7 +118,7 @@ class WaveLens(RealLens):
         slopes = dr.select(inside, across, u / w), dr.select(inside, up, v / w), 1
         return origin, slopes, dr.select(inside, weight, traced)
 
-    def _met(self, ray: Emission, x: Any, y: Any, depth: Any, lens: Point) -> Any:
+    def _met(self, distance: Distance, ray: Emission, x: Any, y: Any, depth: Any, lens: Point) -> Any:
         """Return 1 over the distance that a ray goes, or the ray through the middle of the lens if it is blocked."""
         import drjit as dr
 
@@ -126,8 +126,7 @@ class WaveLens(RealLens):
         passed = weight > 0
         start = lens[0] + dr.select(passed, at_x, 0.0), lens[1] + dr.select(passed, at_y, 0.0), 0
         chief = (*self._bands[0].chief(x, y, self._depth / depth), 1)
-        assert self._distance is not None
-        return 1 / self._distance(start, [dr.select(passed, *pair) for pair in zip(direction, chief, strict=True)])
+        return 1 / distance(start, [dr.select(passed, *pair) for pair in zip(direction, chief, strict=True)])
 
 
 class _Band:

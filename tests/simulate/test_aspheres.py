@@ -132,11 +132,15 @@ def test_scaling_a_lens_scales_its_polynomial() -> None:
     one = replace(lens([1.0, -1.2], [0.2], [1.5, 1.0], 0.15), aspheric=((0.5, -3.0), (1.0, 2.0, -40.0)))
     disk, across, down = exit_disk(one, 1.5, 0.05), *spread(100)
     point, direction, weight, length = trace_path(one, disk, 0.03, 0.01, across, down, 1.5)
+    assert np.mean(weight > 0) > 0.5
     for factor in (1e-3, 40.0):
         wide = Disk(disk.height * factor, disk.radius * factor)
-        scaled = trace_path(one.scaled(factor), wide, 0.03 * factor, 0.01 * factor, across, down, 1.5 * factor)
+        places = wide, 0.03 * factor, 0.01 * factor, across, down, 1.5 * factor
+        scaled = trace_path(one.scaled(factor), *places)
         expected = (tuple(value * factor for value in point), direction, weight, length * factor)
         same(scaled, expected, 1e-12 * max(factor, 1))
+        unscaled = trace_path(replace(one.scaled(factor), aspheric=one.aspheric), *places)[1]
+        assert np.abs(np.array(unscaled) - direction).max() > 1e-3, "the polynomial has an effect"
 
 
 def test_light_through_an_asphere_goes_the_same_way_back() -> None:

@@ -128,8 +128,18 @@ def test_openings_wider_than_the_pitch_are_refused(ommatid: Command) -> None:
         assert not Path("g.exr").exists()
 
 
+def first_prescription(name: str, changes: list[str]) -> Prescription | None:
+    camera = derive(read(GALLERY / f"{name}.toml", changes, ["I"]))
+    return prescription_of(camera, camera.types[0]) if camera.types[0].optics.surfaces is not None else None
+
+
 def test_a_single_lens_may_be_wider_than_the_pitch() -> None:
     alone = ["camera.lens.I.array=[1, 1]", "camera.lens_pitch=0.4 mm"]
     camera = derive(read(GALLERY / "planoconvex.toml", alone, ["I"]))
-    prescription_of(camera, camera.types[0])
-    derive(read(GALLERY / "tile19.toml", [*alone, 'camera.lens.I.aperture="3 mm"'], ["I"]))
+    assert 2 * prescription_of(camera, camera.types[0]).semi_diameter.max() > camera.lens_pitch
+    wide = [*alone, 'camera.lens.I.aperture="3 mm"']
+    assert derive(read(GALLERY / "tile19.toml", wide, ["I"])).types[0].optics.aperture == 3.0
+    for scene, change in (("planoconvex", alone), ("tile19", wide)):
+        two = [key.replace("[1, 1]", "[1, 2]") for key in change]
+        with pytest.raises(InputError, match=r"of at most (camera\.)?lens_pitch, 0\.4 mm"):
+            first_prescription(scene, two)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
@@ -49,7 +51,7 @@ def verdict_of(
         pixels_used=int(used.sum()),
         left_out=without_pixels(stack.camera, used),
     )
-    light = assumed.method.task.model.light(result.image)
+    light = partial(assumed.method.task.model.light, result.image)
     evidence = evidence_of(stack, model, used, light, assumed.prior.kind == "independent")
     return judge(_parts(stack, model, assumed, result), evidence, check)
 

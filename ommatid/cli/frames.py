@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,8 @@ from ommatid.runtime.errors import InputError
 from . import failures, output
 
 if TYPE_CHECKING:
-    from ommatid.batch.frames import Region
+    from ommatid.batch.frames import Frame, Region
+    from ommatid.reconstruct.output.run_json import RunReport
 
 
 def reconstruct(
@@ -31,9 +32,7 @@ def reconstruct(
     Raises InputError before anything is written if a stack is not of the model's camera, and BatchError at the end if a
     frame failed or, if `strict`, if one is not to be trusted.
     """
-    from ommatid.analysis.run_table import frame_row
     from ommatid.batch.frames import FrameOptions, reconstruct_frames
-    from ommatid.reconstruct.output.verdict_words import is_trusted
 
     if not stacks:
         raise InputError(f"{model}: expected stacks and then their model, got one file; name a stack before it")
@@ -45,21 +44,27 @@ def reconstruct(
     with output.progress_bar("reconstruct") as progress:
         asked = FrameOptions(model, changes, lenses, regions)
         for frame, work in reconstruct_frames(stacks, folder, asked, workers, progress):
-            heading = {"file": str(frame.output), "stack": str(frame.stack)}
-            try:
-                report, made = work()
-            except Exception as error:
-                codes.append(failures.report(error))
-                documents[frame.stack] = {**heading, "error": str(error), "exit_code": codes[-1]}
-                rows[frame.stack] = frame.output.name, f"failed: {error}"
-                continue
-            output.say_done("reconstruct", made, frame.output)
-            documents[frame.stack] = {**heading, **report.plain()}
-            rows[frame.stack] = frame_row(frame.output.name, report)
-            codes.append(failures.NOT_TRUSTED if strict and not is_trusted(report) else 0)
-    in_order = [rows[stack] for stack in stacks]
-    output.print_result(
-        [documents[stack] for stack in stacks], [(f"{len(stacks)} frames: {folder}", in_order)], as_json
-    )
+            documents[frame.stack], rows[frame.stack], code = _described(frame, work, strict)
+            codes.append(code)
+    section = f"{len(stacks)} frames: {folder}", [rows[stack] for stack in stacks]
+    output.print_result([documents[stack] for stack in stacks], [section], as_json)
     if max(codes):
         raise failures.BatchError(max(codes))
+
+
+def _described(
+    frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict: bool
+) -> tuple[dict[str, Any], tuple[str, str], int]:
+    """Finish a frame, and return its JSON object, its row and its exit code."""
+    from ommatid.analysis.run_table import frame_row
+    from ommatid.reconstruct.output.verdict_words import is_trusted
+
+    name, heading = frame.output.name, {"file": str(frame.output), "stack": str(frame.stack)}
+    try:
+        report, made = work()
+    except Exception as error:
+        code = failures.report(error)
+        return {**heading, "error": str(error), "exit_code": code}, (name, f"failed: {error}"), code
+    output.say_done("reconstruct", made, frame.output)
+    code = failures.NOT_TRUSTED if strict and not is_trusted(report) else 0
+    return {**heading, **report.plain()}, frame_row(name, report), code

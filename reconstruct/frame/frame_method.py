@@ -96,9 +96,14 @@ class FrameMethod(Method):
         """The solution f^ - f0."""
         task = self.task
         recorded = task.recorded if task.complete else np.where(task.used, task.recorded, 0.0)
-        mean = self.system.observation.forward(np.full(task.model.unknowns, task.prior.mean))
+        conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=np.ones(0))
+        mean, _ = self.shared("mean", conditions, self._readings_of_mean)
         right = self.system.right_hand_side(recorded - mean)
         return self.system.solve(right, task.settings.accuracy, lambda done: self.execution.progress(SOLVING * done))
+
+    def _readings_of_mean(self) -> FloatArray:
+        """Return H f0: (M,)."""
+        return self.system.observation.forward(np.full(self.task.model.unknowns, self.task.prior.mean))
 
     def estimate_image(self) -> FloatArray:
         """Compute f^ without its error: (N,)."""

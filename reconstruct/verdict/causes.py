@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,10 +42,12 @@ class RunEvidence:
     detailed: bool
 
 
-def evidence_of(stack: Stack, model: Model, used: BoolArray, light: FloatArray, independent: bool) -> RunEvidence:
+def evidence_of(
+    stack: Stack, model: Model, used: BoolArray, light: Callable[[], FloatArray], independent: bool
+) -> RunEvidence:
     """Collect what may explain a residual.
 
-    used : (M,) True for measurements that are used;  light : (M,) as the estimate predicts it
+    used : (M,) True for measurements that are used;  light : yields the light, (M,), that the estimate predicts
     """
     camera, scene = stack.camera, stack.scene
     ideal = model.record["method"] == "ideal"
@@ -72,22 +74,27 @@ def without_pixels(camera: Camera, used: BoolArray) -> tuple[str, ...]:
     return tuple(sub.name for sub, part in pairs if not used[part].any())
 
 
-def _dark(stack: Stack, used: BoolArray, light: FloatArray) -> tuple[str, ...]:
+def _dark(stack: Stack, used: BoolArray, light: Callable[[], FloatArray]) -> tuple[str, ...]:
     camera = stack.camera
-    parts = camera.slices()
-    means, predicted = (
-        np.array([_mean(values[part][used[part]]) for part in parts]) for values in (stack.values, light)
-    )
-    dark: list[str] = []
+    means = _means(stack.values, used, camera)
+    darker: list[int] = []
     for lens_type in camera.types:
         index = [number for number, sub in enumerate(camera.sub_imagers) if sub.type is lens_type]
         typical = float(np.nanmedian(means[index])) if np.isfinite(means[index]).any() else 0.0
-        dark += [
-            camera.sub_imagers[number].name
-            for number in index
-            if means[number] < DARK * typical and means[number] < UNEXPLAINED * predicted[number]
-        ]
-    return tuple(dark)
+        darker += [number for number in index if means[number] < DARK * typical]
+    if not darker:
+        return ()
+    predicted = _means(light(), used, camera)
+    return tuple(
+        camera.sub_imagers[number].name for number in darker if means[number] < UNEXPLAINED * predicted[number]
+    )
+
+
+def _means(values: FloatArray, used: BoolArray, camera: Camera) -> FloatArray:
+    """Return the mean of each sub-imager's measurements that are used."""
+    if used.all():
+        return np.array([_mean(values[part]) for part in camera.slices()])
+    return np.array([_mean(values[part][used[part]]) for part in camera.slices()])
 
 
 def _mean(values: FloatArray) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 from typing import Literal
 
@@ -92,12 +93,15 @@ def residual_parts(residual: WhitenedResidual, camera: Camera) -> list[ResidualP
         parts += sums.parts("sub-imager", [sub.name for sub in camera.sub_imagers], sums.subs)
     if camera.measurements >= LEAST_IN_REGION * REGIONS**2:
         names = [name for row in PLACES for name in row]
-        parts += sums.parts("region", names, _Scattered(regions(camera)[residual.used], len(names)))
+        labels = regions(camera)
+        used = labels if residual.used.all() else labels[residual.used]
+        parts += sums.parts("region", names, _Scattered(used, len(names)))
     return parts
 
 
+@lru_cache(maxsize=1)  # for the next frame of the same camera
 def regions(camera: Camera) -> IntArray:
-    """Return the region of the target in which each measurement is centred, by rows from 0: (M,)."""
+    """Return the region of the target in which each measurement is centred, by rows from 0: (M,), not to be changed."""
     numbers = np.empty(camera.measurements, dtype=np.int64)
     for sub, part in zip(camera.sub_imagers, camera.slices(), strict=True):
         thirds = [

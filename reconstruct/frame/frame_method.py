@@ -133,11 +133,12 @@ class FrameMethod(Method):
         if as_expected and actual.size > freedoms:
             total = actual.size - freedoms
         inputs = ResidualInputs(task.observe, task.draw_deviation, actual, deviation, draws, total=total)
-        residuals = (
-            column - task.observe(self._solve(system.right_hand_side(task.on_all_measurements(column, 0.0))))
-            for column in inputs.columns()
-        )
-        return inputs.power(residuals, task.expected_noise)
+
+        def residual(column: FloatArray) -> FloatArray:
+            observed = task.observe(self._solve(system.right_hand_side(task.on_all_measurements(column, 0.0))))
+            return np.subtract(column, observed, out=observed)
+
+        return inputs.power(map(residual, inputs.columns()), task.expected_noise)
 
     def _solve(self, right: FloatArray) -> FloatArray:
         return self.system.solve(right, self.task.settings.accuracy).image

@@ -83,13 +83,11 @@ def residual_parts(residual: WhitenedResidual, camera: Camera) -> list[ResidualP
     Lens types are left out where there is one, and sub-imagers where each is a lens type.
     """
     sums = _Sums(residual, camera)
-    subs = np.repeat(np.arange(len(camera.sub_imagers)), [part.stop - part.start for part in camera.slices()])
-    types = np.repeat(np.arange(len(camera.types)), [part.stop - part.start for part in camera.type_slices()])
     parts = sums.parts("all", ["all"], np.zeros(camera.measurements, dtype=np.intp))
     if len(camera.types) > 1:
-        parts += sums.parts("lens type", [lens_type.name for lens_type in camera.types], types)
+        parts += sums.parts("lens type", [lens_type.name for lens_type in camera.types], _numbers(camera.type_slices()))
     if len(camera.sub_imagers) > len(camera.types):
-        parts += sums.parts("sub-imager", [sub.name for sub in camera.sub_imagers], subs)
+        parts += sums.parts("sub-imager", [sub.name for sub in camera.sub_imagers], _numbers(camera.slices()))
     if camera.measurements >= LEAST_IN_REGION * REGIONS**2:
         parts += sums.parts("region", [name for row in PLACES for name in row], regions(camera))
     return parts
@@ -108,18 +106,21 @@ def regions(camera: Camera) -> IntArray:
     return numbers
 
 
+def _numbers(parts: list[slice]) -> IntArray:
+    """Return the number of the part that holds each measurement: (M,)."""
+    return np.repeat(np.arange(len(parts)), [part.stop - part.start for part in parts])
+
+
 class _Sums:
     """Sums over the measurements of any part."""
 
     def __init__(self, residual: WhitenedResidual, camera: Camera) -> None:
-        self.residual = residual
-        self.subs = np.repeat(np.arange(len(camera.sub_imagers)), [part.stop - part.start for part in camera.slices()])[
-            residual.used
-        ]
+        self.residual, self.camera = residual, camera
+        self.complete, self.has_shared = bool(residual.used.all()), bool(residual.shared.any())
 
     def parts(self, kind: Kind, names: list[str], labels: IntArray) -> list[ResidualPart]:
         """Return the parts with these names from the (M,) index of each measurement's name."""
-        labels = labels[self.residual.used]
+        labels = self._used(labels)
         residual, count = self.residual, len(names)
         power = residual.power
         sizes = np.bincount(labels, minlength=count)
@@ -149,14 +150,18 @@ class _Sums:
             if sizes[number]
         ]
 
+    def _used(self, labels: IntArray) -> IntArray:
+        return labels if self.complete else labels[self.residual.used]
+
     def _variance(self, power: FloatArray, labels: IntArray, count: int) -> FloatArray:
         """Return the variance of the sums of squares with these means."""
         residual = self.residual
         variance = 2 * residual.largest * _sums(labels, power, count)
         variance += 3 * _sums(labels, residual.spread * power**2, count)
-        if residual.shared.any():
-            subs = int(self.subs.max()) + 1
-            shared = _sums(self.subs + subs * labels, residual.shared * power, subs * count).reshape(count, subs)
+        if self.has_shared:
+            of_sub = self._used(_numbers(self.camera.slices()))
+            subs = int(of_sub.max()) + 1
+            shared = _sums(of_sub + subs * labels, residual.shared * power, subs * count).reshape(count, subs)
             variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance
 

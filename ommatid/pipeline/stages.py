@@ -11,7 +11,7 @@ from typing import Any
 from ommatid.batch.batch import Member, prepare
 from ommatid.batch.remote import RunObserver
 from ommatid.reconstruct.output.run_json import RunReport, StudyCase, TimeReport
-from ommatid.reconstruct.output.time_spent import FILES, PAGE, with_stage
+from ommatid.reconstruct.output.time_spent import FILES, with_stage
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
@@ -110,15 +110,12 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
 
 
 def with_page(report: RunReport, camera: Camera, folder: Path, observer: RunObserver) -> RunReport:
-    """Write report.html of a folder whose run.json is `report`; add the time that it took to run.json."""
-    begun = perf_counter()
+    """Write report.html of a folder whose run.json is `report`, and return the report with the time of the page."""
     if not write_page(camera, folder, observer):
         return report
     from ommatid.reconstruct.output import run_json
 
-    complete = with_stage(report, PAGE, perf_counter() - begun)
-    run_json.write(folder, complete)
-    return complete
+    return run_json.read(folder)
 
 
 def write_page(camera: Camera, folder: Path, observer: RunObserver) -> bool:

@@ -183,7 +183,8 @@ class FrameMethod(Method):
         """Return (I - H A) x: (measurements used,)."""
         task = self.task
         right = self.system.right_hand_side(task.on_all_measurements(column, 0.0))
-        return column - task.observe(self._solve(right))
+        observed = task.observe(self._solve(right))
+        return np.subtract(column, observed, out=observed)
 
     def _solve(self, right: FloatArray) -> FloatArray:
         return self.system.solve(right, self.task.settings.accuracy).image

@@ -41,7 +41,16 @@ def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibra
 
 def with_stage(report: RunReport, name: str, seconds: float) -> RunReport:
     """Return a report with the time of one more stage, which changes none of its other numbers."""
-    stages = {**report.stages, name: StageReport(seconds=seconds)}
+    return _with_stages(report, {**report.stages, name: StageReport(seconds=seconds)})
+
+
+def before_page(report: RunReport) -> RunReport:
+    """Return a report as it was before the time of its page was added."""
+    stages = {name: stage for name, stage in report.stages.items() if name != PAGE}
+    return report if PAGE not in report.stages else _with_stages(report, stages)
+
+
+def _with_stages(report: RunReport, stages: dict[str, StageReport]) -> RunReport:
     spent = time_spent(stages, report.error, calibrated=report.stages["calibrate"].method != "ideal")
     asked = report.spent.model_dump(include={"within", "asked", "chosen", "start_up"}, exclude_unset=True)
     if report.spent.within is not None:

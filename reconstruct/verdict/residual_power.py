@@ -123,13 +123,16 @@ class ResidualInputs:
         if self.deviation is not None:
             yield self.observe(self.deviation)
         if self.deviation is not None or self.leverage is None:
-            root = np.sqrt(self.actual)
             for _ in range(self.draws):
-                noise = root * rng.normal(size=root.size)
-                yield noise if self.whiten is None else self.whiten(noise)
+                yield self._noise(rng)
         if self.leverage is None:
             for _ in range(self.draws):
                 yield self.observe(self.draw_image(rng))
+
+    def _noise(self, rng: np.random.Generator) -> FloatArray:
+        noise = rng.normal(size=self.actual.size)
+        noise *= np.sqrt(self.actual)
+        return noise if self.whiten is None else self.whiten(noise)
 
     def block(self) -> FloatArray:
         """All columns together: (M, count)."""
@@ -141,7 +144,7 @@ class ResidualInputs:
     def power(self, residuals: Iterator[FloatArray], expected_noise: FloatArray) -> ResidualPower:
         """Return the expected squares from the residuals, (M,) each, of the columns in their order."""
         white = 1 / np.sqrt(expected_noise)
-        bias = None if self.deviation is None else np.square(white * next(residuals))
+        bias = None if self.deviation is None else np.square(_scaled(next(residuals), white))
         if self.leverage is not None:
             noise = None if bias is None else self._mean_square(white, residuals)
             return ResidualPower(np.clip(1 - self.leverage, 0.0, 1.0), bias, noise, 0 if bias is None else self.draws)
@@ -158,8 +161,14 @@ class ResidualInputs:
         """Return the mean square of the next residuals, whitened, and add these to `samples`, (draws, M)."""
         total = np.zeros(white.size)
         for number in range(self.draws):
-            residual = white * next(residuals)
-            total += np.square(residual)
+            residual = _scaled(next(residuals), white)
             if samples is not None:
                 samples[number] += residual
+            total += np.square(residual, out=residual)
         return total / self.draws
+
+
+def _scaled(values: FloatArray, factors: FloatArray) -> FloatArray:
+    """Multiply values that nothing else needs by factors, without a copy: a large frame has none to spare."""
+    values *= factors
+    return values

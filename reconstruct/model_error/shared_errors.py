@@ -20,6 +20,7 @@ from scipy import ndimage, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.formats.picture import averaged
+from ommatid.scenes.model import Model
 
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
@@ -84,6 +85,11 @@ class SharedErrors:
             float(actual @ np.square(operators.weigh(task.observe(operators.posterior(image))))) for image in combined
         )
         return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
+
+
+def has_shared_errors(model: Model) -> bool:
+    """Return True if entries of H follow from few numbers with errors."""
+    return model.error_variance(np.zeros(model.unknowns)) is not None
 
 
 def whitened(residual: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> FloatArray:

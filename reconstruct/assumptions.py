@@ -28,7 +28,7 @@ from .methods.observed_stack import ObservedStack
 from .model_error.attenuation import can_be_corrected, with_attenuation
 from .model_error.contrast import Contrast, true_contrast, without_noise
 from .model_error.shared_errors import NEGLIGIBLE as NEGLIGIBLE_PART
-from .model_error.shared_errors import bound, with_shared_errors
+from .model_error.shared_errors import bound, has_shared_errors, with_shared_errors
 from .noise import (
     CERTAIN,
     SHARED,
@@ -53,7 +53,7 @@ class Assumptions:
     """The prior, the noise by cause, (pixels used,) each, the fit of either, and the method that assumes them.
 
     contrast : of the true image, where the uncertainty of H depends on it
-    shared_image : (N,) on which errors of few numbers of H act, None where H has none
+    shared_image : (N,) on which errors of few numbers of H act, None where they are no part of the noise
     """
 
     method: Method
@@ -70,8 +70,8 @@ class Assumptions:
         truth : (N,), or (pixels of the world,) for a method that takes detail into account
         """
         method, independent = self.method, self._independent_noise
-        needed = self.contrast is not None or self.shared_image is not None
-        operators = method.operators() if needed else None
+        shared = has_shared_errors(method.task.model)
+        operators = method.operators() if self.contrast is not None or shared else None
         if operators is None:
             # Errors that measurements share count as independent ones of the same variance.
             return self._without_attenuation(self._with_shared_as_independent, truth)
@@ -79,13 +79,14 @@ class Assumptions:
         if self.contrast is not None:
             known = truth if truth is not None and truth.size == method.task.model.unknowns else None
             result = with_attenuation(result, method, operators, self.contrast.image, known, actual)
-        if self.shared_image is None:
+        if not shared:
             return result
+        image = method.image if self.shared_image is None else self.shared_image
         if SHARED not in self.noise:
-            most = bound(method.task, self.shared_image)
+            most = bound(method.task, image)
             if most <= NEGLIGIBLE_PART * result.expected.mse:
                 return replace(result, left_out=most)
-        return with_shared_errors(result, method, operators, self.shared_image, truth, actual)
+        return with_shared_errors(result, method, operators, image, truth, actual)
 
     @property
     def _independent_noise(self) -> Noise:
@@ -202,12 +203,12 @@ def _assumptions(
 
 
 def _shared_image(method: Method, noise: Noise, image: FloatArray | None) -> FloatArray | None:
-    """Return the image on which errors of few numbers of H act, (N,), None where H has none.
+    """Return the image on which errors of few numbers of H act, (N,), None where they are no part of the noise.
 
     image : of which `noise` was taken, None where it is the same for all images
     """
     if SHARED not in noise:
-        return None if method.task.model.error_variance(method.image) is None else method.image
+        return None
     actual = total_variance(noise)
     operators = method.operators()
     if float(noise[SHARED].sum()) <= NEGLIGIBLE * float(actual.sum()) or operators is None:

@@ -10,7 +10,7 @@ from ommatid.reconstruct.detail.detailed_model import independent_detail, model_
 from ommatid.reconstruct.expected_error import ExpectedError
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance
-from ommatid.reconstruct.noise import Noise, known_noise, uniform, usable_pixels
+from ommatid.reconstruct.noise import SHARED, Noise, known_noise, uniform, usable_pixels
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
@@ -23,6 +23,7 @@ from ommatid.simulate.calibration.stopping_rule import StoppingRule
 
 from .prediction.sensor_noise import expected_noise
 
+SEED = 20260408  # of an image of white noise, different from those of data, calibration and the other analyses
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
 TINY = float(np.finfo(np.float64).tiny)
 TABLES = ("prior", "estimator", "tiles", "noise", "sensor")  # on which the expected error depends
@@ -98,7 +99,10 @@ def _negligible_bound(stack: Stack, model: Model) -> float | None:
     """
     used = usable_pixels(stack, model).used
     others = total_variance(known_noise(stack))[used]
-    relative = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))[used] / np.maximum(others, TINY)
+    uncertain = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))
+    shared = model.error_variance(WHITE * np.random.default_rng(SEED).random(model.unknowns))
+    uncertain = uncertain if shared is None else uncertain + shared
+    relative = uncertain[used] / np.maximum(others, TINY)
     if not relative.size or float(relative.max()) <= NEGLIGIBLE:
         return float(relative.max(initial=0.0))
     return float(relative.mean()) if float(relative.mean()) <= NEGLIGIBLE / 10 else None
@@ -114,11 +118,13 @@ def _added(noise: Noise, expected: ExpectedError, mse_without: Callable[[], floa
     """
     part = expected.parts.get("calibration", 0.0)
     rest = expected.mse - part
-    if "calibration" not in noise or part == 0:
+    if part == 0:
         return 0.0
-    others = total_variance({name: values for name, values in noise.items() if name != "calibration"})
+    by_model = {name: values for name, values in noise.items() if name in ("calibration", SHARED)}
+    others = total_variance({name: values for name, values in noise.items() if name not in by_model})
     relative = part / max(rest, TINY)
-    if float(np.max(noise["calibration"] / np.maximum(others, TINY), initial=0.0)) <= NEGLIGIBLE:
+    uncertain = total_variance(by_model) if by_model else np.zeros(others.size)
+    if float(np.max(uncertain / np.maximum(others, TINY), initial=0.0)) <= NEGLIGIBLE:
         return relative
     return max(relative, expected.mse / max(mse_without(), TINY) - 1)
 

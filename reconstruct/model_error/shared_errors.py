@@ -20,6 +20,7 @@ from scipy import ndimage, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.formats.picture import averaged
+from ommatid.scenes.model import Model
 
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
@@ -30,7 +31,8 @@ SEED = 20260407  # of random combinations, different from those of data, calibra
 FEW_PIXELS, FEW_COLUMNS = 4000, 1000  # up to which every column is taken
 DRAWS, FEW_DRAWS = 12, 4  # of combinations, otherwise
 MANY = 250_000  # pixels above which a combination takes long and few are enough
-CROSS_DRAWS = 8  # of combinations for the product with the noise
+SMALL = 0.01  # mean share of the noise, below which few are enough, too
+CROSS_DRAWS = 4  # of combinations for the product with the noise
 MOST_STORED = 2**25  # entries of L that are kept for sums of pixels
 NEIGHBOURHOOD = 9  # pixels, over which the squares of few combinations are averaged for the map
 NEGLIGIBLE = 1e-3  # of the expected error, up to which a bound on the part makes its computation needless
@@ -86,6 +88,11 @@ class SharedErrors:
         return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
 
 
+def has_shared_errors(model: Model) -> bool:
+    """Return True if entries of H follow from few numbers with errors."""
+    return model.error_variance(np.zeros(model.unknowns)) is not None
+
+
 def whitened(residual: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> FloatArray:
     """Return K^-1 r with K K^T the expected covariance of the noise: (measurements used,)."""
     return residual / np.sqrt(task.expected_noise) if operators.whiten is None else operators.whiten(residual)
@@ -104,7 +111,9 @@ def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: Fl
     if exact and directions is not None:
         readings: FloatArray = directions.T.toarray()
     else:
-        rng, count = np.random.default_rng(SEED), FEW_DRAWS if model.unknowns > MANY else DRAWS
+        rng, variance = np.random.default_rng(SEED), model.error_variance(image)
+        share = 0.0 if variance is None else float(np.mean(variance[used] / task.expected_noise))
+        count = FEW_DRAWS if model.unknowns > MANY or share < SMALL else DRAWS
         draws: list[FloatArray] = []
         for _ in range(count):
             draw = model.error_draw(image, rng)

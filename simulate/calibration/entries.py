@@ -83,7 +83,7 @@ def _compared(model: Model, camera: Camera, passes: int) -> dict[str, Any]:
     bent = (lens for lens in camera.types if lens.optics.distortion is not None or lens.is_rotated)
     if not camera.walls or any(camera.is_blurred(lens) for lens in bent):
         return {}
-    if model.fitted is None:
+    if model.fitted is None or model.variance.any():
         return {"agreement": agreement(model.matrix, model.variance, camera, passes)}
     largest, count = model.fitted.largest_deviation
     chance = -np.expm1(count * np.log1p(-2 * special.ndtr(-largest))) if largest else 1.0

@@ -28,6 +28,7 @@ from .selection import SIGNIFICANCE, Candidate, Components, choose, components, 
 from .uncertainty import error_directions
 
 MOST_UNEXPLAINED = 0.1  # of the entries' variance, with which kernels are still far better than entries
+MOST_WIDTH = 48  # pixels of f: wider kernels have as many numbers as entries, and take minutes to learn
 MOST_DESIGNED = 2**24  # entries of the H as designed that is compared
 DESIGNED_DEGREE = 2  # of polynomials that are looked for in the difference from the design
 
@@ -63,6 +64,8 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
     chart = chart_of(responses, camera, lens_type, pixels)
     if chart is None:
         return KernelFit(False, "some pixels of the chart are dark")
+    if chart.places.width > MOST_WIDTH:
+        return KernelFit(False, f"its light reaches {chart.places.width} pixels of f, more than {MOST_WIDTH}")
     candidate = choose(chart)
     details, reason = _details(chart, candidate), ""
     if candidate.rejected:

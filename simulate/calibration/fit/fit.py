@@ -76,13 +76,14 @@ def calibrate_by_fit(
         lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], charted[lens.name])
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
+    charted = {lens.name: charted[lens.name] and chart_of(lens).size < lens.measurements for lens in camera.types}
     unexplained: Subsets = {
         lens.name: chart_of(lens, ~fits[lens.name].views.explained)
         for lens in camera.types
         if charted[lens.name] and not fits[lens.name].views.explained.all()
     }
     rest = None
-    if unexplained or not all(charted.values()):
+    if not all(each.views.explained.all() for each in fits.values()):
         more = measure(unexplained) if unexplained else None
         rest = _rest(camera, fits, charted, (responses, more), variances)
     kernels = {name: each.kernels.footprints for name, each in fits.items() if each.kernels is not None}
@@ -142,22 +143,26 @@ def _rest(
 ) -> MeasuredRows:
     """Return the rows of H that are measured entry by entry.
 
-    measured : responses of the charts and of lens types without one, and of all pixels of what charts do not explain
+    charted : lens types of which the first responses hold but a part;  measured : these, and those of all pixels of
+        what they do not explain
     """
     matrices: list[sparse.csr_array] = []
     kept_variances: list[FloatArray] = []
     kept_batches: list[FloatArray] = []
     sources = [(each, variances(each)) for each in measured if each is not None]
+    sizes = [place.stop - place.start for place in camera.slices()]
+    explained = np.repeat(np.concatenate([fits[lens.name].views.explained for lens in camera.types]), sizes)
     for lens, rows in zip(camera.types, camera.type_slices(), strict=True):
         responses, variance = sources[-1] if charted[lens.name] else sources[0]
         pointers = responses.matrix.indptr
         stored = slice(int(pointers[rows.start]), int(pointers[rows.stop]))
-        if fits[lens.name].views.explained.all():
-            matrices.append(sparse.csr_array((lens.measurements, camera.unknowns)))
-            continue
-        matrices.append(responses.matrix[rows])
-        kept_variances.append(variance[stored])
-        kept_batches.append(responses.batches[:, stored])
+        part = responses.matrix[rows]
+        kept = np.repeat(~explained[rows], np.diff(part.indptr))
+        counts = np.where(explained[rows], 0, np.diff(part.indptr))
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        matrices.append(sparse.csr_array((part.data[kept], part.indices[kept], starts), shape=part.shape))
+        kept_variances.append(variance[stored][kept])
+        kept_batches.append(responses.batches[:, stored][:, kept])
     matrix = sparse.csr_array(sparse.vstack(matrices, format="csr"))
     return MeasuredRows(matrix, np.concatenate(kept_variances), np.concatenate(kept_batches, axis=1))
 

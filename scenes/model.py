@@ -58,6 +58,10 @@ class Model:
             )
         return self.stored
 
+    def to_sparse(self) -> sparse.csr_array:
+        """H as a matrix with entries, (M, N), also where it is applied without them; entry by entry 16 bytes."""
+        return self.boxes.submatrix(*map(slice, (0, 0), self.camera.shape)) if self.stored is None else self.stored
+
     @property
     def entries(self) -> int:
         """Number of entries of H, stored or not."""

@@ -24,6 +24,7 @@ app = typer.Typer(
 for command in (run.run, run.render, calibrate.calibrate, reconstruct.reconstruct, reconstruct.check):
     app.command()(command)
 app.command("import")(calibrate.import_frames)
+app.command("export-model")(calibrate.export_model)
 for command in (predict.predict, predict.design, studies.paper, studies.stability, studies.bench):
     app.command()(command)
 for command in (show.show, show.export, show.init, show.schema, show.doctor):

@@ -69,6 +69,19 @@ def calibrate(
     output.print_result({"file": str(file), **outcome.describe()}, [], as_json)
 
 
+def export_model(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model that calibrate or run wrote (.npz).")],
+    file: Output,
+    as_json: Json = False,
+) -> None:
+    """Write the observation matrix H of a model as a matrix for scipy.sparse.load_npz."""
+    from ommatid.pipeline.calibration import export_matrix
+
+    description = export_matrix(model, file)
+    output.say_done("export-model", True, file)
+    output.print_result({"file": str(file), **description}, [], as_json)
+
+
 def import_frames(
     scene: SceneFile,
     images: Images,

@@ -9,7 +9,7 @@ from typing import Any
 
 from ommatid.analysis.recording_warnings import calibration_warnings
 from ommatid.runtime.errors import InputError, naming_source
-from ommatid.runtime.files import check_output
+from ommatid.runtime.files import check_output, write_whole
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file
 from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
@@ -87,6 +87,21 @@ def calibrate_file(
         return _from_points(setup, output, recording)
     with naming_source(path):
         return CalibrationOutcome(*calibrated_model(setup, output, progress), warnings=[])
+
+
+def export_matrix(model: Path, output: Path) -> dict[str, int]:
+    """Write H of a model file as SciPy's sparse matrix, and return its size. Raises InputError or MachineError."""
+    from scipy import sparse
+
+    check_output(output, model)
+    stored = model_file.read(model).to_sparse()
+
+    def fill(beside: Path) -> None:
+        with beside.open("wb") as stream:
+            sparse.save_npz(stream, stored, compressed=False)
+
+    write_whole(output, fill)
+    return {"measurements": stored.shape[0], "unknowns": stored.shape[1], "entries": int(stored.nnz)}
 
 
 def _from_points(setup: Setup, output: Path, recording: PointRecording) -> CalibrationOutcome:

@@ -99,7 +99,7 @@ def expected_samples(setup: Setup, right: Reference) -> int:
     Raises InputError without noise, to which the variance could be compared.
     """
     camera, sampler = setup.camera, setup.scene.render.sampler
-    allowed = float(np.nanmean(allowed_variance(setup)(right.light)))
+    allowed = float(np.nanmean(allowed_variance(setup)(right.light, slice(0, right.light.size))))
     if camera.has_box_footprints and sampler in JITTERED:
         return max(on_grid(LEAST, sampler, cells_of(lens_type.ratio)).total for lens_type in camera.types)
     ratio = float(setup.image.var()) / (FEWEST_PASSES * AIM * allowed)

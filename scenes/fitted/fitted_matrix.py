@@ -199,11 +199,11 @@ class FittedMatrix:
                 moves = self._moves(sub, gradients, place)
                 parts.append(moves @ views.own[number])
                 common.append(moves @ views.shared[number])
-            columns = [sparse.block_diag(parts, format="csc")] if own else []
+            columns = [sparse.csc_array((lens.measurements, 0), dtype=np.float64)]
+            columns += [_block_diagonal(parts)] if own else []
             columns += [sparse.csc_array(np.concatenate(common))] if shared else []
-            size = lens.measurements
-            blocks.append(sparse.csc_array(sparse.hstack(columns)) if columns else sparse.csc_array((size, 0)))
-        return sparse.csc_array(sparse.block_diag(blocks, format="csc"))
+            blocks.append(sparse.csc_array(sparse.hstack(columns)))
+        return sparse.csc_array(sparse.block_diag(blocks))
 
     def error_variance(self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]) -> FloatArray:
         """Return the variance of each measurement by the errors of the numbers, (M,): the diagonal of L L^T."""
@@ -229,9 +229,10 @@ class FittedMatrix:
                 directions = self.kernels[lens.name].error_directions(image)
                 drawn[slices[0].start : slices[-1].stop] = directions @ rng.normal(size=directions.shape[1])
                 continue
-            common = rng.normal(size=views.shared.shape[2])
+            common = rng.normal(size=(views.shared.shape[2],))
             for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
-                error = views.own[number] @ rng.normal(size=views.own.shape[2]) + views.shared[number] @ common
+                alone = rng.normal(size=(views.own.shape[2],))
+                error = views.own[number] @ alone + views.shared[number] @ common
                 drawn[place] = self._moves(sub, gradients, place) @ error
         return drawn
 
@@ -240,6 +241,11 @@ class FittedMatrix:
         index = np.indices(sub.type.pixels).reshape(2, -1).astype(np.float64)
         rows, columns = displacements(self.camera, sub, (index[0], index[1]))
         return gradients[0][place, None] * rows + gradients[1][place, None] * columns
+
+
+def _block_diagonal(blocks: list[FloatArray]) -> sparse.csc_array:
+    joined: Any = sparse.block_diag(blocks)
+    return sparse.csc_array(joined)
 
 
 def gradient(image: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:

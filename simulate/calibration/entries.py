@@ -50,8 +50,7 @@ def rendered_model(
     if fits(setup):
         from .fit.fit import calibrate_by_fit
 
-        one = plan(scene.calibration.sample_count, scene.render.sampler) if plans is None else None
-        rays = {lens.name: (one or plans[lens.name]).total for lens in camera.types}
+        rays = {name: work.total for name, work in (plans or same_plans(setup)).items()}
         views_alone = scene.calibration.fit == "geometry"
         fit = calibrate_by_fit(
             setup.simulated, measure, lambda each: entry_variances(each, camera), rays, with_kernels=not views_alone
@@ -71,6 +70,12 @@ def rendered_model(
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
     return replace(model, record=record)
+
+
+def same_plans(setup: Setup) -> Plans:
+    """Return the samples that the scene asks for, the same for all lens types."""
+    work = plan(setup.scene.calibration.sample_count, setup.scene.render.sampler)
+    return {lens_type.name: work for lens_type in setup.camera.types}
 
 
 def fits(setup: Setup) -> bool:

@@ -197,7 +197,7 @@ def _rendering_variance(setup: Setup, camera: _Camera, image: FloatArray) -> tup
     if scene.render.samples != "auto":
         return variance, said
     check_noise_target(scene)
-    allowed = np.nan_to_num(allowed_variance(setup)(light))
+    allowed = np.nan_to_num(allowed_variance(setup)(light, slice(0, light.size)))
     variance = np.where(variance > RENDERING_DONE * allowed, np.maximum(RENDERING_AIM * allowed, floor), variance)
     aim = (
         f"the rendering's variance is {RENDERING_AIM * SHARE:g} of the sensor's or less, as render.samples 'auto' plans"

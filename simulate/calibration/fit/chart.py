@@ -70,8 +70,9 @@ class ChartRows:
 def centroids(values: FloatArray, row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return the centroids of rows of H in windows: (pixels, W, V) to (pixels,) rows and columns of f."""
     light = np.maximum(values.sum(axis=(1, 2)), np.finfo(float).tiny)
-    down = np.einsum("pwv,w->p", values, np.arange(values.shape[1]) + 0.5) / light
-    across = np.einsum("pwv,v->p", values, np.arange(values.shape[2]) + 0.5) / light
+    high, wide = (np.arange(size, dtype=np.float64) + 0.5 for size in values.shape[1:])
+    down = values.sum(axis=2) @ high / light
+    across = values.sum(axis=1) @ wide / light
     return row + down, column + across
 
 

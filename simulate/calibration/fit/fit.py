@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views
@@ -126,7 +126,8 @@ def _fit_type(
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(camera.sub_imagers))
     explained = np.array([each.chance >= single for each in explanations])
     numbers = np.where(explained[:, None], fit.numbers, designed_views(subs))
-    return _TypeFit(Views(numbers, explained, fit.own, fit.shared, fit.structure), fit, explanations)
+    own, shared = (np.where(explained[:, None, None], each, 0.0) for each in (fit.own, fit.shared))
+    return _TypeFit(Views(numbers, explained, own, shared, fit.structure), fit, explanations)
 
 
 def _views_as_designed(subs: list[SubImager], explained: bool) -> Views:
@@ -148,7 +149,7 @@ def _rest(
     """
     matrices: list[sparse.csr_array] = []
     kept_variances: list[FloatArray] = []
-    kept_batches: list[FloatArray] = []
+    kept_batches: list[Float32Array] = []
     sources = [(each, variances(each)) for each in measured if each is not None]
     sizes = [place.stop - place.start for place in camera.slices()]
     explained = np.repeat(np.concatenate([fits[lens.name].views.explained for lens in camera.types]), sizes)

@@ -32,8 +32,14 @@ LEAST_LIGHT = 0.3  # of a pixel's rays that have to meet the target for its cent
 LOST = 0.02  # of them that may miss it where footprints are no boxes
 NEAR = 0.05  # pixels of f, for the derivatives of centroids: 1 of a pixel seen as a whole, less at the target's edge
 ROUNDED = 1e-9  # of a pixel's light
-REDUCTIONS = (((K1,), "designed"), ((ROTATION,), "shared"), ((ROTATION,), "designed"))
-REDUCTIONS += (((MAGNIFICATION,), "shared"), ((MAGNIFICATION,), "designed"), ((ROW, COLUMN), "designed"))
+REDUCTIONS = (
+    ((K1,), "designed"),
+    ((ROTATION,), "shared"),
+    ((ROTATION,), "designed"),
+    ((MAGNIFICATION,), "shared"),
+    ((MAGNIFICATION,), "designed"),
+    ((ROW, COLUMN), "designed"),
+)
 Structure = tuple[str, ...]  # of each number "own", "shared" or "designed"
 FREE: Structure = ("own", "own", "own", "own", "shared")  # distortion is the lens type's
 

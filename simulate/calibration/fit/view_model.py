@@ -55,7 +55,7 @@ def _exact(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
     cells = np.repeat(np.arange(pixels.size), np.diff(rows.indptr))
     row, column = np.divmod(rows.indices.astype(np.int64), camera.columns)
     row, column = row - chart.row[cells], column - chart.column[cells]
-    values = np.zeros(chart.values.shape)
+    values = np.zeros_like(chart.values)
     inside = (row >= 0) & (row < values.shape[1]) & (column >= 0) & (column < values.shape[2])
     values[cells[inside], row[inside], column[inside]] = rows.data[inside]
     return values

@@ -10,7 +10,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy import sparse
@@ -244,8 +244,7 @@ class FittedMatrix:
 
 
 def _block_diagonal(blocks: list[FloatArray]) -> sparse.csc_array:
-    joined: Any = sparse.block_diag(blocks)
-    return sparse.csc_array(joined)
+    return sparse.csc_array(cast(Any, sparse).block_diag(blocks))
 
 
 def gradient(image: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:

@@ -11,8 +11,7 @@ that one sampling of the kernels serves all pixels. Light beside the target is c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -22,13 +21,12 @@ from numpy.polynomial import legendre
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.processors import processors
 
 from ..camera import Camera
 from ..lens_type import LensType
+from ..optics.boxes import by_rows
 from .wide_correlation import WideCorrelation
 
-ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 PIXELS_AT_ONCE = 2**14
 WIDE = 24  # pixels of f of the narrowest kernels that Fourier transforms apply faster than sums
 
@@ -186,7 +184,7 @@ class KernelFootprints:
         def work(first: int, last: int) -> None:
             correlate(grid, *tables, out, first, last)
 
-        _by_rows(self.places.starts[0].size, work)
+        by_rows(self.places.starts[0].size, work)
         return out.ravel()
 
     def adjoint(self, readings: FloatArray, out: FloatArray) -> None:
@@ -203,7 +201,7 @@ class KernelFootprints:
         def work(first: int, last: int) -> None:
             spread(source, *tables, out, first, last)
 
-        _by_rows(out.shape[0], work)
+        by_rows(out.shape[0], work)
 
     def _wide(self, kernels: FloatArray, coefficients: FloatArray) -> WideCorrelation:
         _, weights, down, across, *_ = self._tables(kernels, coefficients)
@@ -296,10 +294,3 @@ def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, 
     (lens_type,) = (each for each in camera.types if each.name == description["lens"])
     places = KernelPlaces(camera, lens_type, int(description["margin"]))
     return KernelFootprints(places, int(description["degree"]), **arrays)
-
-
-def _by_rows(rows: int, work: Callable[[int, int], None]) -> None:
-    tasks = [(first, min(first + ROWS_AT_ONCE, rows)) for first in range(0, rows, ROWS_AT_ONCE)]
-    with ThreadPoolExecutor(processors()) as threads:
-        for _ in threads.map(work, *zip(*tasks, strict=True)):
-            pass

@@ -95,7 +95,7 @@ class Box:
         def work(first: int, last: int) -> None:
             average(image, down.order, down.start, down_share, across.start, across_share, target, first, last)
 
-        _by_rows(down.start.size, work)
+        by_rows(down.start.size, work)
 
     def adjoint(self, readings: FloatArray, out: FloatArray) -> None:
         """Add H^T g to `out`: (measurements of the type,) to (rows, columns)."""
@@ -107,7 +107,7 @@ class Box:
         def work(first: int, last: int) -> None:
             spread(source, down.order, down.start, down_share, across.start, across_share, out, first, last)
 
-        _by_rows(out.shape[0], work)
+        by_rows(out.shape[0], work)
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Indices of the type's measurements inside a window of f, by their first pixel: (m,)."""
@@ -198,7 +198,8 @@ def _pattern(axis: BoxAxis, window: slice) -> bytes:
     return shares.indptr.tobytes() + (shares.indices - window.start).tobytes() + shares.data.tobytes()
 
 
-def _by_rows(rows: int, work: Callable[[int, int], None]) -> None:
+def by_rows(rows: int, work: Callable[[int, int], None]) -> None:
+    """Run `work` on ranges of rows, which do not depend on the number of threads, on all processors."""
     tasks = [(first, min(first + ROWS_AT_ONCE, rows)) for first in range(0, rows, ROWS_AT_ONCE)]
     if len(tasks) == 1:
         work(*tasks[0])

@@ -6,6 +6,9 @@ from __future__ import annotations
 from math import atan, degrees
 from typing import Any
 
+import numpy as np
+
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Sampler
@@ -82,6 +85,14 @@ def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:
     }
 
 
+def black(camera: Camera, channels: int) -> dict[str, Any]:
+    """Return a black picture on the target."""
+    import mitsuba as mi
+
+    texels = np.zeros((camera.rows, camera.columns, channels), dtype=np.float32)
+    return texture_of({"bitmap": mi.Bitmap(texels)})
+
+
 def texture_of(source: dict[str, Any]) -> dict[str, Any]:
     """Return a texture of unmodified texels: upright, not filtered, not wrapped, not read as sRGB."""
     import mitsuba as mi
@@ -95,3 +106,20 @@ def texture_of(source: dict[str, Any]) -> dict[str, Any]:
         "to_uv": upright,
         **source,
     }
+
+
+def depths(scene: Any, pinhole: Camera, seed: int, far: float) -> FloatArray:
+    """Return the distance along z that a pinhole camera's only sub-imager sees at a point per pixel, (pixels,).
+
+    Infinite where it sees no surface. Transparent surfaces count like any other.
+    far : of the far clipping plane, in distances of the target
+    """
+    import mitsuba as mi
+
+    (sub,) = pinhole.sub_imagers
+    sensor = mi.load_dict(stock_sensor(pinhole, sub, "independent", 1, far=far))
+    positions = mi.load_dict({"type": "aov", "aovs": "place:position", "block_size": BLOCK})
+    choices: Any = {"sensor": sensor, "integrator": positions, "spp": 1, "seed": seed}
+    rendered: Any = mi.render(scene, **choices)
+    z = np.array(rendered, dtype=np.float64)[..., -1].ravel()
+    return np.where(z > 0, z, np.inf)

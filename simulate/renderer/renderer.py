@@ -25,7 +25,7 @@ from ommatid.scenes.scene import Sampler, Scene
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting
 from ..sampling.seeds import seed_of
-from .plugins import BLOCK, scene_of, stock_sensor, stock_sensors, target_of, texture_of
+from .plugins import black, depths, scene_of, stock_sensors, target_of
 from .points.grid import Grid
 from .variant import activate, check_fast_variant
 
@@ -91,7 +91,7 @@ class Renderer:
         self._texels = "target.emitter.radiance.data"
         self._texture: Any = None
         if world is None:
-            texture: Any = mi.load_dict(self._black()) if fast else self._black()
+            texture: Any = mi.load_dict(black(camera, self.channels)) if fast else black(camera, self.channels)
             self._scene = mi.load_dict(scene_of(target_of(camera, texture)))
             self._texture = texture if fast else None
             self._integrator: Any = self._scene.integrator()
@@ -227,19 +227,8 @@ class Renderer:
         return self._texture.eval_1(at, at.is_valid())
 
     def depths(self, pinhole: Camera, seed: int) -> FloatArray:
-        """Return the distance along z that a pinhole camera's only sub-imager sees at a point per pixel, (pixels,).
-
-        Infinite where it sees no surface. Transparent surfaces count like any other.
-        """
-        import mitsuba as mi
-
-        (sub,) = pinhole.sub_imagers
-        sensor = mi.load_dict(stock_sensor(pinhole, sub, "independent", 1, far=FAR))
-        positions = mi.load_dict({"type": "aov", "aovs": "place:position", "block_size": BLOCK})
-        choices: Any = {"sensor": sensor, "integrator": positions, "spp": 1, "seed": seed}
-        rendered: Any = mi.render(self._scene, **choices)
-        z = np.array(rendered, dtype=np.float64)[..., -1].ravel()
-        return np.where(z > 0, z, np.inf)
+        """Return the distance along z of what a pinhole camera's only sub-imager sees; see `plugins.depths`."""
+        return depths(self._scene, pinhole, seed, FAR)
 
     def hits(
         self, group: str, samples: int, seed: Callable[[int], int], block: slice, subset: IntArray | None = None
@@ -279,7 +268,8 @@ class Renderer:
 
         self._unit = world_of(world).white / WHITE
         has_target = world.target.image is not None
-        staged = stage(world, variant, mi.load_dict(target_of(self.camera, self._black())) if has_target else None)
+        target = target_of(self.camera, black(self.camera, self.channels))
+        staged = stage(world, variant, mi.load_dict(target) if has_target else None)
         self._scene, self._integrator, self.direct_only = staged.scene, staged.integrator, staged.direct_only
         self._texels = f"{TARGET}.{self._texels.partition('.')[2]}" if has_target else ""
         for generator in self._generators.values():
@@ -294,12 +284,6 @@ class Renderer:
         met = self._scene.ray_intersect_preliminary(ray, coherent=False)
         far = FAR * self.camera.distance
         return dr.minimum(dr.select(met.is_valid(), met.t * ray.d.z, far), far)
-
-    def _black(self) -> dict[str, Any]:
-        import mitsuba as mi
-
-        texels = np.zeros((self.camera.rows, self.camera.columns, self.channels), dtype=np.float32)
-        return texture_of({"bitmap": mi.Bitmap(texels)})
 
     def rows(self, group: str) -> slice:
         """Return the rows of H, or measurements, of a group's pixels."""

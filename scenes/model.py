@@ -59,7 +59,7 @@ class Model:
         return self.stored
 
     def to_sparse(self) -> sparse.csr_array:
-        """H as a matrix with entries, (M, N), also where it is applied without them; entry by entry 16 bytes."""
+        """H as a matrix with entries, (M, N), also where it is applied without them."""
         return self.boxes.submatrix(*map(slice, (0, 0), self.camera.shape)) if self.stored is None else self.stored
 
     @property
@@ -119,9 +119,8 @@ class Model:
 
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """H^T g: (M,) to (N,)."""
-        if self.stored is None:
-            return self.boxes.adjoint(measurements)
-        return self.stored.T @ np.asarray(measurements, dtype=np.float64)
+        stored = self.stored
+        return self.boxes.adjoint(measurements) if stored is None else stored.T @ np.asarray(measurements, np.float64)
 
     def as_linear_operator(self) -> LinearOperator:
         """Return H as a SciPy linear operator, (M, N), for iterative solvers; H need not be stored."""
@@ -212,6 +211,8 @@ class Model:
 
         noise : random images with the noise of `image`, whose scatter is not that of the true image and is subtracted
         """
+        if not self.variance.size:
+            return np.zeros(self.measurements)
         flat = np.asarray(image, dtype=np.float64).ravel()
         contrast = flat[self.matrix.indices]
         level = self.matrix @ flat
@@ -288,6 +289,8 @@ class Model:
 
         prior_variance : (N,) of the pixels of f;  prior_mean : of every pixel, which light lost beside the target shows
         """
+        if not self.variance.size:
+            return np.zeros(self.measurements)
         variance = self._row_sums(self.variance * prior_variance[self.matrix.indices])
         if self.record["method"] == RECORDED:
             return variance + self._row_sums(self.variance) * prior_mean**2

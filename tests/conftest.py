@@ -48,6 +48,7 @@ variant = "scalar_rgb"
 
 [calibration]
 samples = 16
+fit = "none"
 """
 
 

@@ -63,13 +63,18 @@ def for_prior(setup: Setup) -> StoppingRule:
     assumed_prior = scene.assumed_prior.model_copy(update={"kind": prior.kind})
 
     def added_error(model: Model) -> float:
-        used = np.isfinite(noise) & (np.diff(model.matrix.indptr) > 0)
+        used = np.isfinite(noise)
+        if model.stored is not None:
+            used &= np.diff(model.stored.indptr) > 0
         model = model_of_f(model, camera, prior)
         from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
+        random = np.random.default_rng(SEED).normal(size=model.unknowns)
+        shared = model.error_variance(prior.mean + prior.variance**0.5 * random)
+        from_model = from_model if shared is None else from_model + shared
         causes = {"noise": noise[used], "calibration": from_model[used], **independent_detail(model, used)}
         setting = scene.estimator.noise_variance
         recorded = model.forward(np.full(model.unknowns, prior.mean))
-        method = METHODS[choose_method(scene, camera, exact=False).method]
+        method = METHODS[choose_method(scene, camera, exact=model.has_boxes).method]
 
         def expected(noise: Noise) -> ExpectedError:
             assumed = uniform(setting, int(used.sum())) if isinstance(setting, float) else total_variance(noise)

@@ -122,6 +122,7 @@ def check_held_out(
     return with_fallback(stack, model, checked)
 
 
+@one_thread()
 def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Execution | None = None) -> HeldOutCheck:
     """Check a task whose noise is known; `method` is that of the estimate. Arguments and errors: `check_held_out`."""
     if method == "fit":
@@ -162,6 +163,7 @@ def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: 
     return HeldOutCheck(subs, _familywise(first), explained, task.prior, fitted, (len(shown), total))
 
 
+@one_thread()
 def quick_check(task: EstimationTask, method: str) -> HeldOutCheck | None:
     """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
     possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())

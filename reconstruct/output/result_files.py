@@ -109,7 +109,8 @@ def write_results(folder: Path, stack: Stack, restoration: Reconstruction, repor
 def fingerprint_of(stack: Stack, model: Model) -> str:
     """Fingerprint of everything that an estimate depends on."""
     entries = () if model.stored is None else (model.stored.data, model.stored.indices, model.stored.indptr)
-    arrays = (stack.values, stack.variance, *entries, model.variance, model.batches)
+    fitted = () if model.fitted is None else model.fitted.determining
+    arrays = (stack.values, stack.variance, *entries, model.variance, model.batches, *fitted)
     return fingerprint([digest(*arrays), [stack.record, model.record], stack.scene.plain()])
 
 

@@ -93,6 +93,16 @@ class FittedMatrix:
             for lens in self.camera.types
         ]
 
+    @property
+    def determining(self) -> list[FloatArray]:
+        """All arrays that determine H and its errors, in a fixed order; part of fingerprints."""
+        names = [lens.name for lens in self.camera.types]
+        views = [
+            each for name in names for each in (self.views[name].numbers, self.views[name].own, self.views[name].shared)
+        ]
+        kernels = [self.kernels[name].arrays for name in names if name in self.kernels]
+        return views + [arrays[key] for arrays in kernels for key in sorted(arrays)]
+
     @cached_property
     def numbers(self) -> FloatArray:
         """The numbers of all sub-imagers, (sub-imagers, 5)."""

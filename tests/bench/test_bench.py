@@ -25,7 +25,6 @@ from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
-from ommatid.simulate.adaptive_render import LEAST
 
 from ..conftest import Command
 from ..examples import GALLERY, VARIANTS, needs, scene
@@ -287,7 +286,7 @@ def test_adaptive_samples_leave_the_noise_alone(subject: Subject) -> None:
         repeat = job.work(0)
         assert repeat.mse is not None
         assert repeat.samples is not None
-        assert repeat.samples >= LEAST
+        assert repeat.samples >= 18, "two passes of a grid of 3 x 3 have no error"
         assert repeat.mse < 1.1 * subject.noise_floor, job.name
 
 

@@ -283,7 +283,6 @@ OPTIONS = [
     Case("no scene", ("run",), ("SCENE",)),
     Case("no output", ("calibrate", "tiny.toml"), ("--output",)),
     Case("a file for the folder", ("run", "tiny.toml", "-o", "tiny.toml"), ("tiny.toml", "folder")),
-    Case("a folder for the estimate", (*RECONSTRUCT[:-1], "out"), ("out", "folder")),
     Case("a folder for the model", ("calibrate", "tiny.toml", "-o", "out"), ("out", "folder")),
     Case("a picture for the estimate", (*RECONSTRUCT[:-1], "new.png"), ("new.png", "new.exr")),
     Case("no folder for the model", ("calibrate", "tiny.toml", "-o", "no/new.npz"), ("no/new.npz", "does not exist")),

@@ -17,6 +17,9 @@ SEEDS = 20
 DRAWN, MISALIGNED = "image drawn from the prior", "misalignment"  # purposes of seeds besides the scene's own
 
 
+ENOUGH = 896  # samples of entries of H, where the scene takes as many as the noise justifies
+
+
 @dataclass(frozen=True)
 class Cell:
     """A scene of the gallery with changes, and how often it is run.
@@ -49,7 +52,8 @@ class Cell:
         own, changed = (read(Path(self.scene), changes).calibration for changes in ((), self.changes))
         if "ideal" in (own.method, changed.method):
             return False
-        return changed.sample_count < own.sample_count
+        asked = ENOUGH if own.samples == "auto" else own.sample_count
+        return changed.samples != "auto" and changed.sample_count < asked
 
     def described(self, number: int) -> Scene:
         """Return the scene of run `number`, with a seed of its own for data, noise and calibration.

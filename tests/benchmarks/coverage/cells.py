@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from .cell import Cell
 
-IDEAL, POINTS = "calibration.method=ideal", "calibration.method=points"
+IDEAL, POINTS = "calibration.method=ideal", "calibration.fit=none"  # points are the scene's method
 COARSE = "render.samples=256"  # so few that rendering is most of the noise
 FITTED = "calibration.fit=geometry"
 # Corners of crops of the photograph, each the most extreme in its mean or its standard deviation at that size.
@@ -26,7 +26,7 @@ TILE = (
 
 
 def _samples(number: int) -> tuple[str, str]:
-    return "calibration.method=transport", f"calibration.samples={number}"
+    return "calibration.method=transport", f"calibration.samples={number}", "calibration.fit=none"
 
 
 def _origin(corner: tuple[int, int]) -> str:
@@ -76,8 +76,8 @@ def _lenses() -> Iterable[Cell]:
     bright = _origin((20, 250))
     yield Cell("tile19-bright-0.8mm-16384", "tile19", (bright, *_apertures("0.8 mm"), *_samples(16384)), 5)
     yield Cell("tile19-bright-0.4mm-32768", "tile19", (bright, *_apertures("0.4 mm"), *_samples(32768)), 6)
-    yield Cell("tile19-fitted-256", "tile19", (FITTED, *_samples(256)), 8)
-    yield Cell("tile19-fitted-4096", "tile19", (FITTED, *_samples(4096)), 10)
+    yield Cell("tile19-fitted-256", "tile19", (*_samples(256), FITTED), 8)
+    yield Cell("tile19-fitted-4096", "tile19", (*_samples(4096), FITTED), 10)
     yield Cell("tile19-points-4096", "tile19", (POINTS,), 10)
     yield Cell("still_life-29-ideal", "still_life", (_size(29), COARSE), 2)
     yield Cell("corridor-29-ideal", "corridor", (_size(29), COARSE), 2)

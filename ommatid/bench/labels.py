@@ -28,7 +28,7 @@ def label_points(panel: Any, labels: Sequence[Label], widening: float) -> None:
     panel.set_xlim(left, left * (right / left) ** widening)
     low, high = np.log(panel.get_ylim())
     floor = float(panel.get_ylim()[0])  # where a logarithmic axis shows an error of 0
-    rising = sorted((replace(label, y=max(label.y, floor)) for label in labels), key=lambda label: label.y)
+    rising = sorted((label._replace(y=max(label.y, floor)) for label in labels), key=lambda label: label.y)
     centers = [float((np.log(label.y) - low) / (high - low)) for label in rising]
     heights = [LINE_HEIGHT * (1 + label.text.count("\n")) for label in rising]
     for center, label in zip(_separated(centers, heights), rising, strict=True):

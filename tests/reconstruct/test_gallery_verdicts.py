@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.restore import restore
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
@@ -53,7 +54,8 @@ def test_a_scene_of_the_gallery_has_the_verdict_that_it_states(name: str, tmp_pa
     camera = derive(described)
     setup = Setup(described, camera)
     truth = load(described) if described.world is None else cached_truth(tmp_path / "truth.exr", setup)
-    verdict = restore(render(setup), calibrate(setup), truth.ravel()).verdict
+    stack = render(setup)
+    verdict = restore(stack, calibrate(setup, stopping_rule=for_stack(stack)), truth.ravel()).verdict
     assert described.expect is not None
     assert verdict.trusted == (described.expect == "trusted"), verdict.reasons
     if described.world is not None:

@@ -48,6 +48,12 @@ NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs 
 RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
 
 
+def _needs_no_matrix(stack: Stack, model: Model) -> bool:
+    """Return True if H is applied without being stored; methods for misalignment start from H as designed."""
+    trusted = stack.scene.estimator.misalignment == "trust"
+    return (model.has_boxes if trusted else model.is_exact) and not stack.camera.has_detail
+
+
 @dataclass(frozen=True)
 class Assumptions:
     """The prior, the noise by cause, (pixels used,) each, the fit of either, and the method that assumes them.
@@ -126,7 +132,7 @@ def method_for(stack: Stack, model: Model) -> Method:
 def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Result]) -> Result:
     """Return work(choice) for the chosen method, or for tiles where a frame chosen by "auto" does not converge."""
     check_noise_fit(stack)
-    choice = choose_method(stack.scene, stack.camera, model.is_exact and not stack.camera.has_detail)
+    choice = choose_method(stack.scene, stack.camera, _needs_no_matrix(stack, model))
     try:
         return work(choice)
     except NotReachedError as error:

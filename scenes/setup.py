@@ -81,6 +81,13 @@ class Setup:
         return self.scene.calibration.method == "ideal" and camera.has_box_footprints and not camera.has_detail
 
     @property
+    def may_have_boxes(self) -> bool:
+        """True if the estimator's H is ideal or may follow from views, so that it need not be stored."""
+        camera, calibration = self.camera, self.scene.calibration
+        fits = calibration.method == "ideal" or calibration.fit != "none"
+        return fits and camera.has_box_footprints and not camera.has_detail
+
+    @property
     def has_closed_form(self) -> bool:
         """True if H of the simulated camera with its misalignments has a closed form."""
         camera = self.simulated

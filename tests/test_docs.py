@@ -228,7 +228,8 @@ def undocumented(folder: Path) -> list[str]:
         missing += [f"{path.name}: {name}" for name in sorted(names - set(code_spans(section(page, heading))))]
     arrays = set(code_spans(section(page, "`model.npz`")))
     with zipfile.ZipFile(folder / "model.npz") as file:
-        missing += [name for name in file.namelist() if name.removesuffix(".npy") not in arrays]
+        stored = [re.sub(r"^(views|kernels)\.[^.]+\.", r"\1.NAME.", name) for name in file.namelist()]
+        missing += [name for name in stored if name.removesuffix(".npy") not in arrays]
     keys = set(code_spans(section(page, "`run.json`")))
     document = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     return missing + [key for key in leaves(document) if not is_documented(key, keys)]

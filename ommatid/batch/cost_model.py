@@ -33,7 +33,7 @@ def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str])
     """Estimate the cost of a scene of a batch; 0 for one with errors, which are reported when it is run."""
     try:
         setup = Setup.from_scene(read(member.scene, (*changes, *member.changes), lenses))
-        choice = choose_method(setup.scene, setup.camera, setup.has_structured_matrix)
+        choice = choose_method(setup.scene, setup.camera, setup.may_have_boxes)
     except InputError:
         return CostEstimate(0.0, 0)
     calibration, samples = setup.scene.calibration, setup.scene.calibration.samples

@@ -41,7 +41,7 @@ class DesignComparison:
 def describe_scene(scene: Scene) -> dict[str, Any]:
     """Describe the geometry and the plan of a scene in JSON's types. Raises InputError that names the scene file."""
     setup = Setup.from_scene(scene)
-    choice = choose_method(scene, setup.camera, setup.has_structured_matrix)
+    choice = choose_method(scene, setup.camera, setup.may_have_boxes)
     with naming_source(scene.source):
         lens_optics, light = optics(setup.camera), electrons(setup)
     return summary.describe(setup, variant.choose(scene.render.variant), choice, lens_optics, light)

@@ -78,7 +78,7 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
     if scene.study is not None and "transport" in scene.study.models:
         with naming_source(scene.source):
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
-    choose_method(scene, camera, setup.has_structured_matrix)  # checks the memory before any work
+    choose_method(scene, camera, setup.may_have_boxes)  # checks the memory before any work
     study.check_study(scene, camera)
     start_up, begun = None if observer.start_up is None else observer.start_up(), perf_counter()
     stack, rendered = _rendered(setup, folder, observer)

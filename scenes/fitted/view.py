@@ -18,8 +18,6 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..camera import Camera
 from ..lens_type import LensOptics, SubImager
-from ..optics.distortion import coefficients
-from ..optics.footprints import sub_matrix
 from ..pose import Misalignment, pose_of
 
 UNITS = {
@@ -36,7 +34,7 @@ ROW, COLUMN, MAGNIFICATION, ROTATION, K1 = range(COUNT)
 def designed(sub: SubImager) -> FloatArray:
     """Return the numbers of a sub-imager as designed, (5,): all 0 but its k1 and its patch's rotation."""
     numbers = np.zeros(COUNT)
-    numbers[K1] = coefficients(sub)[0]
+    numbers[K1] = 0.0 if sub.type.optics.distortion is None else sub.type.optics.distortion[0]
     return numbers
 
 
@@ -70,6 +68,9 @@ def entries(camera: Camera, sub: SubImager, numbers: FloatArray) -> sparse.csr_a
 
     Raises InputError if the distortion folds the image.
     """
+    from ..optics.distortion import coefficients
+    from ..optics.footprints import sub_matrix
+
     k1, k2 = float(numbers[K1]), coefficients(sub)[1]
     optics = LensOptics(distortion=(k1, k2) if k1 or k2 else None)
     alone = replace(sub, type=replace(sub.type, optics=optics))

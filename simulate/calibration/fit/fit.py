@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import sparse
@@ -21,12 +21,14 @@ from ommatid.scenes.fitted.fitted_model import MeasuredRows
 from ommatid.scenes.fitted.view import COUNT, UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 
-from ...kernel_fit.kernel_fit import KernelFit, fit_kernels, refusal
 from ..point_sources import Responses, Subsets
 from .chart import chart_of, chart_rows
 from .explanation import Explanation, explanation
 from .view_fit import SIGNIFICANCE, ViewFit, fit_views
 from .view_model import predicted
+
+if TYPE_CHECKING:
+    from ...kernel_fit.kernel_fit import KernelFit
 
 Measure = Callable[[Subsets], Responses]
 Variances = Callable[[Responses], FloatArray]
@@ -58,7 +60,11 @@ def is_sharp(camera: Camera, lens_type: LensType) -> bool:
 
 def has_chart(camera: Camera, lens_type: LensType, with_kernels: bool = True) -> bool:
     """Return True if few numbers may explain a lens type, so that a chart of its pixels is measured first."""
-    return is_sharp(camera, lens_type) or (with_kernels and not refusal(camera, lens_type))
+    if is_sharp(camera, lens_type) or not with_kernels:
+        return is_sharp(camera, lens_type)
+    from ...kernel_fit.kernel_fit import refusal
+
+    return not refusal(camera, lens_type)
 
 
 def calibrate_by_fit(
@@ -112,6 +118,8 @@ def _fit_type(
     if not charted:
         return _TypeFit(_views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
+        from ...kernel_fit.kernel_fit import fit_kernels
+
         kernels = fit_kernels(responses, camera, lens, chart_of(lens))
         return _TypeFit(_views_as_designed(subs, kernels.accepted), None, [], kernels)
     pointers = responses.matrix.indptr

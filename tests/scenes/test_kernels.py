@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ommatid.scenes.fitted import kernels as module
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
+from ommatid.scenes.optics import boxes
 from ommatid.simulate.ideal import ideal_matrix
 from tests.examples import camera
 
@@ -78,12 +78,12 @@ def test_the_field_is_measured_from_the_lens_s_axis() -> None:
 
 
 def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ROWS_AT_ONCE", 3)
+    monkeypatch.setattr(boxes, "ROWS_AT_ONCE", 3)
     footprints, rng = random_kernels(2), np.random.default_rng(3)
     image, readings = rng.normal(size=CAMERA.shape), rng.normal(size=CAMERA.types[1].measurements)
     results: list[tuple[bytes, bytes]] = []
     for threads in (1, 4):
-        monkeypatch.setattr(module, "processors", lambda threads=threads: threads)
+        monkeypatch.setattr(boxes, "processors", lambda threads=threads: threads)
         out = np.zeros(CAMERA.shape)
         footprints.adjoint(readings, out)
         results.append((footprints.forward(image).tobytes(), out.tobytes()))

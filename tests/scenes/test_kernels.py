@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ommatid.scenes.fitted import kernels as module
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
 from ommatid.scenes.optics import boxes
 from ommatid.simulate.ideal import ideal_matrix

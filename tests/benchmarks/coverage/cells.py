@@ -25,7 +25,7 @@ TILE = (
 )
 
 
-def _samples(number: int) -> tuple[str, str]:
+def _samples(number: int) -> tuple[str, ...]:
     return "calibration.method=transport", f"calibration.samples={number}", "calibration.fit=none"
 
 

@@ -63,7 +63,9 @@ def test_spurious_information_of_h_is_reported() -> None:
     """Two types leave a null space, which a noisy H seems to see: Eq. 5 then predicts half of the actual error."""
     shares: list[float] = []
     for lenses in ((), ("I", "II")):
-        stack, model, restoration = chain(read(GALLERY / "tile19.toml", ["calibration.samples=1024", "calibration.fit=none"], lenses))
+        stack, model, restoration = chain(
+            read(GALLERY / "tile19.toml", ["calibration.samples=1024", "calibration.fit=none"], lenses)
+        )
         shares.append(restoration.spurious_information)
         lines = run_table.rows(report_of(stack, model, restoration))
         name, words = lines[0]

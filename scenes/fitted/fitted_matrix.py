@@ -6,7 +6,6 @@ over pixels. To first order a displaced view reads H f' along the displacement, 
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -15,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, FloatArray
 
 from ..camera import Camera
 from ..lens_type import LensType, SubImager
@@ -172,14 +171,6 @@ class FittedMatrix:
 
     def _no_rows(self, sub: SubImager) -> sparse.csr_array:
         return sparse.csr_array((sub.type.pixels[0] * sub.type.pixels[1], self.camera.unknowns))
-
-    def signature(self, rows: slice, columns: slice) -> Hashable:
-        """Return a key that is equal for two windows only if their submatrices are equal."""
-        return self.boxes.signature(rows, columns)
-
-    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
-        """Return the indices of the measurements that see nothing outside a window of f."""
-        return self.boxes.measurements_inside(rows, columns)
 
     def restrict(self, camera: Camera) -> FittedMatrix:
         """Return H of a camera with some of the lens types."""

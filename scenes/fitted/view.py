@@ -32,7 +32,7 @@ ROW, COLUMN, MAGNIFICATION, ROTATION, K1 = range(COUNT)
 
 
 def designed(sub: SubImager) -> FloatArray:
-    """Return the numbers of a sub-imager as designed, (5,): all 0 but its k1 and its patch's rotation."""
+    """Return the numbers of a sub-imager as designed, (5,): all 0 but its k1."""
     numbers = np.zeros(COUNT)
     numbers[K1] = 0.0 if sub.type.optics.distortion is None else sub.type.optics.distortion[0]
     return numbers

@@ -68,9 +68,7 @@ class Renderer:
         self._sampler: Sampler = sampler
         self.camera = camera
         self.is_fast = fast = not variant.startswith("scalar")
-        self.groups: dict[str, tuple[LensType, ...]] = {lens_type.name: (lens_type,) for lens_type in camera.types}
-        if fast and together and all(lens_type.optics.is_pinhole for lens_type in camera.types):
-            self.groups = {"camera": camera.types}
+        self.groups = _groups(camera, fast and together)
         self.channels = 3 if variant.endswith("rgb") and world is None else 1
         self.exact_below = EXACT_SUMS[fast]
         self._generators: dict[str, RayGenerator] = {}
@@ -293,3 +291,10 @@ class Renderer:
                 return slice(start, start + sum(member.measurements for member in self.groups[group]))
             start += lens_type.measurements
         raise KeyError(group)
+
+
+def _groups(camera: Camera, together: bool) -> dict[str, tuple[LensType, ...]]:
+    """Return the lens types that are rendered together, by a name."""
+    if together and all(lens_type.optics.is_pinhole for lens_type in camera.types):
+        return {"camera": camera.types}
+    return {lens_type.name: (lens_type,) for lens_type in camera.types}

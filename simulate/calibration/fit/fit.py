@@ -98,7 +98,8 @@ def calibrate_by_fit(
         {name: each.views for name, each in fits.items()},
         {name: each for name, each in kernels.items() if each is not None},
     )
-    return FittedCalibration(fitted, rest, responses, _record(camera, fits, subsets))
+    record = {"kind": "auto" if with_kernels else "geometry", **_record(camera, fits, subsets)}
+    return FittedCalibration(fitted, rest, responses, record)
 
 
 def _by_type(camera: Camera) -> list[list[SubImager]]:
@@ -184,7 +185,6 @@ def _record(camera: Camera, fits: dict[str, _TypeFit], subsets: Subsets) -> dict
         sum(getattr(each, name) for fit in fits.values() for each in fit.explanations) for name in ("left", "expected")
     )
     return {
-        "kind": "auto",
         "accepted": int(explained.sum()),
         "refused": [name for name, good in zip(names, explained.tolist(), strict=True) if not good],
         "structure": {name: dict(zip(UNITS, fit.views.structure, strict=True)) for name, fit in fits.items()},

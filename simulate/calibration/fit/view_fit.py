@@ -97,13 +97,14 @@ def fit_views(camera: Camera, subs: list[SubImager], charts: list[ChartRows], ra
         )
 
     def iterated(numbers: FloatArray, structure: Structure) -> tuple[FloatArray, list[Centroids], ViewSolution]:
-        for step in range(STEPS):
-            problems = problems_at(numbers)
+        problems = problems_at(numbers)
+        for _ in range(STEPS):
             solution = solve(problems, structure)
             before, numbers = numbers, start + solution.numbers * units
-            if np.abs((numbers - before) / units).max(initial=0.0) < SETTLED / rays or step == STEPS - 1:
-                return numbers, problems, solution
-        raise AssertionError
+            if np.abs((numbers - before) / units).max(initial=0.0) < SETTLED / rays:
+                break
+            problems = problems_at(numbers)
+        return numbers, problems, solve(problems, structure)
 
     numbers, problems, _ = iterated(start, FREE)
     structure, chances = _structure(problems)

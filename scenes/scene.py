@@ -22,13 +22,14 @@ from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTabl
 from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.overrides import apply_overrides, keep_lenses
-from .tables.sensor import LightTable, NoiseTable, SensorTable
+from .tables.sensor import LightTable, NoiseTable, SensorTable, adds_noise, with_default_samples
 from .tables.table import Table
-from .tables.units import Corner, FileName, Length, Pair, Samples, Time
+from .tables.units import AUTO, Corner, FileName, Length, Pair, Samples, Time
 
 TRUTH = "truth.exr"
 WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
+WITHOUT_NOISE = 256  # samples where there is no noise that "auto" could compare with
 IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where render.samples is "auto"
 
 
@@ -66,8 +67,9 @@ class RenderTable(Table):
     """Settings of the rendering of the sub-images."""
 
     samples: Samples = Field(
-        default=256,
-        description='rays per sensor pixel, in 16 passes or more; "auto": until their variance is 0.1 of the sensor\'s',
+        default=AUTO,
+        description='rays per sensor pixel, in 16 passes or more; "auto": until their variance is 0.1 of the sensor\'s;'
+        f" absent from a scene without noise: {WITHOUT_NOISE}",
     )
     time: Time | None = Field(
         default=None, description='time limit of samples = "auto", at whatever variance; absent: no limit'
@@ -96,8 +98,9 @@ class CalibrationTable(Table):
 
     method: Literal["points", "transport", "ideal"] = "points"
     samples: Samples = Field(
-        default=256,
-        description='rays per sensor pixel, in 16 passes or more; "auto": until H adds less than 10 % to the error',
+        default=AUTO,
+        description='rays per sensor pixel, in 16 passes or more; "auto": until H adds less than 10 % to the error;'
+        f" absent from a scene without noise: {WITHOUT_NOISE}",
     )
     fit: Literal["auto", "geometry", "none"] | None = Field(
         default=None,
@@ -142,6 +145,11 @@ class Scene(Table):
     study: StudyTable | None = None
 
     _source: Path = PrivateAttr(default=Path("scene"))
+
+    @model_validator(mode="before")
+    @classmethod
+    def _count_samples_without_noise(cls, data: Any) -> Any:
+        return data if adds_noise(data) else with_default_samples(data, WITHOUT_NOISE)
 
     @model_validator(mode="after")
     def _check_combination(self) -> Scene:

@@ -1,9 +1,9 @@
 """A camera in the terms of optics: magnification, f-number, field of view, Airy disk, and the area of its sensor.
 
-Lengths are millimetres. Fields of view are in degrees, because they are only printed. A lens of focal length f, in focus
-at the distance F, has its sensor at depth d behind it, 1/f = 1/F + 1/d, and images a target at distance Z with the
-optical magnification d / Z. An aperture D is the f-number N = f / D, works at the sensor at d / D = N (1 + d / F), and
-has an Airy disk of diameter 2.44 wavelength d / D.
+Lengths are millimetres. Fields of view are in degrees, because they are only printed. A lens of focal length f, in
+focus at the distance F, has its sensor at depth d behind it, 1/f = 1/F + 1/d, and images a target at distance Z with
+the optical magnification d / Z. An aperture D is the f-number N = f / D, works at the sensor at d / D = N (1 + d / F),
+and has an Airy disk of diameter 2.44 wavelength d / D.
 """
 
 from __future__ import annotations

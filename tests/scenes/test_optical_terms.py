@@ -19,7 +19,7 @@ def terms_of(name: str, *changes: str) -> OpticalTerms:
 
 
 def test_type_i_of_the_tile_images_at_one_to_five_hundred() -> None:
-    """A 6 um pixel spans 3 pixels of 1 mm: 1/500, so the sensor is 1 m / 500 behind the lens, and 1/f = 1/2 + 1/1000."""
+    """A 6 um pixel spans 3 pixels of 1 mm: 1/500. So the sensor is 2 mm behind the lens, and 1/f = 1/2 + 1/1000."""
     lens = terms_of("tile19").types[0]
     assert lens.grid_magnification == Fraction(1, 3)
     assert lens.magnification == pytest.approx(1 / 500, rel=1e-12)

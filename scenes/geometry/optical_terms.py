@@ -110,8 +110,7 @@ def optical_terms(scene: Scene, camera: Camera) -> OpticalTerms:
 
 def sensor_size(scene: Scene) -> tuple[float, float] | None:
     """Height and width of the sensor in mm; None if the scene does not give them."""
-    del scene
-    return None
+    return None if scene.camera.sensor is None else scene.camera.sensor.size
 
 
 def sensor_extent(camera: Camera) -> tuple[float, float]:

@@ -258,6 +258,6 @@ class CameraTable(Table):
             if lens.aperture is not None and lens.aperture > self.lens_pitch * (1 + 1e-9):
                 raise ValueError(
                     f"expected lens.{lens.name}.aperture of at most lens_pitch, {self.lens_pitch:g} mm, got"
-                    f" {lens.aperture:g} mm; make the aperture smaller or lens_pitch larger"
+                    f" {lens.aperture:g} mm; make the aperture smaller, or f_number or lens_pitch larger"
                 )
         return self

@@ -8,37 +8,39 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import Field, PrivateAttr, ValidationError, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 
+from .geometry.solution import complete
 from .tables import toml
 from .tables.camera import CameraTable
 from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
 from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.overrides import apply_overrides, keep_lenses
-from .tables.sensor import LightTable, NoiseTable, SensorTable, adds_noise, with_default_samples
-from .tables.table import Table
-from .tables.units import AUTO, Corner, FileName, Length, Pair, Samples, Time
+from .tables.sampling import CalibrationTable, RenderTable, with_samples_without_noise
+from .tables.sensor import LightTable, NoiseTable, SensorTable
+from .tables.table import Table, allow_absent
+from .tables.units import Corner, FileName, Length, Pair
 
 TRUTH = "truth.exr"
 WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
-Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
-WITHOUT_NOISE = 256  # samples where there is no noise that "auto" could compare with
-IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where render.samples is "auto"
 
 
 class TargetTable(Table):
     """The flat picture that the camera looks at, and the grid on which the image is reconstructed."""
 
+    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("pixel_pitch", "distance")))
+
     image: FileName | None = Field(
         default=None,
-        description='"photo:NAME" for a picture of scikit-image, or a PNG, TIFF, EXR or NPY file; absent: a [world]',
+        description='"photo:NAME" for a picture of scikit-image, or a PNG, TIFF, EXR or NPY file; absent: none',
     )
     origin: Corner | None = Field(
         default=None, description="row and column where the crop starts; absent: the whole picture"
@@ -61,64 +63,6 @@ class WorldTable(Table):
         description="a Mitsuba scene file, in millimetres, with the camera at the origin looking along +z, +y up"
     )
     white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that corresponds to a value of 255")
-
-
-class RenderTable(Table):
-    """Settings of the rendering of the sub-images."""
-
-    samples: Samples = Field(
-        default=AUTO,
-        description='rays per sensor pixel, in 16 passes or more; "auto": until their variance is 0.1 of the sensor\'s;'
-        f" absent from a scene without noise: {WITHOUT_NOISE}",
-    )
-    time: Time | None = Field(
-        default=None, description='time limit of samples = "auto", at whatever variance; absent: no limit'
-    )
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    variant: Literal["auto", "scalar_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
-    sampler: Sampler = Field(
-        default="multijitter", description="how rays are distributed; stratified ones round samples up to a valid count"
-    )
-    complete: bool = Field(default=False, description="simulate every effect, however small")
-
-    @property
-    def sample_count(self) -> int:
-        """Number of samples for computations that need it in advance."""
-        return IN_PLACE_OF_AUTO if self.samples == "auto" else self.samples
-
-    @model_validator(mode="after")
-    def _check_time(self) -> RenderTable:
-        if self.time is not None and self.samples != "auto":
-            raise ValueError(f'time ends samples = "auto", got samples = {self.samples}; remove one of the two keys')
-        return self
-
-
-class CalibrationTable(Table):
-    """Settings of the calibration, which determines the observation matrix H."""
-
-    method: Literal["points", "transport", "ideal"] = "points"
-    samples: Samples = Field(
-        default=AUTO,
-        description='rays per sensor pixel, in 16 passes or more; "auto": until H adds less than 10 % to the error;'
-        f" absent from a scene without noise: {WITHOUT_NOISE}",
-    )
-    fit: Literal["auto", "geometry", "none"] | None = Field(
-        default=None,
-        description='"auto": H by few numbers where they explain it; "geometry": by views alone; "none": entries',
-    )
-
-    @property
-    def sample_count(self) -> int:
-        """Number of samples. Raises ValueError for "auto"."""
-        if self.samples == "auto":
-            raise ValueError("expected a number of samples, got 'auto'")
-        return self.samples
-
-    @model_validator(mode="after")
-    def _check_fit(self) -> CalibrationTable:
-        if self.fit in ("auto", "geometry") and self.method == "ideal":
-            raise ValueError("fit belongs to a calibrated H, got method 'ideal'; take 'points' or 'transport'")
-        return self
 
 
 class Scene(Table):
@@ -149,7 +93,7 @@ class Scene(Table):
     @model_validator(mode="before")
     @classmethod
     def _count_samples_without_noise(cls, data: Any) -> Any:
-        return data if adds_noise(data) else with_default_samples(data, WITHOUT_NOISE)
+        return with_samples_without_noise(data)
 
     @model_validator(mode="after")
     def _check_combination(self) -> Scene:
@@ -163,8 +107,6 @@ class Scene(Table):
             )
         if self.light is not None and self.camera.wavelength is not None:
             raise ValueError("expected camera.wavelength or light.spectrum, got both; remove one")
-        if self.target.image is None and self.world is None:
-            raise ValueError("expected a picture, target.image, or a Mitsuba scene, world.file, got neither")
         if self.target.image is None and self.target.shape is None:
             raise ValueError("a target without a picture needs target.shape, the grid to reconstruct, got none")
         if self.estimator.prior_variance is not None and (self.prior.kind == "fit" or self.target.detail > 1):
@@ -222,10 +164,14 @@ def with_tables(scene: Scene, **tables: Any) -> Scene:
 
 def parse(data: dict[str, Any], source: Path) -> Scene:
     """Validate a scene's tables. Raises InputError that names the file, the key and what was expected."""
+    completed, contradiction = complete(data)
     try:
-        scene = Scene.model_validate(data)
+        scene = Scene.model_validate(completed)
     except ValidationError as error:
-        raise InputError(f"{source}: {explain(error, data, Scene)}") from error
+        absent = all(problem["type"] == "missing" for problem in error.errors())
+        raise InputError(f"{source}: {(absent and contradiction) or explain(error, completed, Scene)}") from error
+    if contradiction:
+        raise InputError(f"{source}: {contradiction}")
     return _with_source(scene, source)
 
 
@@ -264,7 +210,7 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     scene = parse(data, source)
     update: dict[str, Any] = {}
     if any(lens.surfaces is not None for lens in scene.camera.lens):
-        from .tables.lens_file import with_surfaces
+        from .formats.lens_file import with_surfaces
 
         update["camera"] = with_surfaces(scene.camera, source)
     update |= _with_curves(scene)

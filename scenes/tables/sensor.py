@@ -162,25 +162,3 @@ class SensorTable(Table):
         """DN from which on a pixel is saturated: the least of the range of its bits, its full well and `saturation`."""
         largest = min(2.0**self.bits - 1, float(int(self.full_well * self.gain + self.black_level)))
         return largest if self.saturation is None else min(largest, float(self.saturation))
-
-
-def adds_noise(data: object) -> bool:
-    """Return True if the sensor of a scene's raw data adds noise, with which samples = "auto" compares that of rays."""
-    tables = cast(dict[str, object], data) if isinstance(data, dict) else {}
-    noise = tables.get("noise")
-    if not isinstance(noise, dict):
-        return "sensor" in tables
-    noise = cast(dict[str, object], noise)
-    return bool(noise.get("variance")) or "bits" in noise
-
-
-def with_default_samples(data: object, samples: int) -> object:
-    """Return a scene's raw data with `samples` in the tables render and calibration that state none."""
-    if not isinstance(data, dict):
-        return data
-    tables = dict(cast(dict[str, object], data))
-    for name in ("render", "calibration"):
-        table = tables.get(name, {})
-        if isinstance(table, dict) and "samples" not in table:
-            tables[name] = {"samples": samples} | cast(dict[str, object], table)
-    return tables

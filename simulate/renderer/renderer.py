@@ -20,7 +20,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.tables.sampling import Sampler
 
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting

@@ -40,6 +40,15 @@ class FigureFiles:
         """Write a figure in every format. Raises InputError or MachineError."""
         save_figure(figure, path, self.formats, self.resolution)
 
+    def replace(self, figure: Any, path: Path) -> None:
+        """Write a figure in every format, and remove its files in others, which show something older."""
+        self.save(figure, path)
+        for name in set(FORMATS) - set(self.formats):
+            path.with_suffix(f".{name}").unlink(missing_ok=True)
+
+
+SCREEN_PNG = FigureFiles()
+
 
 def figure_formats(text: str) -> tuple[str, ...]:
     """Read the names of formats, such as "png,svg". Raises InputError."""

@@ -22,10 +22,11 @@ from ommatid.scenes.stack import Stack
 from ..methods.prepared import Prepared
 from ..restore import Reconstruction, check_match, restore
 from . import figures, run_json
+from .overview import ESTIMATE, OVERVIEW, write_overview
 from .report import report_of
 from .run_json import RunReport
 
-ESTIMATE, PICTURE, OVERVIEW = "estimate.exr", "estimate.png", "overview.png"
+PICTURE = "estimate.png"
 ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
 
 
@@ -102,7 +103,7 @@ def write_results(folder: Path, stack: Stack, restoration: Reconstruction, repor
     record = {"title": stack.scene.title, "fingerprint": report.fingerprint}
     write_estimate(folder / ESTIMATE, restoration, record)
     figures.write_estimate(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
-    figures.write_overview(folder / OVERVIEW, stack.scene.title, stack, restoration)
+    write_overview(folder, stack, report)
     run_json.write(folder, report)
 
 

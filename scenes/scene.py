@@ -28,6 +28,7 @@ from .tables.sampling import CalibrationTable, RenderTable, with_samples_without
 from .tables.sensor import LightTable, NoiseTable, SensorTable
 from .tables.table import Table, allow_absent
 from .tables.units import Corner, FileName, Length, Pair
+from .tables.world import WorldTable
 
 TRUTH = "truth.exr"
 WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
@@ -54,15 +55,6 @@ class TargetTable(Table):
     )
     pixel_pitch: Length = Field(description="side of one pixel of the target")
     distance: Length = Field(description="distance from the plane of the lenses to the target")
-
-
-class WorldTable(Table):
-    """A Mitsuba scene behind the target or, where the target has no picture, in its place."""
-
-    file: FileName = Field(
-        description="a Mitsuba scene file, in millimetres, with the camera at the origin looking along +z, +y up"
-    )
-    white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that corresponds to a value of 255")
 
 
 class Scene(Table):

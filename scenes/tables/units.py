@@ -101,6 +101,11 @@ def length(text: str) -> float:
     return _in_units(text, unit="mm", what="a length", examples=("1 mm", "6 um"))
 
 
+def angle(value: object) -> float:
+    """Convert a text such as "-90 deg" to radians. Raises ValueError that says what was expected."""
+    return _in_units(value, unit="rad", what="an angle", examples=("1 deg", "-2 mrad"), signed=True)
+
+
 def _ratio(value: object) -> Fraction:
     try:
         if isinstance(value, bool) or not isinstance(value, str | int | float | Fraction):

@@ -117,6 +117,7 @@ class JobShare:
         record = _JobRecord(scenes=tuple(ended)).model_dump_json()
         replace_text(self._record(self.job.number), record, self._temporary)
         described: dict[int, str] = {}
+        scenes: list[EndedScene] = []
         result: Result | None = None
         while True:
             records = _records(self.plan, self.folder, self.number)
@@ -124,12 +125,13 @@ class JobShare:
             if missing:
                 return result, f"{self.job}: done; not ended yet: {_listed(missing)}"
             if records == described:
-                return result, f"{self.job}: done; all jobs have ended"
+                return result, f"{self.job}: done; all jobs have ended{_failed(scenes)}"
             writer = claimed_text(self._claim, str(self.job.number), self._temporary)
             if writer != str(self.job.number):
                 return result, f"{self.job}: done; job {writer} writes the tables, repeat it if it was stopped"
             try:
-                result = describe(self._in_order(records))
+                scenes = self._in_order(records)
+                result = describe(scenes)
             finally:
                 self._claim.unlink(missing_ok=True)
             described = records
@@ -232,6 +234,11 @@ def _refused(output: Path, plan: JobPlan, missing: Sequence[int], different: str
         f"{output}: results would differ, because the job that began first has {others}; install the same versions on"
         f" all machines, or {where}"
     )
+
+
+def _failed(scenes: Sequence[EndedScene]) -> str:
+    count = sum(bool(scene.failure) for scene in scenes)
+    return f"; {count} of {len(scenes)} scenes failed" if count else ""
 
 
 def _listed(jobs: Sequence[int]) -> str:

@@ -45,6 +45,12 @@ Workers = Annotated[
     int | None,
     typer.Option("--workers", metavar="N", min=1, help="Number of processes (default: chosen automatically)."),
 ]
+Job = Annotated[
+    str,
+    typer.Option(
+        "--job", metavar="I/N", help="Do the share of job I of N in the folder of all; /N or auto in a job array."
+    ),
+]
 Strict = Annotated[
     bool, typer.Option("--strict", help="Exit with code 3 if the results are not to be trusted; they are written.")
 ]

@@ -11,6 +11,7 @@ from . import failures, output
 from .options import (
     Complete,
     Folder,
+    Job,
     Json,
     Lenses,
     SceneFiles,
@@ -39,13 +40,14 @@ def run(
     sweep: Sweeps = None,
     scheduler: Scheduler = "",
     workers: Workers = None,
+    job: Job = "",
     complete: Complete = False,
     within: Within = "",
     strict: Strict = False,
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
-    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
+    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch, share_of_job
     from ommatid.pipeline.sections import run_sections
     from ommatid.pipeline.time_budget import stages_within
 
@@ -55,11 +57,13 @@ def run(
 
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
+    share = share_of_job(job, members, folder, ("run", *([f"--within {within}"] if within else [])), *asked, scheduler)
+    members = members if share is None else share.members
     stages, workers = stages_within(within, members, STARTED, output.say, scheduler, workers)
     observer = partial(output.observer, alone=len(members) == 1)
     batch = scene_batch(*asked, stages, observer, report)
     pool = scheduler, workers
-    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder)
+    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder, share=share)
     finish_batch(outcome, as_json, strict)
 
 
@@ -71,20 +75,24 @@ def render(
     sweep: Sweeps = None,
     scheduler: Scheduler = "",
     workers: Workers = None,
+    job: Job = "",
     complete: Complete = False,
     as_json: Json = False,
 ) -> None:
     """Render the sub-images alone."""
     from ommatid.pipeline import stages
-    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
+    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch, share_of_job
 
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         return {"file": str(member.folder / "stack.exr"), **description}
 
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
+    share = share_of_job(job, members, folder, ("render",), *asked, scheduler)
+    members = members if share is None else share.members
     batch = scene_batch(*asked, stages.render, output.observer, report)
-    finish_batch(run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder), as_json)
+    outcome = run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder, share=share)
+    finish_batch(outcome, as_json)
 
 
 def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False) -> None:
@@ -93,6 +101,8 @@ def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False) -> 
     Raises BatchError if a scene failed or, if `strict`, if the results of one are not to be trusted.
     """
     output.print_result(outcome.documents, outcome.sections, as_json)
+    if outcome.jobs:
+        output.say(outcome.jobs)
     verdicts = [document["verdict"]["trusted"] for document in outcome.documents if "verdict" in document]
     code = max(outcome.exit_code, failures.NOT_TRUSTED if strict and not all(verdicts) else 0)
     if code:

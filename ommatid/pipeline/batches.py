@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -9,11 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.batch import sweep
+from ommatid.batch.array_job import read_job
 from ommatid.batch.batch import Batch, Description, Member
+from ommatid.batch.cost_model import estimate_cost
+from ommatid.batch.job_plan import EndedScene, JobShare, join_jobs
 from ommatid.batch.remote import RunObserver, Stages
-from ommatid.batch.sweep_row import summary
+from ommatid.batch.sweep_row import SweepRow, summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.page.batch_index import cached_index
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.scene import read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
@@ -21,11 +27,15 @@ from .stages import library_versions, open_member, process_count
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """The results of a batch: a JSON document per scene, the table of a sweep, and the worst exit code."""
+    """The results of a batch: a JSON document per scene, the table of a sweep, and the worst exit code.
+
+    jobs : a sentence on the jobs that share the batch; empty where there are none
+    """
 
     documents: list[Description]
     sections: list[Section]
     exit_code: int
+    jobs: str = ""
 
 
 def batch_members(
@@ -54,6 +64,43 @@ def scene_batch(
     return Batch(open_scene, stages, observe, report, library_versions, count)
 
 
+def share_of_job(
+    job: str,
+    members: Sequence[Member],
+    folder: Path,
+    words: Sequence[str],
+    changes: Sequence[str],
+    lenses: Sequence[str],
+    scheduler: str = "",
+) -> JobShare | None:
+    """Return the share of the job that `--job` names, None without that option.
+
+    folder : of the batch, in which the jobs agree;  words : of the command that are not in the other arguments
+    Raises InputError if the option cannot be read, or if jobs of another command have not ended in the folder.
+    """
+    if not job:
+        return None
+    if scheduler:
+        raise InputError("--job and --scheduler: expected one of them; both distribute the scenes over machines")
+    command = (*words, *(f"--set {change}" for change in changes), *([f"--lens {','.join(lenses)}"] if lenses else []))
+
+    def seconds(member: Member) -> float:
+        return estimate_cost(member, changes, lenses).seconds
+
+    def facts() -> dict[str, str]:
+        return library_versions(any(_selects_variant(member, changes, lenses) for member in members))
+
+    return join_jobs(read_job(job, os.environ), members, folder, command, seconds, facts)
+
+
+def _selects_variant(member: Member, changes: Sequence[str], lenses: Sequence[str]) -> bool:
+    """Whether a scene leaves the variant to the machine; False for one with errors, which are reported later."""
+    try:
+        return read(member.scene, (*changes, *member.changes), lenses).render.variant == "auto"
+    except InputError:
+        return False
+
+
 def run_batch(
     batch: Batch,
     members: Sequence[Member],
@@ -64,11 +111,13 @@ def run_batch(
     sweep_folder: Path | None = None,
     index_folder: Path | None = None,
     with_folders: bool = True,
+    share: JobShare | None = None,
 ) -> BatchOutcome:
     """Run every scene of a batch, even if others fail.
 
     report_failure : returns the exit code of an exception;  with_folders : documents of a sweep name the folders
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
+    share : of a job, whose scenes `members` are; the last job writes table and page
     """
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
@@ -82,13 +131,38 @@ def run_batch(
             failures[member] = str(error) or type(error).__name__
             results[member] = {**document, "error": str(error), "exit_code": codes[-1]}
     documents = [results[member] for member in members]
-    sections = _sweep_sections(documents, sweep_folder) if members[0].changes else []
+    ended = [
+        EndedScene(
+            folder=member.folder.name,
+            failure=failures.get(member, ""),
+            row=summary(results[member]) if member.changes else None,
+        )
+        for member in members
+    ]
+    describe = partial(_describe, sweep_folder, index_folder, report_failure)
+    if share is None:
+        sections, code = describe(ended)
+        return BatchOutcome(documents, sections, max(*codes, code))
+    described, jobs = share.end(ended, describe)
+    sections, code = described or _describe(None, None, report_failure, ended)
+    return BatchOutcome(documents, sections, max(*codes, code), jobs)
+
+
+def _describe(
+    sweep_folder: Path | None,
+    index_folder: Path | None,
+    report_failure: Callable[[Exception], int],
+    ended: Sequence[EndedScene],
+) -> tuple[list[Section], int]:
+    """Write the table of a sweep and the page of a batch; return the printed table, and an exit code."""
+    rows = [scene.row for scene in ended if scene.row is not None]
+    sections = _sweep_sections(rows, sweep_folder) if rows else []
     if index_folder is not None:
         try:
-            cached_index(index_folder, {member.folder: failures.get(member, "") for member in members})
+            cached_index(index_folder, {index_folder / scene.folder: scene.failure for scene in ended})
         except Exception as error:
-            codes.append(report_failure(error))
-    return BatchOutcome(documents, sections, max(codes))
+            return sections, report_failure(error)
+    return sections, 0
 
 
 def _heading(member: Member, with_folder: bool) -> dict[str, Any]:
@@ -99,8 +173,7 @@ def _heading(member: Member, with_folder: bool) -> dict[str, Any]:
     return document
 
 
-def _sweep_sections(documents: list[Description], folder: Path | None) -> list[Section]:
-    rows = [summary(document) for document in documents]
+def _sweep_sections(rows: list[SweepRow], folder: Path | None) -> list[Section]:
     if folder is None:
         return [("Sweep", lines(rows))]
     write_sweep(folder, rows)

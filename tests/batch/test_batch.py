@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import select
-import signal
 import subprocess
 import sys
-import time
-from collections.abc import Generator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +24,7 @@ from ommatid.runtime.processors import one_thread, processors
 
 from ..conftest import TINY, Command, shell
 from ..runs import FILES, MADE, assert_same_content, content
+from .attempts import attempt, modification_times
 
 COMMAND = ("run", "tiny.toml", "-o", "out", "--sweep", "render.seed=1,2", "--json")
 SCENES = ("tiny+render.seed=1", "tiny+render.seed=2")
@@ -37,85 +32,12 @@ SHARED = ("index.html", "sweep.csv", "sweep.json", "sweep.png")
 OUTPUT = {*SHARED, *(f"{scene}/{name}" for scene in SCENES for name in FILES)}
 MOST_CHANGES = 60  # of files: a command is killed after a random number of changes up to this
 
-# Forks commands from a process that has imported everything, so that each begins its work at once.
-STARTER = """
-import os, sys
-import mitsuba, numba, scipy.linalg, skimage.metrics, matplotlib.backends.backend_agg
-import ommatid.pipeline.stages, ommatid.analysis.depth_error, ommatid.analysis.study, ommatid.batch.sweep_table
-import ommatid.reconstruct.output.figures, ommatid.reconstruct.output.run_json, ommatid.reconstruct.output.result_files
-from ommatid.cli import app
-for line in sys.stdin:
-    number = os.fork()
-    if number:
-        print(number, os.waitpid(number, 0)[1], flush=True)
-        continue
-    os.setsid()
-    folder, *sys.argv[1:] = line.split()
-    os.chdir(folder)
-    os.dup2(os.open("stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-    os.dup2(os.open("stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
-    open("number.new", "w").write(str(os.getpid()))
-    os.rename("number.new", "number")
-    try:
-        app.main()
-    except SystemExit as ended:
-        os._exit(ended.code)
-    finally:
-        os._exit(99)
-"""
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """A command that was killed or ended, and its output."""
-
-    killed: bool
-    out: str
-    err: str
-
-
-def modification_times(out: Path) -> dict[str, int]:
-    """Modification time of every file below a folder, hidden ones included."""
-    times: dict[str, int] = {}
-    for folder, _, names in os.walk(out):
-        for name in names:
-            path = Path(folder) / name
-            with suppress(FileNotFoundError):  # renamed meanwhile
-                times[str(path.relative_to(out))] = path.stat().st_mtime_ns
-    return times
-
 
 def finished_files(times: dict[str, int], scene: str) -> dict[str, int]:
     """Files of finished stages. Those of the reconstruction are finished once run.json, the last, is there."""
     here = {name: times[f"{scene}/{name}"] for name in MADE if f"{scene}/{name}" in times}
     finished = MADE if "run.json" in here else ("stack.exr", "model.npz")
     return {f"{scene}/{name}": here[name] for name in finished if name in here}
-
-
-def attempt(starter: subprocess.Popen[str], here: Path, workers: int, changes: int) -> Attempt:
-    """Run the command, and kill it with all its processes after a number of changes of its files."""
-    assert starter.stdin is not None
-    assert starter.stdout is not None
-    (here / "number").unlink(missing_ok=True)
-    before, seen = modification_times(here / "out"), 0
-    starter.stdin.write(" ".join((str(here), *COMMAND, "--workers", str(workers))) + "\n")
-    starter.stdin.flush()
-    while not (here / "number").exists():
-        time.sleep(0.001)
-    group = int((here / "number").read_text(encoding="ascii"))
-    while seen < changes and not select.select([starter.stdout], [], [], 0.001)[0]:
-        now = modification_times(here / "out")
-        seen += len(now.items() ^ before.items())
-        before = now
-    if seen >= changes:
-        with suppress(ProcessLookupError):
-            os.killpg(group, signal.SIGKILL)
-    number, status = map(int, starter.stdout.readline().split())
-    assert number == group
-    out, err = ((here / name).read_text(encoding="utf-8") for name in ("stdout", "stderr"))
-    killed = os.WIFSIGNALED(status)
-    assert killed or os.waitstatus_to_exitcode(status) == 0, err
-    return Attempt(killed, out, err)
 
 
 def kill_and_resume(starter: subprocess.Popen[str], here: Path, workers: int, random: np.random.Generator) -> int:
@@ -128,7 +50,8 @@ def kill_and_resume(starter: subprocess.Popen[str], here: Path, workers: int, ra
     kills = 0
     while True:
         before = modification_times(here / "out")
-        ended = attempt(starter, here, 1 if kills else workers, int(random.integers(1, MOST_CHANGES)))
+        count = 1 if kills else workers
+        ended = attempt(starter, here, (*COMMAND, "--workers", str(count)), int(random.integers(1, MOST_CHANGES)))
         after = modification_times(here / "out")
         finished = {scene: finished_files(before, scene) for scene in SCENES}
         for scene, times in finished.items():
@@ -155,18 +78,11 @@ def rows_without_times(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def starter() -> Generator[subprocess.Popen[str]]:
-    pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, "-c", STARTER], stdin=pipe, stdout=pipe, text=True) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory, starter: subprocess.Popen[str]) -> Path:
     """Output folder of a batch that is not killed."""
     here = tmp_path_factory.mktemp("uninterrupted")
     (here / "tiny.toml").write_text(TINY, encoding="utf-8")
-    assert not attempt(starter, here, 1, sys.maxsize).killed
+    assert not attempt(starter, here, (*COMMAND, "--workers", "1"), sys.maxsize).killed
     assert modification_times(here / "out").keys() == OUTPUT
     return here / "out"
 

@@ -1,4 +1,4 @@
-"""Batches on processes and clusters: the same files and messages as of one process, and a clean end by Ctrl-C."""
+"""Batches on processes, clusters and jobs: the same files and messages as of one process, and a clean end by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Generator
@@ -15,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 
@@ -25,8 +27,10 @@ from ommatid.scenes.setup import Setup
 
 from ..conftest import TINY, Command, Ended, interpreter, shell
 from ..runs import FILES, assert_same_content, content, numbers, without
+from .attempts import attempt
 
 SEEDS = (1, 2, 3)
+FILES_OF_A_RUN = 12  # changes of files, at the very least, that a scene needs: a job is killed before them
 
 
 def write_scenes(folder: Path) -> list[str]:
@@ -73,6 +77,77 @@ def test_a_batch_gives_the_same_files_wherever_it_is_done(
         assert_same_content(here / "out" / name, content(folder / name))
     estimates = {(folder / name / "estimate.png").read_bytes() for name in names}
     assert len(estimates) == len(scenes), "seeds differ, and so do the pictures: the comparison can fail"
+
+
+def test_jobs_of_which_one_is_killed_give_the_same_files(
+    scenes: list[str], here: Path, starter: subprocess.Popen[str], alone: tuple[Path, Ended]
+) -> None:
+    command = ("run", *scenes, "-o", "out", "--json", "--job")
+    changes = int(np.random.default_rng().integers(2, FILES_OF_A_RUN))
+    attempts = [attempt(starter, here, (*command, f"{job}/3"), sys.maxsize) for job in (3, 1)]
+    attempts.append(attempt(starter, here, (*command, "2/3"), changes))
+    assert [ended.killed for ended in attempts] == [False, False, True], f"not killed after {changes} changes of files"
+    assert not (here / "out" / "index.html").exists()
+    attempts.append(attempt(starter, here, (*command, "2/3"), sys.maxsize))
+    assert [ended.err.splitlines()[-1] for ended in attempts if not ended.killed] == [
+        "job 3 of 3: done; not ended yet: 1, 2",
+        "job 1 of 3: done; not ended yet: 2",
+        "job 2 of 3: done; all jobs have ended",
+    ]
+    folder, expected = alone
+    printed = [document for ended in (attempts[1], attempts[3], attempts[0]) for document in documents(ended.out)]
+    assert printed == documents(expected.out)
+    for name in (Path(scene).stem for scene in scenes):
+        assert {path.name for path in (here / "out" / name).iterdir()} == FILES
+        assert_same_content(here / "out" / name, content(folder / name))
+    written = {path.name for path in (here / "out").iterdir()}
+    assert written == {".jobs", *(path.name for path in folder.iterdir())}
+    assert not {path.name for path in (here / "out" / ".jobs").iterdir() if not path.name.endswith(".json")}
+
+
+def test_jobs_write_the_table_of_a_sweep_as_one_process_does(here: Path, ommatid: Command) -> None:
+    sweep = ("render", "tiny.toml", "--sweep", "render.seed=1,2", "--sweep", "camera.lens.I.magnification=1/3,2")
+    expected = ommatid(*sweep, "-o", "alone")
+    codes = [ommatid(*sweep, "-o", "out", "--job", f"{job}/3").code for job in (3, 1, 2)]
+    assert expected.code == max(codes) == 2
+    assert 0 in codes, "a job has the code of its own scenes"
+    tables = [
+        [
+            {key: value for key, value in row.items() if not key.startswith(("seconds", "folder"))}
+            for row in json.loads((here / folder / "sweep.json").read_text(encoding="utf-8"))
+        ]
+        for folder in ("alone", "out")
+    ]
+    assert tables[0] == tables[1]
+    assert [row.get("failed") is not None for row in tables[1]] == [False, True, False, True]
+
+
+def test_the_index_of_jobs_names_the_failures_of_all(
+    here: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, magnification in (("two", "2"), ("three", "3")):
+        (here / f"{name}.toml").write_text(TINY.replace('"1/3"', magnification), encoding="utf-8")
+    for job in ("1", "2"):
+        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", job)
+        ended = ommatid("run", "two.toml", "three.toml", "-o", "out", "--job", "/2")
+        assert ended.code == 2
+        assert (here / "out" / "index.html").exists() == (job == "2")
+    assert ended.err.endswith("job 2 of 2: done; all jobs have ended; 2 of 2 scenes failed\n")
+    index = (here / "out" / "index.html").read_text(encoding="utf-8")
+    for name in ("two.toml", "three.toml"):
+        assert f"{name}: camera.lens" in index
+
+
+def test_a_job_of_another_command_is_refused_before_anything_is_done(here: Path, ommatid: Command) -> None:
+    first = ommatid("render", "tiny.toml", "other.toml", "-o", "out", "--job", "2/2")
+    assert first.err.endswith("job 2 of 2: done; not ended yet: 1\n")
+    ended = ommatid("render", "tiny.toml", "other.toml", "-o", "out", "--set", "noise.bits=8", "--job", "1/2")
+    assert ended.code == 2
+    assert "expected 'render', not 'render --set noise.bits=8'" in ended.err
+    assert {path.name for path in (here / "out").iterdir()} == {".jobs"}
+    assert ommatid("run", "tiny.toml", "--job", "1/2", "--scheduler", "tcp://localhost:1").err.startswith(
+        "ommatid: --job and --scheduler: expected one of them"
+    )
 
 
 def test_a_batch_on_processes_imports_no_dask(here: Path) -> None:

@@ -1,0 +1,46 @@
+"""Files by which jobs on several machines agree, on shared file systems without locks.
+
+They rely on what such systems, NFS among them, promise: a link is made once, and a renamed file appears whole. Each
+job writes beside the others into one folder. Whoever writes there sees what was written there before, also where a
+system keeps old listings of folders for a while.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def replace_text(path: Path, text: str, temporary: Path) -> None:
+    """Write a file atomically. `temporary` is a name in the same folder that only this job uses."""
+    _fill(temporary, text)
+    temporary.replace(path)
+
+
+def claimed_text(path: Path, text: str, temporary: Path) -> str:
+    """Write a file unless there is one, and return what stands there: one of several jobs finds its own text.
+
+    temporary : a name in the same folder that only this job uses
+    """
+    while True:
+        _fill(temporary, text)
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            pass
+        except OSError:  # a file system without links, where two jobs that begin at the same moment are not kept apart
+            if not path.exists():
+                temporary.replace(path)
+        temporary.unlink(missing_ok=True)
+        try:
+            return path.read_text(encoding="utf-8")
+        except FileNotFoundError:  # removed since
+            continue
+
+
+def _fill(path: Path, text: str) -> None:
+    path.unlink(missing_ok=True)  # of a job that was killed: perhaps a link to a file that others read
+    with path.open("x", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())

@@ -11,6 +11,8 @@ from functools import partial
 
 import typer
 
+from ommatid.runtime.versions import command_line
+
 from . import calibrate, predict, reconstruct, run, show, studies
 from .failures import exit_code_of
 
@@ -33,4 +35,6 @@ for command in (show.show, show.export, show.init, show.schema, show.doctor):
 
 def main() -> None:
     """Run the command line and exit."""
-    sys.exit(exit_code_of(partial(app, standalone_mode=False)))
+    with command_line(["ommatid", *sys.argv[1:]]):
+        code = exit_code_of(partial(app, standalone_mode=False))
+    sys.exit(code)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import platform
 import shutil
 import signal
 import subprocess
 import sys
 import tomllib
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +18,7 @@ import pytest
 
 from ommatid.pipeline.calibration import calibrate_file
 from ommatid.pipeline.stages import export_scene
+from ommatid.reconstruct.output.single_sub_image import best_single_sub_image
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import stack
@@ -187,6 +190,20 @@ def test_run_json_agrees_with_the_images(finished: Path) -> None:
     assert error["psnr"] == pytest.approx(10 * np.log10(255**2 / measured), rel=single)
     assert error["predicted_mse"] == pytest.approx(maps["variance"].mean(), rel=single)
     np.testing.assert_array_equal(maps["truth"], channels(finished / "truth.exr")["Y"])
+
+
+def test_run_json_says_what_one_sub_image_alone_yields_and_who_computed_when(finished: Path) -> None:
+    run = json.loads((finished / "run.json").read_text(encoding="utf-8"))
+    error, baseline = run["error"], run["error"]["baseline"]
+    recorded, truth = stack.read(finished / "stack.exr"), channels(finished / "truth.exr")["Y"].astype(np.float64)
+    best = best_single_sub_image(recorded, truth)
+    assert best is not None
+    assert baseline == pytest.approx({"sub_imager": best.name, "mse": best.mse, "psnr": best.psnr, "ssim": best.ssim})
+    assert error["gain"] == pytest.approx(10 * np.log10(baseline["mse"] / error["mse"]))
+    assert run["command"] == ["ommatid", "run", "tiny.toml", "-o", "out"]
+    assert run["host"] == platform.node()
+    age = datetime.now(UTC) - datetime.fromisoformat(run["date"])
+    assert timedelta(0) <= age < timedelta(days=1)
 
 
 def test_the_scene_in_the_folder_reproduces_the_stack(here: Path, finished: Path, ommatid: Command) -> None:

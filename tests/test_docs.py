@@ -152,7 +152,7 @@ def run_command(line: str, comment: str, folder: Path, ommatid: Command) -> None
     result = shell(*command, cwd=folder) if "--workers" in arguments else ommatid(*command)
     assert result.code == 0, f"{line}: {result.err}"
     if stated_error:  # stated with four digits
-        assert json.loads(result.out)["mse"] == pytest.approx(float(stated_error[1]), rel=1e-3), line
+        assert json.loads(result.out)[0]["mse"] == pytest.approx(float(stated_error[1]), rel=1e-3), line
     for output in re.findall(r"prints `([^`]+)`", comment):
         assert output in result.err, line
     if arguments[0] == "init":

@@ -19,6 +19,7 @@ from ommatid.runtime.dask_cluster import scratch_folder
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import write_whole
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.versions import command, command_line
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
@@ -46,7 +47,7 @@ class ScenePackage:
     """Everything that a worker needs for a scene.
 
     tables, source : the scene, and its file for messages;  image : on the target, (rows, columns)
-    folder, files : the scene's folder for messages, and its content
+    folder, files : the scene's folder for messages, and its content;  command : words of the command line
     """
 
     tables: dict[str, Any]
@@ -54,6 +55,7 @@ class ScenePackage:
     image: FloatArray
     folder: str
     files: dict[str, bytes]
+    command: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ class SceneOutcome:
 
 def packed(setup: Setup, folder: Path) -> ScenePackage:
     """Pack a scene and the content of its folder."""
-    return ScenePackage(setup.resolved.plain(), str(setup.scene.source), setup.picture, str(folder), _contents(folder))
+    tables, source = setup.resolved.plain(), str(setup.scene.source)
+    return ScenePackage(tables, source, setup.picture, str(folder), _contents(folder), command())
 
 
 def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
@@ -82,7 +85,8 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
             scene = parse(package.tables, Path(package.source))
             return stages(Setup(scene, derive(scene), package.image), folder, observer)
 
-        outcome = outcome_of(work)
+        with command_line(package.command):
+            outcome = outcome_of(work)
         error = outcome.error
         if isinstance(error, InputError | MachineError):
             error = type(error)(str(error).replace(temporary, package.folder))

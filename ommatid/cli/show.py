@@ -19,9 +19,12 @@ def show(
     """Show the camera in the terms of optics, the plan, and the skipped effects."""
     from ommatid.pipeline.descriptions import describe_scene
     from ommatid.pipeline.sections import scene_sections
+    from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
 
-    description = describe_scene(read(scene, options.changes(sets, complete), options.lens_names(lens)))
+    described = read(scene, options.changes(sets, complete), options.lens_names(lens))
+    output.warn_all(conversions(described))
+    description = describe_scene(described)
     output.print_result(description, scene_sections(description), as_json)
     for sentence in description["warnings"]:
         output.say(f"warning: {sentence}")

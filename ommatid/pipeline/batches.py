@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.batch import sweep
-from ommatid.batch.array_job import read_job
 from ommatid.batch.batch import Batch, Description, Member
 from ommatid.batch.cost_model import estimate_cost
-from ommatid.batch.job_plan import EndedScene, JobShare, join_jobs
+from ommatid.batch.jobs.array_job import read_job
+from ommatid.batch.jobs.job_plan import EndedScene, JobShare, join_jobs
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.batch.sweep_row import SweepRow, summary
 from ommatid.batch.sweep_table import lines, write_sweep

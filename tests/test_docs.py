@@ -286,6 +286,12 @@ def test_every_page_is_in_the_index_and_fits_a_terminal() -> None:
             assert len(line) <= 140 or line.startswith("|"), f"{page.name}: {line}"
 
 
+def test_every_page_is_in_the_navigation_of_the_site() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    listed = re.findall(r"[\w./-]+\.md", navigation)
+    assert sorted(listed) == sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+
+
 def test_make_targets_exist() -> None:
     for page in PAGES:
         for target in re.findall(r"make ([a-z]+)`", text_of(page)):

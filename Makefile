@@ -5,7 +5,7 @@ BIN := .venv/bin
 READY := .venv/ready
 DOCS_READY := .venv/docs-ready
 
-.PHONY: demo test docs check bench setup llvm browser clean
+.PHONY: demo test figures docs check bench setup llvm browser clean
 
 demo: setup
 	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
@@ -14,6 +14,10 @@ demo: setup
 # One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
 test: setup browser
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
+# Figures of the pages that take minutes to compute anew; `make test` checks all others.
+figures: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m figures tests/test_figures.py
 
 # The documentation as a site with search, which works from its files and without a network. mkdocs.yml says why MkDocs.
 docs: setup $(DOCS_READY)

@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from math import hypot, log
+from math import log
 from typing import Any
 
 import numpy as np
@@ -137,39 +137,44 @@ def check_world(setup: Setup) -> WorldView:
         return view
     where = f"{scene.source}: world.file: {world_of(scene).file}"
     if view.depths is None or (not view.sky and view.met < ENOUGH * view.views):
-        raise InputError(_unseen(where, view, setup.camera))
-    shift = displacement(setup.camera, view.depths[1])
-    if view.met >= ENOUGH * view.views and shift > max(setup.camera.shape):
-        raise InputError(_too_near(where, view, setup.camera, view.depths[1], shift))
+        raise InputError(_unseen(where, view, setup.camera, world_of(scene)))
+    if view.met >= ENOUGH * view.views and _beyond_target(setup.camera, view.depths[1]):
+        raise InputError(_too_near(where, view, setup.camera, world_of(scene), view.depths[1]))
     return view
 
 
 def sees_enough(camera: Camera, depths: FloatArray) -> bool:
-    """Return True if enough views meet a surface, whose displacement between lenses is smaller than the target."""
+    """Return True if enough views meet a surface, of which opposite lenses of the array see a part in common."""
     met = depths[np.isfinite(depths)]
-    return met.size >= ENOUGH * depths.size and displacement(camera, float(np.median(met))) <= max(camera.shape)
+    return met.size >= ENOUGH * depths.size and not _beyond_target(camera, float(np.median(met)))
 
 
-def displacement(camera: Camera, depth: float) -> float:
-    """Return by how many pixels of f the outermost lens sees a point at `depth` displaced."""
-    offset = max(hypot(*sub.lens) for sub in camera.sub_imagers)
-    return offset * abs(camera.distance / depth - 1) / camera.target_pitch
+def displacement(camera: Camera, depth: float) -> FloatArray:
+    """Return by how many rows and columns of f opposite lenses of the array see a point at `depth` displaced."""
+    across, down = np.ptp([sub.lens for sub in camera.sub_imagers], axis=0)
+    return np.array([down, across]) * abs(camera.distance / depth - 1) / camera.target_pitch
 
 
-def _unseen(where: str, view: WorldView, camera: Camera) -> str:
+def _beyond_target(camera: Camera, depth: float) -> bool:
+    return bool(np.any(displacement(camera, depth) > camera.shape))
+
+
+def _unseen(where: str, view: WorldView, camera: Camera, table: WorldTable) -> str:
     half = [camera.columns * camera.target_pitch / 2, camera.rows * camera.target_pitch / 2]
     seen = ", ".join(f"{axis} {-end:.4g} to {end:.4g}" for axis, end in zip("xy", half, strict=True))
     return (
         f"{where}: {view.met} of {view.views} views of sensor pixels meet a surface, expected half or more: the camera"
         f" stands at 0, 0, 0, looks along +z and sees {seen} mm at {camera.distance:.4g} mm, and the world's box is"
-        f" {_box_words(view.box)}; {_remedy(view)}"
+        f" {_box_words(view.box)}; {_remedy(view, table)}"
     )
 
 
-def _remedy(view: WorldView) -> str:
+def _remedy(view: WorldView, table: WorldTable) -> str:
     unit = "correct world.unit"
     if view.fitting_unit is not None:
         unit = f"set world.unit = '{view.fitting_unit}' if the file is in {view.fitting_unit}"
+    if table.camera is not None:
+        return f"{unit}, or turn the file's sensor"
     sensor = f", or take world.camera = '{FROM_FILE}'" if view.sensors == 1 else ""
     return f"{unit}, or move the world with world.to_world{sensor}"
 
@@ -187,11 +192,12 @@ def _fitting_unit(world: Any, camera: Camera, table: WorldTable) -> str | None:
     return min(found, key=lambda unit: found[unit]) if found else None
 
 
-def _too_near(where: str, view: WorldView, camera: Camera, median: float, shift: float) -> str:
+def _too_near(where: str, view: WorldView, camera: Camera, table: WorldTable, median: float) -> str:
     return (
         f"{where}: half of the surfaces that the camera sees are nearer than {median:.4g} mm, and the target's plane is"
-        f" at {camera.distance:.4g} mm: lenses see them displaced by {shift:.3g} pixels of f, more than the whole"
-        f" target, and the world's box is {_box_words(view.box)}; {_remedy(view)}"
+        f" at {camera.distance:.4g} mm: opposite lenses of the array see them displaced by"
+        f" {displacement(camera, median).max():.3g} pixels of f, more than the whole target, and the world's box is"
+        f" {_box_words(view.box)}; {_remedy(view, table)}"
     )
 
 

@@ -50,7 +50,8 @@ from .printed_figures import agree, rounds_to
 
 DOCS = ROOT / "docs"
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
-COMMANDS: dict[str, Any] = dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+PROGRAM: Any = typer.main.get_command(app)
+COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
 # Commands that another test runs, named with a string that the test contains: they take too long to run twice.
 TESTED_ELSEWHERE = {
     "stability": ("stability/test_stability.py", "write_stability"),
@@ -353,7 +354,8 @@ def test_every_command_and_option_is_documented_and_has_help(command: str, ommat
 
 
 def test_every_documented_option_exists() -> None:
-    parameters = [parameter for command in COMMANDS.values() for parameter in command.params]
+    commands = [PROGRAM, *COMMANDS.values()]
+    parameters = [parameter for command in commands for parameter in command.params]
     known = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", prose(DOCS / "commands.md")):
         assert option in known | {"--help"}, option

@@ -26,7 +26,14 @@ app = typer.Typer(
     help="Simulate, calibrate and reconstruct the images of flat compound-eye cameras, with error bars.",
 )
 with_arguments = partial(app.command, no_args_is_help=True)  # without any, they print their help
-for command in (run.run, run.render, calibrate.calibrate, reconstruct.reconstruct, reconstruct.check):
+for command in (
+    run.run,
+    run.render,
+    calibrate.calibrate,
+    reconstruct.reconstruct,
+    reconstruct.report,
+    reconstruct.check,
+):
     with_arguments()(command)
 with_arguments("import")(calibrate.import_frames)
 with_arguments("export-model")(calibrate.export_model)

@@ -98,10 +98,10 @@ def detail(verbose: bool, quiet: bool) -> Detail:
     return "table" if verbose else "verdict" if quiet else "summary"
 
 
-def print_report(name: str, page: Path, report: RunReport, sections: Iterable[Section], detail: Detail) -> None:
+def print_report(name: str, page: Path | None, report: RunReport, sections: Iterable[Section], detail: Detail) -> None:
     """Print the tables, the six lines or the verdict of a result.
 
-    name : of the scene;  page : its report.html;  sections : its tables
+    name : of the scene;  page : its report.html, None without one;  sections : its tables
     """
     from ommatid.pipeline.summary_lines import summary_lines, verdict_line
     from ommatid.reconstruct.output.verdict_words import is_trusted

@@ -14,14 +14,14 @@ def verdict_line(name: str, report: RunReport) -> str:
     return f"{name}: {heading(report)}: {grounds(report)}"
 
 
-def summary_lines(name: str, report: RunReport, page: Path) -> list[str]:
+def summary_lines(name: str, report: RunReport, page: Path | None) -> list[str]:
     """Return six lines: verdict, error against expectation, quality, what limits the error, time, and the page."""
     rows = {
         "error": _error(report.error),
         "quality": _quality(report),
         "limit": limit(report),
         "time": _time(report),
-        "page": str(page),
+        "page": "none is written with the estimate alone; name a folder with -o" if page is None else str(page),
     }
     return [verdict_line(name, report), *(f"  {label:8} {words}" for label, words in rows.items())]
 

@@ -142,6 +142,7 @@ class Scene(Table):
     study: StudyTable | None = None
 
     _source: Path = PrivateAttr(default=Path("scene"))
+    _world_copy: Path | None = PrivateAttr(default=None)
 
     @model_validator(mode="after")
     def _check_combination(self) -> Scene:
@@ -179,6 +180,11 @@ class Scene(Table):
         return self._source
 
     @property
+    def world_copy(self) -> Path | None:
+        """The file to read in place of `world.file`, if this is another machine."""
+        return self._world_copy
+
+    @property
     def assumed_prior(self) -> PriorTable:
         """The prior that the estimator assumes: [prior], with estimator.prior_variance where it is set."""
         variance = self.estimator.prior_variance
@@ -212,12 +218,16 @@ def with_tables(scene: Scene, **tables: Any) -> Scene:
     return _with_source(scene.model_copy(update=tables), scene.source)
 
 
-def parse(data: dict[str, Any], source: Path) -> Scene:
-    """Validate a scene's tables. Raises InputError that names the file, the key and what was expected."""
+def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) -> Scene:
+    """Validate a scene's tables. Raises InputError that names the file, the key and what was expected.
+
+    world_copy : file that is read in place of `world.file`, on another machine
+    """
     try:
         scene = Scene.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{source}: {explain(error, data, Scene)}") from error
+    scene._world_copy = world_copy  # pyright: ignore[reportPrivateUsage]
     return _with_source(scene, source)
 
 

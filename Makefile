@@ -3,8 +3,9 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 READY := .venv/ready
+DOCS_READY := .venv/docs-ready
 
-.PHONY: demo test check bench setup llvm browser clean
+.PHONY: demo test figures docs check bench setup llvm browser clean
 
 demo: setup
 	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
@@ -13,6 +14,15 @@ demo: setup
 # One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
 test: setup browser
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
+# Figures of the pages that take minutes to compute anew; `make test` checks all others.
+figures: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m figures tests/test_figures.py
+
+# The documentation as a site with search, which works from its files and without a network. mkdocs.yml says why MkDocs.
+docs: setup $(DOCS_READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	@echo "Open build/site/index.html."
 
 check: setup
 	$(BIN)/ruff check .
@@ -30,6 +40,10 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $(READY)
+
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $(DOCS_READY)
 
 # The fast backend wants LLVM 17 or newer; Debian's libllvm19 is installed where that can be done without asking.
 # Where it cannot, everything works on the slow backend, and `ommatid doctor` names the one command that mends it.
@@ -52,4 +66,4 @@ browser:
 	@{ $(BROWSER); } >/dev/null || echo "No chromium here: tests of reports in a browser are skipped."
 
 clean:
-	rm -rf .venv out
+	rm -rf .venv out build

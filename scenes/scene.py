@@ -8,36 +8,40 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import Field, PrivateAttr, ValidationError, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 
+from .geometry.solution import complete
 from .tables import toml
 from .tables.camera import CameraTable
 from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
 from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.overrides import apply_overrides, keep_lenses
+from .tables.sampling import CalibrationTable, RenderTable, with_samples_without_noise
 from .tables.sensor import LightTable, NoiseTable, SensorTable
-from .tables.table import Table
-from .tables.units import Corner, FileName, Length, Pair, Samples, Time
+from .tables.table import Table, allow_absent
+from .tables.units import Corner, FileName, Length, Pair
+from .tables.world import WorldTable
 
 TRUTH = "truth.exr"
 WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
-Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
-IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where render.samples is "auto"
 
 
 class TargetTable(Table):
     """The flat picture that the camera looks at, and the grid on which the image is reconstructed."""
 
+    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("pixel_pitch", "distance")))
+
     image: FileName | None = Field(
         default=None,
-        description='"photo:NAME" for a picture of scikit-image, or a PNG, TIFF, EXR or NPY file; absent: a [world]',
+        description='"photo:NAME" for a picture of scikit-image, or a PNG, TIFF, EXR or NPY file; absent: none',
     )
     origin: Corner | None = Field(
         default=None, description="row and column where the crop starts; absent: the whole picture"
@@ -51,71 +55,6 @@ class TargetTable(Table):
     )
     pixel_pitch: Length = Field(description="side of one pixel of the target")
     distance: Length = Field(description="distance from the plane of the lenses to the target")
-
-
-class WorldTable(Table):
-    """A Mitsuba scene behind the target or, where the target has no picture, in its place."""
-
-    file: FileName = Field(
-        description="a Mitsuba scene file, in millimetres, with the camera at the origin looking along +z, +y up"
-    )
-    white: float = Field(default=1.0, gt=0, le=1e12, description="radiance that corresponds to a value of 255")
-
-
-class RenderTable(Table):
-    """Settings of the rendering of the sub-images."""
-
-    samples: Samples = Field(
-        default=256,
-        description='rays per sensor pixel, in 16 passes or more; "auto": until their variance is 0.1 of the sensor\'s',
-    )
-    time: Time | None = Field(
-        default=None, description='time limit of samples = "auto", at whatever variance; absent: no limit'
-    )
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    variant: Literal["auto", "scalar_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
-    sampler: Sampler = Field(
-        default="multijitter", description="how rays are distributed; stratified ones round samples up to a valid count"
-    )
-    complete: bool = Field(default=False, description="simulate every effect, however small")
-
-    @property
-    def sample_count(self) -> int:
-        """Number of samples for computations that need it in advance."""
-        return IN_PLACE_OF_AUTO if self.samples == "auto" else self.samples
-
-    @model_validator(mode="after")
-    def _check_time(self) -> RenderTable:
-        if self.time is not None and self.samples != "auto":
-            raise ValueError(f'time ends samples = "auto", got samples = {self.samples}; remove one of the two keys')
-        return self
-
-
-class CalibrationTable(Table):
-    """Settings of the calibration, which determines the observation matrix H."""
-
-    method: Literal["points", "transport", "ideal"] = "points"
-    samples: Samples = Field(
-        default=256,
-        description='rays per sensor pixel, in 16 passes or more; "auto": until H adds less than 10 % to the error',
-    )
-    fit: Literal["auto", "geometry", "none"] | None = Field(
-        default=None,
-        description='"auto": H by few numbers where they explain it; "geometry": by views alone; "none": entries',
-    )
-
-    @property
-    def sample_count(self) -> int:
-        """Number of samples. Raises ValueError for "auto"."""
-        if self.samples == "auto":
-            raise ValueError("expected a number of samples, got 'auto'")
-        return self.samples
-
-    @model_validator(mode="after")
-    def _check_fit(self) -> CalibrationTable:
-        if self.fit in ("auto", "geometry") and self.method == "ideal":
-            raise ValueError("fit belongs to a calibrated H, got method 'ideal'; take 'points' or 'transport'")
-        return self
 
 
 class Scene(Table):
@@ -144,6 +83,11 @@ class Scene(Table):
     _source: Path = PrivateAttr(default=Path("scene"))
     _world_copy: Path | None = PrivateAttr(default=None)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _count_samples_without_noise(cls, data: Any) -> Any:
+        return with_samples_without_noise(data)
+
     @model_validator(mode="after")
     def _check_combination(self) -> Scene:
         if self.noise is not None and self.sensor is not None:
@@ -156,8 +100,6 @@ class Scene(Table):
             )
         if self.light is not None and self.camera.wavelength is not None:
             raise ValueError("expected camera.wavelength or light.spectrum, got both; remove one")
-        if self.target.image is None and self.world is None:
-            raise ValueError("expected a picture, target.image, or a Mitsuba scene, world.file, got neither")
         if self.target.image is None and self.target.shape is None:
             raise ValueError("a target without a picture needs target.shape, the grid to reconstruct, got none")
         if self.estimator.prior_variance is not None and (self.prior.kind == "fit" or self.target.detail > 1):
@@ -223,10 +165,14 @@ def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) ->
 
     world_copy : file that is read in place of `world.file`, on another machine
     """
+    completed, contradiction = complete(data)
     try:
-        scene = Scene.model_validate(data)
+        scene = Scene.model_validate(completed)
     except ValidationError as error:
-        raise InputError(f"{source}: {explain(error, data, Scene)}") from error
+        absent = all(problem["type"] == "missing" for problem in error.errors())
+        raise InputError(f"{source}: {(absent and contradiction) or explain(error, completed, Scene)}") from error
+    if contradiction:
+        raise InputError(f"{source}: {contradiction}")
     scene._world_copy = world_copy  # pyright: ignore[reportPrivateUsage]
     return _with_source(scene, source)
 
@@ -266,7 +212,7 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     scene = parse(data, source)
     update: dict[str, Any] = {}
     if any(lens.surfaces is not None for lens in scene.camera.lens):
-        from .tables.lens_file import with_surfaces
+        from .formats.lens_file import with_surfaces
 
         update["camera"] = with_surfaces(scene.camera, source)
     update |= _with_curves(scene)

@@ -49,6 +49,7 @@ from .sampling.passes import (
 from .sampling.seeds import sampler_seeds
 from .sampling.sobol import power_of_two_plan
 from .sampling.sub_imager_progress import LEAPS, SubImagerProgress, mean_of_known
+from .world_view import rendered_world
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
 LEAST = 256  # samples per pixel of a first round, at least
@@ -98,8 +99,7 @@ def render_until(
     """
     scene = setup.scene
     allowed, variant = allowed_variance(setup), choose(scene.render.variant)
-    world = None if scene.world is None else scene
-    renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=world)
+    renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     rounds = AdaptiveRounds(setup, renderer, allowed)
     state = State() if checkpoint is None else checkpoint.state()

@@ -7,8 +7,7 @@ rendered with the same integrator as the sub-images, with separate seeds, and wi
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 
@@ -17,16 +16,15 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.versions import versions
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.formats.picture import write_truth
-from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.setup import Setup
 
 from .renderer.variant import choose
 from .renderer.world import describe
 from .sampling.passes import Plan, Tally, plan
 from .sampling.samplers import filling
+from .world_view import ideal_camera, rendered_world
 
 FINER = 3  # depth is the median of 3 x 3 points of a pixel
 TRUER = 4  # times the samples of a sensor pixel, whose own noise changes the estimate by far more
@@ -47,19 +45,6 @@ class Truth:
     samples: int
 
 
-def ideal_camera(camera: Camera, finer: int = 1) -> Camera:
-    """Return a pinhole in the array's centre with `finer` x `finer` sensor pixels per pixel of f."""
-    lens_type = LensType(
-        "truth",
-        Fraction(1, finer),
-        (1, 1),
-        (camera.rows * finer, camera.columns * finer),
-        (Fraction(1), Fraction(1)),
-        (0, 0),
-    )
-    return replace(camera, types=(lens_type,), wavelength=None, tolerance=None, lens_columns=None, walls=True)
-
-
 def truth(setup: Setup) -> Truth:
     """Render the image that an estimate is compared with; its seeds are neither those of data nor of calibration.
 
@@ -69,7 +54,7 @@ def truth(setup: Setup) -> Truth:
 
     scene, camera = setup.scene, setup.camera
     variant, work = choose(scene.render.variant), _plan(setup)
-    renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=scene)
+    renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     start = int(np.random.SeedSequence(scene.render.seed, spawn_key=(zlib.crc32(b"truth"),)).generate_state(1)[0])
     tally = Tally(camera.unknowns)

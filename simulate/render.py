@@ -25,6 +25,7 @@ from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint
 from .sampling.passes import OverPasses, Plan, plan, rounding_variance
 from .sampling.seeds import sampler_seeds
+from .world_view import rendered_world
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
 
@@ -100,8 +101,7 @@ def light(
         raise ValueError("expected a number of samples, got 'auto', which `render_until` renders")
     variant = choose(scene.render.variant)
     work = plan(scene.render.samples, scene.render.sampler) if work is None else work
-    world = None if scene.world is None else scene
-    renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=world)
+    renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     mean, variance = render_bands(renderer, scene.render.seed, work, progress, checkpoint)
     return Rendering(
@@ -126,7 +126,7 @@ def render(
     truth : image that the estimate is compared with; None: the image on the target
     Raises InputError if the requested variant does not work here.
     """
-    scene, start = setup.scene, perf_counter()
+    scene, world, start = setup.scene, rendered_world(setup), perf_counter()
     if scene.render.samples == "auto":
         from .adaptive_render import render_until
 
@@ -141,6 +141,7 @@ def render(
         "sampler": scene.render.sampler,
         **rendering.record(),
         **({STRAIGHT: True} if rendering.direct_only else {}),
+        **({} if world is None or world.world is None else {"white": world.world.white}),
         "versions": versions("mitsuba", "drjit", "OpenEXR"),
     }
     return exposed(setup, rendering.mean, rendering.stated_variance(setup.camera), record)

@@ -12,6 +12,7 @@ from ommatid.scenes.setup import Setup
 
 from .noise_target import check_noise_target
 from .renderer.variant import check_fast_variant, check_transport_variant, choose
+from .world_view import check_world
 
 SENSOR, TARGET = 12 * 8, 6 * 8  # bytes that a rendering takes per measurement and per pixel of f
 ENTRY = 12 + 8 + 8 * 4  # bytes per entry of H: the entry, its variance, its batches
@@ -34,6 +35,8 @@ def check_scene(setup: Setup, calibrates: bool = True) -> None:
             check_noise_target(scene)
         if calibrates and scene.calibration.method == "transport":
             check_transport_variant(variant)
+        if scene.world is not None:
+            check_world(setup)
 
 
 def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:

@@ -36,11 +36,13 @@ def scene(
 ) -> Scene:
     """A scene with lens types A, B, ... of (magnification, array, pixels) and more tables by name.
 
-    A calibrated H has entries, which most tests are about, unless `calibration` names another fit.
+    A calibrated H has entries, which most tests are about, unless `calibration` names another fit, and the numbers of
+    samples are fixed unless `render` and `calibration` name others.
     """
-    calibration = tables.get("calibration", {})
+    calibration = {"samples": 256} | tables.get("calibration", {})
     if calibration.get("method") != "ideal":
-        tables = tables | {"calibration": {"fit": "none"} | calibration}
+        calibration = {"fit": "none"} | calibration
+    tables = tables | {"render": {"samples": 256} | tables.get("render", {}), "calibration": calibration}
     names = "ABCDEFGH"
     data: dict[str, Any] = {
         "target": {

@@ -37,8 +37,9 @@ def document(ended: Ended) -> Any:
 
 
 def numbers(description: dict[str, Any]) -> dict[str, Any]:
-    """A run's description without names, fingerprints and times."""
-    kept = {key: value for key, value in description.items() if key not in ("fingerprint", "scene", "file", "spent")}
+    """A run's description without names, fingerprints, times, the command and the machine."""
+    left_out = ("fingerprint", "scene", "file", "spent", "command", "date", "host")
+    kept = {key: value for key, value in description.items() if key not in left_out}
     computing = ("render", "calibrate", "reconstruct")
     stages = {name: {**description["stages"][name], "seconds": None} for name in computing}
     return {**kept, "stages": stages}

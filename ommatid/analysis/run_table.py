@@ -11,11 +11,11 @@ from ommatid.reconstruct.output.run_json import (
     ModelReport,
     RegionReport,
     RunReport,
-    SolverReport,
     StageReport,
     TimeReport,
 )
-from ommatid.reconstruct.output.verdict_words import grounds, heading, is_trusted
+from ommatid.reconstruct.output.solver_report import SolverReport
+from ommatid.reconstruct.output.verdict_words import error_words, grounds, heading, is_trusted
 
 from .summary import skipped_words
 
@@ -45,8 +45,8 @@ def rows(report: RunReport) -> list[Row]:
 def frame_row(name: str, report: RunReport) -> Row:
     """Return the name of a frame of many, and its verdict, error and time in words."""
     error, difference = report.error, report.diagnostics.noise_difference
-    words = [heading(report), f"expected error {error.predicted_mse:.4g}"]
-    words += [] if error.mse is None else [f"measured {error.mse:.4g}"]
+    words = [heading(report), f"expected error {error_words(error.predicted_mse)}"]
+    words += [] if error.mse is None else [f"measured {error_words(error.mse)}"]
     words.append(f"{report.stages['reconstruct'].seconds:.2f} s")
     if difference is None:
         words.append("error bars computed")
@@ -98,12 +98,14 @@ def _method(solver: SolverReport) -> str:
 def _error_rows(error: ErrorReport) -> list[Row]:
     lines: list[Row] = []
     if error.mse is not None:
-        lines.append(("mean squared error, measured", f"{error.mse:.4g}"))
+        lines.append(("mean squared error, measured", error_words(error.mse)))
     given = error.expected_given_truth
     if given is not None:
-        lines.append(("  expected for this picture", f"{given.mse:.4g} (99 %: {given.low:.4g} to {given.high:.4g})"))
+        lines.append(
+            ("  expected for this picture", f"{error_words(given.mse)}, 99 %: {given.low:.4g} to {given.high:.4g}")
+        )
     total = error.predicted_mse
-    lines.append(("  predicted (Eq. 5)", f"{total:.4g}"))
+    lines.append(("  predicted (Eq. 5)", error_words(total)))
     return lines + [
         (f"    from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / total:.1f} %)")
         for name, part in error.budget.items()

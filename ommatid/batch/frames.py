@@ -25,6 +25,7 @@ from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, make_folder
 from ommatid.runtime.pool import worker_pool
 from ommatid.runtime.progress import Progress
+from ommatid.runtime.versions import origin
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
 from ommatid.scenes.formats import exr
@@ -183,7 +184,7 @@ def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunR
     truth = result_files.truth_beside(frame.stack, stack)
     names = frame.stack, options.model
     outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, prepared=prepared)
-    report = report.with_changes(fingerprint=frame.fingerprint, **_region_reports(outcome, options.regions))
+    report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **_region_reports(outcome, options.regions))
     figures.write_estimate(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
     record = {"title": stack.scene.title, "fingerprint": frame.fingerprint, "report": report.plain()}
     result_files.write_estimate(frame.output, outcome, record)

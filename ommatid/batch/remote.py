@@ -19,6 +19,7 @@ from ommatid.runtime.dask_cluster import scratch_folder
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import write_whole
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.versions import command, command_line
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
@@ -49,7 +50,7 @@ class ScenePackage:
     """Everything that a worker needs for a scene.
 
     tables, source : the scene, and its file for messages;  image : on the target, (rows, columns)
-    folder, files : the scene's folder for messages, and its content
+    folder, files : the scene's folder for messages, and its content;  command : words of the command line
     world : the files of its [world], if it has one
     """
 
@@ -58,6 +59,7 @@ class ScenePackage:
     image: FloatArray
     folder: str
     files: dict[str, bytes]
+    command: tuple[str, ...] = ()
     world: WorldPackage | None = None
 
 
@@ -73,9 +75,9 @@ class SceneOutcome:
 
 def packed(setup: Setup, folder: Path) -> ScenePackage:
     """Pack a scene, the content of its folder, and its world. Raises InputError."""
+    tables, source = setup.resolved.plain(), str(setup.scene.source)
     world = None if setup.scene.world is None else packed_world(setup.scene)
-    source = str(setup.scene.source)
-    return ScenePackage(setup.resolved.plain(), source, setup.picture, str(folder), _contents(folder), world)
+    return ScenePackage(tables, source, setup.picture, str(folder), _contents(folder), command(), world)
 
 
 def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
@@ -90,7 +92,8 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
             scene = parse(package.tables, Path(package.source), world)
             return stages(Setup(scene, derive(scene), package.image), folder, observer)
 
-        outcome = outcome_of(work)
+        with command_line(package.command):
+            outcome = outcome_of(work)
         error = outcome.error
         if isinstance(error, InputError | MachineError):
             message = str(error)

@@ -1,89 +1,119 @@
 """Figure of a sweep's errors: measured ones as points, predicted ones (Eq. 5) as lines.
 
-The key with most values is the x axis. The key with the second most is shown by colour; every combination of the rest
-(and of scenes, if there are several) has its own marker and line style.
+The key with most values is the x axis, numeric where its values are numbers or quantities. The key with the second
+most is shown by colour; every combination of the rest (and of scenes, if there are several) has its own marker and line
+style. The value at which a curve crosses twice the smallest predicted error is written beside it.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
+from math import log
 from pathlib import Path
 from typing import Any
 
-from ommatid.runtime.files import write_whole
+from ommatid.figures.quantity_axis import GREY_LEVELS, QuantityAxis, quantity_axis, spans_decade
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 
 from .sweep_row import SweepRow
 
 NAN = float("nan")
-DECADES = 30.0  # ratio of the largest to the smallest value from which an axis is logarithmic
-MOST_TICKS = 12
 MARGIN = 1.5  # of a logarithmic error axis, beyond the largest and the smallest error
-OFFSET = 18.0  # 1/72 inch, between the points of the first and of the last curve
+TWICE = 2.0
+MOST_CROSSINGS = 6
+WIDEST = 130  # characters of a line of the legend
 SCENE = "scene"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 LINES = ("-", "--", ":", "-.")
-UNITS = {"variance": "squared units of f", "noise_variance": "squared units of f", "samples": "per sensor pixel"}
-_NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zA-Zµ]*)")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B", "#56B4E9")  # of names; Okabe and Ito
+WORDS = {
+    ("calibration.method", "ideal"): "H as designed, not calibrated",
+    ("calibration.method", "points"): "calibrated by point sources",
+    ("calibration.method", "transport"): "calibrated by rays",
+}
 
 Style = tuple[str, str]  # marker and line style
 Combination = tuple[str, ...]  # values of the keys that share a style
 
 
 @dataclass(frozen=True)
-class Scale:
-    """The x axis of a swept key: the position of each value, numeric or one step per category."""
+class Crossing:
+    """Where a curve crosses twice the smallest predicted error of the sweep.
 
-    key: str
-    positions: dict[str, float]
-    unit: str
-    logarithmic: bool
-    categories: bool
+    values : of the keys other than the one along x;  position : along x;  error : the predicted error there
+    """
 
-
-def scale(key: str, values: Sequence[str]) -> Scale:
-    """Axis for the values of a key: numbers of one unit are numeric, ratios and everything else are categories."""
-    matches = [match for value in values if (match := _NUMBER.fullmatch(value.strip("\"'"))) is not None]
-    units = {match[2] for match in matches}
-    if len(matches) < len(values) or len(units) != 1:
-        return Scale(key, {value: float(index) for index, value in enumerate(values)}, "", False, True)
-    numbers = [float(match[1]) for match in matches]
-    unit = units.pop() or UNITS.get(key.rsplit(".", 1)[-1], "")
-    return Scale(key, dict(zip(values, numbers, strict=True)), unit, _spans_decades(numbers), False)
+    values: dict[str, str]
+    position: float
+    error: float
 
 
-def write_figure(path: Path, rows: Sequence[SweepRow]) -> None:
+def write_figure(path: Path, rows: Sequence[SweepRow], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the errors of a sweep. Raises MachineError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    settings = [{**row.values, SCENE: row.scene} for row in rows]
+    settings = _settings(rows)
     x_key, colour_key, style_keys = _roles(settings)
-    axis = scale(x_key, list(dict.fromkeys(setting[x_key] for setting in settings)))
-    figure: Any = Figure(figsize=(10, 6), dpi=110, layout="constrained")
+    axis = _axis(x_key, settings)
+    figure: Any = Figure(figsize=(10, 6), layout="constrained")
     FigureCanvasAgg(figure)
     panel = figure.subplots()
-    colours = _colours(list(dict.fromkeys(setting[colour_key] for setting in settings)) if colour_key else [""])
+    shown = list(dict.fromkeys(setting[colour_key] for setting in settings)) if colour_key else [""]
+    colours = _colours(colour_key, shown)
     styles: dict[Combination, Style] = {}
     for setting in settings:
         combination = tuple(setting[key] for key in style_keys)
         styles.setdefault(combination, (MARKERS[len(styles) % len(MARKERS)], LINES[len(styles) % len(LINES)]))
-    last = len(colours) * len(styles) - 1
-    for index, (value, combination) in enumerate(product(colours, styles)):
-        curve = [
-            row
-            for row, setting in zip(rows, settings, strict=True)
-            if (not colour_key or setting[colour_key] == value)
-            and tuple(setting[key] for key in style_keys) == combination
-        ]
-        offset = (index - last / 2) / max(last, 1) * OFFSET
-        _draw_curve(panel, curve, axis, colours[value], styles[combination], offset)
+    for value, combination in product(colours, styles):
+        wanted = {**({colour_key: value} if colour_key else {}), **dict(zip(style_keys, combination, strict=True))}
+        curve = [row for row, setting in zip(rows, settings, strict=True) if wanted.items() <= setting.items()]
+        _draw_curve(panel, curve, axis, colours[value], styles[combination])
     _label_axes(panel, rows, axis)
+    _draw_crossings(panel, rows, axis, colour_key, colours)
     handles = _legend(rows, (colour_key, colours), (style_keys, styles))
-    figure.legend(handles=handles, loc="outside right upper", fontsize=9)
-    write_whole(path, lambda temporary: figure.savefig(temporary, format="png"))
+    longest = max(len(line) for handle in handles for line in handle.get_label().splitlines())
+    figure.legend(handles=handles, loc="outside lower center", ncols=max(1, WIDEST // (longest + 8)), fontsize=9)
+    files.replace(figure, path)
+
+
+def _settings(rows: Sequence[SweepRow]) -> list[dict[str, str]]:
+    return [{**row.values, SCENE: row.scene} for row in rows]
+
+
+def _axis(key: str, settings: Sequence[Mapping[str, str]]) -> QuantityAxis:
+    return quantity_axis(key, list(dict.fromkeys(setting[key] for setting in settings)))
+
+
+def crossings(rows: Sequence[SweepRow]) -> tuple[QuantityAxis, list[Crossing]]:
+    """Return the axis along x, and where each curve rises above twice the smallest predicted error of the sweep.
+
+    Between two values of the key the logarithm of the error is interpolated. Empty where the key has names as values,
+    and for curves that stay below or begin above.
+    """
+    settings = _settings(rows)
+    key = _roles(settings)[0]
+    axis = _axis(key, settings)
+    known = [row.predicted_mse for row in rows if row.predicted_mse]
+    curves: dict[Combination, list[tuple[float, float]]] = {}
+    others = [name for name in settings[0] if name != key and len({setting[name] for setting in settings}) > 1]
+    for row, setting in zip(rows, settings, strict=True):
+        if row.predicted_mse:
+            point = axis.positions[setting[key]], row.predicted_mse
+            curves.setdefault(tuple(setting[name] for name in others), []).append(point)
+    if axis.categories or not known:
+        return axis, []
+    level, found = TWICE * min(known), list[Crossing]()
+    for combination, points in curves.items():
+        for (left, low), (right, high) in pairwise(sorted(points)):
+            if low < level <= high:
+                share = (log(level) - log(low)) / (log(high) - log(low))
+                values = dict(zip(others, combination, strict=True))
+                found.append(Crossing(values, axis.between(left, right, share), level))
+                break
+    return axis, found
 
 
 def _roles(settings: Sequence[Mapping[str, str]]) -> tuple[str, str, list[str]]:
@@ -94,34 +124,30 @@ def _roles(settings: Sequence[Mapping[str, str]]) -> tuple[str, str, list[str]]:
     return x_key, (varied or [""])[0], varied[1:]
 
 
-def _colours(values: Sequence[str]) -> dict[str, Any]:
+def _colours(key: str, values: Sequence[str]) -> dict[str, Any]:
+    """Colours of a scale for numbers, and colours that differ for names."""
     from matplotlib import colormaps
 
+    if quantity_axis(key, values).categories and len(values) <= len(COLOURS):
+        return dict(zip(values, COLOURS, strict=False))
     shades: Any = colormaps["viridis"]
     last = max(len(values) - 1, 1)
     return {value: shades(0.88 * index / last) for index, value in enumerate(values)}
 
 
-def _draw_curve(panel: Any, rows: Sequence[SweepRow], axis: Scale, colour: Any, style: Style, offset: float) -> None:
-    """Draw one curve; failed scenes leave a gap.
-
-    offset : of the points along x, 1/72 inch, so that the points of different curves do not hide one another
-    """
-    from matplotlib.transforms import ScaledTranslation
-
-    inch: Any = panel.figure.dpi_scale_trans
-    shifted: Any = panel.transData + ScaledTranslation(offset / 72, 0, inch)
+def _draw_curve(panel: Any, rows: Sequence[SweepRow], axis: QuantityAxis, colour: Any, style: Style) -> None:
+    """Draw one curve; failed scenes leave a gap."""
     rows = sorted(rows, key=lambda row: axis.positions[row.values[axis.key]])
     x = [axis.positions[row.values[axis.key]] for row in rows]
     predicted = [_or_nan(row.predicted_mse) for row in rows]
     measured = [_or_nan(row.mse) for row in rows]
     marker, line = style
     panel.plot(x, predicted, linestyle=line, color=colour, linewidth=1.6)
-    if len(x) == 1 or all(row.mse is None for row in rows):
-        panel.plot(x, predicted, "_", color=colour, markersize=14)
+    if all(row.mse is None for row in rows):
+        panel.plot(x, predicted, ".", color=colour, markersize=7)
     low, high = ([_or_nan(_interval(row)[end]) for row in rows] for end in (0, 1))
-    panel.vlines(x, low, high, color=colour, linewidth=3, alpha=0.3, transform=shifted)
-    points = {"marker": marker, "markersize": 6, "markeredgecolor": "white", "transform": shifted}
+    panel.vlines(x, low, high, color=colour, linewidth=5, alpha=0.3)
+    points = {"marker": marker, "markersize": 6, "markeredgecolor": "white"}
     panel.plot(x, measured, linestyle="none", color=colour, **points)
 
 
@@ -133,29 +159,62 @@ def _or_nan(number: float | None) -> float:
     return NAN if number is None else number
 
 
-def _label_axes(panel: Any, rows: Sequence[SweepRow], axis: Scale) -> None:
+def _label_axes(panel: Any, rows: Sequence[SweepRow], axis: QuantityAxis) -> None:
     failed = sum(row.failed is not None for row in rows)
     scenes = ", ".join(dict.fromkeys(Path(row.scene).stem for row in rows))
     note = f"; {failed} of {len(rows)} failed, see sweep.csv" if failed else ""
     panel.set_title(f"Sweep of {scenes}{note}", fontsize=11)
-    panel.set_xlabel(f"{axis.key} ({axis.unit})" if axis.unit else axis.key)
-    panel.set_ylabel("mean squared error (squared units of f)")
-    if axis.logarithmic:
-        panel.set_xscale("log")
-    if axis.categories or len(axis.positions) <= MOST_TICKS:
-        panel.set_xticks(list(axis.positions.values()), [value.strip("\"'") for value in axis.positions])
-        panel.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
-    if len(axis.positions) > MOST_TICKS // 2:
-        panel.tick_params(axis="x", labelrotation=45)
+    panel.set_ylabel(f"mean squared error ({GREY_LEVELS} squared)")
+    axis.draw(panel.xaxis)
     numbers = [number for row in rows for number in (row.mse, row.predicted_mse, *_interval(row))]
     errors = [number for number in numbers if number is not None]
-    if _spans_decades(errors):
+    if spans_decade(errors):
         panel.set_yscale("log")
         panel.set_ylim(min(errors) / MARGIN, max(errors) * MARGIN)
     else:
         panel.set_ylim(0, max(errors) * 1.1 or 1.0)
     panel.grid(visible=True, color="0.9")
     panel.set_axisbelow(True)
+    _label_roots(panel)
+
+
+def _label_roots(panel: Any) -> None:
+    """Show the root of the error on the right."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    right = panel.secondary_yaxis("right", functions=(_root, _square))
+    right.set_ylabel(f"RMS error ({GREY_LEVELS})")
+    if panel.get_yscale() == "log":
+        locator: Any = LogLocator(subs=(1, 2, 5))
+        right.yaxis.set_major_locator(locator)
+        right.yaxis.set_major_formatter("{x:g}")
+        right.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _root(squares: Any) -> Any:
+    return abs(squares) ** 0.5
+
+
+def _square(roots: Any) -> Any:
+    return roots**2
+
+
+def _draw_crossings(
+    panel: Any, rows: Sequence[SweepRow], axis: QuantityAxis, colour_key: str, colours: Mapping[str, Any]
+) -> None:
+    """Mark twice the smallest predicted error, and write at which value of x each curve crosses it."""
+    _, found = crossings(rows)
+    if not 0 < len(found) <= MOST_CROSSINGS:
+        return
+    level = found[0].error
+    panel.axhline(level, color="0.35", linewidth=1, linestyle=(0, (1, 2)), zorder=1)
+    text: dict[str, Any] = {"fontsize": 8, "color": "0.3", "va": "bottom"}
+    panel.text(0.008, level, "twice the smallest error", transform=panel.get_yaxis_transform(), **text)
+    for crossing in found:
+        colour = colours.get(crossing.values.get(colour_key, ""), COLOURS[0])
+        panel.plot([crossing.position], [level], "x", color=colour, markersize=8, markeredgewidth=2, zorder=6)
+        place: dict[str, Any] = {"xytext": (7, -5), "textcoords": "offset points", "va": "top", "fontsize": 9}
+        panel.annotate(axis.words(crossing.position), (crossing.position, level), color=colour, **place)
 
 
 def _legend(
@@ -186,8 +245,7 @@ def _legend(
 
 
 def _label(key: str, value: str) -> str:
-    return Path(value).stem if key == SCENE else f"{key} = {value}"
-
-
-def _spans_decades(values: Sequence[float]) -> bool:
-    return bool(values) and min(values) > 0 and max(values) / min(values) >= DECADES
+    if key == SCENE:
+        return Path(value).stem
+    words = WORDS.get((key, value.strip("\"'")))
+    return f"{key} = {value}" + (f" ({words})" if words else "")

@@ -19,9 +19,10 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.sampling import Sampler
 from ommatid.simulate.adaptive_render import AdaptiveRendering
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.calibration.point_sources import RENDERINGS

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ommatid.batch import sweep
-from ommatid.batch.array_job import read_job
 from ommatid.batch.batch import Batch, Description, Member
 from ommatid.batch.cost_model import estimate_cost
-from ommatid.batch.job_plan import EndedScene, JobShare, join_jobs
+from ommatid.batch.jobs.array_job import read_job
+from ommatid.batch.jobs.job_plan import EndedScene, JobShare, join_jobs
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.batch.sweep_row import SweepRow, summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.formats import picture
 from ommatid.scenes.scene import read
 
 from .sections import Section
@@ -49,6 +51,18 @@ def batch_members(
     for scene in scenes:
         sweep.check_keys(scene, axes, changes, lenses)
     return sweep.members(scenes, axes, folder)
+
+
+def batch_warnings(members: Sequence[Member], changes: Sequence[str], lenses: Sequence[str]) -> list[str]:
+    """Return what is lost when the pictures of the scenes are read, a sentence each.
+
+    Scenes with errors have none; their errors are reported when they are run.
+    """
+    sentences: list[str] = []
+    for member in members:
+        with suppress(InputError):
+            sentences += picture.conversions(read(member.scene, (*changes, *member.changes), lenses))
+    return list(dict.fromkeys(sentences))
 
 
 def scene_batch(

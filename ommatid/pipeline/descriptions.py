@@ -20,6 +20,7 @@ from ommatid.runtime.versions import versions
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.renderer import variant
+from ommatid.simulate.world_view import check_world
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
     choice = choose_method(scene, setup.camera, setup.may_have_boxes)
     with naming_source(scene.source):
         lens_optics, light = optics(setup.camera), electrons(setup)
-    return summary.describe(setup, variant.choose(scene.render.variant), choice, lens_optics, light)
+        world = {} if scene.world is None else {"world": check_world(setup).describe()}
+    return summary.describe(setup, variant.choose(scene.render.variant), choice, lens_optics, light) | world
 
 
 def predict_with_light(scene: Scene, rays: bool = True) -> tuple[Prediction, dict[str, Any] | None]:

@@ -13,6 +13,7 @@ from ommatid.analysis import depth_error, light_table, prediction_table, run_tab
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.scenes.scene import Scene
+from ommatid.simulate import world_view
 from ommatid.simulate.lenses import sharpness
 
 Section = tuple[str, list[tuple[str, str]]]
@@ -30,9 +31,11 @@ def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
 
 
 def scene_sections(description: dict[str, Any]) -> list[Section]:
-    """Tabulate the description of a scene: geometry, optics, electrons, plan, skipped effects."""
-    geometry, *others = summary.sections(description)
-    return [geometry, *_optics_sections(description.get("optics", ())), *_light_sections(description), *others]
+    """Tabulate the description of a scene: geometry, lens types, optics, electrons, plan, skipped effects."""
+    geometry, lenses, *others = summary.sections(description)
+    optics, world = _optics_sections(description.get("optics", ())), description.get("world")
+    worlds = [] if world is None else [("World", world_view.rows(world))]
+    return [geometry, *worlds, lenses, *optics, *_light_sections(description), *others]
 
 
 def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:

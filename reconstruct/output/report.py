@@ -20,33 +20,33 @@ from ..held_out.check import quick_check
 from ..restore import Reconstruction
 from .held_out_report import held_out_report
 from .run_json import (
+    BaselineReport,
     DiagnosticsReport,
     ErrorReport,
     FittedNumber,
     IntervalReport,
     ModelReport,
-    RejectedForm,
     ResidualReport,
     RunReport,
     SeedReport,
     SkippedReport,
-    SolverReport,
     StageReport,
     VerdictReport,
 )
+from .single_sub_image import best_single_sub_image
+from .solver_report import RejectedForm, SolverReport
 from .time_spent import time_spent
 
 
 def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunReport:
     """Return the content of run.json, without a fingerprint."""
     start = perf_counter()
-    held_out = _held_out(restoration)
+    held_out, error = _held_out(restoration), _error(restoration, stack)
     stages = {
         "render": _stage(stack.record),
         "calibrate": _stage(model.record),
         "reconstruct": StageReport(seconds=restoration.seconds + perf_counter() - start),
     }
-    error = _error(restoration)
     as_run = stack.scene.model_copy(update={"calibration": model.scene.calibration})
     return RunReport(
         title=stack.scene.title,
@@ -94,8 +94,15 @@ def _stage(record: dict[str, Any]) -> StageReport:
     return StageReport(**{key: record[key] for key in StageReport.model_fields if key in record})
 
 
-def _error(restoration: Reconstruction) -> ErrorReport:
-    measured = {} if restoration.error is None else asdict(restoration.error)
+def _error(restoration: Reconstruction, stack: Stack) -> ErrorReport:
+    measured: dict[str, Any] = {} if restoration.error is None else asdict(restoration.error)
+    single = best_single_sub_image(stack, restoration.truth)
+    if single is not None and restoration.error is not None:
+        measured["baseline"] = BaselineReport(
+            sub_imager=single.name, mse=single.mse, psnr=single.psnr, ssim=single.ssim
+        )
+        psnr = restoration.error.psnr
+        measured["gain"] = None if psnr is None or single.psnr is None else psnr - single.psnr
     if restoration.interval is not None:
         measured["expected_given_truth"] = IntervalReport.model_validate(restoration.interval)
     return ErrorReport(

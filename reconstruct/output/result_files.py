@@ -12,6 +12,7 @@ from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.versions import origin
 from ommatid.runtime.workers import Workers
 from ommatid.scenes.formats import exr
 from ommatid.scenes.formats.picture import averaged
@@ -22,10 +23,11 @@ from ommatid.scenes.stack import Stack
 from ..methods.prepared import Prepared
 from ..restore import Reconstruction, check_match, restore
 from . import figures, run_json
+from .overview import ESTIMATE, OVERVIEW, write_overview
 from .report import report_of
 from .run_json import RunReport
 
-ESTIMATE, PICTURE, OVERVIEW = "estimate.exr", "estimate.png", "overview.png"
+PICTURE = "estimate.png"
 ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
 
 
@@ -102,7 +104,7 @@ def write_results(folder: Path, stack: Stack, restoration: Reconstruction, repor
     record = {"title": stack.scene.title, "fingerprint": report.fingerprint}
     write_estimate(folder / ESTIMATE, restoration, record)
     figures.write_estimate(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
-    figures.write_overview(folder / OVERVIEW, stack.scene.title, stack, restoration)
+    write_overview(folder, stack, report)
     run_json.write(folder, report)
 
 
@@ -119,7 +121,8 @@ def _read_results(folder: Path) -> tuple[RunReport, str | None]:
     report = run_json.read(folder)
     made_from = exr.read(folder / ESTIMATE)[0].record["fingerprint"]
     whole = report.fingerprint == made_from and all((folder / name).is_file() for name in (PICTURE, OVERVIEW))
-    return report, made_from if whole and report.verdict is not None else None
+    earlier = report.verdict is None or (report.error.mse is not None and report.error.baseline is None)
+    return report, made_from if whole and not earlier else None
 
 
 def cached_results(
@@ -130,6 +133,6 @@ def cached_results(
 
     def make() -> tuple[Reconstruction, RunReport]:
         restoration, report = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
-        return restoration, report.with_changes(fingerprint=current)
+        return restoration, report.with_changes(fingerprint=current, **origin())
 
     return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made))

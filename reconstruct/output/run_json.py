@@ -17,6 +17,7 @@ from ommatid.runtime.files import write_text
 
 from .held_out_report import HeldOutReport
 from .record import Record
+from .solver_report import SolverReport
 
 RUN = "run.json"
 
@@ -45,39 +46,31 @@ class IntervalReport(Record):
     high: float
 
 
+class BaselineReport(Record):
+    """The best single sub-image, enlarged to f's grid, and its error against the truth."""
+
+    sub_imager: str
+    mse: float
+    psnr: float | None
+    ssim: float | None
+
+
 class ErrorReport(Record):
-    """Measured and predicted error; `budget` holds the parts of `predicted_mse` by cause."""
+    """Measured and predicted error; `budget` holds the parts of `predicted_mse` by cause.
+
+    gain : dB of `psnr` over that of the baseline, None if one of them is exact
+    """
 
     mse: float | None = None
     trimmed_mse: float | None = None
     psnr: float | None = None
     ssim: float | None = None
+    baseline: BaselineReport | None = None
+    gain: float | None = None
     predicted_mse: float
     predicted_trimmed_mse: float | None = None
     budget: dict[str, float]
     expected_given_truth: IntervalReport | None = None
-
-
-class RejectedForm(Record):
-    """A form of the estimator that was given up, with the reason."""
-
-    method: str
-    why_not: str
-
-
-class SolverReport(Record):
-    """The method and form that ran, and the bounds on their numerical error."""
-
-    way: str
-    method: str
-    why: str
-    condition: float | None
-    digits: float
-    bound: float | None
-    unit: str
-    variance_bound: float
-    refinements: int
-    tried: tuple[RejectedForm, ...] = ()
 
 
 class ResidualReport(Record):
@@ -240,10 +233,17 @@ class StudyCase(Record):
 
 
 class RunReport(Record):
-    """Everything that run.json holds."""
+    """Everything that run.json holds.
+
+    command : words of the command line, absent for results of the Python interface
+    date : UTC, ISO 8601;  host : name of the machine that reconstructed
+    """
 
     fingerprint: str = ""
     title: str
+    command: tuple[str, ...] = ()
+    date: str | None = None
+    host: str | None = None
     verdict: VerdictReport | None = None  # absent in files of earlier versions
     measurements: int
     unknowns: int

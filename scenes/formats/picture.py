@@ -23,6 +23,7 @@ from ..scene import Scene
 from . import npz, tiff
 from .exr import Part, read_channels, write
 
+STEPS = 257.0  # of a 16-bit value per grey level: 65535 is 255
 LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
 
 
@@ -30,13 +31,19 @@ def load(scene: Scene) -> FloatArray:
     """Load the target's picture, cropped as the scene says and rounded to float32: (detail rows, detail columns).
 
     A target without a picture, of a scene with a world, is zero: its image is not known before it is rendered.
-    Raises InputError if the picture is missing, unreadable, too small for the crop or contains NaN.
+    Raises InputError if there is neither picture nor world, or the picture is unreadable, too small for the crop or
+    contains NaN.
     """
     target = scene.target
     where = f"{scene.source}: target.image"
     if target.image is None:
         if target.shape is None:
             raise InputError(f"{where} and target.shape are absent; name a picture, or give the shape for a [world]")
+        if scene.world is None:
+            raise InputError(
+                f"{where} is absent, so there is nothing to render; name a picture such as photo:camera, or a [world]"
+                " (show, predict, design and calibrate need none)"
+            )
         check_memory(
             prod(target.shape) * target.detail**2 * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one"
         )
@@ -57,6 +64,40 @@ def load(scene: Scene) -> FloatArray:
     if not np.isfinite(rounded).all():
         raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
     return rounded
+
+
+def conversions(scene: Scene) -> list[str]:
+    """Return what is lost or rescaled when the target's picture is read, a sentence each.
+
+    Raises InputError if the picture is missing or unreadable.
+    """
+    image = scene.target.image
+    if image is None:
+        return []
+    dtype, channels = _stored(_picture_path(image, f"{scene.source}: target.image"))
+    sentences: list[str] = []
+    if channels >= 3:
+        weights = " + ".join(f"{weight} {name}" for weight, name in zip(LUMINANCE, "RGB", strict=True))
+        sentences.append(f"{image} is a colour picture: only its luminance is simulated, {weights}")
+    if dtype.kind == "u" and dtype.itemsize == 2:
+        sentences.append(f"{image} has 16-bit values: they are divided by {STEPS:g}, to the range from 0 to 255")
+    return sentences
+
+
+def _stored(path: Path) -> tuple[np.dtype[Any], int]:
+    """Return type and number of channels of a picture file, of PNG and JPEG from the header alone."""
+    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        from PIL import Image
+
+        try:
+            with Image.open(path, formats=("PNG", "JPEG")) as opened:
+                wide = opened.mode.startswith("I")
+                colours = 3 if opened.mode in ("P", "PA") else len(opened.getbands())
+                return np.dtype(np.uint16 if wide else np.uint8), colours
+        except Exception as error:
+            raise InputError(f"{path} could not be read as a picture; it is damaged or another kind of file") from error
+    pixels = decode(path, str(path))
+    return pixels.dtype, pixels.shape[2] if pixels.ndim == 3 else 1
 
 
 def target_shape(scene: Scene) -> tuple[int, int]:
@@ -96,7 +137,7 @@ def luminance(pixels: NDArray[Any], where: str) -> FloatArray:
     if pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
         return values
     if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
-        return values / 257.0
+        return values / STEPS
     raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
 
 
@@ -133,12 +174,17 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
 
 def _pixels(image: str, where: str) -> NDArray[Any]:
     """Read the picture that `target.image` names."""
+    return decode(_picture_path(image, where), where)
+
+
+def _picture_path(image: str, where: str) -> Path:
+    """Return the file of a picture. Raises InputError if there is none."""
     if image.startswith("photo:"):
-        return decode(_photo_path(image.removeprefix("photo:"), where), where)
+        return _photo_path(image.removeprefix("photo:"), where)
     path = Path(image)
     if not path.is_file():
         raise InputError(f"{where}: there is no picture {path}; name a PNG, TIFF, EXR or NPY file, or photo:camera")
-    return decode(path, where)
+    return path
 
 
 def _photo_path(name: str, where: str) -> Path:

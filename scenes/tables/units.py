@@ -82,6 +82,15 @@ def _in_units(value: object, *, unit: str, what: str, examples: tuple[str, str],
     return number
 
 
+def in_unit(text: str, unit: str) -> float:
+    """Convert a text such as "1 um" to a number of another unit. Raises ValueError if it is no such quantity."""
+    base, factor = next(((base, factor) for (name, base), factor in FACTORS.items() if name == unit), (unit, 1.0))
+    try:
+        return _quantity(text, base) / factor
+    except Exception as error:  # pint raises a dozen types
+        raise ValueError(f"expected a quantity in {unit}, got {shortened_repr(text)}") from error
+
+
 def duration(text: str) -> float:
     """Convert a text such as "30 s", "30s" or "2 min" to seconds. Raises ValueError that says what was expected."""
     return _in_units(text, unit="s", what="a time", examples=("30 s", "2 min"))
@@ -90,6 +99,11 @@ def duration(text: str) -> float:
 def length(text: str) -> float:
     """Convert a text such as "555 nm" to millimetres. Raises ValueError that says what was expected."""
     return _in_units(text, unit="mm", what="a length", examples=("1 mm", "6 um"))
+
+
+def angle(value: object) -> float:
+    """Convert a text such as "-90 deg" to radians. Raises ValueError that says what was expected."""
+    return _in_units(value, unit="rad", what="an angle", examples=("1 deg", "-2 mrad"), signed=True)
 
 
 def _ratio(value: object) -> Fraction:

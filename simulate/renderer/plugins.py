@@ -11,9 +11,10 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType, SubImager
-from ommatid.scenes.scene import Sampler
+from ommatid.scenes.tables.sampling import Sampler
 
 from ..sampling.samplers import fitting
+from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
 BLOCK = 4  # scalar variants seed by block, and derive its size from the number of threads unless it is given
 
@@ -33,11 +34,17 @@ def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
 
 
 def stock_sensor(
-    camera: Camera, sub: SubImager, sampler: Sampler, samples: int, channels: int = 1, far: float = 2.0
+    camera: Camera,
+    sub: SubImager,
+    sampler: Sampler,
+    samples: int,
+    channels: int = 1,
+    far: float = 2.0,
+    placement: Placement = MILLIMETRES_AT_ORIGIN,
 ) -> dict[str, Any]:
     """Return one sub-imager as Mitsuba's `perspective` sensor with a shifted principal point.
 
-    far : of the far clipping plane, in distances of the target
+    far : of the far clipping plane, in distances of the target;  placement : of the camera in a world
     """
     import mitsuba as mi
 
@@ -46,28 +53,29 @@ def stock_sensor(
     height = float(sub.type.ratio) * rows * camera.target_pitch
     x, y = camera.position(*sub.type.middle(sub.window))
     lens_x, lens_y = sub.lens
+    pose = mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0])
     return {
         "type": "perspective",
         "fov_axis": "x",
         "fov": 2 * degrees(atan(width / 2 / camera.distance)),
-        "near_clip": camera.distance * 1e-3,
-        "far_clip": camera.distance * far,
+        "near_clip": camera.distance * 1e-3 / placement.unit,
+        "far_clip": camera.distance * far / placement.unit,
         "principal_point_offset_x": -(x - lens_x) / width,
         "principal_point_offset_y": -(y - lens_y) / height,
-        "to_world": mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0]),
+        "to_world": placement.to_world(pose, rigid=True),
         "film": film(columns, rows, channels),
         "sampler": {"type": sampler, "sample_count": fitting(sampler, samples)},
     }
 
 
 def stock_sensors(
-    camera: Camera, types: tuple[LensType, ...], sampler: Sampler, channels: int, far: float
+    camera: Camera, types: tuple[LensType, ...], sampler: Sampler, channels: int, far: float, placement: Placement
 ) -> dict[int, Any]:
     """Create Mitsuba's sensors of the sub-imagers of some lens types, by their number in the camera."""
     import mitsuba as mi
 
     return {
-        index: mi.load_dict(stock_sensor(camera, sub, sampler, 16, channels, far))
+        index: mi.load_dict(stock_sensor(camera, sub, sampler, 16, channels, far, placement))
         for index, sub in enumerate(camera.sub_imagers)
         if sub.type in types
     }
@@ -108,18 +116,18 @@ def texture_of(source: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def depths(scene: Any, pinhole: Camera, seed: int, far: float) -> FloatArray:
-    """Return the distance along z that a pinhole camera's only sub-imager sees at a point per pixel, (pixels,).
+def depths(scene: Any, pinhole: Camera, seed: int, far: float, placement: Placement) -> FloatArray:
+    """Return the distance along z, mm, that a pinhole camera's only sub-imager sees at a point per pixel, (pixels,).
 
     Infinite where it sees no surface. Transparent surfaces count like any other.
-    far : of the far clipping plane, in distances of the target
+    far : of the far clipping plane, in distances of the target;  placement : of the camera in the scene
     """
     import mitsuba as mi
 
     (sub,) = pinhole.sub_imagers
-    sensor = mi.load_dict(stock_sensor(pinhole, sub, "independent", 1, far=far))
-    positions = mi.load_dict({"type": "aov", "aovs": "place:position", "block_size": BLOCK})
-    choices: Any = {"sensor": sensor, "integrator": positions, "spp": 1, "seed": seed}
+    sensor = mi.load_dict(stock_sensor(pinhole, sub, "independent", 1, far=far, placement=placement))
+    channels = mi.load_dict({"type": "aov", "aovs": "place:position,far:depth", "block_size": BLOCK})
+    choices: Any = {"sensor": sensor, "integrator": channels, "spp": 1, "seed": seed}
     rendered: Any = mi.render(scene, **choices)
-    z = np.array(rendered, dtype=np.float64)[..., -1].ravel()
-    return np.where(z > 0, z, np.inf)
+    place, along = np.split(np.array(rendered, dtype=np.float64)[..., -4:].reshape(-1, 4), [3], axis=1)
+    return np.where(along[:, 0] > 0, placement.to_camera(place)[:, 2], np.inf)

@@ -19,13 +19,14 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.layout.pixel_places import PixelPlaces
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.scene import Sampler
+from ommatid.scenes.tables.sampling import Sampler
 
 from ..sampling.samplers import RELATED_DRAWS, fitting
 from .lens import Distance, LensModel, ThinLens
 from .points.grid import Grid
 from .points.sobol import SobolDraws
 from .reseeded_sampler import ReseededSampler
+from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
 
@@ -64,6 +65,7 @@ class RayGenerator:
         self.lens = lens_of(camera, types[0])
         self._places = PixelPlaces(camera, types)
         self.pixels = self._places.count
+        self._placement = MILLIMETRES_AT_ORIGIN
         self._loaded: tuple[slice, list[Any], Any] | None = None  # of the last block of all pixels
         self._pitch = float(camera.pixel_pitch)
         self._crossing = None
@@ -74,8 +76,9 @@ class RayGenerator:
             self._crossing = Crosstalk(camera, models)
             self.lens.tail = self._crossing.tail
 
-    def follow(self, distance: Distance) -> None:
-        """Tell all lenses how far the surfaces of a world are."""
+    def follow(self, distance: Distance, placement: Placement) -> None:
+        """Tell all lenses how far the surfaces of a world are, and where the camera stands in it."""
+        self._placement = placement
         (self._crossing or self.lens).follow(distance)
         self.lens.captured = 1.0 if self._crossing is not None else self.lens.captured
 
@@ -165,8 +168,8 @@ class RayGenerator:
             own = dr.gather(mi.UInt32, places[1], index)
             start, direction, weight = self._crossing.emit(own, (x, y, -z), draws, (lens_x, lens_y))
         ray = dr.zeros(mi.RayDifferential3f, lanes)
-        ray.o = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
-        ray.d = dr.normalize(mi.Vector3f(*direction))
+        origin = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
+        ray.o, ray.d = self._placement.carry(origin, dr.normalize(mi.Vector3f(*direction)))
         ray.maxt = dr.largest(mi.Float)
         return ray, weight
 

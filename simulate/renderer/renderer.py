@@ -10,6 +10,7 @@ and can round up to the next one's.) Around the target, or instead of it, there 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from math import isqrt
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.scene import Sampler, Scene
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.tables.sampling import Sampler
 
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting
@@ -28,9 +30,11 @@ from ..sampling.seeds import seed_of
 from .plugins import black, depths, scene_of, stock_sensors, target_of
 from .points.grid import Grid
 from .variant import activate, check_fast_variant
+from .worlds.placement import MILLIMETRES_AT_ORIGIN
 
 if TYPE_CHECKING:
     from .rays import RayGenerator, Rays
+    from .world import StagedWorld
 
 EXACT_SUMS = 2**22, 2**50  # float32 sums of whole numbers below, and float64 ones, lose less than 1/4
 MOST_TEXELS = 2**24  # that float32 can number
@@ -44,7 +48,7 @@ class Renderer:
     channels : number of pictures that can be on the target at once, as its colours
     exact_below : limit below which sums of whole numbers are exact
     is_fast : True on the backends where the rays of many pixels start together
-    direct_only : True if interreflections in a world are left out, since nothing there reflects
+    staged : the world, if there is one
     """
 
     def __init__(
@@ -79,13 +83,9 @@ class Renderer:
             self._generators = {
                 group: RayGenerator(camera, types, sampler, world is not None) for group, types in self.groups.items()
             }
-        else:
-            far = 2.0 if world is None else FAR
-            self._sensors = {
-                group: stock_sensors(camera, types, sampler, self.channels, far) for group, types in self.groups.items()
-            }
         self._unit = 1.0  # radiance of a value of 1
-        self.direct_only = False
+        self.staged: StagedWorld | None = None
+        self._placement = MILLIMETRES_AT_ORIGIN
         self._texels = "target.emitter.radiance.data"
         self._texture: Any = None
         if world is None:
@@ -95,7 +95,18 @@ class Renderer:
             self._integrator: Any = self._scene.integrator()
         else:
             self._build_world(world, variant)
+        if not fast:
+            far = 2.0 if world is None else FAR
+            self._sensors = {
+                group: stock_sensors(camera, types, sampler, self.channels, far, self._placement)
+                for group, types in self.groups.items()
+            }
         self._parameters = mi.traverse(self._scene)
+
+    @property
+    def direct_only(self) -> bool:
+        """True if interreflections in a world are left out, since nothing there reflects."""
+        return self.staged is not None and self.staged.direct_only
 
     @property
     def has_equal_weights(self) -> bool:
@@ -226,7 +237,7 @@ class Renderer:
 
     def depths(self, pinhole: Camera, seed: int) -> FloatArray:
         """Return the distance along z of what a pinhole camera's only sub-imager sees; see `plugins.depths`."""
-        return depths(self._scene, pinhole, seed, FAR)
+        return depths(self._scene, pinhole, seed, FAR, self._placement)
 
     def hits(
         self, group: str, samples: int, seed: Callable[[int], int], block: slice, subset: IntArray | None = None
@@ -259,29 +270,18 @@ class Renderer:
         return self._generators[group].lens.captured
 
     def _build_world(self, world: Scene, variant: str) -> None:
-        """Use a world as the scene, with the target in it if it has a picture."""
-        import mitsuba as mi
+        """Use a world, whose white is a number, as the scene, with the target in it if it has a picture."""
+        from .world import TARGET, stage, white_of
 
-        from .world import TARGET, stage, world_of
-
-        self._unit = world_of(world).white / WHITE
+        self._unit = white_of(world) / WHITE
         has_target = world.target.image is not None
-        target = target_of(self.camera, black(self.camera, self.channels))
-        staged = stage(world, variant, mi.load_dict(target) if has_target else None)
-        self._scene, self._integrator, self.direct_only = staged.scene, staged.integrator, staged.direct_only
+        target = target_of(self.camera, black(self.camera, self.channels)) if has_target else None
+        staged = stage(world, variant, target)
+        self.staged, self._scene, self._integrator = staged, staged.scene, staged.integrator
+        self._placement = staged.placement
         self._texels = f"{TARGET}.{self._texels.partition('.')[2]}" if has_target else ""
         for generator in self._generators.values():
-            generator.follow(self._distance)
-
-    def _distance(self, origin: tuple[Any, Any, Any], direction: tuple[Any, Any, Any]) -> Any:
-        """Return the distance along z of the surface that rays meet first, a large one where they meet none."""
-        import drjit as dr
-        import mitsuba as mi
-
-        ray = mi.Ray3f(mi.Point3f(*origin), dr.normalize(mi.Vector3f(*direction)))
-        met = self._scene.ray_intersect_preliminary(ray, coherent=False)
-        far = FAR * self.camera.distance
-        return dr.minimum(dr.select(met.is_valid(), met.t * ray.d.z, far), far)
+            generator.follow(partial(staged.distance, far=FAR * self.camera.distance), staged.placement)
 
     def rows(self, group: str) -> slice:
         """Return the rows of H, or measurements, of a group's pixels."""

@@ -1,7 +1,8 @@
 """Worlds: Mitsuba scene files behind the flat target, or instead of it.
 
-The file is in millimetres, the camera at its origin looking along +z with +y up. Its own sensors are ignored, its
-integrator is used; without one, light is followed along paths of up to 8 segments if anything reflects it.
+The file has its own coordinates, in which the camera stands (`worlds.placement`). Its sensors are ignored but for the
+pose of one, if the scene asks for it. Its integrator is used; without one, light is followed along paths of up to 8
+segments if anything reflects it.
 """
 
 # pyright: basic
@@ -18,26 +19,41 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.scene import Scene, WorldTable
+from ommatid.scenes.scene import Scene
+from ommatid.scenes.tables.world import FROM_FILE, WorldTable
 
 from .plugins import BLOCK
 from .variant import activate
+from .worlds.placement import FINEST, Placement
 
 TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file
 BACKWARDS = "ptracer"  # the integrator that starts at the emitters, and takes no block size
+SENSORS_AT_ORIGIN = ("perspective", "thinlens", "orthographic")  # that stand there without a to_world
 DEEPEST = 8  # segments of a path, if the file has no integrator
 
 
 @dataclass(frozen=True)
 class StagedWorld:
-    """A world with the target in it as a Mitsuba scene, and its integrator.
+    """A world with the target in it as a Mitsuba scene, its integrator, and where the camera stands in it.
 
-    direct_only : True if interreflections are left out, since nothing reflects
+    direct_only : True if interreflections are left out, since nothing reflects;  sensors : number of them in the file
     """
 
     scene: Any
     integrator: Any
+    placement: Placement
+    sensors: int
     direct_only: bool = False
+
+    def distance(self, origin: tuple[Any, Any, Any], direction: tuple[Any, Any, Any], far: float) -> Any:
+        """Return the distance along z, mm, of the surface that rays meet first, `far` where they meet none."""
+        import drjit as dr
+        import mitsuba as mi
+
+        along = dr.normalize(mi.Vector3f(*direction))
+        ray = mi.Ray3f(*self.placement.carry(mi.Point3f(*origin), along))
+        met = self.scene.ray_intersect_preliminary(ray, coherent=False)
+        return dr.minimum(dr.select(met.is_valid(), met.t * (along.z * self.placement.unit), far), far)
 
 
 def world_of(scene: Scene) -> WorldTable:
@@ -50,6 +66,14 @@ def world_of(scene: Scene) -> WorldTable:
 def path_of(scene: Scene) -> Path:
     """Return the world's file on this machine. Raises ValueError for a scene without a [world]."""
     return scene.world_copy or Path(world_of(scene).file)
+
+
+def white_of(scene: Scene) -> float:
+    """Return the radiance of a value of 255. Raises ValueError if it is still to be found."""
+    white = world_of(scene).white
+    if isinstance(white, str):
+        raise ValueError(f"{scene.source}: expected world.white as a number, got '{white}'")
+    return white
 
 
 def files(scene: Scene) -> list[Path]:
@@ -95,13 +119,15 @@ def describe(scene: Scene) -> dict[str, Any]:
     for path in files(scene):
         with path.open("rb") as stream:
             sums[os.path.relpath(path, folder)] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return {"white": world.white, "target": scene.target.image is not None, "files": sums}
+    place, has_target = world.describe_place(), scene.target.image is not None
+    return {"white": world.white, "target": has_target, "files": sums, **({"place": place} if place else {})}
 
 
-def stage(scene: Scene, variant: str, target: Any | None) -> StagedWorld:
-    """Build the world, with the target's rectangle (a Mitsuba shape) in it, if there is one.
+def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWorld:
+    """Build the world, with the target's rectangle (a Mitsuba shape as a dictionary) in it, if there is one.
 
-    Raises InputError for a file that Mitsuba cannot build a scene from, and for a world without an emitter.
+    Raises InputError for a file that Mitsuba cannot build a scene from, for a world without an emitter, and for a file
+    that does not state where the camera stands if it is asked.
     """
     activate(variant)
     import mitsuba as mi
@@ -114,11 +140,14 @@ def stage(scene: Scene, variant: str, target: Any | None) -> StagedWorld:
         state = mi.parser.parse_file(config, file)
         if state.root.type != mi.ObjectType.Scene:
             raise InputError(f"{where} holds a single {state.root.type.name.lower()}; expected a whole <scene>")
+        sensors = [node.props for node in _nodes(state) if node.type == mi.ObjectType.Sensor]
+        placement = _placement(scene, sensors, where)
         has_integrator = _adapt(state, Path(file).parent)
         mi.parser.transform_all(config, state)
         if target is not None:
-            target.set_id(TARGET)  # by which its parameters are identified
-            state.root.props[TARGET] = target
+            shape: Any = mi.load_dict({**target, "to_world": placement.to_world(target["to_world"])})
+            shape.set_id(TARGET)  # by which its parameters are identified
+            state.root.props[TARGET] = shape
         built: Any = mi.parser.instantiate(config, state)
     except (RuntimeError, TypeError) as error:
         reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
@@ -128,10 +157,50 @@ def stage(scene: Scene, variant: str, target: Any | None) -> StagedWorld:
     if not has_integrator:
         direct_only = not (scene.render.complete or has_interreflections(built))
         path = {"type": "path", "max_depth": 1 if direct_only else DEEPEST, "block_size": BLOCK}
-        return StagedWorld(built, mi.load_dict(path), direct_only)
+        return StagedWorld(built, mi.load_dict(path), placement, len(sensors), direct_only)
     if not isinstance(built.integrator(), mi.SamplingIntegrator):
         raise InputError(f"{where}: its integrator does not follow rays from a camera; expected one such as 'path'")
-    return StagedWorld(built, built.integrator())
+    return StagedWorld(built, built.integrator(), placement, len(sensors))
+
+
+def _nodes(state: Any) -> list[Any]:
+    """Return the nodes of a parsed file that stand in its root."""
+    import mitsuba as mi
+
+    root, resolved = state.root.props, mi.Properties.Type.ResolvedReference
+    return [state.nodes[root[key].index()] for key in list(root.keys()) if root.type(key) == resolved]
+
+
+def _placement(scene: Scene, sensors: list[Any], where: str) -> Placement:
+    """Return where the camera stands in a file with these sensors. Raises InputError."""
+    table = world_of(scene)
+    placement = Placement.of_table(table) if table.camera != FROM_FILE else _pose_of_sensor(table, sensors, where)
+    if placement.spacing > scene.target.pixel_pitch / FINEST:
+        raise InputError(
+            f"{where}: the camera stands so far from the file's origin that float32 moves it in steps of"
+            f" {placement.spacing:.2g} mm, expected at most 1/{FINEST} of target.pixel_pitch; move the world there"
+        )
+    return placement
+
+
+def _pose_of_sensor(table: WorldTable, sensors: list[Any], where: str) -> Placement:
+    import mitsuba as mi
+
+    asks = f"{where}: world.camera = '{FROM_FILE}' takes the pose of the file's sensor"
+    if len(sensors) != 1:
+        remedy = "leave one in the file" if sensors else "add one, or state world.to_world instead"
+        raise InputError(f"{asks}: expected one sensor, got {len(sensors)}; {remedy}")
+    (props,) = sensors
+    has_pose = "to_world" in props and props.type("to_world") == mi.Properties.Type.Transform
+    if not has_pose and props.plugin_name() not in SENSORS_AT_ORIGIN:
+        raise InputError(f"{asks}: expected one with a to_world, got a '{props.plugin_name()}' without; add it there")
+    matrix = np.array(props["to_world"].matrix, dtype=np.float64) if has_pose else np.eye(4)
+    placement = Placement.of_sensor(matrix, table)
+    if placement is None:
+        raise InputError(
+            f"{asks}: expected a to_world that moves and rotates, got one that shears or stretches; correct it there"
+        )
+    return placement
 
 
 def _adapt(state: Any, folder: Path) -> bool:

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ommatid.batch import job_files
-from ommatid.batch.array_job import ArrayJob, read_job
 from ommatid.batch.batch import Member
-from ommatid.batch.job_plan import FOLDER, EndedScene, JobShare, join_jobs, shares
+from ommatid.batch.jobs import job_files
+from ommatid.batch.jobs.array_job import ArrayJob, read_job
+from ommatid.batch.jobs.job_plan import FOLDER, EndedScene, JobShare, join_jobs, shares
 from ommatid.runtime.errors import InputError
 
 SCENES = 7

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,8 +16,9 @@ from ommatid.analysis.predict import predict_scene
 from ommatid.analysis.prediction_table import json_of
 from ommatid.batch import sweep_figure
 from ommatid.batch.sweep import SweepAxis, members, sweep_axes
-from ommatid.batch.sweep_row import read_rows, summary
-from ommatid.batch.sweep_table import write_sweep
+from ommatid.batch.sweep_row import SweepRow, read_rows, summary
+from ommatid.batch.sweep_table import lines, write_sweep
+from ommatid.figures.saving import FigureFiles
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import read
 from ommatid.scenes.tables.overrides import value_of
@@ -183,23 +185,86 @@ def test_a_damaged_table_is_refused(content: str, tmp_path: Path) -> None:
 # --- the figure
 
 
-@pytest.mark.parametrize(
-    ("values", "positions", "unit", "logarithmic", "categories"),
-    [
-        (["1e-6", "1e-4", "1e-2"], [1e-6, 1e-4, 1e-2], "squared units of f", True, False),
-        (["1", "2", "4"], [1, 2, 4], "squared units of f", False, False),
-        (["0.1 mm", "0.2 mm"], [0.1, 0.2], "mm", False, False),
-        (["0.1 mm", "200 um"], [0, 1], "", False, True),
-        (["1/2", "1/3", "1/5"], [0, 1, 2], "", False, True),
-        (["-1", "0", "100"], [-1, 0, 100], "squared units of f", False, False),
-    ],
-)
-def test_numbers_of_one_unit_have_a_numeric_axis(
-    values: list[str], positions: list[float], unit: str, logarithmic: bool, categories: bool
-) -> None:
-    axis = sweep_figure.scale("noise.variance", values)
-    assert [axis.positions[value] for value in values] == positions
-    assert (axis.unit, axis.logarithmic, axis.categories) == (unit, logarithmic, categories)
+def test_every_curve_has_a_colour_and_the_error_both_scales(rows_of_tolerance: list[SweepRow], tmp_path: Path) -> None:
+    figure = drawn(rows_of_tolerance, tmp_path)
+    [panel] = figure.axes
+    assert (panel.get_xscale(), panel.get_yscale()) == ("log", "log")
+    assert panel.get_xlabel() == "camera.tolerance.position (nm)"
+    assert [label.get_text() for label in panel.get_xticklabels()] == ["1", "10", "100", "1000"]
+    [right] = panel.child_axes
+    figure.canvas.draw()
+    assert np.square(right.get_ylim()) == pytest.approx(panel.get_ylim())
+    for axes in (panel, right):
+        assert "grey levels" in axes.get_ylabel()
+        assert len(inside(axes.yaxis)) > 1
+    legend = " ".join(text.get_text() for text in figure.legends[0].get_texts())
+    assert "ideal (H as designed, not calibrated)" in legend
+    assert "transport (calibrated by rays)" in legend
+
+
+def inside(axis: Any) -> list[float]:
+    low, high = sorted(axis.get_view_interval())
+    return [tick for tick in axis.get_ticklocs() if low <= tick <= high]
+
+
+def test_measured_points_are_at_their_values(rows_of_tolerance: list[SweepRow], tmp_path: Path) -> None:
+    """Points on the finished figure, in pixels, map back to lengths in nm and to measured errors."""
+    panel = drawn(rows_of_tolerance, tmp_path).axes[0]
+    points: list[Any] = []
+    for line in panel.lines:
+        if line.get_marker() == "o":
+            place = line.get_transform().transform(line.get_xydata())
+            points += panel.transData.inverted().transform(place).tolist()
+    lengths = {value: 10.0**power for power, value in enumerate(POSITIONS)}
+    expected = [[lengths[row.values["camera.tolerance.position"]], row.mse] for row in rows_of_tolerance]
+    assert np.sort(points, axis=0) == pytest.approx(np.sort(np.array(expected, dtype=float), axis=0), rel=1e-9)
+
+
+def test_a_sweep_says_where_the_error_is_twice_the_smallest(rows_of_tolerance: list[SweepRow]) -> None:
+    """Between decades the logarithm is interpolated, which is exact for the power that these errors follow."""
+    axis, found = sweep_figure.crossings(rows_of_tolerance)
+    assert [crossing.values["calibration.method"] for crossing in found] == ["ideal", "transport"]
+    assert [crossing.position for crossing in found] == pytest.approx([2**0.5, 200**0.5], rel=1e-9)
+    assert axis.words(found[1].position) == "14 nm"
+    printed = [value for name, value in lines(rows_of_tolerance) if "twice the smallest" in name]
+    assert printed[0] == "at camera.tolerance.position = 1.4 nm, calibration.method = ideal"
+    named = [
+        row.model_copy(update={"values": {"render.sampler": name}}) for name, row in zip("abc", NAMED, strict=True)
+    ]
+    assert sweep_figure.crossings(named)[1] == []
+
+
+POSITIONS = ("1 nm", "10 nm", "100 nm", "1 um")
+NAMED = [SweepRow(scene="a.toml", values={}, predicted_mse=float(error)) for error in (1, 2, 4)]
+
+
+@pytest.fixture
+def rows_of_tolerance() -> list[SweepRow]:
+    """Errors of the square of the tolerance, uncalibrated, and a tenth of the length's effect, calibrated."""
+    return [
+        SweepRow(
+            scene="a.toml",
+            values={"camera.tolerance.position": length, "calibration.method": method},
+            predicted_mse=max(1.0, (10.0**power / scale) ** 2),
+            mse=1.1 * max(1.0, (10.0**power / scale) ** 2),
+        )
+        for power, length in enumerate(POSITIONS)
+        for method, scale in (("ideal", 1.0), ("transport", 10.0))
+    ]
+
+
+class FigureKept(FigureFiles):
+    """Keeps the figure that is to be written."""
+
+    def replace(self, figure: Any, path: Path) -> None:
+        assert path.suffix == ".png"
+        object.__setattr__(self, "figure", figure)
+
+
+def drawn(rows: list[SweepRow], folder: Path) -> Any:
+    kept: Any = FigureKept()
+    sweep_figure.write_figure(folder / "sweep.png", rows, kept)
+    return kept.figure
 
 
 def documents_of(swept: dict[str, list[str]]) -> list[dict[str, Any]]:
@@ -215,24 +280,21 @@ def documents_of(swept: dict[str, list[str]]) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_every_row_of_a_sweep_is_drawn_and_read_again(
-    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_row_of_a_sweep_is_drawn_and_read_again(count: int, tmp_path: Path) -> None:
     keys: dict[str, list[str]] = {
         "noise.variance": list(NOISES),
         "prior.variance": ["1", "2"],
         "render.seed": ["1", "2"],
     }
     rows = [summary(description) for description in documents_of(dict(list(keys.items())[:count]))]
-    panels: list[Any] = []
-    monkeypatch.setattr(sweep_figure, "_label_axes", lambda *arguments: panels.append(arguments[0]))
     write_sweep(tmp_path, rows)
-    [panel] = panels
+    [panel] = drawn(rows, tmp_path).axes
+    curves = [line for line in panel.lines if len(line.get_xdata()) == len(NOISES)]
     for name, is_line in (("mse", False), ("predicted_mse", True)):
-        lines = [line for line in panel.lines if (line.get_marker() == "None") == is_line]
-        heights = sorted(float(y) for line in lines for y in line.get_ydata())
+        of_kind = [line for line in curves if (line.get_marker() == "None") == is_line]
+        heights = sorted(float(y) for line in of_kind for y in line.get_ydata())
         assert heights == sorted(getattr(row, name) for row in rows)
-    styles = {(str(line.get_color()), line.get_linestyle()) for line in panel.lines if line.get_marker() == "None"}
+    styles = {(str(line.get_color()), line.get_linestyle()) for line in curves if line.get_marker() == "None"}
     assert len(styles) == len(rows) / len(NOISES), "every combination of the other keys has a line of its own"
     typed = [{key: float(text) for key, text in row.values.items()} for row in rows]
     expected = [row.model_copy(update={"values": values}) for row, values in zip(rows, typed, strict=True)]

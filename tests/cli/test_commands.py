@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import platform
 import shutil
 import signal
 import subprocess
 import sys
 import tomllib
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +18,7 @@ import pytest
 
 from ommatid.pipeline.calibration import calibrate_file
 from ommatid.pipeline.stages import export_scene
+from ommatid.reconstruct.output.single_sub_image import best_single_sub_image
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import stack
@@ -74,7 +77,8 @@ def test_predict_gives_the_values_of_the_reference(
     ended = ommatid(
         "predict", GALLERY / f"{scene}.toml", "--no-rays", "--set", "noise.variance=1e-6", *options, "--json"
     )
-    predicted = document(ended)
+    (predicted,) = document(ended)
+    assert predicted.pop("scene") == str(GALLERY / f"{scene}.toml")
     keys = ["measurements", "unknowns", "rank", "null_space", "condition", "mse", "trimmed_mse", "trim"]
     assert list(predicted)[:8] == keys
     others = {"degrees_of_freedom", "resolution", "method", "prior_variance", "assumes", "recovers_nothing"}
@@ -101,19 +105,19 @@ def arguments(command: str, finished: Path) -> list[str | Path]:
 def test_json_is_the_only_output_on_stdout(command: str, here: Path, finished: Path) -> None:
     # A new process, since libraries may print when they are loaded and unloaded.
     ended = shell(*arguments(command, finished), "--json", cwd=here)
-    assert isinstance(document(ended), list if command in ("run", "render") else dict)
+    assert isinstance(document(ended), list if command in ("run", "render", "predict") else dict)
     assert "Traceback" not in ended.err
 
 
 @pytest.mark.parametrize("command", ["run", "predict", "show", "reconstruct"])
-def test_without_json_there_is_a_table_with_the_title(
+def test_without_json_the_results_are_printed_for_reading(
     command: str, here: Path, finished: Path, ommatid: Command
 ) -> None:
     assert here.is_dir()
     ended = ommatid(*arguments(command, finished))
     assert ended.code == 0
-    assert ("estimate.exr" if command == "reconstruct" else "Tiny") in ended.out
-    assert "measure" in ended.out
+    assert {"run": "tiny", "reconstruct": "estimate.exr"}.get(command, "Tiny") in ended.out
+    assert ("grey levels RMS" if command != "show" else "measurements") in ended.out
 
 
 @pytest.mark.parametrize("title", ["[/x]", "[red]hot", ":smile: and [[brackets]]"])
@@ -187,6 +191,20 @@ def test_run_json_agrees_with_the_images(finished: Path) -> None:
     assert error["psnr"] == pytest.approx(10 * np.log10(255**2 / measured), rel=single)
     assert error["predicted_mse"] == pytest.approx(maps["variance"].mean(), rel=single)
     np.testing.assert_array_equal(maps["truth"], channels(finished / "truth.exr")["Y"])
+
+
+def test_run_json_says_what_one_sub_image_alone_yields_and_who_computed_when(finished: Path) -> None:
+    run = json.loads((finished / "run.json").read_text(encoding="utf-8"))
+    error, baseline = run["error"], run["error"]["baseline"]
+    recorded, truth = stack.read(finished / "stack.exr"), channels(finished / "truth.exr")["Y"].astype(np.float64)
+    best = best_single_sub_image(recorded, truth)
+    assert best is not None
+    assert baseline == pytest.approx({"sub_imager": best.name, "mse": best.mse, "psnr": best.psnr, "ssim": best.ssim})
+    assert error["gain"] == pytest.approx(10 * np.log10(baseline["mse"] / error["mse"]))
+    assert run["command"] == ["ommatid", "run", "tiny.toml", "-o", "out"]
+    assert run["host"] == platform.node()
+    age = datetime.now(UTC) - datetime.fromisoformat(run["date"])
+    assert timedelta(0) <= age < timedelta(days=1)
 
 
 def test_the_scene_in_the_folder_reproduces_the_stack(here: Path, finished: Path, ommatid: Command) -> None:

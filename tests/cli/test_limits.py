@@ -15,10 +15,9 @@ import pytest
 from ommatid.runtime.errors import InputError, shortened, shortened_repr
 from ommatid.runtime.memory import check_memory, free_memory
 from ommatid.scenes import camera, model_file, scene, stack
-from ommatid.scenes.formats import exr, npz, picture
+from ommatid.scenes.formats import exr, lens_file, npz, picture
 from ommatid.scenes.hardware import frames
 from ommatid.scenes.optics.blur import blur_of
-from ommatid.scenes.tables import lens_file
 
 from ..conftest import TINY, Command, shell
 from ..examples import scene as example

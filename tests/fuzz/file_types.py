@@ -15,9 +15,8 @@ import numpy as np
 
 from ommatid.runtime.files import digest
 from ommatid.scenes import camera, model_file, scene, stack
-from ommatid.scenes.formats import curve, picture
+from ommatid.scenes.formats import curve, lens_file, picture
 from ommatid.scenes.hardware import frames, source_positions
-from ommatid.scenes.tables import lens_file
 from ommatid.scenes.zemax.agf import read_catalogue
 
 from ..conftest import TINY

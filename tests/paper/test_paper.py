@@ -25,6 +25,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables.sensor import NoiseTable
 
 from ..examples import familywise
+from ..printed_figures import check_figures
 
 
 @dataclass(frozen=True)
@@ -275,6 +276,13 @@ def test_the_printed_table_names_every_claim(written: Written) -> None:
     for claim in written.description["claims"]:
         own = "" if claim["source"] == "paper" else "not in the paper, "
         assert lines[claim["claim"]].startswith(own + claim["holds"])
+
+
+def test_the_page_states_what_trimming_removes(written: Written) -> None:
+    claims = [written.claim(f"three types: trimming the {side} x {side} tile")["numbers"] for side in (35, 19)]
+    large, small = ([100 * value for _, value in sorted(numbers.items(), reverse=True)] for numbers in claims)
+    check_figures("paper.md", "removes {} % of the error with three types and {} % with two", *reversed(large))
+    check_figures("paper.md", "19 x 19 tile ({} % and {} %)", *reversed(small))
 
 
 def test_claims_fail_on_swapped_tiles(computed: Tiles) -> None:

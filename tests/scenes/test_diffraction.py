@@ -11,6 +11,8 @@ from ommatid.scenes.optics.blur import Blur, transfer
 from ommatid.scenes.optics.diffraction import TAIL, Pattern, pattern
 from ommatid.scenes.optics.radial_density import NODES, panel_nodes
 
+from ..printed_figures import check_figures
+
 Numbers = NDArray[np.float64]
 
 WAVES = [0.0, 0.1, 0.3, 1.0, 3.0, 20.0]
@@ -34,6 +36,12 @@ def modulation(psf: Pattern, q: float) -> float:
 def test_the_strehl_ratio_of_defocus_is_its_squared_sinc(waves: float) -> None:
     v = np.array([1e-4])
     assert 2 * pattern(waves).spread(v)[0] / v[0] == pytest.approx(np.sinc(waves) ** 2, abs=1e-8)
+
+
+def test_the_strehl_ratio_of_the_documentation() -> None:
+    v = np.array([1e-4])
+    strehl = 2 * pattern(0.21).spread(v)[0] / v[0]
+    check_figures("diffraction.md", "with 0.21 waves of defocus, the Strehl ratio is {};", strehl)
 
 
 @pytest.mark.parametrize(("waves", "strehl", "half"), [(0.085, 0.98, 0.378), (0.21, 0.87, 0.318), (0.33, 0.69, 0.226)])

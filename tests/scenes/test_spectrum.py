@@ -17,6 +17,7 @@ from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import Scene, parse, read, with_changes, write
 
 from ..examples import scene
+from ..printed_figures import check_figures
 
 # By hand: 500 lux on a white target, a lens 0.1 mm wide 1.2 mm before a pixel of 6 um x 6 um, 10 ms.
 # E / pi x pi sin^2 x area x time, sin^2 = 0.05^2 / (0.05^2 + 1.2^2) = 1.73310e-3:
@@ -61,6 +62,16 @@ def test_electrons_of_one_wavelength_are_those_by_hand(light: str) -> None:
     """The pixel is wide enough that cos^4 takes 1e-5 of its light."""
     assert white(lit(light)) == pytest.approx(BY_HAND[light], rel=3e-5)
     assert white(lit(wavelength=light)) == pytest.approx(BY_HAND[light], rel=3e-5)
+
+
+def test_the_table_of_the_documentation() -> None:
+    lights = ("450 nm", "550 nm", "650 nm", "D65", "LED-B3")
+    row = {light: (spectrum.efficacy(lit(light)[0]), white(lit(light))) for light in lights}
+    check_figures("noise.md", '| `"450 nm"` | {} | {} |', *row["450 nm"])
+    check_figures("noise.md", '| `"550 nm"`, the default | {} | {} |', *row["550 nm"])
+    check_figures("noise.md", '| `"650 nm"` | {} | {} |', *row["650 nm"])
+    check_figures("noise.md", '| `"D65"` | {} | {} |', *row["D65"])
+    check_figures("noise.md", '| `"LED-B3"` | {} | {} |', *row["LED-B3"])
 
 
 def test_electrons_of_daylight_are_those_by_hand() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ommatid.scenes.tables.lens_file import read_lens
+from ommatid.scenes.formats.lens_file import read_lens
 from ommatid.simulate.lenses.prescription import Prescription, prescribe
 from ommatid.simulate.lenses.ray_trace import Disk, trace_path
 

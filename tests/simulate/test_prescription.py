@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.lens_file import read_lens
 from ommatid.scenes.scene import read, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface
-from ommatid.scenes.tables.lens_file import read_lens
 from ommatid.simulate.lenses.prescription import Prescription, prescribe, prescription_of
 
 from ..examples import GALLERY

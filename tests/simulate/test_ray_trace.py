@@ -49,7 +49,7 @@ def crossing(lens: Prescription, height: Any) -> Array:
 
 
 def double_gauss(tmp_path: Any) -> Prescription:
-    from ommatid.scenes.tables.lens_file import read_lens
+    from ommatid.scenes.formats.lens_file import read_lens
 
     (tmp_path / "gauss.dat").write_text(DOUBLE_GAUSS, encoding="utf-8")
     return prescribe(read_lens(tmp_path / "gauss.dat"))

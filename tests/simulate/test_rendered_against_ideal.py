@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ommatid.scenes.camera import derive
-from ommatid.scenes.scene import Sampler, parse
+from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.sampling import Sampler
 from ommatid.simulate.calibration.point_sources import responses_from_points
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, light

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +10,10 @@ import pytest
 from ommatid.analysis.depth_error import disparity
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.formats.picture import load
-from ommatid.scenes.scene import TRUTH, Scene, parse
+from ommatid.scenes.scene import TRUTH, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.cache import cached_stack
 from ommatid.simulate.ground_truth import truth
@@ -22,52 +21,11 @@ from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, light
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.renderer.world import files, has_interreflections, stage
-from ommatid.simulate.sampling.passes import rounding_variance
 
 from ..conftest import TINY, Command
-from ..examples import GALLERY, VARIANTS, Lenses, assert_student, needs
+from ..examples import GALLERY, VARIANTS, assert_student, needs
 from ..examples import scene as flat_scene
-
-Z = 1000.0
-FAST = "llvm_ad_mono"
-THIRDS: Lenses = (("1/3", [3, 3], [3, 3]), ("1/4", [2, 2], [2, 2]))
-
-
-def glow(radiance: object) -> str:
-    return f'<emitter type="area"><float name="radiance" value="{radiance}"/></emitter>'
-
-
-def rectangle(width: float, height: float, x: float, y: float, z: float, rest: str) -> str:
-    """Return a rectangle that faces the camera; `rest` is its material."""
-    return f"""<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/>
-        <scale x="{width / 2}" y="{height / 2}"/><translate x="{x}" y="{y}" z="{z}"/></transform>{rest}</shape>"""
-
-
-def cube(x: float, y: float, z: float, half: float, rest: str) -> str:
-    return f"""<shape type="cube"><transform name="to_world"><scale x="{half}" y="{half}" z="0.05"/>
-        <translate x="{x}" y="{y}" z="{z}"/></transform>{rest}</shape>"""
-
-
-def world(
-    folder: Path, content: str, lenses: Lenses = THIRDS, target: dict[str, Any] | None = None, **more: Any
-) -> tuple[Scene, Camera]:
-    """Return a scene of 12 x 12 pixels of 1 mm at 1 m in front of a world of this content, and its camera."""
-    path = folder / "world.xml"
-    path.write_text(f'<scene version="3.0.0">{content}</scene>', encoding="utf-8")
-    data = flat_scene((12, 12), lenses, render={"variant": more.pop("variant", FAST), "samples": 256}).plain()
-    data["world"] = {"file": str(path), "white": more.pop("white", 1.0)}
-    data["target"] |= target or {}
-    if target is None:
-        del data["target"]["image"], data["target"]["origin"]
-    for name, table in more.items():
-        data[name] = {**data[name], **table}
-    described = parse(data, Path("test.toml"))
-    return described, derive(described)
-
-
-def floored(rendering: Rendering) -> Any:
-    return np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
-
+from .world_files import FAST, THIRDS, Z, cube, floored, glow, rectangle, world
 
 CHECKS = (
     '<emitter type="area"><texture type="checkerboard" name="radiance"><float name="color0" value="1.6"/>'

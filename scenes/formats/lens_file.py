@@ -20,13 +20,13 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
 
+from ..tables import glass, toml
+from ..tables.camera import CameraTable, Surface
+from ..tables.messages import explain
+from ..tables.table import Table
+from ..tables.units import pair
 from ..zemax.agf import Catalogue, read_catalogue
 from ..zemax.zmx import read_zmx
-from . import glass, toml
-from .camera import CameraTable, Surface
-from .messages import explain
-from .table import Table
-from .units import pair
 
 COLUMNS = "radius, thickness, index of refraction, diameter"
 

@@ -18,10 +18,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import make_folder
 
+from ..batch import Member
+from ..sweep_row import SweepRow
 from .array_job import ArrayJob
-from .batch import Member
 from .job_files import claimed_text, replace_text
-from .sweep_row import SweepRow
 
 Result = TypeVar("Result")
 

@@ -1,0 +1,1 @@
+"""Where a Mitsuba scene stands before the camera, and what the camera sees of it."""

@@ -1,0 +1,58 @@
+"""Axes of swept keys: positions in one unit, logarithmic from a decade on, names side by side."""
+
+from __future__ import annotations
+
+import pytest
+
+from ommatid.figures.quantity_axis import quantity_axis, spans_decade
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "positions", "title", "logarithmic"),
+    [
+        ("noise.variance", ["1e-6", "1e-4"], [1e-6, 1e-4], "noise.variance (grey levels squared)", True),
+        ("noise.bits", ["6", "8", "12"], [6, 8, 12], "noise.bits (bits)", False),
+        ("camera.tolerance.position", ["1 nm", "30 nm", "1 um"], [1, 30, 1000], "camera.tolerance.position (nm)", True),
+        ("camera.lens.I.aperture", ["0.1 mm", "200 um"], [0.1, 0.2], "camera.lens.I.aperture (mm)", False),
+        ("camera.lens_pitch", ["500 µm", "1 mm", "600um"], [500, 1000, 600], "camera.lens_pitch (µm)", False),
+        ("render.time", ["1 s", "2 min"], [1, 120], "render.time (s)", True),
+        ("camera.tolerance.tilt", ['"1 deg"', '"2 mrad"', '"1 mrad"'], [17.4532925, 2, 1], None, True),
+        ("prior.mean", ["-1", "0", "100"], [-1, 0, 100], "prior.mean (grey levels)", False),
+        ("x", ["1/2", "1/3", "0.25"], [0.5, 1 / 3, 0.25], "x", False),
+    ],
+)
+def test_numbers_and_quantities_are_at_their_sizes(
+    key: str, values: list[str], positions: list[float], title: str | None, logarithmic: bool
+) -> None:
+    axis = quantity_axis(key, values)
+    assert [axis.positions[value] for value in values] == pytest.approx(positions)
+    assert (axis.logarithmic, axis.categories) == (logarithmic, False)
+    assert title is None or axis.title == title
+
+
+@pytest.mark.parametrize(
+    "values", [["ideal", "points"], ["1 mm", "1 s"], ["1 mm", "2"], ["[2, 2]", "[3, 3]"], ["nan", "1"], ["1e999", "1"]]
+)
+def test_names_and_mixed_kinds_are_categories(values: list[str]) -> None:
+    axis = quantity_axis("some.key", values)
+    assert list(axis.positions.values()) == [0.0, 1.0]
+    assert axis.categories
+    assert not axis.logarithmic
+    assert axis.title == "some.key"
+
+
+def test_huge_powers_of_ten_take_no_time() -> None:
+    assert quantity_axis("x", ["1e-999999999", "1"]).positions == {"1e-999999999": 0.0, "1": 1.0}
+
+
+def test_a_decade_is_a_factor_of_ten() -> None:
+    assert spans_decade([1e-9, 1e-8])
+    assert not spans_decade([1.0, 9.99])
+    assert not spans_decade([0.0, 100.0])
+
+
+def test_positions_between_values_are_said_with_their_unit() -> None:
+    assert quantity_axis("x", ["1 nm", "1 um"]).words(162.03) == "160 nm"
+    assert quantity_axis("noise.bits", ["6", "12"]).words(8.04) == "8 bits"
+    assert quantity_axis("x", ["1 nm", "100 nm"]).between(1, 100, 0.5) == pytest.approx(10)
+    assert quantity_axis("x", ["1", "3"]).between(1, 3, 0.5) == pytest.approx(2)

@@ -1,0 +1,91 @@
+"""The overview of a result: its headline, and no empty slot whatever is known."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ommatid.figures.saving import FigureFiles
+from ommatid.reconstruct.output import run_json, verdict_words
+from ommatid.reconstruct.output.overview import OVERVIEW, grid, headline, write_overview
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.scenes import stack as stack_file
+from ommatid.scenes.formats import exr
+
+
+@pytest.mark.parametrize("count", range(3, 25))
+def test_the_last_panel_fills_what_is_left(count: int) -> None:
+    rows, columns = grid(count)
+    assert rows * columns >= count > (rows - 1) * columns, "the last row begins with a panel of its own"
+
+
+class KeptFigure(FigureFiles):
+    """Keeps the figure and writes nothing."""
+
+    def replace(self, figure: Any, path: Path) -> None:
+        assert path.name == OVERVIEW
+        object.__setattr__(self, "figure", figure)
+
+
+def drawn(folder: Path, report: RunReport | None = None) -> Any:
+    kept: Any = KeptFigure()
+    stack = stack_file.read(folder / "stack.exr")
+    write_overview(folder, stack, run_json.read(folder) if report is None else report, kept)
+    return kept.figure
+
+
+@pytest.fixture(scope="module")
+def without_truth(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = shutil.copytree(finished, tmp_path_factory.mktemp("overview") / "run")
+    [part] = exr.read(folder / "estimate.exr")
+    maps = {name: part.channels[name] for name in ("estimate", "variance")}
+    exr.write(folder / "estimate.exr", [exr.Part("estimate", maps, part.record)])
+    return folder
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_every_slot_is_filled_and_every_axis_has_a_unit(known: bool, finished: Path, without_truth: Path) -> None:
+    figure = drawn(finished if known else without_truth)
+    panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
+    specs = [axes.get_subplotspec().get_topmost_subplotspec() for axes in panels]
+    cells = [cell for spec in specs for cell in range(spec.num1, spec.num2 + 1)]
+    rows, columns = specs[0].get_gridspec().get_geometry()
+    assert sorted(cells) == list(range(rows * columns))
+    titles = " ".join(axes.get_title() for axes in panels)
+    assert ("Truth" in titles, "Error: estimate" in titles) == (known, known)
+    for axes in figure.axes:
+        labels = [axes.get_xlabel(), axes.get_ylabel()]
+        assert any(label.endswith(("pixels)", "(%)", "levels)", "(0 to 255)")) for label in labels), labels
+
+
+def test_the_headline_is_the_verdict_and_the_error(finished: Path) -> None:
+    report = run_json.read(finished)
+    error = report.error
+    assert error.mse is not None
+    assert error.expected_given_truth is not None
+    root, expected = error.mse**0.5, error.expected_given_truth.mse**0.5
+    assert headline(report).startswith(f"RMS error {root:.3g} grey levels, expected {expected:.3g}")
+    words = [text.get_text() for text in drawn(finished).texts]
+    heading = verdict_words.heading(report).capitalize()
+    assert any(text.startswith(f"{heading}: RMS error") for text in words)
+
+
+@pytest.mark.parametrize(("gain", "words"), [(8.25, "8.2 dB better than"), (-1.5, "1.5 dB worse than"), (None, None)])
+def test_the_gain_over_the_best_single_sub_image_is_said(gain: float | None, words: str | None, finished: Path) -> None:
+    report = run_json.read(finished)
+    error = report.error.model_copy(update={"gain": gain})
+    if "gain" not in type(error).model_fields:
+        pytest.skip("run.json has no gain yet")
+    said = headline(report.model_copy(update={"error": error}))
+    assert (f"{words} the best single sub-image" in said) if words else ("sub-image" not in said)
+
+
+def test_without_the_truth_the_error_is_expected(finished: Path) -> None:
+    document = json.loads((finished / run_json.RUN).read_text(encoding="utf-8"))
+    document["error"] = {name: document["error"][name] for name in ("predicted_mse", "budget")}
+    report = RunReport.model_validate(document)
+    assert headline(report) == f"expected RMS error {report.error.predicted_mse**0.5:.3g} grey levels"

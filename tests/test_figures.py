@@ -1,0 +1,340 @@
+"""Figures that the pages state: those of the commands that print them, and no others.
+
+Those marked `figures` take minutes: `make figures` runs them, and `make docs` does before it builds the pages.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ommatid
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics.radiometry import electrons
+from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.lenses.etendue import transmissions
+from ommatid.simulate.renderer.variant import unusable_reason
+
+from .benchmarks import f_numbers
+from .conftest import Command, shell
+from .documentation import PAGES, Block, blocks, page_name, text_of
+from .examples import GALLERY
+from .printed_figures import check_figures, is_printed, rounds_to, stated_figures, unchecked_decimals
+
+STARTER = str(GALLERY / "starter.toml")
+needs_fast_backend = pytest.mark.skipif(bool(unusable_reason("llvm_ad_mono")), reason="needs the fast backend")
+
+# Decimal numbers of these sections are no output of a command of the page. A section of `None`: all of a page.
+NOT_PRINTED: dict[tuple[str, str | None], str] = {
+    ("README.md", "Two commands"): "the version of Python",
+    ("docs/install.md", "Install"): "the version of Python",
+    ("docs/speed.md", None): "times and ratios of `make bench`",
+    ("docs/batches.md", "Many frames of one camera"): "ratios of times, `python -m tests.benchmarks film`",
+    ("docs/frames.md", "Time and memory"): "times and memory, `python -m tests.benchmarks frames`",
+    ("docs/frames.md", "Whole frames"): "defaults and limits of the program",
+    ("docs/frames.md", "Error bars"): "experiments against exact solutions, which no command prints",
+    ("docs/frames.md", "Tiles"): "experiments against exact solutions, which no command prints",
+    ("docs/calibration.md", "H by few numbers"): "experiments against the true H, which no command prints",
+    ("docs/calibration.md", "Learnt kernels"): "`python -m tests.benchmarks.learnt_kernels`, twenty seeds",
+    ("docs/diffraction.md", "One wavefront"): "constants of the text",
+    ("docs/diffraction.md", "Which f-number"): "f-numbers",
+    ("docs/lenses.md", "A real lens"): "an experiment against the closed form, 65,536 rays of every pixel",
+    ("docs/lenses.md", "Walls"): "worlds with 16384 samples, an hour",
+    ("docs/lenses.md", "Misalignment"): "constants of the text",
+    ("docs/noise.md", "Light"): "constants of the text",
+    ("docs/paper.md", "Assumptions"): "constants of the text",
+    ("docs/pictures.md", "Values"): "constants of the text",
+    ("docs/priors.md", "Priors"): "constants of the text",
+    ("docs/scene-file.md", "`[camera.tolerance]`"): "constants of the text",
+    ("docs/scene-file.md", "`[sensor]`"): "constants of the text",
+    ("docs/time.md", "As many as are needed"): "experiments with the samplers, which no command prints",
+    ("docs/trust.md", "The held-out check"): "constants of the text",
+    ("docs/trust.md", "Coverage"): "the table of `python -m tests.benchmarks coverage`, six hours",
+    ("docs/trust.md", "Limits of the error bar"): "the table of `python -m tests.benchmarks coverage`, six hours",
+    ("docs/troubleshooting.md", "Memory"): "an order of magnitude",
+    ("docs/units.md", "Positions of the sub-imagers"): "stated and printed in the Python block before it",
+}
+
+
+@cache
+def predicted(name: str, *changes: str, lens: str = "") -> float:
+    """Return the expected error of Eq. 5 as `predict --no-rays` prints it."""
+    return ommatid.predict(ommatid.read_scene(name, set=changes, lens=lens), rays=False).mse
+
+
+def camera_of(name: str) -> Camera:
+    return derive(ommatid.read_scene(name))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("figures")
+
+
+def ran(folder: Path, name: str, *changes: str) -> RunReport:
+    """Return run.json of a run of a scene of the gallery with changes."""
+    scene = ommatid.read_scene(name, set=changes)
+    return ommatid.run(scene, folder / re.sub(r"\W+", "-", "-".join([name, *changes]))).summary
+
+
+# --- sentences of the pages
+
+
+def test_the_photograph_of_the_readme() -> None:
+    camera = camera_of("photo")
+    check_figures("README.md", "it shows {} pixels reconstructed from fifty", camera.unknowns)
+    assert len(camera.sub_imagers) == 50
+
+
+def test_the_error_is_proportional_to_the_noise() -> None:
+    check_figures("noise.md", "it is {} for `tile19`", predicted("tile19", "noise.variance=1e-6") / 1e-6)
+
+
+def test_which_type_to_add(ommatid: Command) -> None:
+    result = json.loads(ommatid("design", "tile19", "--lens", "I", "--candidates", "1/2,1/4,1/5", "--json").out)
+    errors = {candidate["magnification"]: candidate["expected"]["mse"] for candidate in result["candidates"]}
+    alone = predicted("tile19", lens="I")
+    check_figures("camera.md", "Type I alone leaves an error of {}.", alone)
+    check_figures(
+        "camera.md",
+        "A second type of 1/2 reduces it to {}, 1/4 to {}, and 1/5 to {}.",
+        *(errors[magnification] for magnification in ("1/2", "1/4", "1/5")),
+    )
+
+
+@pytest.mark.parametrize(("lens", "count"), [("I", 0), ("II", 1), ("III", 2)])
+def test_electrons_of_white_pixels(lens: str, count: int) -> None:
+    scene = ommatid.read_scene("sensor")
+    camera = derive(scene)
+    types = np.concatenate([np.full(np.prod(sub.type.pixels), sub.type.name) for sub in camera.sub_imagers])
+    collected = 255 * electrons(scene, camera)[types == lens].mean()
+    sentence = "a white pixel collects {} electrons behind lens type I, {} behind II and {} behind III"
+    assert rounds_to(collected, stated_figures("noise.md", sentence)[count])
+
+
+def test_light_that_surfaces_reflect() -> None:
+    lost = [100 * (1 - transmissions(camera_of(name))["I"]) for name in ("planoconvex", "doublet")]
+    check_figures("lenses.md", "`planoconvex` loses {} % of the light and `doublet` {} %", *lost)
+
+
+def test_which_f_number() -> None:
+    """Errors are the trace of (H^T H)^-1 here, that of Eq. 5 over a noise variance that goes to zero."""
+    stated = (0.1, 0.2, 0.25, 0.3, 0.4)
+    errors: list[float] = []
+    for ratio in stated:
+        camera = f_numbers.camera_of("perfect", ratio * f_numbers.PITCH / 550e-6, "550 nm")
+        singular = np.linalg.svd(ideal_matrix(camera).toarray(), compute_uv=False)
+        errors.append(np.sum(singular**-2.0) / camera.unknowns)
+    perfect = predicted("tile19", "noise.variance=1e-6") / 1e-6
+    check_figures("diffraction.md", "in sensor pixels | 0 | {} | {} | {} | {} | {} |\n| ---", *stated)
+    airy = [2 * 1.21967 * ratio for ratio in stated]
+    check_figures("diffraction.md", "| Airy disk, in sensor pixels | 0 | {} | {} | {} | {} | {} |", *airy)
+    check_figures(
+        "diffraction.md", "| expected error over noise variance | {} | {} | {} | {} | {} | {} |", perfect, *errors
+    )
+
+
+# --- sentences about runs, which take minutes
+
+
+@pytest.mark.figures
+@needs_fast_backend
+def test_the_first_camera(folder: Path) -> None:
+    check_figures("first-camera.md", "`predict --no-rays` computes {}, which is the effect", predicted(STARTER))
+    error = ran(folder, STARTER, "render.samples=4096", "calibration.samples=4096").error
+    assert error.expected_given_truth is not None
+    check_figures(
+        "first-camera.md",
+        "the measured error is {}, the predicted error {}, and the interval {} to {}.",
+        *(float(error.mse or 0), error.predicted_mse, error.expected_given_truth.low, error.expected_given_truth.high),
+    )
+
+
+@pytest.mark.figures
+@needs_fast_backend
+def test_a_prior_fitted_to_a_noisy_stack(folder: Path) -> None:
+    independent = ran(folder, "tile35", "noise.variance=1").error.mse
+    fitted = ran(folder, "tile35", "noise.variance=1", "prior.kind=fit").error.mse
+    assert independent is not None
+    assert fitted is not None
+    check_figures(
+        "priors.md",
+        "the prior of the paper leaves a mean squared error of {}, and `prior.kind=fit` leaves {}.",
+        independent,
+        fitted,
+    )
+
+
+@pytest.mark.figures
+@needs_fast_backend
+def test_two_seeds_of_a_real_sensor(folder: Path) -> None:
+    runs = [ran(folder, "sensor", f"render.seed={seed}").error for seed in (0, 1)]
+    expected = runs[0].expected_given_truth
+    assert expected is not None
+    measured = [float(run.mse or 0) for run in runs]
+    check_figures("noise.md", "Two runs with different seeds measured errors of {} and {};", *measured)
+    check_figures(
+        "noise.md",
+        "the expected error for the picture is {}, and {} to {} its 99 % interval",
+        *(expected.mse, expected.low, expected.high),
+    )
+
+
+@pytest.mark.figures
+@needs_fast_backend
+def test_diversity_by_distortion(folder: Path) -> None:
+    flat = predicted("distorted", "target.detail=", "prior.kind=independent")
+    error = ran(folder, "distorted").error
+    check_figures("lenses.md", "reaches the error of three types: {} at a noise variance of 1e-2", flat)
+    check_figures(
+        "lenses.md",
+        "the error is {}, and {} is expected on average, of which {} are detail that f does not hold",
+        *(float(error.mse or 0), error.predicted_mse, error.budget["detail"]),
+    )
+
+
+@pytest.mark.figures
+@needs_fast_backend
+def test_studies_of_a_misaligned_camera(folder: Path) -> None:
+    fine = {case.model: (float(case.mse or 0), case.predicted) for case in ran(folder, "misaligned").study}
+    check_figures("lenses.md", 'misalignment ignored (`"trust"`) | {} | {}, far too small |', *fine["ideal"])
+    check_figures(
+        "lenses.md", "| transport | {} | {} |\n| true | {} | {} |\n\nIn a world", *fine["transport"], *fine["true"]
+    )
+    models = 'study.models=["ideal","robust","transport","fitted","true"]'
+    changes = ("target.detail=", "prior.correlation_length=25 mm", models)
+    flat = {case.model: (float(case.mse or 0), case.predicted) for case in ran(folder, "misaligned", *changes).study}
+    check_figures("lenses.md", 'misalignment ignored (`"trust"`) | {} | {}, too small |', *flat["ideal"])
+    check_figures("lenses.md", 'noise (`"robust"`) | {} | {}, an average', *flat["robust"])
+    check_figures("lenses.md", "an average over images of the prior | | transport | {} | {} |", *flat["transport"])
+    check_figures("lenses.md", "without point sources | {} | {} |", *flat["fitted"])
+    check_figures("lenses.md", "without point sources | {} | {} | | true | {} | {} |", *flat["fitted"], *flat["true"])
+
+
+FLAT = ("noise.variance=1e-3", "prior.kind=independent", "prior.correlation_length=", "target.detail=")
+
+
+@pytest.mark.figures
+@needs_fast_backend
+def test_sensor_pixels_for_real_lenses() -> None:
+    def row(pitch: str) -> list[float]:
+        keys = (*FLAT, f"camera.pixel_pitch={pitch}")
+        lights = ("camera.wavelength=550 nm", "camera.wavelength=none")
+        return [predicted(name, *keys, light) for name in ("planoconvex", "doublet") for light in lights]
+
+    check_figures("lenses.md", "| 6 um | {} | {} | {} | {} |", *row("6 um"))
+    check_figures("lenses.md", "| 12 um | {} | {} | {} | {} |", *row("12 um"))
+    check_figures("lenses.md", "| 18 um, as in the gallery | {} | {} | {} | {} |", *row("18 um"))
+    check_figures("lenses.md", "| 24 um | {} | {} | {} | {} |", *row("24 um"))
+
+
+@pytest.mark.figures
+def test_errors_by_rays_alone() -> None:
+    ratios = [row.waves / row.rays for row in f_numbers.rows(("doublet", "planoconvex"), (5.6, 8.0, 11.0))]
+    check_figures("diffraction.md", "The error by rays alone is {} to {} times too small", min(ratios), max(ratios))
+
+
+# --- output of commands, in text blocks
+
+# First lines of the text blocks that are no output of the command before them: formulas, files, other programs.
+NOT_OUTPUT = {
+    "batches.md": ("ommatid reconstruct film/0*.exr", "dask scheduler"),
+    "install.md": ("source .venv/bin/activate", "pip install ."),
+    "lenses.md": ("# radius  thickness",),
+    "recorded.md": ("ommatid import tile19 mosaic.png", "ommatid calibrate tile19 --points"),
+    "trust.md": ("python -m tests.benchmarks",),
+    "worlds.md": ("offset of the lens",),
+}
+FORMULAS = ("equations.md",)  # pages whose text blocks are all formulas
+
+
+def outputs(page: Path) -> list[Block]:
+    """Return the text blocks of a page that show what the shell block before them prints."""
+    if page.name in FORMULAS:
+        return []
+    excepted = NOT_OUTPUT.get(page.name, ())
+    return [block for block in blocks(page) if block.language == "text" and not block.text.startswith(excepted)]
+
+
+PAGES_WITH_OUTPUT = [page for page in PAGES if outputs(page)]
+
+
+@pytest.mark.figures
+@needs_fast_backend
+@pytest.mark.parametrize("page", PAGES_WITH_OUTPUT, ids=page_name)
+def test_outputs_in_a_page_are_those_of_its_commands(page: Path, tmp_path: Path) -> None:
+    """Runs the commands up to the last output as they are printed, with all samples."""
+    shown = outputs(page)
+    everything = blocks(page)
+    if "ommatid init mine.toml" not in text_of(page):
+        assert shell("init", "mine.toml", cwd=tmp_path).code == 0
+    printed = ""
+    for block in everything[: everything.index(shown[-1]) + 1]:
+        if block.language == "sh":
+            printed = ""
+            for command, _ in block.commands():
+                program, *arguments = shlex.split(command)
+                if program == "ommatid":
+                    ended = shell(*arguments, cwd=tmp_path)
+                    assert ended.code == 0, ended.err
+                    printed += ended.out
+        elif block in shown:
+            assert is_printed(block.text, printed), (
+                f"{page.name} states\n{block.text}\nbut the command prints\n{printed}"
+            )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_every_output_follows_its_command(page: Path) -> None:
+    everything = blocks(page)
+    for block in outputs(page):
+        before = [other.language for other in everything[: everything.index(block)] if other.language != "text"]
+        assert before[-1:] == ["sh"], f"{page.name}: which command prints this?\n{block.text}"
+
+
+# --- no others
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_every_decimal_number_of_a_page_is_checked(page: Path) -> None:
+    """A decimal number is checked by the test of its command, excepted above, or a constant of the text."""
+    name = page_name(page)
+    left = [
+        f"{heading}: {number}"
+        for heading, number in unchecked_decimals(page)
+        if (name, None) not in NOT_PRINTED and (name, heading) not in NOT_PRINTED
+    ]
+    assert not left, f"{name}: {left}: check them with check_figures in the test of the command that prints them"
+
+
+def test_exceptions_exist() -> None:
+    for name, heading in NOT_PRINTED:
+        page = next(page for page in PAGES if page_name(page) == name)
+        found = {each for each, _ in unchecked_decimals(page)}
+        assert found if heading is None else heading in found, f"{name}: no decimal number in '{heading}'"
+
+
+@pytest.mark.parametrize(("value", "passes"), [(279.78, True), (279.4, False), (281.0, False)])
+def test_a_wrong_figure_is_reported(value: float, passes: bool) -> None:
+    sentence = "it is {} for `tile19`"
+    assert stated_figures("noise.md", sentence) == ("280",)
+    if passes:
+        check_figures("noise.md", sentence, value)
+    else:
+        with pytest.raises(AssertionError, match="states 280"):
+            check_figures("noise.md", sentence, value)
+
+
+def test_outputs_are_compared_without_frames_and_times() -> None:
+    printed = "┌──────┬──────┐\n│ rank │ 3481 │\n│ time │ 3 s  │\n│ error │ 1.286 per │\n│      │ pixel │\n└──┘"
+    assert is_printed("rank   3481\ntime 12.5 s\nerror  1.286 per pixel", printed)
+    assert not is_printed("rank   3482", printed)
+    assert not is_printed("error  1.285 per pixel", printed)
+    assert not is_printed("error  1.286 per pixel\nrank 3481", printed), "another order"

@@ -81,6 +81,7 @@ class Scene(Table):
     study: StudyTable | None = None
 
     _source: Path = PrivateAttr(default=Path("scene"))
+    _world_copy: Path | None = PrivateAttr(default=None)
 
     @model_validator(mode="before")
     @classmethod
@@ -121,6 +122,11 @@ class Scene(Table):
         return self._source
 
     @property
+    def world_copy(self) -> Path | None:
+        """The file to read in place of `world.file`, if this is another machine."""
+        return self._world_copy
+
+    @property
     def assumed_prior(self) -> PriorTable:
         """The prior that the estimator assumes: [prior], with estimator.prior_variance where it is set."""
         variance = self.estimator.prior_variance
@@ -154,8 +160,11 @@ def with_tables(scene: Scene, **tables: Any) -> Scene:
     return _with_source(scene.model_copy(update=tables), scene.source)
 
 
-def parse(data: dict[str, Any], source: Path) -> Scene:
-    """Validate a scene's tables. Raises InputError that names the file, the key and what was expected."""
+def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) -> Scene:
+    """Validate a scene's tables. Raises InputError that names the file, the key and what was expected.
+
+    world_copy : file that is read in place of `world.file`, on another machine
+    """
     completed, contradiction = complete(data)
     try:
         scene = Scene.model_validate(completed)
@@ -164,6 +173,7 @@ def parse(data: dict[str, Any], source: Path) -> Scene:
         raise InputError(f"{source}: {(absent and contradiction) or explain(error, completed, Scene)}") from error
     if contradiction:
         raise InputError(f"{source}: {contradiction}")
+    scene._world_copy = world_copy  # pyright: ignore[reportPrivateUsage]
     return _with_source(scene, source)
 
 

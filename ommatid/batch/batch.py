@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.errors import MachineError
 from ommatid.runtime.files import check_output, clear_abandoned, make_folder
 from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.processors import processors
@@ -100,10 +100,6 @@ class Batch:
         for member in members:
             try:
                 setup = self.open(member)
-                if setup.scene.world is not None:
-                    raise InputError(
-                        f"{member.scene}: the files of a [world] are not sent to other machines; leave out --scheduler"
-                    )
                 prepare(setup, member.folder)
             except Exception as error:
                 yield member, partial(_raise, error)

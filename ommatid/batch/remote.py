@@ -24,6 +24,9 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
 
+from .world_package import WorldPackage, packed_world, unpacked_world
+
+WORLD = "world"  # folder inside that of the scene, on a worker
 LAST = "run.json"  # is written last, since it vouches for the other files
 
 
@@ -48,6 +51,7 @@ class ScenePackage:
 
     tables, source : the scene, and its file for messages;  image : on the target, (rows, columns)
     folder, files : the scene's folder for messages, and its content;  command : words of the command line
+    world : the files of its [world], if it has one
     """
 
     tables: dict[str, Any]
@@ -56,6 +60,7 @@ class ScenePackage:
     folder: str
     files: dict[str, bytes]
     command: tuple[str, ...] = ()
+    world: WorldPackage | None = None
 
 
 @dataclass(frozen=True)
@@ -69,9 +74,10 @@ class SceneOutcome:
 
 
 def packed(setup: Setup, folder: Path) -> ScenePackage:
-    """Pack a scene and the content of its folder."""
+    """Pack a scene, the content of its folder, and its world. Raises InputError."""
     tables, source = setup.resolved.plain(), str(setup.scene.source)
-    return ScenePackage(tables, source, setup.picture, str(folder), _contents(folder), command())
+    world = None if setup.scene.world is None else packed_world(setup.scene)
+    return ScenePackage(tables, source, setup.picture, str(folder), _contents(folder), command(), world)
 
 
 def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
@@ -82,14 +88,18 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
             (folder / name).write_bytes(content)
 
         def work(observer: RunObserver) -> dict[str, Any]:
-            scene = parse(package.tables, Path(package.source))
+            world = None if package.world is None else unpacked_world(package.world, folder / WORLD)
+            scene = parse(package.tables, Path(package.source), world)
             return stages(Setup(scene, derive(scene), package.image), folder, observer)
 
         with command_line(package.command):
             outcome = outcome_of(work)
         error = outcome.error
         if isinstance(error, InputError | MachineError):
-            error = type(error)(str(error).replace(temporary, package.folder))
+            message = str(error)
+            if package.world is not None:
+                message = message.replace(str(folder / WORLD), package.world.root)
+            error = type(error)(message.replace(temporary, package.folder))
         files = {name: content for name, content in _contents(folder).items() if package.files.get(name) != content}
         return replace(outcome, files=files, error=error)
 

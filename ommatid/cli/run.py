@@ -66,12 +66,13 @@ def run(
     detail, others = output.detail(verbose, quiet), formats_of(formats)
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
+    words = ("run", *(f"{option} {value}" for option, value in (("--within", within), ("--format", formats)) if value))
+    share = None if dry_run else share_of_job(job, members, folder, words, *asked, scheduler)
+    members = members if share is None else share.members
     output.warn_all(batch_warnings(members, *asked))
     if dry_run:
         _print_plans(members, *asked, as_json)
         return
-    share = share_of_job(job, members, folder, ("run", *([f"--within {within}"] if within else [])), *asked, scheduler)
-    members = members if share is None else share.members
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
     report = partial(_print_run, None if as_json else detail)
@@ -131,9 +132,9 @@ def render(
 
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
-    output.warn_all(batch_warnings(members, *asked))
     share = share_of_job(job, members, folder, ("render",), *asked, scheduler)
     members = members if share is None else share.members
+    output.warn_all(batch_warnings(members, *asked))
     batch = scene_batch(*asked, with_options(stages.render, force, ()), output.observer, report)
     outcome = run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder, share=share)
     finish_batch(outcome, as_json)

@@ -63,6 +63,11 @@ def world_of(scene: Scene) -> WorldTable:
     return scene.world
 
 
+def path_of(scene: Scene) -> Path:
+    """Return the world's file on this machine. Raises ValueError for a scene without a [world]."""
+    return scene.world_copy or Path(world_of(scene).file)
+
+
 def white_of(scene: Scene) -> float:
     """Return the radiance of a value of 255. Raises ValueError if it is still to be found."""
     white = world_of(scene).white
@@ -76,7 +81,7 @@ def files(scene: Scene) -> list[Path]:
 
     Raises InputError if there is no such file or it is not XML.
     """
-    path = Path(world_of(scene).file)
+    path = path_of(scene)
     known, waiting = [path], [path]
     while waiting:
         for name in _named(waiting.pop(), scene):
@@ -101,7 +106,7 @@ def _named(path: Path, scene: Scene) -> list[str]:
     names = [
         element.get("value" if element.tag == "string" else "filename")
         for element in elements
-        if element.tag == "include" or (element.tag == "string" and element.get("name") == "filename")
+        if element.tag in ("include", "spectrum") or (element.tag == "string" and element.get("name") == "filename")
     ]
     return [name for name in names if name]
 
@@ -109,7 +114,7 @@ def _named(path: Path, scene: Scene) -> list[str]:
 def describe(scene: Scene) -> dict[str, Any]:
     """Describe a world for a fingerprint, by SHA-256 of its file and of those that it names. Raises InputError."""
     world = world_of(scene)
-    folder = Path(world.file).parent
+    folder = path_of(scene).parent
     sums: dict[str, str] = {}
     for path in files(scene):
         with path.open("rb") as stream:
@@ -127,7 +132,7 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
     activate(variant)
     import mitsuba as mi
 
-    file = world_of(scene).file
+    file = str(path_of(scene))
     where = f"{scene.source}: world.file: {file}"
     files(scene)  # its errors are clearer than Mitsuba's
     config = mi.parser.ParserConfig(variant)

@@ -1,8 +1,8 @@
 """Files by which jobs on several machines agree, on shared file systems without locks.
 
-They rely on what such systems, NFS among them, promise: a link is made once, and a renamed file appears whole. Each
-job writes beside the others into one folder. A job that writes there sees what was written there before, also where a
-system keeps old listings of folders for a while.
+They rely on what such systems, NFS among them, promise: a link is made once, and a renamed file appears whole. All jobs
+write into one folder, since a job that has written there sees what was written before, also where a system keeps old
+listings of folders for a while.
 """
 
 from __future__ import annotations

@@ -1,0 +1,100 @@
+"""Worlds that are sent to other machines with their scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from skimage.io import imsave
+
+from ommatid.batch.batch import prepare
+from ommatid.batch.remote import RunObserver, carry_out, outcome_of, packed, unpack
+from ommatid.batch.world_package import packed_world, unpacked_world
+from ommatid.pipeline.stages import open_scene, results, run
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.formats import exr
+from ommatid.scenes.setup import Setup
+from ommatid.simulate.renderer.world import files
+
+from ..conftest import TINY, Command
+from ..runs import assert_same_content, content
+
+WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/>
+<scale value="6"/><translate z="1000"/></transform><emitter type="area"><texture type="bitmap" name="radiance">
+<string name="filename" value="{picture}"/></texture></emitter></shape></scene>"""
+DEEP = TINY.replace('image = "photo:camera"\norigin = [100, 230]\n', "").replace(
+    "[noise]", '[world]\nfile = "places/world.xml"\n\n[noise]'
+)
+
+
+@pytest.fixture
+def deep(here: Path) -> Path:
+    """A scene whose world includes a file of its own folder, which names a picture of another one."""
+    (here / "places").mkdir()
+    (here / "pictures").mkdir()
+    imsave(here / "pictures" / "wall.png", np.arange(0, 256, 4, dtype=np.uint8).reshape(8, 8), check_contrast=False)
+    (here / "places" / "world.xml").write_text(
+        '<scene version="3.0.0"><include filename="wall.xml"/></scene>', encoding="utf-8"
+    )
+    (here / "places" / "wall.xml").write_text(WALL.format(picture="../pictures/wall.png"), encoding="utf-8")
+    (here / "deep.toml").write_text(DEEP.replace("samples = 16\nfit", 'method = "ideal"\nfit'), encoding="utf-8")
+    return here / "deep.toml"
+
+
+def without_page(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+    return results(setup, folder, observer).plain()
+
+
+def test_a_world_gives_the_same_results_on_a_machine_without_its_files(deep: Path, here: Path) -> None:
+    folder, alone, setup = here / "out", here / "alone", open_scene(deep)
+    assert outcome_of(lambda observer: without_page(setup, alone, observer)).error is None
+    prepare(setup, folder)
+    package = packed(setup, folder)
+    for name in ("places", "pictures"):
+        (here / name).rename(here / f"moved {name}")
+    outcome = carry_out(without_page, package)
+    assert outcome.error is None
+    unpack(outcome, folder)
+    assert_same_content(folder, content(alone))
+    assert {path.name for path in folder.iterdir()} == {path.name for path in alone.iterdir()}
+    truth = exr.read(folder / "truth.exr")[0].channels["Y"]
+    assert np.ptp(truth) > 100, "the picture of the wall is seen"
+
+
+def test_a_scene_with_a_world_is_rendered_on_a_cluster(deep: Path, here: Path, address: str, ommatid: Command) -> None:
+    ended = ommatid("render", str(deep), "-o", "out", "--scheduler", address)
+    assert ended.code == 0, ended.err
+    assert {path.name for path in (here / "out" / "deep").iterdir()} == {"scene.toml", "truth.exr", "stack.exr"}
+
+
+def test_messages_about_a_world_name_the_users_files(deep: Path, here: Path) -> None:
+    (here / "places" / "wall.xml").write_text('<scene version="3.0.0"></scene>', encoding="utf-8")
+    folder, setup = here / "out" / "deep", open_scene(deep)
+    prepare(setup, folder)
+    outcome = carry_out(run, packed(setup, folder))
+    assert isinstance(outcome.error, InputError)
+    assert f"world.file: {here / 'places' / 'world.xml'}" in str(outcome.error)
+
+
+def test_the_files_of_a_world_keep_their_places(deep: Path, tmp_path: Path) -> None:
+    package = packed_world(open_scene(deep).scene)
+    assert package.contents.keys() == {"places/world.xml", "places/wall.xml", "pictures/wall.png"}
+    assert unpacked_world(package, tmp_path / "copy") == tmp_path / "copy" / "places" / "world.xml"
+    for name, written in package.contents.items():
+        assert (tmp_path / "copy" / name).read_bytes() == (deep.parent / name).read_bytes() == written
+
+
+def test_a_file_with_an_absolute_name_is_refused(deep: Path, here: Path) -> None:
+    picture = here / "pictures" / "wall.png"
+    (here / "places" / "wall.xml").write_text(WALL.format(picture=picture), encoding="utf-8")
+    with pytest.raises(InputError, match=r"deep\.toml: world\.file: names .*wall\.png, which other machines"):
+        packed_world(open_scene(deep).scene)
+
+
+def test_the_file_of_a_spectrum_belongs_to_its_world(deep: Path, here: Path) -> None:
+    lamp = '<emitter type="constant"><spectrum name="radiance" filename="lamp.spd"/></emitter>'
+    (here / "places" / "wall.xml").write_text(f'<scene version="3.0.0">{lamp}</scene>', encoding="utf-8")
+    (here / "places" / "lamp.spd").write_text("400 1\n700 1\n", encoding="utf-8")
+    assert [path.name for path in files(open_scene(deep).scene)] == ["world.xml", "wall.xml", "lamp.spd"]

@@ -42,7 +42,7 @@ class WorldView:
     depths : nearest, median and farthest distance along z of those surfaces; None if there are none
     box : least and largest x, y and z of all surfaces; None if there are none
     sky : True if light comes from where there is no surface
-    sensors : number of sensors in the file;  white : radiance of a value of 255
+    sensors : number of sensors in the file;  white : radiance of a value of 255, 0 if none was found
     fitting_unit : in which the camera would see the world, if it does not; None if there is none
     """
 
@@ -111,7 +111,7 @@ def world_view(setup: Setup) -> WorldView:
         box=None if box is None else (tuple(box[0].tolist()), tuple(box[1].tolist())),
         sky=has_surroundings(world.scene),
         sensors=world.sensors,
-        white=table.white if isinstance(table.white, float) else _brightest(renderer, scene),
+        white=table.white if isinstance(table.white, float) else _brightest(renderer, scene.render.seed),
         fitting_unit=None if sees_enough(camera, depths) else _fitting_unit(world, camera, table),
     )
     _known[key] = view
@@ -123,24 +123,31 @@ def rendered_world(setup: Setup) -> Scene | None:
     scene = setup.scene
     if scene.world is None or isinstance(scene.world.white, float):
         return None if scene.world is None else scene
-    return with_tables(scene, world=scene.world.model_copy(update={"white": world_view(setup).white}))
+    white = world_view(setup).white
+    _check_white(scene, white)
+    return with_tables(scene, world=scene.world.model_copy(update={"white": white}))
 
 
 def check_world(setup: Setup) -> WorldView:
     """Return what the camera sees of a world.
 
-    Raises InputError if it sees next to nothing, or if the world is so near that the lenses have no view in common.
+    Raises InputError if it sees next to nothing, no light, or a world so near that the lenses have no view in common.
     A picture on the target is seen in any case, so that a world around it may be anywhere.
     """
     view, scene = world_view(setup), setup.scene
-    if scene.target.image is not None or view.box is None:
-        return view
+    if scene.target.image is None and view.box is not None:
+        _check_surfaces(setup, view)
+    _check_white(scene, view.white)
+    return view
+
+
+def _check_surfaces(setup: Setup, view: WorldView) -> None:
+    scene = setup.scene
     where = f"{scene.source}: world.file: {world_of(scene).file}"
     if view.depths is None or (not view.sky and view.met < ENOUGH * view.views):
         raise InputError(_unseen(where, view, setup.camera, world_of(scene)))
     if view.met >= ENOUGH * view.views and _beyond_target(setup.camera, view.depths[1]):
         raise InputError(_too_near(where, view, setup.camera, world_of(scene), view.depths[1]))
-    return view
 
 
 def sees_enough(camera: Camera, depths: FloatArray) -> bool:
@@ -164,7 +171,7 @@ def _unseen(where: str, view: WorldView, camera: Camera, table: WorldTable) -> s
     seen = ", ".join(f"{axis} {-end:.4g} to {end:.4g}" for axis, end in zip("xy", half, strict=True))
     return (
         f"{where}: {view.met} of {view.views} views of sensor pixels meet a surface, expected half or more: the camera"
-        f" stands at 0, 0, 0, looks along +z and sees {seen} mm at {camera.distance:.4g} mm, and the world's box is"
+        f" stands at 0, 0, 0, looks along +z and sees {seen} mm at {camera.distance:.4g} mm, and the world's bounding box is"
         f" {_box_words(view.box)}; {_remedy(view, table)}"
     )
 
@@ -196,7 +203,7 @@ def _too_near(where: str, view: WorldView, camera: Camera, table: WorldTable, me
     return (
         f"{where}: half of the surfaces that the camera sees are nearer than {median:.4g} mm, and the target's plane is"
         f" at {camera.distance:.4g} mm: opposite lenses of the array see them displaced by"
-        f" {displacement(camera, median).max():.3g} pixels of f, more than the whole target, and the world's box is"
+        f" {displacement(camera, median).max():.3g} pixels of f, more than the whole target, and the world's bounding box is"
         f" {_box_words(view.box)}; {_remedy(view, table)}"
     )
 
@@ -247,19 +254,22 @@ def _without_picture(scene: Scene) -> Any:
     return scene.target.model_copy(update={"image": None})
 
 
-def _brightest(renderer: Any, scene: Scene) -> float:
-    """Return the radiance that all but the brightest pixels of a coarse picture stay below. Raises InputError."""
-    seed = np.random.SeedSequence(scene.render.seed, spawn_key=(zlib.crc32(b"white"),)).generate_state(1)
+def _brightest(renderer: Any, seed: int) -> float:
+    """Return the radiance that all but the brightest pixels of a coarse picture stay below; 0 if there is no light."""
+    first = int(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(b"white"),)).generate_state(1)[0])
     (group,) = renderer.groups
 
     def seeds(sensor: int) -> int:
-        return (int(seed[0]) + sensor) % 2**32
+        return (first + sensor) % 2**32
 
     radiance = renderer.expose(group, SAMPLES, seeds)[0] / WHITE  # where a radiance of 1 is white
     white = float(np.percentile(radiance, BRIGHT))
-    if not 0 < white < np.inf:
+    return white if 0 < white < np.inf else 0.0
+
+
+def _check_white(scene: Scene, white: float) -> None:
+    if not white:
         raise InputError(
             f"{scene.source}: world.file: {world_of(scene).file}: world.white 'auto' needs light that the camera sees,"
-            f" got a radiance of {white:g}; add lamps to the file, or state world.white"
+            " got a black view; add lamps to the file, or state world.white"
         )
-    return white

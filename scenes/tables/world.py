@@ -152,6 +152,12 @@ class WorldTable(Table):
     def _check_pose(self) -> WorldTable:
         if self.camera is not None and self.to_world is not None:
             raise ValueError('camera = "from file" takes the pose of the file\'s sensor, got to_world too; remove one')
+        factor = 1.0 if self.to_world is None else float(np.linalg.norm(self.to_world[:3]))
+        if not 1 / LARGEST <= self.unit_length * factor <= LARGEST:
+            raise ValueError(
+                f"expected a length of 1 in the file to become {1 / LARGEST:g} to {LARGEST:g} mm by unit, scale and"
+                f" to_world, got {self.unit_length * factor:g} mm; change scale"
+            )
         return self
 
     @property

@@ -175,10 +175,10 @@ def _placement(scene: Scene, sensors: list[Any], where: str) -> Placement:
     """Return where the camera stands in a file with these sensors. Raises InputError."""
     table = world_of(scene)
     placement = Placement.of_table(table) if table.camera != FROM_FILE else _pose_of_sensor(table, sensors, where)
-    if placement.spacing > scene.target.pixel_pitch / FINEST:
+    if not placement.spacing <= scene.target.pixel_pitch / FINEST:  # also where float32 overflows
         raise InputError(
             f"{where}: the camera stands so far from the file's origin that float32 moves it in steps of"
-            f" {placement.spacing:.2g} mm, expected at most 1/{FINEST} of target.pixel_pitch; move the world there"
+            f" {placement.spacing:.2g} mm; expected at most 1/{FINEST} of target.pixel_pitch: move it nearer"
         )
     return placement
 

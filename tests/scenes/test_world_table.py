@@ -61,6 +61,8 @@ def test_a_transform_is_numbers_rows_or_steps(transform: list[Any]) -> None:
         ({"camera": "file"}, "'from file'"),
         ({"unit": "yard"}, "'mm'"),
         ({"scale": -1}, "greater than 0"),
+        ({"scale": 1e10, "unit": "m"}, "to become 1e-12 to 1e\\+12 mm by unit, scale and to_world, got 1e\\+13 mm"),
+        ({"to_world": [{"scale": 1e-13}]}, "got 1e-13 mm"),
         ({"white": "bright"}, "expected a radiance above 0 and up to 1e\\+12, or \"auto\", got 'bright'"),
         ({"white": 0}, "expected a radiance above 0"),
     ],

@@ -200,7 +200,7 @@ def test_a_camera_where_float32_is_too_coarse_is_refused(tmp_path: Path) -> None
         place = {"to_world": [{"translate": [0, distance, 0]}], "unit": "m"}
         described, camera = world(tmp_path, '<emitter type="constant"/>', variant="scalar_rgb", world=place)
         if refused:
-            with pytest.raises(InputError, match=r"in steps of 31 mm, expected at most 1/100 of target\.pixel_pitch"):
+            with pytest.raises(InputError, match=r"in steps of 31 mm; expected at most 1/100 of target\.pixel_pitch"):
                 truth(Setup(described, camera))
         else:
             truth(Setup(described, camera))

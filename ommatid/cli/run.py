@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from . import failures, output
 from .options import (
+    SCREEN,
     Complete,
+    FigureFormats,
+    FigureResolution,
     Folder,
     Json,
     Lenses,
@@ -21,6 +24,7 @@ from .options import (
     Within,
     Workers,
     changes,
+    figure_files,
     lens_names,
 )
 
@@ -41,25 +45,29 @@ def run(
     workers: Workers = None,
     complete: Complete = False,
     within: Within = "",
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
     strict: Strict = False,
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
     from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
     from ommatid.pipeline.sections import run_sections
+    from ommatid.pipeline.stages import with_figures
     from ommatid.pipeline.time_budget import stages_within
 
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         output.print_tables([] if as_json else run_sections(member.folder, description))
         return description
 
+    figures = figure_files(figure_formats, figure_resolution)
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
     stages, workers = stages_within(within, members, STARTED, output.say, scheduler, workers)
     observer = partial(output.observer, alone=len(members) == 1)
-    batch = scene_batch(*asked, stages, observer, report)
-    pool = scheduler, workers
-    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder)
+    batch = scene_batch(*asked, with_figures(stages, figures), observer, report)
+    folders: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures}
+    outcome = run_batch(batch, members, failures.report, scheduler, workers, **folders)
     finish_batch(outcome, as_json, strict)
 
 

@@ -8,20 +8,37 @@ from typing import Annotated
 import typer
 
 from . import options, output
-from .options import Complete, Json, Lenses, Output, SceneFile, Sets
+from .options import SCREEN, Complete, FigureFormats, FigureResolution, Json, Lenses, Output, SceneFile, Sets
 
+FigureFile = Annotated[
+    Path | None, typer.Option("--figure", metavar="FILE", help="Write a drawing of the camera: .png, .svg or .pdf.")
+]
 NewFile = Annotated[Path, typer.Argument(metavar="FILE", help="The scene file to write.")]
 
 
 def show(
-    scene: SceneFile, sets: Sets = None, lens: Lenses = "", complete: Complete = False, as_json: Json = False
+    scene: SceneFile,
+    sets: Sets = None,
+    lens: Lenses = "",
+    complete: Complete = False,
+    figure: FigureFile = None,
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
+    as_json: Json = False,
 ) -> None:
     """Show the geometry, the plan, and the skipped effects."""
     from ommatid.pipeline.descriptions import describe_scene
     from ommatid.pipeline.sections import scene_sections
     from ommatid.scenes.scene import read
 
-    description = describe_scene(read(scene, options.changes(sets, complete), options.lens_names(lens)))
+    described = read(scene, options.changes(sets, complete), options.lens_names(lens))
+    description = describe_scene(described)
+    if figure is not None:
+        from ommatid.figures.camera_drawing import write_drawing
+
+        files = options.figure_files(figure_formats, figure_resolution, figure.suffix.lstrip(".").lower())
+        for path in write_drawing(figure, described, files):
+            output.say(f"{path}: written")
     output.print_result(description, scene_sections(description), as_json)
 
 

@@ -13,6 +13,7 @@ from ommatid.batch.batch import Batch, Description, Member
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.batch.sweep_row import summary
 from ommatid.batch.sweep_table import lines, write_sweep
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 
 from .sections import Section
@@ -64,10 +65,12 @@ def run_batch(
     sweep_folder: Path | None = None,
     index_folder: Path | None = None,
     with_folders: bool = True,
+    figures: FigureFiles = SCREEN_PNG,
 ) -> BatchOutcome:
     """Run every scene of a batch, even if others fail.
 
     report_failure : returns the exit code of an exception;  with_folders : documents of a sweep name the folders
+    figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     """
     results: dict[Member, Description] = {}
@@ -82,7 +85,7 @@ def run_batch(
             failures[member] = str(error) or type(error).__name__
             results[member] = {**document, "error": str(error), "exit_code": codes[-1]}
     documents = [results[member] for member in members]
-    sections = _sweep_sections(documents, sweep_folder) if members[0].changes else []
+    sections = _sweep_sections(documents, sweep_folder, figures) if members[0].changes else []
     if index_folder is not None:
         try:
             cached_index(index_folder, {member.folder: failures.get(member, "") for member in members})
@@ -99,9 +102,9 @@ def _heading(member: Member, with_folder: bool) -> dict[str, Any]:
     return document
 
 
-def _sweep_sections(documents: list[Description], folder: Path | None) -> list[Section]:
+def _sweep_sections(documents: list[Description], folder: Path | None, figures: FigureFiles) -> list[Section]:
     rows = [summary(document) for document in documents]
     if folder is None:
         return [("Sweep", lines(rows))]
-    write_sweep(folder, rows)
+    write_sweep(folder, rows, figures)
     return [(f"Sweep: {folder / 'sweep.csv'}", lines(rows))]

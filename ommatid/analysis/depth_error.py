@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.output.run_json import DepthBin
 from ommatid.runtime.arrays import BoolArray, FloatArray
-from ommatid.runtime.files import write_whole
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.scene import TRUTH
@@ -111,13 +111,19 @@ def _distance(depth_bin: DepthBin) -> str:
     return f"{near} mm" if near == far else f"{near} to {far} mm"
 
 
-def draw(path: Path, camera: Camera, bins: Sequence[DepthBin], title: str = "") -> None:
+def draw(
+    path: Path,
+    camera: Camera,
+    bins: Sequence[DepthBin],
+    title: str = "Error against distance",
+    files: FigureFiles = SCREEN_PNG,
+) -> None:
     """Draw error and expected deviation against distance above, and each lens type's disparity below."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullLocator
 
-    figure: Any = Figure(figsize=(6.4, 6.4), dpi=110, layout="constrained")
+    figure: Any = Figure(figsize=(6.4, 6.4), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
     above, below = figure.subplots(2, 1, sharex=True)
@@ -133,7 +139,7 @@ def draw(path: Path, camera: Camera, bins: Sequence[DepthBin], title: str = "") 
     expected = [depth_bin.expected_deviation for _, _, depth_bin in known]
     above.plot(middles, expected, "k_", markersize=14, label="expected without depth (Eq. 5)")
     above.set_ylim(bottom=0)
-    above.set_ylabel("rms error (units of the values, 0 to 255)")
+    above.set_ylabel("RMS error (grey levels)")
     if known:
         near = 0.95 * min(camera.distance, *(near for near, _, _ in known))
         far = 1.05 * max(camera.distance, *(far for _, far, _ in known))
@@ -145,12 +151,12 @@ def draw(path: Path, camera: Camera, bins: Sequence[DepthBin], title: str = "") 
     below.xaxis.set_minor_locator(NullLocator())
     below.xaxis.set_major_formatter("{x:g}")
     below.set_xlabel("distance along the axis (mm)")
-    below.set_ylabel("rms disparity (pixels of f)")
+    below.set_ylabel("RMS disparity (target pixels)")
     for axes in (above, below):
         axes.axvline(camera.distance, color="0.6", linestyle=":", label="the target's plane")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
-    write_whole(path, lambda beside: figure.savefig(beside, format="png"))
+    files.replace(figure, path)
 
 
 def depth_error_of_run(folder: Path, camera: Camera) -> tuple[DepthBin, ...]:
@@ -166,5 +172,5 @@ def depth_error_of_run(folder: Path, camera: Camera) -> tuple[DepthBin, ...]:
         channel.astype(np.float64) for channel in (maps["truth"], maps["estimate"], maps["variance"], known["depth"])
     )
     bins = error_by_depth(camera, depth, estimate - truth, variance)
-    draw(folder / PICTURE, camera, bins, "Error against distance")
+    draw(folder / PICTURE, camera, bins)
     return bins

@@ -88,10 +88,10 @@ def _axis(key: str, settings: Sequence[Mapping[str, str]]) -> QuantityAxis:
 
 
 def crossings(rows: Sequence[SweepRow]) -> tuple[QuantityAxis, list[Crossing]]:
-    """Return the axis along x, and where each curve rises above twice the smallest predicted error of the sweep.
+    """Return the axis along x, and where each curve crosses twice the smallest predicted error of the sweep.
 
     Between two values of the key the logarithm of the error is interpolated. Empty where the key has names as values,
-    and for curves that stay below or begin above.
+    and for curves that stay on one side, or have a single value below.
     """
     settings = _settings(rows)
     key = _roles(settings)[0]
@@ -108,7 +108,7 @@ def crossings(rows: Sequence[SweepRow]) -> tuple[QuantityAxis, list[Crossing]]:
     level, found = TWICE * min(known), list[Crossing]()
     for combination, points in curves.items():
         for (left, low), (right, high) in pairwise(sorted(points)):
-            if low < level <= high:
+            if sum(error < level for _, error in points) > 1 and (low < level) != (high < level):
                 share = (log(level) - log(low)) / (log(high) - log(low))
                 values = dict(zip(others, combination, strict=True))
                 found.append(Crossing(values, axis.between(left, right, share), level))

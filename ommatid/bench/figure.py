@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.analysis.pareto import pareto_front
-from ommatid.runtime.files import write_whole
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 
 from .labels import Label, label_points
 from .slopes import TOLERANCE, median_error, median_seconds
@@ -19,11 +19,10 @@ from .table import ALONE, AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quan
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
-RESOLUTION = 110
 FRONT: dict[str, Any] = {"color": "0.75", "linewidth": 7, "alpha": 0.6, "solid_capstyle": "round"}
 ADAPTIVE: dict[str, Any] = {"markersize": 10, "markeredgecolor": "black", "linestyle": "none"}
 BOX: dict[str, Any] = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-IMAGE_ERROR = "mean squared error of the image (squared values of f)"
+IMAGE_ERROR = "mean squared error of the image (grey levels squared)"
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ Abscissa = Callable[[Cell], float | None]
 Ordinate = Callable[[Cell], Quantiles | None]
 
 
-def write_figures(folder: Path, table: BenchTable) -> None:
+def write_figures(folder: Path, table: BenchTable, files: FigureFiles = SCREEN_PNG) -> None:
     """Write a PNG for each stage that has cells: render.png, calibrate.png, reconstruct.png."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -59,18 +58,18 @@ def write_figures(folder: Path, table: BenchTable) -> None:
     for stage in STAGES:
         if not table.of(stage):
             continue
-        figure: Any = Figure(figsize=(19, 7.4), dpi=RESOLUTION, layout="constrained")
+        figure: Any = Figure(figsize=(19, 7.4), layout="constrained")
         FigureCanvasAgg(figure)
         if stage == "reconstruct":
             _draw_reconstruction(figure, table)
         else:
             _draw_sampling(figure, table, stage)
-        write_whole(folder / f"{stage}.png", lambda path, figure=figure: figure.savefig(path, format="png"))
+        files.replace(figure, folder / f"{stage}.png")
 
 
 def _draw_sampling(figure: Any, table: BenchTable, stage: Stage) -> None:
     """Draw error against samples with slopes, error against seconds, and the image's error against seconds."""
-    unit = "RMS over sensor pixels (values of f, 0 to 255)" if stage == "render" else "RMS over entries of H"
+    unit = "RMS over sensor pixels (grey levels)" if stage == "render" else "RMS over entries of H"
     name = "Rendering" if stage == "render" else "Calibration"
     figure.suptitle(f"{name}: {table.title}", parse_math=False)
     panels = figure.subplots(1, 3, width_ratios=(1.35, 1, 1))

@@ -11,6 +11,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables.gallery import gallery_names
 
 if TYPE_CHECKING:
+    from ommatid.figures.saving import FigureFiles
     from ommatid.scenes.hardware.frames import AcquisitionSettings
 
 _SCENE = f"A scene file, or a scene of the gallery by name: {', '.join(gallery_names())}."
@@ -69,6 +70,14 @@ Strict = Annotated[
 Within = Annotated[
     str, typer.Option("--within", metavar="TIME", help='Find the best result within a time, such as "30 s".')
 ]
+FigureFormats = Annotated[
+    str, typer.Option("--figure-format", metavar="NAME,...", help="Write figures also in these formats: svg, pdf.")
+]
+FigureResolution = Annotated[
+    int,
+    typer.Option("--figure-dpi", metavar="N", min=20, max=1200, help="Dots per inch of PNG figures; 300 for slides."),
+]
+SCREEN = 110  # dots per inch
 
 # Recorded frames
 Dark = Annotated[
@@ -136,6 +145,13 @@ def lens_names(lens: str) -> tuple[str, ...]:
 def changes(sets: list[str] | None, complete: bool = False) -> tuple[str, ...]:
     """Collect the changes of `--set` and `--complete`, in the order in which they apply."""
     return (*(sets or ()), *(("render.complete=true",) if complete else ()))
+
+
+def figure_files(formats: str, resolution: int, always: str = "png") -> FigureFiles:
+    """Return the files in which a command writes its figures. Raises InputError for an unknown format."""
+    from ommatid.figures.saving import FigureFiles, figure_formats
+
+    return FigureFiles(tuple(dict.fromkeys((always, *(figure_formats(formats) if formats else ())))), resolution)
 
 
 def regions(texts: list[str] | None) -> tuple[tuple[tuple[int, int], tuple[int, int]], ...]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ommatid.runtime.errors import InputError
 
 from . import failures, options, output
-from .options import Json, Lenses, SceneFile, Sets, Sweeps
+from .options import SCREEN, FigureFormats, FigureResolution, Json, Lenses, SceneFile, Sets, Sweeps
 from .run import finish_batch
+
+if TYPE_CHECKING:
+    from ommatid.figures.saving import FigureFiles
 
 SweepFolder = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the table and the plot of --sweep.")
@@ -32,6 +35,8 @@ def predict(
     sweep: Sweeps = None,
     folder: SweepFolder = None,
     no_rays: NoRays = False,
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
     as_json: Json = False,
 ) -> None:
     """Predict the error, the rank and the null space of H.
@@ -40,7 +45,8 @@ def predict(
     """
     asked = options.changes(sets), options.lens_names(lens)
     if sweep:
-        _predict_sweep(scene, sweep, folder, *asked, not no_rays, as_json)
+        figures = options.figure_files(figure_formats, figure_resolution)
+        _predict_sweep(scene, sweep, folder, *asked, not no_rays, figures, as_json)
         return
     if folder is not None:
         raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
@@ -87,6 +93,7 @@ def _predict_sweep(
     changes: tuple[str, ...],
     lenses: tuple[str, ...],
     rays: bool,
+    figures: FigureFiles,
     as_json: bool,
 ) -> None:
     from ommatid.pipeline import stages
@@ -95,5 +102,5 @@ def _predict_sweep(
     members = batch_members([scene], Path(), sweep, changes, lenses)
     predicted = partial(stages.predict_scene, rays=rays)
     batch = scene_batch(changes, lenses, predicted, output.observer, lambda _, description: description)
-    outcome = run_batch(batch, members, failures.report, sweep_folder=folder, with_folders=False)
+    outcome = run_batch(batch, members, failures.report, sweep_folder=folder, with_folders=False, figures=figures)
     finish_batch(outcome, as_json)

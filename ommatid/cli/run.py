@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from . import failures, output
 from .options import (
+    SCREEN,
     Complete,
     DryRun,
+    FigureFormats,
+    FigureResolution,
     Folder,
     Force,
     Formats,
@@ -28,6 +31,7 @@ from .options import (
     Within,
     Workers,
     changes,
+    figure_files,
     lens_names,
 )
 
@@ -49,6 +53,8 @@ def run(
     job: Job = "",
     complete: Complete = False,
     within: Within = "",
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
     formats: Formats = "",
     force: Force = False,
     dry_run: DryRun = False,
@@ -60,13 +66,15 @@ def run(
     """Render, calibrate, reconstruct and report."""
     from ommatid.batch.stage_options import with_options
     from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch, share_of_job
+    from ommatid.pipeline.stages import with_figures
     from ommatid.pipeline.time_budget import stages_within
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
+    figures = figure_files(figure_formats, figure_resolution)
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
-    words = ("run", *(f"{option} {value}" for option, value in (("--within", within), ("--format", formats)) if value))
+    words = _job_words(within, formats, figure_formats)
     share = None if dry_run else share_of_job(job, members, folder, words, *asked, scheduler)
     members = members if share is None else share.members
     output.warn_all(batch_warnings(members, *asked))
@@ -76,9 +84,10 @@ def run(
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
     report = partial(_print_run, None if as_json else detail)
-    batch = scene_batch(*asked, with_options(stages, force, others), observer, report)
-    pool = scheduler, workers
-    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder, share=share)
+    stages = with_options(with_figures(stages, figures), force, others)
+    batch = scene_batch(*asked, stages, observer, report)
+    folders: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures}
+    outcome = run_batch(batch, members, failures.report, scheduler, workers, **folders, share=share)
     finish_batch(outcome, as_json, strict)
 
 
@@ -107,6 +116,12 @@ def _print_plans(members: Sequence[Member], asked: tuple[str, ...], lenses: tupl
         return
     for member, described in zip(members, plans, strict=True):
         output.print_lines(plan.lines(member.folder.name, described))
+
+
+def _job_words(within: str, formats: str, figure_formats: str) -> tuple[str, ...]:
+    """Return the command and those of its options that all jobs of a batch must agree on."""
+    options = (("--within", within), ("--format", formats), ("--figure-format", figure_formats))
+    return ("run", *(f"{option} {value}" for option, value in options if value))
 
 
 def render(

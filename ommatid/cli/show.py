@@ -11,8 +11,11 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables.gallery import gallery_names
 
 from . import options, output
-from .options import Complete, Json, Lenses, Output, SceneFile, Sets
+from .options import SCREEN, Complete, FigureFormats, FigureResolution, Json, Lenses, Output, SceneFile, Sets
 
+FigureFile = Annotated[
+    Path | None, typer.Option("--figure", metavar="FILE", help="Write a drawing of the camera: .png, .svg or .pdf.")
+]
 NewFile = Annotated[Path | None, typer.Argument(metavar="FILE", help="The scene file to write.", show_default=False)]
 Source = Annotated[
     str,
@@ -24,7 +27,14 @@ ListScenes = Annotated[bool, typer.Option("--list", help="List the scenes of the
 
 
 def show(
-    scene: SceneFile, sets: Sets = None, lens: Lenses = "", complete: Complete = False, as_json: Json = False
+    scene: SceneFile,
+    sets: Sets = None,
+    lens: Lenses = "",
+    complete: Complete = False,
+    figure: FigureFile = None,
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
+    as_json: Json = False,
 ) -> None:
     """Show the camera in the terms of optics, the plan, and the skipped effects."""
     from ommatid.pipeline.descriptions import describe_scene
@@ -35,6 +45,12 @@ def show(
     described = read(scene, options.changes(sets, complete), options.lens_names(lens))
     output.warn_all(conversions(described))
     description = describe_scene(described)
+    if figure is not None:
+        from ommatid.figures.camera_drawing import write_drawing
+
+        files = options.figure_files(figure_formats, figure_resolution, figure.suffix.lstrip(".").lower())
+        for path in write_drawing(figure, described, files):
+            output.say(f"{path}: written")
     output.print_result(description, scene_sections(description), as_json)
     for sentence in description["warnings"]:
         output.say(f"warning: {sentence}")

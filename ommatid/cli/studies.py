@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from . import options, output
-from .options import Folder, Json, Lenses, SceneFile, Sets
+from .options import SCREEN, FigureFormats, FigureResolution, Folder, Json, Lenses, SceneFile, Sets
 
 Photograph = Annotated[str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the noise in Figure 7.")]
@@ -19,17 +19,28 @@ Seconds = Annotated[
 
 
 def paper(
-    folder: Folder = Path("paper"), image: Photograph = "photo:camera", seed: Seed = 0, as_json: Json = False
+    folder: Folder = Path("paper"),
+    image: Photograph = "photo:camera",
+    seed: Seed = 0,
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
+    as_json: Json = False,
 ) -> None:
     """Compute the paper's figures and claims anew."""
     from ommatid.paper.paper import rows, write_paper
 
+    figures = options.figure_files(figure_formats, figure_resolution)
     with output.progress_bar("paper") as progress:
-        description = write_paper(folder, image, seed, progress)
+        description = write_paper(folder, image, seed, progress, figures)
     output.print_result(description, [(f"The paper's claims: {folder / 'claims.csv'}", rows(description))], as_json)
 
 
-def stability(folder: Folder = Path("stability"), as_json: Json = False) -> None:
+def stability(
+    folder: Folder = Path("stability"),
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
+    as_json: Json = False,
+) -> None:
     """Count correct digits on stiff and extreme cases, against exact arithmetic."""
     from ommatid.scenes.camera import derive
     from ommatid.scenes.scene import read
@@ -38,10 +49,11 @@ def stability(folder: Folder = Path("stability"), as_json: Json = False) -> None
     from ommatid.stability.cases import CHANGES, LENSES
     from ommatid.stability.stability import rows, write_stability
 
+    figures = options.figure_files(figure_formats, figure_resolution)
     tile = GALLERY / "tile19.toml"
     matrices = {name: ideal_matrix(derive(read(tile, CHANGES, lenses))) for name, lenses in LENSES.items()}
     with output.progress_bar("stability") as progress:
-        summary = write_stability(folder, matrices, progress)
+        summary = write_stability(folder, matrices, progress, figures)
     output.print_result(summary, [("Stiff and extreme cases", rows(summary))], as_json)
 
 
@@ -51,6 +63,8 @@ def bench(
     seconds: Seconds = 240,
     sets: Sets = None,
     lens: Lenses = "",
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
     as_json: Json = False,
 ) -> None:
     """Measure error against run time of every stage.
@@ -59,10 +73,15 @@ def bench(
     """
     from ommatid.bench.bench import bench as measure
     from ommatid.bench.bench import rows
+    from ommatid.bench.figure import write_figures
+    from ommatid.figures.saving import SCREEN_PNG
     from ommatid.pipeline.stages import open_scene
 
+    figures = options.figure_files(figure_formats, figure_resolution)
     setup = open_scene(scene, options.changes(sets), options.lens_names(lens))
     with output.progress_bar("bench") as progress:
         table, made = measure(setup, folder, seconds, progress)
+    if figures != SCREEN_PNG:
+        write_figures(folder, table, figures)
     output.say_done("bench", made, folder / "bench.json")
     output.print_result(table.describe(), [(f"Error against run time: {table.title}", rows(table))], as_json)

@@ -7,14 +7,17 @@ a few millimetres deep, and the target; the ratio of the scales is written at th
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
-from ommatid.scenes.camera import Camera
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Scene
 
 from .camera_key import write_key
 from .lengths import length_words
+from .saving import FORMATS, SCREEN_PNG, FigureFiles
 from .sensor_drawing import draw_sensor, draw_sub_images, sensor_aspect
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
@@ -62,6 +65,15 @@ def camera_drawing(scene: Scene, camera: Camera) -> Any:
     name = scene.title or scene.source.stem
     figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center", parse_math=False)
     return figure
+
+
+def write_drawing(path: Path, scene: Scene, files: FigureFiles = SCREEN_PNG) -> list[Path]:
+    """Write the drawing of a scene's camera, and return its files. Raises InputError or MachineError."""
+    for name in files.formats:
+        if name not in FORMATS:
+            raise InputError(f"--figure {path}: expected a file that ends in .{', .'.join(FORMATS)}, got '{path.name}'")
+    files.save(camera_drawing(scene, derive(scene)), path)
+    return files.paths(path)
 
 
 def _draw_section(near: Any, far: Any, scene: Scene, camera: Camera, colours: dict[str, str]) -> None:

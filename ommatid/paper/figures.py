@@ -11,26 +11,25 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.files import write_whole
 from ommatid.scenes.constants import WHITE
 
 from .photographs import Photograph, TileCrops, Trials
 from .tile_errors import ACTUAL, EXPECTED, THREE, PaperTile, TileError, inner
 
-RESOLUTION = 130
 LENS_COLOURS = ("tab:blue", "tab:orange", "tab:green")  # of lens types
 MARKERS = ("o", "s", "^", "D")  # of expected noise variances
 NOISE_COLOURS = ("#1b9e77", "#d95f02", "#7570b3", "#a6761d")  # the same
 TILE_COLOURS = ("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#a6761d")  # of tiles of a photograph
 MARKER_STEP = 8  # actual noise variances from marker to marker
-ERROR = "expected squared error per pixel (squared units of f)"
-NOISE = "actual noise variance (squared units of f)"
+ERROR = "expected squared error per pixel (grey levels squared)"
+NOISE = "actual noise variance (grey levels squared)"
 EXPECTED_NOISE = "noise variance that\nthe estimator expects"
 
 
-def draw_sweeps(path: Path, shown: list[PaperTile]) -> None:
+def draw_sweeps(path: Path, shown: list[PaperTile], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 2 or 4: mean error against actual noise, whole and trimmed, one line per estimator and combination."""
     figure = _figure(12.0, 6.0)
     side = shown[0].side
@@ -50,10 +49,10 @@ def draw_sweeps(path: Path, shown: list[PaperTile]) -> None:
         [({"color": "black", "marker": marker}, _power(value)) for marker, value in markers],
     )
     figure.suptitle(f"Error of the {side} x {side} tile against noise, by lens types and by what the estimator expects")
-    _save(figure, path)
+    files.replace(figure, path)
 
 
-def draw_maps(path: Path, shown: list[PaperTile], noise: float) -> None:
+def draw_maps(path: Path, shown: list[PaperTile], noise: float, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 3: the error within the tile for each combination of lens types, and below it without the border.
 
     Every map has its own scale, from 0 to its maximum.
@@ -65,7 +64,7 @@ def draw_maps(path: Path, shown: list[PaperTile], noise: float) -> None:
         for axes, tile in zip(panels, shown, strict=True):
             _error_map(figure, axes, tile, noise, trim)
     figure.suptitle(f"Error within the {side} x {side} tile; noise variance {_power(noise)}, as the estimator expects")
-    _save(figure, path)
+    files.replace(figure, path)
 
 
 def _error_map(figure: Any, axes: Any, tile: PaperTile, noise: float, trim: int) -> None:
@@ -83,10 +82,10 @@ def _error_map(figure: Any, axes: Any, tile: PaperTile, noise: float, trim: int)
     for axis in (axes.xaxis, axes.yaxis):
         axis.get_major_locator().set_params(integer=True)
     bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-    bar.set_label("expected squared error (squared units of f)")
+    bar.set_label("expected squared error (grey levels squared)")
 
 
-def draw_sides(path: Path, shown: list[PaperTile]) -> None:
+def draw_sides(path: Path, shown: list[PaperTile], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 5: tiles of several sizes with three lens types, on the same axes."""
     figure = _figure(15.0, 5.8)
     panels = figure.subplots(1, len(shown), sharey=True)
@@ -101,7 +100,7 @@ def draw_sides(path: Path, shown: list[PaperTile]) -> None:
         _axes(axes, f"{tile.side} x {tile.side}, lenses {lenses}", NOISE, f"average {ERROR}")
     panels[0].legend(title=EXPECTED_NOISE, fontsize=9, title_fontsize=9, loc="upper left")
     figure.suptitle(f"Error of tiles of three sizes with three lens types ({'+'.join(THREE)})")
-    _save(figure, path)
+    files.replace(figure, path)
 
 
 def _error_of_one(axes: Any, best: FloatArray) -> None:
@@ -114,7 +113,7 @@ def _error_of_one(axes: Any, best: FloatArray) -> None:
     )
 
 
-def draw_distortion(path: Path, shown: list[PaperTile], noise: float) -> None:
+def draw_distortion(path: Path, shown: list[PaperTile], noise: float, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw error against noise of one lens type with and without distortion and of three types, and maps of it."""
     figure = _figure(14.5, 5.2)
     axes, *panels = figure.subplots(1, 1 + len(shown), width_ratios=(1.9, *(1.0 for _ in shown)))
@@ -132,12 +131,12 @@ def draw_distortion(path: Path, shown: list[PaperTile], noise: float) -> None:
         _axes(panel, f"{tile.name}\naverage {error.mean():.3g}", "column (target pixels)", "row (target pixels)")
         panel.grid(visible=False)
         bar = figure.colorbar(drawn, ax=panel, fraction=0.046, pad=0.03)
-        bar.set_label("expected squared error")
+        bar.set_label("expected squared error (grey levels squared)")
     figure.suptitle(f"Distortion as lens diversity; maps: expected squared error at noise variance {_power(noise)}")
-    _save(figure, path)
+    files.replace(figure, path)
 
 
-def draw_photograph(path: Path, photograph: Photograph, side: int) -> None:
+def draw_photograph(path: Path, photograph: Photograph, side: int, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 7: measured and predicted errors of six tiles against noise and bits, the tiles above."""
     figure = _figure(13.0, 10.2)
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 3.2))
@@ -159,16 +158,16 @@ def draw_photograph(path: Path, photograph: Photograph, side: int) -> None:
             r"Quantisation in steps of 256/$2^\mathrm{bits}$; the estimator expects noise of step$^2$/12",
         ),
     )
-    labels = ("noise variance (squared units of f)", "bits per measurement")
+    labels = ("noise variance (grey levels squared)", "bits per measurement")
     for (errors, ratios), (trials, levels, title), label in zip(panels.T, experiments, labels, strict=True):
         _trials(errors, trials, levels, photograph.crops)
-        _axes(errors, title, label, "mean squared error per pixel (squared units of f)")
+        _axes(errors, title, label, "mean squared error per pixel (grey levels squared)")
         _ratios(ratios, trials, levels)
         _axes(ratios, "", label, "measured over predicted")
     panels[0, 0].set_xscale("log")
     panels[0, 1].xaxis.get_major_locator().set_params(integer=True)
     panels[0, 0].legend(fontsize=9, loc="upper left")
-    _save(figure, path)
+    files.replace(figure, path)
 
 
 def _trials(axes: Any, trials: Trials, levels: list[float], crops: TileCrops) -> None:
@@ -216,7 +215,7 @@ def _figure(width: float, height: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure: Any = Figure(figsize=(width, height), dpi=RESOLUTION, layout="constrained")
+    figure: Any = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
@@ -233,7 +232,3 @@ def _legend(axes: Any, title: str, entries: list[tuple[dict[str, Any], str]]) ->
 
     handles: list[Any] = [Line2D([], [], lw=1.8, **style) for style, _ in entries]
     axes.legend(handles, [name for _, name in entries], title=title, loc="lower right", fontsize=9, title_fontsize=9)
-
-
-def _save(figure: Any, path: Path) -> None:
-    write_whole(path, lambda beside: figure.savefig(beside, format="png"))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.runtime.files import check_output, make_folder, write_csv
 from ommatid.runtime.progress import Progress, no_progress
 
@@ -32,11 +33,15 @@ Row = Sequence[str | float]
 
 
 def write_paper(
-    folder: Path, image: str = PHOTOGRAPH, seed: int = 0, progress: Progress = no_progress
+    folder: Path,
+    image: str = PHOTOGRAPH,
+    seed: int = 0,
+    progress: Progress = no_progress,
+    files: FigureFiles = SCREEN_PNG,
 ) -> dict[str, Any]:
     """Write figures 2, 3, 4, 5, 7 and one of distortion, each as PNG and CSV, and the claims; return a summary.
 
-    image : the photograph of Fig. 7, a file or `photo:NAME`
+    image : the photograph of Fig. 7, a file or `photo:NAME`;  files : of the figures
     Raises InputError for an unsuitable image or folder, MachineError where it cannot be written.
     """
     started = perf_counter()
@@ -53,8 +58,8 @@ def write_paper(
     diverse = [computed[DISTORTION_SIDE, THREE], *distortion()]
     _write_numbers(folder, computed, photograph, diverse)
     write_csv(folder / CLAIMS, ("claim", "source", "holds", "numbers", "remark"), map(_claim_row, claims))
-    _write_figures(folder, computed, photograph)
-    figures.draw_distortion(folder / "distortion.png", diverse, DISTORTION_NOISE)
+    _write_figures(folder, computed, photograph, files)
+    figures.draw_distortion(folder / "distortion.png", diverse, DISTORTION_NOISE, files)
     progress(1.0)
     return {
         "folder": str(folder),
@@ -83,12 +88,12 @@ def _combinations(computed: Tiles, side: int) -> list[PaperTile]:
     return [computed[side, lenses] for lenses in COMBINATIONS]
 
 
-def _write_figures(folder: Path, computed: Tiles, photograph: Photograph) -> None:
-    figures.draw_sweeps(folder / "fig2.png", _combinations(computed, 19))
-    figures.draw_maps(folder / "fig3.png", _combinations(computed, 19), MAP_NOISE)
-    figures.draw_sweeps(folder / "fig4.png", _combinations(computed, 35))
-    figures.draw_sides(folder / "fig5.png", [computed[side, THREE] for side in SIDES])
-    figures.draw_photograph(folder / "fig7.png", photograph, SIDE)
+def _write_figures(folder: Path, computed: Tiles, photograph: Photograph, files: FigureFiles) -> None:
+    figures.draw_sweeps(folder / "fig2.png", _combinations(computed, 19), files)
+    figures.draw_maps(folder / "fig3.png", _combinations(computed, 19), MAP_NOISE, files)
+    figures.draw_sweeps(folder / "fig4.png", _combinations(computed, 35), files)
+    figures.draw_sides(folder / "fig5.png", [computed[side, THREE] for side in SIDES], files)
+    figures.draw_photograph(folder / "fig7.png", photograph, SIDE, files)
 
 
 def _write_numbers(folder: Path, computed: Tiles, photograph: Photograph, diverse: list[PaperTile]) -> None:

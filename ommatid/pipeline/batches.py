@@ -18,6 +18,7 @@ from ommatid.batch.jobs.job_plan import EndedScene, JobShare, join_jobs
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.batch.sweep_row import SweepRow, summary
 from ommatid.batch.sweep_table import lines, write_sweep
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import picture
@@ -126,10 +127,12 @@ def run_batch(
     index_folder: Path | None = None,
     with_folders: bool = True,
     share: JobShare | None = None,
+    figures: FigureFiles = SCREEN_PNG,
 ) -> BatchOutcome:
     """Run every scene of a batch, even if others fail.
 
     report_failure : returns the exit code of an exception;  with_folders : documents of a sweep name the folders
+    figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     share : of a job, whose scenes `members` are; the last job writes table and page
     """
@@ -153,24 +156,25 @@ def run_batch(
         )
         for member in members
     ]
-    describe = partial(_describe, sweep_folder, index_folder, report_failure)
+    describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
     if share is None:
         sections, code = describe(ended)
         return BatchOutcome(documents, sections, max(*codes, code))
     described, jobs = share.end(ended, describe)
-    sections, code = described or _describe(None, None, report_failure, ended)
+    sections, code = described or _describe(None, None, figures, report_failure, ended)
     return BatchOutcome(documents, sections, max(*codes, code), jobs)
 
 
 def _describe(
     sweep_folder: Path | None,
     index_folder: Path | None,
+    figures: FigureFiles,
     report_failure: Callable[[Exception], int],
     ended: Sequence[EndedScene],
 ) -> tuple[list[Section], int]:
     """Write the table of a sweep and the page of a batch; return the printed table, and an exit code."""
     rows = [scene.row for scene in ended if scene.row is not None]
-    sections = _sweep_sections(rows, sweep_folder) if rows else []
+    sections = _sweep_sections(rows, sweep_folder, figures) if rows else []
     if index_folder is not None:
         try:
             cached_index(index_folder, {index_folder / scene.folder: scene.failure for scene in ended})
@@ -187,8 +191,8 @@ def _heading(member: Member, with_folder: bool) -> dict[str, Any]:
     return document
 
 
-def _sweep_sections(rows: list[SweepRow], folder: Path | None) -> list[Section]:
+def _sweep_sections(rows: list[SweepRow], folder: Path | None, figures: FigureFiles) -> list[Section]:
     if folder is None:
         return [("Sweep", lines(rows))]
-    write_sweep(folder, rows)
+    write_sweep(folder, rows, figures)
     return [(f"Sweep: {folder / 'sweep.csv'}", lines(rows))]

@@ -9,7 +9,8 @@ from time import perf_counter
 from typing import Any
 
 from ommatid.batch.batch import Member, prepare
-from ommatid.batch.remote import RunObserver
+from ommatid.batch.remote import RunObserver, Stages
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.output.run_json import RunReport, StudyCase, TimeReport
 from ommatid.reconstruct.output.time_spent import FILES, with_stage
 from ommatid.runtime.errors import InputError, naming_source
@@ -63,6 +64,27 @@ def process_count(changes: Sequence[str], lenses: Sequence[str], members: Sequen
 def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     """Execute all stages of a scene, here or on a worker, and return the content of run.json."""
     return with_page(results(setup, folder, observer), setup.camera, folder, observer).plain()
+
+
+def with_figures(stages: Stages, figures: FigureFiles) -> Stages:
+    """Return stages that write the figures of a run in these files, too, even if the results are up to date."""
+    return stages if figures == SCREEN_PNG else partial(_and_figures, stages, figures)
+
+
+def _and_figures(
+    stages: Stages, figures: FigureFiles, setup: Setup, folder: Path, observer: RunObserver
+) -> dict[str, Any]:
+    from ommatid.analysis.depth_error import PICTURE, draw
+    from ommatid.reconstruct.output import run_json
+    from ommatid.reconstruct.output.overview import write_overview
+    from ommatid.scenes import stack
+
+    description = stages(setup, folder, observer)
+    report = run_json.read(folder)
+    write_overview(folder, stack.read(folder / "stack.exr"), report, figures)
+    if report.depth:
+        draw(folder / PICTURE, setup.camera, report.depth, files=figures)
+    return description
 
 
 @one_thread()

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ommatid.runtime.files import write_whole
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 
 from .outcome import SweepOutcome
 
@@ -28,12 +28,12 @@ TITLES = {"three": "three types: H has full rank", "two": "two types: H has a nu
 _TEXT = {"ha": "right", "fontsize": 8, "color": "0.4"}
 
 
-def write_figure(path: Path, curves: list[SweepOutcome]) -> None:
+def write_figure(path: Path, curves: list[SweepOutcome], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the digits lost, with one row of panels per H and one column per quantity."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure: Any = Figure(figsize=(14, 9.5), dpi=110, layout="constrained")
+    figure: Any = Figure(figsize=(14, 9.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(TITLES), len(PANELS), sharex=True, sharey=True)
     for row, (lenses, title) in enumerate(TITLES.items()):
@@ -45,13 +45,13 @@ def write_figure(path: Path, curves: list[SweepOutcome]) -> None:
             _draw_axes(panel)
             panel.set_title(f"{title}\n{quantity}", fontsize=10)
             if row == len(TITLES) - 1:
-                panel.set_xlabel("noise variance (squared units of f)")
+                panel.set_xlabel("noise variance (grey levels squared)")
             if column == 0:
-                panel.set_ylabel("digits lost, of 16")
+                panel.set_ylabel("decimal digits lost, of 16")
     handles, names = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize=9)
     figure.suptitle("Digits lost by the forms of the estimator, against exact arithmetic")
-    write_whole(path, lambda stream: figure.savefig(stream, format="png"))
+    files.replace(figure, path)
 
 
 def _draw_axes(panel: Any) -> None:

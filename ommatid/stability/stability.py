@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
@@ -112,7 +113,9 @@ def run(matrices: Matrices, progress: Callable[[float], None]) -> tuple[list[Swe
     return curves, table
 
 
-def write_stability(folder: Path, matrices: Matrices, progress: Callable[[float], None]) -> dict[str, Any]:
+def write_stability(
+    folder: Path, matrices: Matrices, progress: Callable[[float], None], figures: FigureFiles = SCREEN_PNG
+) -> dict[str, Any]:
     """Write stability.csv, stability.md and stability.png; return a summary. Raises InputError or MachineError."""
     make_folder(folder)
     curves, table = run(matrices, progress)
@@ -122,7 +125,7 @@ def write_stability(folder: Path, matrices: Matrices, progress: Callable[[float]
     columns = [field.name for field in fields(StabilityOutcome)]
     write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
     write_text(folder / "stability.md", markdown(automatic))
-    write_figure(folder / "stability.png", curves)
+    write_figure(folder / "stability.png", curves, figures)
     return {
         "files": [str(folder / name) for name in ("stability.csv", "stability.md", "stability.png")],
         "auto": {verdict: verdicts.count(verdict) for verdict in (RIGHT, REFUSED, FEWER, SILENT)},

@@ -18,12 +18,12 @@ from ommatid.batch import sweep_figure
 from ommatid.batch.sweep import SweepAxis, members, sweep_axes
 from ommatid.batch.sweep_row import SweepRow, read_rows, summary
 from ommatid.batch.sweep_table import lines, write_sweep
-from ommatid.figures.saving import FigureFiles
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import read
 from ommatid.scenes.tables.overrides import value_of
 
 from ..conftest import TINY, Command
+from ..kept_figures import KeptFigures
 from ..runs import document
 
 NOISES = ("1e-4", "1e-2", "1")
@@ -224,14 +224,19 @@ def test_a_sweep_says_where_the_error_is_twice_the_smallest(rows_of_tolerance: l
     """Between decades the logarithm is interpolated, which is exact for the power that these errors follow."""
     axis, found = sweep_figure.crossings(rows_of_tolerance)
     assert [crossing.values["calibration.method"] for crossing in found] == ["ideal", "transport"]
-    assert [crossing.position for crossing in found] == pytest.approx([2**0.5, 200**0.5], rel=1e-9)
-    assert axis.words(found[1].position) == "14 nm"
+    assert [crossing.position for crossing in found] == pytest.approx([200**0.5, 20000**0.5], rel=1e-9)
+    assert axis.words(found[1].position) == "140 nm"
     printed = [value for name, value in lines(rows_of_tolerance) if "twice the smallest" in name]
-    assert printed[0] == "at camera.tolerance.position = 1.4 nm, calibration.method = ideal"
+    assert printed[0] == "at camera.tolerance.position = 14 nm, calibration.method = ideal"
     named = [
         row.model_copy(update={"values": {"render.sampler": name}}) for name, row in zip("abc", NAMED, strict=True)
     ]
     assert sweep_figure.crossings(named)[1] == []
+    falling = [row.model_copy(update={"values": {"noise.bits": bits}}) for bits, row in zip("642", NAMED, strict=True)]
+    assert sweep_figure.crossings(falling)[1] == [], "one value alone is below twice the smallest error"
+    needed = [*falling, NAMED[0].model_copy(update={"values": {"noise.bits": "8"}})]
+    [bits] = sweep_figure.crossings(needed)[1]
+    assert bits.position == pytest.approx(4), "the error of 4 bits is twice that of 6 and 8"
 
 
 POSITIONS = ("1 nm", "10 nm", "100 nm", "1 um")
@@ -245,26 +250,18 @@ def rows_of_tolerance() -> list[SweepRow]:
         SweepRow(
             scene="a.toml",
             values={"camera.tolerance.position": length, "calibration.method": method},
-            predicted_mse=max(1.0, (10.0**power / scale) ** 2),
-            mse=1.1 * max(1.0, (10.0**power / scale) ** 2),
+            predicted_mse=max(0.1, (10.0**power / scale) ** 2 / 10),
+            mse=1.1 * max(0.1, (10.0**power / scale) ** 2 / 10),
         )
         for power, length in enumerate(POSITIONS)
-        for method, scale in (("ideal", 1.0), ("transport", 10.0))
+        for method, scale in (("ideal", 10.0), ("transport", 100.0))
     ]
 
 
-class FigureKept(FigureFiles):
-    """Keeps the figure that is to be written."""
-
-    def replace(self, figure: Any, path: Path) -> None:
-        assert path.suffix == ".png"
-        object.__setattr__(self, "figure", figure)
-
-
 def drawn(rows: list[SweepRow], folder: Path) -> Any:
-    kept: Any = FigureKept()
-    sweep_figure.write_figure(folder / "sweep.png", rows, kept)
-    return kept.figure
+    figures = KeptFigures()
+    sweep_figure.write_figure(folder / "sweep.png", rows, figures)
+    return figures.kept["sweep"]
 
 
 def documents_of(swept: dict[str, list[str]]) -> list[dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import pytest
 from scipy import stats
 
 from ommatid.paper import claims, paper
-from ommatid.paper import figures as paper_figures
 from ommatid.paper.claims import NO, QUALIFIED, YES
 from ommatid.paper.photograph_claims import photograph_claims
 from ommatid.paper.photographs import Photograph, TileCrops, crop_tiles, load, measure, seeds, simulate_trials
@@ -25,6 +23,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables.sensor import NoiseTable
 
 from ..examples import familywise
+from ..kept_figures import KeptFigures
 from ..printed_figures import check_figures
 
 
@@ -46,18 +45,10 @@ class Written:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Written]:
+def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     folder = tmp_path_factory.mktemp("paper") / "new" / "folder"
-    drawn: dict[str, Any] = {}
-
-    def save(figure: Any, path: Path) -> None:
-        drawn[path.stem] = figure
-        original(figure, path)
-
-    original = vars(paper_figures)["_save"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper_figures, "_save", save)
-        yield Written(folder, paper.write_paper(folder), drawn)
+    figures = KeptFigures(write=True)
+    return Written(folder, paper.write_paper(folder, files=figures), figures.kept)
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
-from ommatid.figures.saving import FigureFiles
 from ommatid.reconstruct.output import run_json, verdict_words
 from ommatid.reconstruct.output.overview import OVERVIEW, grid, headline, write_overview
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes import stack as stack_file
 from ommatid.scenes.formats import exr
+
+from ..kept_figures import KeptFigures
 
 
 @pytest.mark.parametrize("count", range(3, 25))
@@ -23,19 +24,10 @@ def test_the_last_panel_fills_what_is_left(count: int) -> None:
     assert rows * columns >= count > (rows - 1) * columns, "the last row begins with a panel of its own"
 
 
-class KeptFigure(FigureFiles):
-    """Keeps the figure and writes nothing."""
-
-    def replace(self, figure: Any, path: Path) -> None:
-        assert path.name == OVERVIEW
-        object.__setattr__(self, "figure", figure)
-
-
-def drawn(folder: Path, report: RunReport | None = None) -> Any:
-    kept: Any = KeptFigure()
-    stack = stack_file.read(folder / "stack.exr")
-    write_overview(folder, stack, run_json.read(folder) if report is None else report, kept)
-    return kept.figure
+def drawn(folder: Path) -> Any:
+    figures = KeptFigures()
+    write_overview(folder, stack_file.read(folder / "stack.exr"), run_json.read(folder), figures)
+    return figures.kept[Path(OVERVIEW).stem]
 
 
 @pytest.fixture(scope="module")

@@ -130,6 +130,19 @@ def test_the_last_job_describes_the_batch_in_the_order_of_its_scenes(tmp_path: P
     assert names == {"1.plan.json", "1.job-1.json", "1.job-2.json", "1.job-3.json"}
 
 
+def test_all_jobs_follow_the_plan_of_the_first(tmp_path: Path) -> None:
+    """The estimated times of other machines may differ, and their shares with them."""
+    members = members_of(tmp_path)
+
+    def share(number: int, seconds: Sequence[float]) -> list[int]:
+        job = ArrayJob(number, 2)
+        joined = join_jobs(job, members, tmp_path, ("run",), lambda member: seconds[members.index(member)], dict)
+        return [members.index(member) for member in joined.members]
+
+    assert share(2, [9, 1, 1, 1, 1, 1, 1]) == [1, 2, 3, 4, 5, 6]
+    assert share(1, [1, 1, 1, 1, 1, 1, 9]) == [0]
+
+
 def test_a_job_without_scenes_waits_for_nothing(tmp_path: Path) -> None:
     shared = joined(tmp_path, 9, 9)
     assert shared.members == ()

@@ -44,8 +44,8 @@ class JobPlan(_JobFile):
     jobs: int
     command: tuple[str, ...]
     scenes: dict[str, tuple[str, ...]]
-    shares: tuple[tuple[int, ...], ...]
     versions: dict[str, str]
+    shares: tuple[tuple[int, ...], ...] = ()
 
     def difference(self, other: JobPlan) -> str:
         """Say what these jobs do, not those of another plan; empty if they do the same."""
@@ -182,13 +182,16 @@ def join_jobs(
         jobs=job.count,
         command=tuple(command),
         scenes={member.folder.name: (str(member.scene), *member.changes) for member in everyone},
-        shares=shares([cost(member) for member in everyone], job.count),
         versions=here,
     )
     number = max((_number_of(path) for path in folder.glob("*.plan.json")), default=1)
     while True:
         path = folder / f"{number}.plan.json"
-        plan = _read_plan(path, claimed_text(path, wanted.model_dump_json(), _temporary(folder, job)))
+        if not path.exists():
+            parts = shares([cost(member) for member in everyone], job.count)
+            text = wanted.model_copy(update={"shares": parts}).model_dump_json()
+            claimed_text(path, text, _temporary(folder, job))
+        plan = _read_plan(path)
         different, others = plan.difference(wanted), plan.other_versions(here)
         if not different and not others:
             break
@@ -202,9 +205,9 @@ def join_jobs(
     return share
 
 
-def _read_plan(path: Path, text: str) -> JobPlan:
+def _read_plan(path: Path) -> JobPlan:
     try:
-        return JobPlan.model_validate_json(text)
+        return JobPlan.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise InputError(f"{path}: expected the plan of jobs, got something else; delete {path.parent}") from error
 

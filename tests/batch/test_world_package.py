@@ -25,7 +25,7 @@ WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_wor
 <scale value="6"/><translate z="1000"/></transform><emitter type="area"><texture type="bitmap" name="radiance">
 <string name="filename" value="{picture}"/></texture></emitter></shape></scene>"""
 DEEP = TINY.replace('image = "photo:camera"\norigin = [100, 230]\n', "").replace(
-    "[noise]", '[world]\nfile = "places/world.xml"\n\n[noise]'
+    "[noise]", '[world]\nfile = "places/world.xml"\nwhite = "auto"\n\n[noise]'
 )
 
 

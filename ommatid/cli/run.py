@@ -74,8 +74,8 @@ def run(
     figures = figure_files(figure_formats, figure_resolution)
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
-    words = _job_words(within, formats, figure_formats)
-    share = None if dry_run else share_of_job(job, members, folder, words, *asked, scheduler)
+    job = "" if dry_run else job
+    share = share_of_job(job, members, folder, _job_words(within, formats, figure_formats), *asked, scheduler)
     members = members if share is None else share.members
     output.warn_all(batch_warnings(members, *asked))
     if dry_run:
@@ -84,11 +84,9 @@ def run(
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
     report = partial(_print_run, None if as_json else detail)
-    stages = with_options(with_figures(stages, figures), force, others)
-    batch = scene_batch(*asked, stages, observer, report)
-    folders: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures}
-    outcome = run_batch(batch, members, failures.report, scheduler, workers, **folders, share=share)
-    finish_batch(outcome, as_json, strict)
+    batch = scene_batch(*asked, with_options(with_figures(stages, figures), force, others), observer, report)
+    files: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures, "share": share}
+    finish_batch(run_batch(batch, members, failures.report, scheduler, workers, **files), as_json, strict)
 
 
 def _print_run(detail: output.Detail | None, member: Member, description: dict[str, Any]) -> dict[str, Any]:

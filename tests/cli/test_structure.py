@@ -12,7 +12,7 @@ from ommatid.cli.app import app
 
 from ..modules import modules
 
-LONGEST = 40  # lines of a function, its signature and docstring included
+LONGEST = 50  # lines of a function, its signature and docstring included
 COMMANDS: dict[str, Any] = cast(Any, typer.main.get_command(app)).commands
 
 

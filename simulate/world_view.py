@@ -171,8 +171,8 @@ def _unseen(where: str, view: WorldView, camera: Camera, table: WorldTable) -> s
     seen = ", ".join(f"{axis} {-end:.4g} to {end:.4g}" for axis, end in zip("xy", half, strict=True))
     return (
         f"{where}: {view.met} of {view.views} views of sensor pixels meet a surface, expected half or more: the camera"
-        f" stands at 0, 0, 0, looks along +z and sees {seen} mm at {camera.distance:.4g} mm, and the world's"
-        f" bounding box is {_box_words(view.box)}; {_remedy(view, table)}"
+        f" stands at 0, 0, 0, looks along +z and sees {seen} mm at {camera.distance:.4g} mm, and the world's bounding"
+        f" box is {_box_words(view.box)}; {_remedy(view, table)}"
     )
 
 
@@ -203,8 +203,8 @@ def _too_near(where: str, view: WorldView, camera: Camera, table: WorldTable, me
     return (
         f"{where}: half of the surfaces that the camera sees are nearer than {median:.4g} mm, and the target's plane is"
         f" at {camera.distance:.4g} mm: opposite lenses of the array see them displaced by"
-        f" {displacement(camera, median).max():.3g} pixels of f, more than the whole target, and the world's"
-        f" bounding box is {_box_words(view.box)}; {_remedy(view, table)}"
+        f" {displacement(camera, median).max():.3g} pixels of f, more than the whole target, and the world's bounding"
+        f" box is {_box_words(view.box)}; {_remedy(view, table)}"
     )
 
 

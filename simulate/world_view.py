@@ -44,6 +44,7 @@ class WorldView:
     sky : True if light comes from where there is no surface
     sensors : number of sensors in the file;  white : radiance of a value of 255, 0 if none was found
     fitting_unit : in which the camera would see the world, if it does not; None if there is none
+    has_picture : True if the target has a picture, which is left out here
     """
 
     views: int
@@ -54,6 +55,7 @@ class WorldView:
     sensors: int
     white: float
     fitting_unit: str | None
+    has_picture: bool
 
     def describe(self) -> dict[str, Any]:
         """Describe the view in JSON's types."""
@@ -68,6 +70,7 @@ class WorldView:
             "sky": self.sky,
             "sensors": self.sensors,
             "white": self.white,
+            "has_picture": self.has_picture,
         }
 
 
@@ -75,7 +78,8 @@ def rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Tabulate the description of a view."""
     met, views, box = description["views_that_meet_a_surface"], description["views"], description["box"]
     others = "; the others see the sky" if description["sky"] and met < views else ""
-    table = [("what the camera sees", f"a surface in {met} of {views} views of sensor pixels{others}")]
+    name = "what the camera sees" + (" without the picture" if description["has_picture"] else "")
+    table = [(name, f"a surface in {met} of {views} views of sensor pixels{others}")]
     if met:
         nearest, median, farthest = (description[name] for name in ("nearest", "median", "farthest"))
         words = f"{nearest:.5g} to {farthest:.5g} mm away, half of them nearer than {median:.5g} mm"
@@ -113,6 +117,7 @@ def world_view(setup: Setup) -> WorldView:
         sensors=world.sensors,
         white=table.white if isinstance(table.white, float) else _brightest(renderer, scene.render.seed),
         fitting_unit=None if sees_enough(camera, depths) else _fitting_unit(world, camera, table),
+        has_picture=scene.target.image is not None,
     )
     _known[key] = view
     return view

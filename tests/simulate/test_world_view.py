@@ -104,7 +104,10 @@ def test_under_a_sky_one_surface_in_view_is_enough(tmp_path: Path) -> None:
 
 def test_a_picture_is_seen_wherever_the_world_is(tmp_path: Path) -> None:
     picture = {"image": "photo:camera", "origin": [96, 224]}
-    assert view_of(tmp_path, rectangle(20, 20, 300, 0, Z, glow(1)), target=picture).met == 0
+    view = view_of(tmp_path, rectangle(20, 20, 300, 0, Z, glow(1)), target=picture)
+    assert view.met == 0
+    first, *_ = module.rows(view.describe())
+    assert first == ("what the camera sees without the picture", "a surface in 0 of 16 views of sensor pixels")
 
 
 NEAR = "half of the surfaces that the camera sees are nearer than 1 mm, and the target's plane is at 1000 mm"

@@ -17,6 +17,7 @@ import pytest
 import ommatid
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses.etendue import transmissions
@@ -24,7 +25,7 @@ from ommatid.simulate.renderer.variant import unusable_reason
 
 from .benchmarks import f_numbers
 from .conftest import Command, shell
-from .documentation import PAGES, Block, blocks, page_name, text_of
+from .documentation import DOCS, PAGES, Block, blocks, page_name, text_of
 from .examples import GALLERY
 from .printed_figures import check_figures, is_printed, rounds_to, stated_figures, unchecked_decimals
 
@@ -43,6 +44,8 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/frames.md", "Tiles"): "experiments against exact solutions, which no command prints",
     ("docs/calibration.md", "H by few numbers"): "experiments against the true H, which no command prints",
     ("docs/calibration.md", "Learnt kernels"): "`python -m tests.benchmarks.learnt_kernels`, twenty seeds",
+    ("docs/choose-a-camera.md", "Describe the sensor and one lens"): "lengths of the example",
+    ("docs/choose-a-camera.md", "What diffraction allows"): "lengths of the example",
     ("docs/diffraction.md", "One wavefront"): "constants of the text",
     ("docs/diffraction.md", "Which f-number"): "f-numbers",
     ("docs/lenses.md", "A real lens"): "an experiment against the closed form, 65,536 rays of every pixel",
@@ -69,8 +72,8 @@ def predicted(name: str, *changes: str, lens: str = "") -> float:
     return ommatid.predict(ommatid.read_scene(name, set=changes, lens=lens), rays=False).mse
 
 
-def camera_of(name: str) -> Camera:
-    return derive(ommatid.read_scene(name))
+def camera_of(name: str, *changes: str) -> Camera:
+    return derive(ommatid.read_scene(name, set=changes))
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +142,60 @@ def test_which_f_number() -> None:
     check_figures(
         "diffraction.md", "| expected error over noise variance | {} | {} | {} | {} | {} | {} |", perfect, *errors
     )
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The scene file of the page on choosing a camera."""
+    path = tmp_path_factory.mktemp("phone") / "phone.toml"
+    path.write_text(next(block.text for block in blocks(DOCS / "choose-a-camera.md") if block.file_name), "utf-8")
+    return str(path)
+
+
+def test_the_optics_of_the_chosen_camera(phone: str) -> None:
+    scene = ommatid.read_scene(phone)
+    camera = derive(scene)
+    terms = optical_terms(scene, camera)
+    check_figures("choose-a-camera.md", "A pixel of the target is {} mm wide,", camera.target_pitch)
+    focal_lengths = [lens.focal_length for lens in terms.types[1:]]
+    check_figures("choose-a-camera.md", "types II and III have focal lengths of {} mm and {} mm.", *focal_lengths)
+    airy = [float(lens.airy_diameter or 0) for lens in terms.types]
+    check_figures("choose-a-camera.md", "The Airy disks are {} to {} pixels wide", min(airy), max(airy))
+    cut_off = 550e-6 * camera.depth(camera.types[0]) / 0.5
+    check_figures("choose-a-camera.md", "wavelength times f-number, {} um on the sensor", 1000 * cut_off)
+    large = camera_of(phone, "camera.pixel_pitch=6.2 um").target_pitch
+    check_figures("choose-a-camera.md", "A pixel of the target is then {} mm wide.", large)
+    single = 3 * camera.target_pitch
+    check_figures("choose-a-camera.md", "before the pixels of 1.55 um has target pixels of {} mm", single)
+
+
+def test_lenses_too_wide_for_the_chosen_sensor(phone: str) -> None:
+    with pytest.raises(ommatid.InputError) as refused:
+        camera_of(phone, "camera.lens_pitch=0.8 mm")
+    width, sensor = re.findall(r"x (\d+\.\d+) mm", str(refused.value))
+    check_figures(
+        "choose-a-camera.md", "they would be {} mm wide, and the sensor has {} mm", float(width), float(sensor)
+    )
+
+
+def test_the_bits_of_the_chosen_camera(phone: str) -> None:
+    bits = [predicted(phone, "camera.pixel_pitch=6.2 um", f"noise.bits={count}") for count in (12, 13)]
+    check_figures("choose-a-camera.md", "Their roots are {} and {} grey levels", *np.sqrt(bits))
+    rays = predicted(phone, "camera.wavelength=none", "noise.bits=11")
+    check_figures("choose-a-camera.md", "11 bits would seem enough, with {} grey levels", rays**0.5)
+
+
+def test_one_lens_type_against_three() -> None:
+    def row(lens: str) -> list[float]:
+        found = ommatid.predict(ommatid.read_scene("tile19", set="noise.variance=1e-2", lens=lens), rays=False)
+        return [found.measurements, float(found.null_space or 0), found.mse]
+
+    check_figures("compare.md", "Three types of `tile19` have {} sensor pixels.", row("")[0])
+    check_figures("compare.md", "Type I three times has {}:", row("I,I,I")[0])
+    check_figures("compare.md", "| I, II, III | {} | {} | {} |", *row("I,II,III"))
+    check_figures("compare.md", "| I, II | {} | {} | {} |", *row("I,II"))
+    check_figures("compare.md", "| I, I, I | {} | {} | {} |", *row("I,I,I"))
+    check_figures("compare.md", "| III, III, III | {} | {} | {} |", *row("III,III,III"))
 
 
 # --- sentences about runs, which take minutes

@@ -205,12 +205,15 @@ def test_one_lens_type_against_three() -> None:
 @needs_fast_backend
 def test_the_first_camera(folder: Path) -> None:
     check_figures("first-camera.md", "`predict --no-rays` computes {}, which is the effect", predicted(STARTER))
-    error = ran(folder, STARTER, "render.samples=4096", "calibration.samples=4096").error
-    assert error.expected_given_truth is not None
+    report = ran(folder, STARTER, "render.samples=256", "calibration.samples=256")
+    needed = ran(folder, STARTER).error.mse
+    assert report.error.mse is not None
+    assert needed is not None
+    rendering = 100 * report.error.budget["rendering"] / report.error.predicted_mse
     check_figures(
-        "first-camera.md",
-        "the measured error is {}, the predicted error {}, and the interval {} to {}.",
-        *(float(error.mse or 0), error.predicted_mse, error.expected_given_truth.low, error.expected_given_truth.high),
+        "time.md",
+        "has an error of {} instead of {}, and the budget says why: {} % of it is due to the rendering.",
+        *(report.error.mse, needed, rendering),
     )
 
 

@@ -58,5 +58,5 @@ def _psnr_and_ssim(psnr: float | None, ssim: float | None) -> str:
 
 
 def _time(report: RunReport) -> str:
-    stages = ", ".join(f"{name} {stage.seconds:.1f}" for name, stage in report.stages.items())
+    stages = ", ".join(f"{name} {stage.seconds:.1f} s" for name, stage in report.stages.items())
     return f"{sum(stage.seconds for stage in report.stages.values()):.1f} s: {stages}"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
 class TargetTable(Table):
     """The flat picture that the camera looks at, and the grid on which the image is reconstructed."""
 
-    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("pixel_pitch", "distance")))
+    model_config = ConfigDict(json_schema_extra=allow_absent("pixel_pitch", "distance"))
 
     image: FileName | None = Field(
         default=None,

@@ -21,7 +21,7 @@ from typing import Any, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from ..tables.units import Length, Magnification
+from ..tables.units import Length, Magnification, Pair
 from .quantities import FieldOfView, FNumber
 from .redundancy import contradiction, required_focal_length
 
@@ -33,6 +33,7 @@ SHARED = {  # by all lens types
     "sensor_pitch": ("camera", "pixel_pitch"),
 }
 LENGTH, RATIO = TypeAdapter[float](Length), TypeAdapter[Fraction](Magnification)
+PIXELS = TypeAdapter[tuple[int, int]](Pair)
 NUMBER, ANGLES = TypeAdapter[float](FNumber), TypeAdapter[tuple[float, ...]](FieldOfView)
 ASKING = ("focal_length", "field_of_view", "f_number")  # keys that only the solution reads
 EXACT = 1000  # largest numerator and denominator of a derived magnification that is kept as it is
@@ -51,7 +52,7 @@ def complete(data: dict[str, Any]) -> tuple[dict[str, Any], str]:
     try:
         shared = {name: _length(data[table][key]) for name, (table, key) in SHARED.items() if key in data[table]}
         known = [ChainMap(_given(lens), shared) for lens in lenses]
-    except (ValidationError, TypeError):
+    except ValidationError:
         return data, ""
     problem = _solve(known, shared, [str(lens.get("name")) for lens in lenses])
     completed = copy.deepcopy(data)
@@ -88,7 +89,7 @@ def _text(length: Fraction) -> str:
 
 
 def _given(lens: Mapping[str, Any]) -> dict[str, Fraction]:
-    """The quantities in the table of a lens type. Raises ValidationError or TypeError for a value that is none.
+    """The quantities in the table of a lens type. Raises ValidationError for a value that is none.
 
     across, down : 2 tan(field of view / 2) along a row of pixels and along a column
     """
@@ -97,8 +98,8 @@ def _given(lens: Mapping[str, Any]) -> dict[str, Fraction]:
         known["magnification"] = RATIO.validate_python(lens["magnification"])
     if "f_number" in lens:
         known["f_number"] = _decimal(NUMBER.validate_python(lens["f_number"]))
-    if isinstance(lens.get("pixels"), list | tuple):
-        known["rows"], known["columns"] = (Fraction(count) for count in lens["pixels"])
+    if "pixels" in lens and lens["pixels"] != "fit":
+        known["rows"], known["columns"] = (Fraction(count) for count in PIXELS.validate_python(lens["pixels"]))
     if "field_of_view" in lens:
         tangents = [Fraction(2 * tan(angle / 2)) for angle in ANGLES.validate_python(lens["field_of_view"])]
         known["across"] = tangents[-1]

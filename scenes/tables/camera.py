@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from functools import partial
 from typing import Annotated, Literal, cast
 
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
@@ -106,7 +105,7 @@ class SubImagerTable(Table):
 class LensTable(Table):
     """One lens type: an array of equal sub-imagers."""
 
-    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("magnification", "pixels")))
+    model_config = ConfigDict(json_schema_extra=allow_absent("magnification", "pixels"))
 
     name: str = Field(pattern=LENS_NAME)
     magnification: Magnification = Field(
@@ -210,7 +209,7 @@ class CameraSensorTable(Table):
 class CameraTable(Table):
     """A flat sensor behind arrays of micro-lenses."""
 
-    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("pixel_pitch",)))
+    model_config = ConfigDict(json_schema_extra=allow_absent("pixel_pitch"))
 
     pixel_pitch: Length = Field(description="side of one sensor pixel")
     lens_pitch: Length = Field(description="distance between the centres of neighbouring lenses")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
@@ -16,6 +16,10 @@ class Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-def allow_absent(schema: dict[str, Any], keys: Iterable[str]) -> None:
+def allow_absent(*keys: str) -> Callable[[dict[str, Any]], None]:
     """Let a scene file omit keys, in the JSON Schema of a table; reading the file derives them from others."""
-    schema["required"] = [key for key in schema.get("required", ()) if key not in keys]
+
+    def drop(schema: dict[str, Any]) -> None:
+        schema["required"] = [key for key in schema.get("required", ()) if key not in keys]
+
+    return drop

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from fractions import Fraction
 from math import atan, radians, tan
 from pathlib import Path
@@ -184,3 +185,30 @@ def optics_of(camera: Camera) -> tuple[float, float, float]:
     lens = camera.types[0]
     assert lens.optics.aperture is not None
     return camera.depth(lens), camera.focal_length(lens), lens.optics.aperture
+
+
+VALUES: list[Any] = [
+    *(None, 0, -1, 1.5, float("inf"), "", "x", "1/3", "1e-15 mm", "1e15 mm", "2 mm", "9 m", "30 deg", "1e-15 rad"),
+    *([], [0, 0], [1], [1, 2, 3], [5, 7], ["30 deg", "1 deg"], ["30 deg", 1], {}, "fit", True, [None, None]),
+]
+LENS_KEYS = ("focal_length", "f_number", "field_of_view", "aperture", "focus", "magnification", "pixels")
+PLANE_KEYS = ("distance", "pixel_pitch")
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    st.dictionaries(st.sampled_from(LENS_KEYS), st.sampled_from(VALUES), min_size=1),
+    st.dictionaries(st.sampled_from(PLANE_KEYS), st.sampled_from(VALUES)),
+    st.dictionaries(st.sampled_from(PLANE_KEYS[1:]), st.sampled_from(VALUES)),
+)
+def test_any_values_give_a_scene_or_one_sentence(
+    lens: dict[str, Any], target: dict[str, Any], camera: dict[str, Any]
+) -> None:
+    with suppress(InputError):  # any other exception is an error of the program
+        derive(described(target, camera, **lens))
+
+
+def test_the_schema_allows_every_key_that_may_follow_from_others_to_be_absent() -> None:
+    tables = Scene.model_json_schema()["$defs"]
+    required = {name: set(tables[name]["required"]) for name in ("TargetTable", "CameraTable", "LensTable")}
+    assert required == {"TargetTable": set(), "CameraTable": {"lens_pitch", "lens"}, "LensTable": {"name", "array"}}

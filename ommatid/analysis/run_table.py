@@ -32,7 +32,7 @@ def rows(report: RunReport) -> list[Row]:
         *(("assumed", assumption) for assumption in report.assumes),
         *_stage_rows(report),
         *_error_rows(report.error),
-        *(_region_row(region) for region in report.regions),
+        *(region_row(region) for region in report.regions),
         *_image_quality_rows(report.error),
         *_solver_rows(report.solver),
         *_diagnostic_rows(report.diagnostics, report.unknowns),
@@ -113,7 +113,8 @@ def _error_rows(error: ErrorReport) -> list[Row]:
     ]
 
 
-def _region_row(region: RegionReport) -> Row:
+def region_row(region: RegionReport) -> Row:
+    """Return the place of a region, and the mean of the estimate in it with its standard deviation."""
     (row, column), (rows, columns) = region.corner, region.size
     return f"mean of {rows} x {columns} pixels at {row}, {column}", f"{region.mean:.4f} +/- {region.deviation:.2g}"
 

@@ -98,6 +98,8 @@ def _print_run(detail: output.Detail | None, member: Member, description: dict[s
         report = RunReport.model_validate(description)
         page, sections = member.folder / "report.html", run_sections(member.folder, description)
         output.print_report(member.folder.name, page, report, sections, detail)
+        if detail == "summary" and report.study:  # asked for by the scene
+            output.print_tables(sections[-1:])
     return description
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import sqrt
 from pathlib import Path
 
+from ommatid.analysis.run_table import region_row
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import grounds, heading, limit
 
@@ -15,7 +16,10 @@ def verdict_line(name: str, report: RunReport) -> str:
 
 
 def summary_lines(name: str, report: RunReport, page: Path | None) -> list[str]:
-    """Return six lines: verdict, error against expectation, quality, what limits the error, time, and the page."""
+    """Return six lines: verdict, error against expectation, quality, what limits the error, time, and the page.
+
+    A line for each region follows, if means of regions were asked for.
+    """
     rows = {
         "error": _error(report.error),
         "quality": _quality(report),
@@ -23,7 +27,8 @@ def summary_lines(name: str, report: RunReport, page: Path | None) -> list[str]:
         "time": _time(report),
         "page": "none is written with the estimate alone; name a folder with -o" if page is None else str(page),
     }
-    return [verdict_line(name, report), *(f"  {label:8} {words}" for label, words in rows.items())]
+    regions = [f"  {'region':8} {name} is {mean}" for name, mean in map(region_row, report.regions)]
+    return [verdict_line(name, report), *(f"  {label:8} {words}" for label, words in rows.items()), *regions]
 
 
 def _error(error: ErrorReport) -> str:
@@ -58,5 +63,6 @@ def _psnr_and_ssim(psnr: float | None, ssim: float | None) -> str:
 
 
 def _time(report: RunReport) -> str:
-    stages = ", ".join(f"{name} {stage.seconds:.1f} s" for name, stage in report.stages.items())
+    names = {name: "import" if stage.method == "imported" else name for name, stage in report.stages.items()}
+    stages = ", ".join(f"{names[name]} {stage.seconds:.1f} s" for name, stage in report.stages.items())
     return f"{sum(stage.seconds for stage in report.stages.values()):.1f} s: {stages}"

@@ -74,14 +74,20 @@ def conversions(scene: Scene) -> list[str]:
     image = scene.target.image
     if image is None:
         return []
-    dtype, channels = _stored(_picture_path(image, f"{scene.source}: target.image"))
-    sentences: list[str] = []
-    if channels >= 3:
-        weights = " + ".join(f"{weight} {name}" for weight, name in zip(LUMINANCE, "RGB", strict=True))
-        sentences.append(f"{image} is a colour picture: only its luminance is simulated, {weights}")
+    path = _picture_path(image, f"{scene.source}: target.image")
+    dtype, _ = _stored(path)
+    sentences = colour_lost(path, image)
     if dtype.kind == "u" and dtype.itemsize == 2:
         sentences.append(f"{image} has 16-bit values: they are divided by {STEPS:g}, to the range from 0 to 255")
     return sentences
+
+
+def colour_lost(path: Path, name: str) -> list[str]:
+    """Return a sentence about the colours of a picture file of that name; nothing for a grey one. Raises InputError."""
+    if _stored(path)[1] < 3:
+        return []
+    weights = " + ".join(f"{weight} {colour}" for weight, colour in zip(LUMINANCE, "RGB", strict=True))
+    return [f"{name} is a colour picture: only its luminance is used, {weights}"]
 
 
 def _stored(path: Path) -> tuple[np.dtype[Any], int]:
@@ -97,7 +103,7 @@ def _stored(path: Path) -> tuple[np.dtype[Any], int]:
         except Exception as error:
             raise InputError(f"{path} could not be read as a picture; it is damaged or another kind of file") from error
     pixels = decode(path, str(path))
-    return pixels.dtype, pixels.shape[2] if pixels.ndim == 3 else 1
+    return pixels.dtype, pixels.shape[2] if pixels.ndim == 3 and pixels.shape[2] <= len("RGBA") else 1
 
 
 def target_shape(scene: Scene) -> tuple[int, int]:

@@ -177,6 +177,17 @@ def test_what_is_lost_of_a_picture_is_said_in_one_warning(
         assert all(line.startswith("warning: ") for line in ended.err.splitlines())
 
 
+def test_colours_of_recorded_frames_are_said_to_be_lost(here: Path, ommatid: Command) -> None:
+    assert here.is_dir()
+    for shape, name in (((3, 3, 3), "colour"), ((3, 3), "grey")):
+        Path(name).mkdir()
+        for number in range(9):
+            save(f"{name}/{number}.png", np.full(shape, 9, np.uint8))
+        ended = ommatid("import", "tiny.toml", name, "-o", f"{name}.exr")
+        assert ended.code == 0, ended.err
+        assert ("warning: colour/0.png is a colour picture" in ended.err) == (name == "colour")
+
+
 def test_files_named_by_set_are_relative_to_the_current_folder(here: Path, ommatid: Command) -> None:
     folder = here / "scenes"
     folder.mkdir()

@@ -95,6 +95,8 @@ def test_the_estimate_alone_and_other_names(finished: Path, here: Path, ommatid:
     ended = ommatid("reconstruct", *files, "-o", "alone.exr", "--region", "2,2,3,3", "-v")
     assert ended.code == 0, ended.err
     assert "mean of 3 x 3 pixels" in ended.out
+    shown = ommatid("reconstruct", *files, "-o", "alone.exr", "--region", "2,2,3,3").out.splitlines()
+    assert shown[6].startswith("  region   mean of 3 x 3 pixels at 2, 2 is ")
     assert {"alone.exr", "alone.png"} == names(here) - {"tiny.toml"}
     estimate = exr.read(finished / "estimate.exr")[0].channels["estimate"]
     np.testing.assert_array_equal(exr.read(Path("alone.exr"))[0].channels["estimate"], estimate)

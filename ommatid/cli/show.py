@@ -26,7 +26,7 @@ def show(
     figure_resolution: FigureResolution = SCREEN,
     as_json: Json = False,
 ) -> None:
-    """Show the geometry, the plan, and the skipped effects."""
+    """Show the camera in the terms of optics, the plan, and the skipped effects."""
     from ommatid.pipeline.descriptions import describe_scene
     from ommatid.pipeline.sections import scene_sections
     from ommatid.scenes.scene import read
@@ -40,6 +40,8 @@ def show(
         for path in write_drawing(figure, described, files):
             output.say(f"{path}: written")
     output.print_result(description, scene_sections(description), as_json)
+    for sentence in description["warnings"]:
+        output.say(f"warning: {sentence}")
 
 
 def export(scene: SceneFile, file: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:

@@ -38,7 +38,8 @@ class Block:
 
     def commands(self) -> list[tuple[str, str]]:
         """Return each command of a shell block with the comment behind it."""
-        lines = [line.strip() for line in self.text.splitlines() if line.strip()]
+        joined = re.sub(r"\s*\\\n\s*", " ", self.text)  # a backslash continues the line
+        lines = [line.strip() for line in joined.splitlines() if line.strip()]
         parts = [re.split(r"\s+# ", line, maxsplit=1) for line in lines]
         return [(part[0], part[1] if len(part) > 1 else "") for part in parts]
 

@@ -75,6 +75,7 @@ SHORTER = {
     "run tile19 -o auto": SCALAR,
     "run tile19 -o within": [*SCALAR, "--within", "5 s"],
     "predict sensor": TILE,
+    "predict tile19 -o tolerance": ["--no-rays"],
     "run": [*QUICK, *SCALAR],
     "render": [*QUICK, *SCALAR],
     "calibrate": [*QUICK, *SCALAR],

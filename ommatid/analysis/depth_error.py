@@ -150,9 +150,10 @@ def draw(
     below.xaxis.set_major_locator(locator)
     below.xaxis.set_minor_locator(NullLocator())
     below.xaxis.set_major_formatter("{x:g}")
-    below.set_xlabel("distance along the axis (mm)")
+    above.tick_params(labelbottom=True)
     below.set_ylabel("RMS disparity (target pixels)")
     for axes in (above, below):
+        axes.set_xlabel("distance along the axis (mm)")
         axes.axvline(camera.distance, color="0.6", linestyle=":", label="the target's plane")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)

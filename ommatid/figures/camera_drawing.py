@@ -12,6 +12,7 @@ from typing import Any
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Scene
 
@@ -47,7 +48,8 @@ def camera_drawing(scene: Scene, camera: Camera) -> Any:
     from matplotlib.figure import Figure
 
     colours = {lens_type.name: COLOURS[index % len(COLOURS)] for index, lens_type in enumerate(camera.types)}
-    face = min(HIGHEST, max(LOWEST, NEAR_WIDTH / sensor_aspect(camera)))
+    terms = optical_terms(scene, camera)
+    face = min(HIGHEST, max(LOWEST, NEAR_WIDTH / sensor_aspect(camera, terms)))
     key = LINE * (len(camera.types) + 2.5)
     height = ABOVE + SECTION + BETWEEN + face + BELOW + key
     figure: Any = Figure(figsize=(WIDTH, height))
@@ -59,9 +61,9 @@ def camera_drawing(scene: Scene, camera: Camera) -> Any:
     section, lower = height - ABOVE - SECTION, BELOW + key
     near, far = axes(LEFT, section, NEAR_WIDTH, SECTION), axes(FAR_LEFT, section, FAR_WIDTH, SECTION)
     _draw_section(near, far, scene, camera, colours)
-    draw_sensor(axes(LEFT, lower, NEAR_WIDTH, face), camera, colours)
-    draw_sub_images(axes(FAR_LEFT, lower, FAR_WIDTH + 0.25, face), camera, colours)
-    write_key(figure, camera, colours, key - 1.5 * LINE, LINE)
+    draw_sensor(axes(LEFT, lower, NEAR_WIDTH, face), camera, terms, colours)
+    draw_sub_images(axes(FAR_LEFT, lower, FAR_WIDTH + 0.25, face), camera, terms, colours)
+    write_key(figure, camera, terms, colours, key - 1.5 * LINE, LINE)
     name = scene.title or scene.source.stem
     figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center", parse_math=False)
     return figure
@@ -101,7 +103,7 @@ def _draw_section(near: Any, far: Any, scene: Scene, camera: Camera, colours: di
     near.text(-deepest, high, "sensor ", va="top", ha="right", fontsize=8)
     for lens_type in camera.types:
         sub = _middle(camera, lens_type)
-        words = f"{lens_type.name}: {length_words(sub.depth)} "
+        words = f"{lens_type.name}: {length_words(sub.depth, 3)} "
         near.text(-sub.depth, sub.patch[0], words, va="center", ha="right", fontsize=8, color=colours[lens_type.name])
 
 
@@ -162,7 +164,7 @@ def _draw_target(axes: Any, scene: Scene, camera: Camera) -> None:
     across = max(width / 2, *seen) * (1 + 3 * AIR)
     axes.set_ylim(-across, across)
     size = f"{length_words(width)} x {length_words(height)}" if width != height else f"{length_words(width)} square"
-    what = "plane of f, " if scene.target.image is None else ""
+    what = "plane of f, " if scene.world is not None else ""
     grid = f"{camera.rows} x {camera.columns} pixels of {length_words(camera.target_pitch)}"
     axes.text(0.03, 0.03, f"{what}{size}:\n{grid}", transform=axes.transAxes, fontsize=8, va="bottom")
 

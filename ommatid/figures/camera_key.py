@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from math import atan, degrees
 from typing import Any
 
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.geometry.optical_terms import LensTerms, OpticalTerms
 from ommatid.scenes.lens_type import LensType
 
 from .lengths import length_words
-from .sensor_drawing import airy_diameter
 
 # Heading of each column, and where it begins, in inches
 COLUMNS = (
@@ -26,39 +25,46 @@ COLUMNS = (
 )
 
 
-def write_key(figure: Any, camera: Camera, colours: dict[str, str], top: float, line: float) -> None:
+def write_key(
+    figure: Any, camera: Camera, terms: OpticalTerms, colours: dict[str, str], top: float, line: float
+) -> None:
     """Write magnifications, arrays, lenses and sub-images of all types as a table; `top` and `line` are inches."""
     width, height = figure.get_size_inches()
     style: dict[str, Any] = {"fontsize": 8, "va": "center"}
     for heading, left in COLUMNS:
         figure.text(left / width, (top + line / 2) / height, heading, fontweight="bold", linespacing=1.1, **style)
-    for number, lens_type in enumerate(camera.types):
+    for number, (lens_type, lens_terms) in enumerate(zip(camera.types, terms.types, strict=True)):
         level = (top - (number + 1) * line) / height
-        for (heading, left), words in zip(COLUMNS, _cells(camera, lens_type), strict=True):
+        for (heading, left), words in zip(COLUMNS, _cells(camera, lens_type, lens_terms), strict=True):
             colour = {"color": colours[lens_type.name], "fontweight": "bold"} if heading == "type" else {}
             figure.text(left / width, level, words, **style, **colour)
 
 
-def _cells(camera: Camera, lens_type: LensType) -> tuple[str, ...]:
-    depth, (rows, columns) = camera.depth(lens_type), lens_type.pixels
-    disk = airy_diameter(camera, lens_type)
+def _cells(camera: Camera, lens_type: LensType, terms: LensTerms) -> tuple[str, ...]:
+    rows, columns = lens_type.pixels
     return (
         lens_type.name,
-        str(1 / lens_type.ratio),
-        f"1/{camera.distance / depth:.4g}",
+        str(terms.grid_magnification),
+        f"1/{1 / terms.magnification:.4g}",
         f"{lens_type.array[0]} x {lens_type.array[1]}",
-        aperture_words(camera, lens_type),
-        length_words(camera.focal_length(lens_type)),
-        length_words(depth),
+        _aperture_words(lens_type, terms),
+        length_words(terms.focal_length),
+        length_words(terms.total_track),
         f"{rows} x {columns} pixels",
-        " x ".join(f"{degrees(2 * atan(count * camera.pixel_pitch / 2 / depth)):.3g}°" for count in (rows, columns)),
-        "not modelled" if disk is None else f"{disk / camera.pixel_pitch:.2g} pixels",
+        " x ".join(f"{angle:.3g}°" for angle in terms.field_of_view),
+        _airy_words(camera, terms),
     )
 
 
-def aperture_words(camera: Camera, lens_type: LensType) -> str:
+def _aperture_words(lens_type: LensType, terms: LensTerms) -> str:
     """Return the diameter and the f-number of a lens, or what it is instead."""
-    optics = lens_type.optics
-    if optics.aperture is not None:
-        return f"{length_words(optics.aperture)}, f/{camera.focal_length(lens_type) / optics.aperture:.2g}"
-    return "pinholes" if optics.surfaces is None else f"{len(optics.surfaces)} surfaces"
+    if terms.aperture is not None and terms.f_number is not None:
+        return f"{length_words(terms.aperture)}, f/{terms.f_number:.2g}"
+    surfaces = lens_type.optics.surfaces
+    return "pinholes" if surfaces is None else f"{len(surfaces)} surfaces"
+
+
+def _airy_words(camera: Camera, terms: LensTerms) -> str:
+    if terms.airy_diameter is None:
+        return "none"
+    return f"{terms.airy_diameter:.2g} pixels" + ("" if camera.wavelength else ", left out")

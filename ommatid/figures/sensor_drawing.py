@@ -10,16 +10,17 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.geometry.optical_terms import OpticalTerms
 from ommatid.scenes.lens_type import LensType, SubImager
 
 from .lengths import length_words, plural
 
 MOST_DRAWN = 40  # rows and columns of an array; of larger ones every second, third, ... sub-imager
 MOST_LINES = 100  # rows and columns of a sub-image whose pixels are drawn
-AIRY = 2.44  # diameter of the first dark ring, in wavelengths times f-number
+INK = "#000000"
 
 
-def draw_sensor(axes: Any, camera: Camera, colours: dict[str, str]) -> None:
+def draw_sensor(axes: Any, camera: Camera, terms: OpticalTerms, colours: dict[str, str]) -> None:
     """Draw lenses and patches as seen from behind the camera, as in a recorded mosaic: type I is on the left."""
     from matplotlib.collections import EllipseCollection, PolyCollection
 
@@ -45,12 +46,13 @@ def draw_sensor(axes: Any, camera: Camera, colours: dict[str, str]) -> None:
             axes.add_collection(EllipseCollection(size, size, [0] * len(subs), offsets=centres, **rings))
         else:
             axes.plot(*centres.T, "+", color=colour, markersize=3, markeredgewidth=0.5)
-    (low, high), used = _frame(camera), _used(camera)
+    low, high = _frame(camera, terms)
     axes.set_xlim(high[0], low[0])  # x to the left, as seen from behind
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", anchor="NW")
     _draw_pitch(axes, camera)
-    words = f"sensor from behind: {plural(len(camera.sub_imagers), 'sub-image')} on {used}"
+    _draw_outline(axes, camera, terms)
+    words = f"sensor from behind: {plural(len(camera.sub_imagers), 'sub-image')} on {_used(terms)}"
     thinned = f"\none row and column of {max(skipped)} is drawn" if max(skipped) > 1 else ""
     axes.set_title(words + thinned, fontsize=10, loc="left")
     axes.set_xlabel("x (mm)", fontsize=9)
@@ -58,20 +60,34 @@ def draw_sensor(axes: Any, camera: Camera, colours: dict[str, str]) -> None:
     axes.tick_params(labelsize=8)
 
 
-def sensor_aspect(camera: Camera) -> float:
+def sensor_aspect(camera: Camera, terms: OpticalTerms) -> float:
     """Return width over height of the frame in which the sensor is drawn."""
-    low, high = _frame(camera)
+    low, high = _frame(camera, terms)
     return float((high[0] - low[0]) / (high[1] - low[1]))
 
 
-def _frame(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    ends = _ends(camera)
-    return ends[0] - camera.lens_pitch, ends[1] + camera.lens_pitch
+def _frame(camera: Camera, terms: OpticalTerms) -> tuple[FloatArray, FloatArray]:
+    low, high = _ends(camera)
+    if terms.sensor_size is None:
+        return low - camera.lens_pitch, high + camera.lens_pitch
+    half = np.maximum((high - low) / 2 + camera.lens_pitch, 0.55 * np.array(terms.sensor_size[::-1]))
+    return (low + high) / 2 - half, (low + high) / 2 + half
 
 
-def _used(camera: Camera) -> str:
-    width, height = _ends(camera)[1] - _ends(camera)[0]
-    return f"{length_words(width, 3)} x {length_words(height, 3)}"
+def _used(terms: OpticalTerms) -> str:
+    return " x ".join(length_words(side, 3) for side in terms.sensor_extent)
+
+
+def _draw_outline(axes: Any, camera: Camera, terms: OpticalTerms) -> None:
+    """Draw the outline of the sensor around the middle of the sub-images, if the scene gives its size."""
+    from matplotlib.patches import Rectangle
+
+    if terms.sensor_size is None or terms.sensor_share is None:
+        return
+    (height, width), (x, y) = terms.sensor_size, _ends(camera).mean(axis=0)
+    axes.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, facecolor="none", edgecolor=INK))
+    words = f"sensor {length_words(height)} x {length_words(width)}, {100 * terms.sensor_share:.2g} % used"
+    axes.text(x + 0.49 * width, y + 0.485 * height, words, ha="left", va="top", fontsize=8)
 
 
 def _ends(camera: Camera) -> FloatArray:
@@ -99,7 +115,7 @@ def _draw_pitch(axes: Any, camera: Camera) -> None:
     y = first[1] - 0.75 * camera.lens_pitch
     arrow: dict[str, Any] = {
         "arrowstyle": "<->",
-        "color": "#000000",
+        "color": INK,
         "linewidth": 0.8,
         "shrinkA": 0,
         "shrinkB": 0,
@@ -110,24 +126,24 @@ def _draw_pitch(axes: Any, camera: Camera) -> None:
     axes.text(second[0], y, words, ha="left", va="center", fontsize=8)
 
 
-def draw_sub_images(axes: Any, camera: Camera, colours: dict[str, str]) -> None:
+def draw_sub_images(axes: Any, camera: Camera, terms: OpticalTerms, colours: dict[str, str]) -> None:
     """Draw the pixels of one sub-image of each lens type side by side, with the Airy disk of a lens to scale."""
     widest = max(lens_type.pixels[1] for lens_type in camera.types)
     tallest = max(lens_type.pixels[0] for lens_type in camera.types)
     left, unit = 0.0, 1e3 * camera.pixel_pitch  # um
-    for lens_type in camera.types:
+    for lens_type, lens_terms in zip(camera.types, terms.types, strict=True):
         rows, columns = lens_type.pixels
         _draw_pixels(axes, lens_type, left, unit, colours[lens_type.name])
-        middle, disk = (left + columns / 2) * unit, airy_diameter(camera, lens_type)
-        if disk is not None:
-            _draw_disk(axes, middle, -rows / 2 * unit, 1e3 * disk)
+        middle = (left + columns / 2) * unit
+        if lens_terms.airy_diameter is not None:
+            _draw_disk(axes, middle, -rows / 2 * unit, lens_terms.airy_diameter * unit)
         name, colour = lens_type.name, colours[lens_type.name]
         axes.text(middle, 0.03 * unit * tallest, name, ha="center", va="bottom", fontsize=9, color=colour)
         left += columns + 0.25 * widest
     axes.set_xlim(-0.1 * widest * unit, (left - 0.15 * widest) * unit)
     axes.set_ylim(-1.08 * tallest * unit, 0.2 * tallest * unit)
     axes.set_aspect("equal", anchor="NW")
-    grey = "; grey: Airy disk" if any(airy_diameter(camera, lens_type) for lens_type in camera.types) else ""
+    grey = "; grey: Airy disk" if any(lens_terms.airy_diameter for lens_terms in terms.types) else ""
     axes.set_title(f"one sub-image, {length_words(camera.pixel_pitch)} pixels{grey}", fontsize=10, loc="left")
     axes.set_xlabel("across the sensor (µm)", fontsize=9)
     axes.tick_params(labelsize=8)
@@ -151,11 +167,3 @@ def _draw_disk(axes: Any, x: float, y: float, diameter: float) -> None:
     from matplotlib.patches import Circle
 
     axes.add_patch(Circle((x, y), diameter / 2, facecolor="#808080", alpha=0.45, edgecolor="none"))
-
-
-def airy_diameter(camera: Camera, lens_type: LensType) -> float | None:
-    """Return the diameter of the Airy disk on the sensor in mm, None without an aperture or with rays alone."""
-    aperture = lens_type.optics.aperture
-    if aperture is None or camera.wavelength is None:
-        return None
-    return AIRY * camera.wavelength * camera.depth(lens_type) / aperture

@@ -131,7 +131,7 @@ def draw_distortion(path: Path, shown: list[PaperTile], noise: float, files: Fig
         _axes(panel, f"{tile.name}\naverage {error.mean():.3g}", "column (target pixels)", "row (target pixels)")
         panel.grid(visible=False)
         bar = figure.colorbar(drawn, ax=panel, fraction=0.046, pad=0.03)
-        bar.set_label("expected squared error (grey levels squared)")
+        bar.set_label("grey levels squared")
     figure.suptitle(f"Distortion as lens diversity; maps: expected squared error at noise variance {_power(noise)}")
     files.replace(figure, path)
 
@@ -224,6 +224,7 @@ def _axes(axes: Any, title: str, across: str, up: str) -> None:
     axes.set_title(title, fontsize=11)
     axes.set_xlabel(across)
     axes.set_ylabel(up)
+    axes.tick_params(labelleft=True, labelbottom=True)
     axes.grid(True, which="major", color="0.85", lw=0.7)
 
 

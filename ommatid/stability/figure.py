@@ -44,10 +44,9 @@ def write_figure(path: Path, curves: list[SweepOutcome], files: FigureFiles = SC
                 _draw_form(panel, points, field, form, FIRST_LANE + lane * LANE_HEIGHT)
             _draw_axes(panel)
             panel.set_title(f"{title}\n{quantity}", fontsize=10)
-            if row == len(TITLES) - 1:
-                panel.set_xlabel("noise variance (grey levels squared)")
-            if column == 0:
-                panel.set_ylabel("decimal digits lost, of 16")
+            panel.set_xlabel("noise variance (grey levels squared)")
+            panel.set_ylabel("decimal digits lost, of 16")
+            panel.tick_params(labelleft=True, labelbottom=True)
     handles, names = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize=9)
     figure.suptitle("Digits lost by the forms of the estimator, against exact arithmetic")

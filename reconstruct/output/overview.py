@@ -26,6 +26,7 @@ COLUMN_INCHES, ROW_INCHES = 3.4, 3.15
 LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.55, 1.25, 0.55  # inches around all panels; a layout by matplotlib takes a second
 MOST_IN_A_ROW = 6
 MOST_SHOWN = 480  # rows and columns of a map that a panel can show
+LEAST_PART = 1e-4  # of the expected error; smaller parts are not drawn
 GOOD, BAD = "#17734a", "#b3261e"  # of the verdict
 
 
@@ -102,7 +103,8 @@ def _panels(stack: Stack, maps: dict[str, FloatArray]) -> list[OverviewPanel]:
 def _draw_budget(axes: Any, report: RunReport) -> None:
     """Draw the parts of the expected error as bars, each below its cause, which leaves room for long names."""
     mse = report.error.predicted_mse
-    shares = {verdict_words.cause(name): 100 * part / mse for name, part in report.error.budget.items() if part > 0}
+    parts = {name: part for name, part in report.error.budget.items() if part > LEAST_PART * mse}
+    shares = {verdict_words.cause(name): 100 * part / mse for name, part in parts.items()}
     bars = axes.barh(range(len(shares)), list(shares.values()), height=0.45, color="tab:blue")
     axes.bar_label(bars, [f"{share:.2g} %" for share in shares.values()], padding=3, fontsize=8)
     for place, cause in enumerate(shares):

@@ -16,6 +16,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import read
 
+from ..modules import ROOT
+
 CASES = ("tile19", "sensor", "single", "corridor")
 BLACK_TARGET = 4  # line width of the target
 
@@ -127,3 +129,17 @@ def test_unknown_formats_are_refused() -> None:
 )
 def test_lengths_have_the_unit_that_suits_them(length: float, words: str) -> None:
     assert length_words(length) == words
+
+
+def test_the_drawing_in_the_documentation_is_that_of_the_program(drawn: tuple[Camera, Any], tmp_path: Path) -> None:
+    """All words and numbers of docs/camera.svg are those of a new drawing of the scene that the page names."""
+    camera, figure = drawn
+    if camera != derive(read(Path("sensor"))):
+        return
+    save_figure(figure, tmp_path / "camera.svg", ["svg"])
+    assert words_of(ROOT / "docs" / "camera.svg") == words_of(tmp_path / "camera.svg")
+
+
+def words_of(path: Path) -> list[str]:
+    root = ElementTree.parse(path).getroot()
+    return sorted(element.text.strip() for element in root.iter() if element.text and element.text.strip())

@@ -20,8 +20,9 @@ LARGEST = 12  # modules of a folder, `__init__` not counted
 BELOW = {
     "runtime": set[str](),
     "scenes": {"runtime"},
+    "figures": {"runtime", "scenes"},
     "simulate": {"runtime", "scenes"},
-    "reconstruct": {"runtime", "scenes"},
+    "reconstruct": {"runtime", "scenes", "figures"},
 }
 
 

@@ -1,0 +1,206 @@
+"""Drawing of a camera: section through lenses and target, the sensor face on, and one sub-image of each lens type.
+
+Positions are millimetres, as in the camera: z along its axis, x and y across. The section is broken between the camera,
+a few millimetres deep, and the target; the ratio of the scales is written at the break.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType, SubImager
+from ommatid.scenes.scene import Scene
+
+from .camera_key import write_key
+from .lengths import length_words
+from .sensor_drawing import draw_sensor, draw_sub_images, sensor_aspect
+
+WIDTH = 10.0  # inches, as are all lengths of the layout
+LEFT, NEAR_WIDTH, FAR_LEFT, FAR_WIDTH = 0.75, 4.7, 6.15, 3.1
+ABOVE, SECTION, BETWEEN, BELOW, LINE = 1.05, 2.5, 1.25, 0.55, 0.21
+LOWEST, HIGHEST = 1.9, 3.4  # height of the drawing of the sensor
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B", "#56B4E9")  # of lens types; legible on dark, too
+INK, GREY = "#000000", "#808080"
+NEAR, FAR = 0.45, 0.6  # ends of the broken axis: a share of the deepest sensor, and of the target's distance
+MOST_WALLS = 80
+AIR = 0.12  # between the drawing and its frame, as a share of its width
+ARROW: dict[str, Any] = {
+    "arrowstyle": "<->",
+    "color": INK,
+    "linewidth": 0.8,
+    "shrinkA": 0,
+    "shrinkB": 0,
+    "mutation_scale": 9,
+}
+
+Ray = tuple[tuple[float, float], ...]  # points (z, x)
+
+
+def camera_drawing(scene: Scene, camera: Camera) -> Any:
+    """Draw a camera to scale, with its lengths, as a Matplotlib figure."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    colours = {lens_type.name: COLOURS[index % len(COLOURS)] for index, lens_type in enumerate(camera.types)}
+    face = min(HIGHEST, max(LOWEST, NEAR_WIDTH / sensor_aspect(camera)))
+    key = LINE * (len(camera.types) + 2.5)
+    height = ABOVE + SECTION + BETWEEN + face + BELOW + key
+    figure: Any = Figure(figsize=(WIDTH, height))
+    FigureCanvasAgg(figure)
+
+    def axes(left: float, bottom: float, width: float, tall: float) -> Any:
+        return figure.add_axes((left / WIDTH, bottom / height, width / WIDTH, tall / height))
+
+    section, lower = height - ABOVE - SECTION, BELOW + key
+    near, far = axes(LEFT, section, NEAR_WIDTH, SECTION), axes(FAR_LEFT, section, FAR_WIDTH, SECTION)
+    _draw_section(near, far, scene, camera, colours)
+    draw_sensor(axes(LEFT, lower, NEAR_WIDTH, face), camera, colours)
+    draw_sub_images(axes(FAR_LEFT, lower, FAR_WIDTH + 0.25, face), camera, colours)
+    write_key(figure, camera, colours, key - 1.5 * LINE, LINE)
+    name = scene.title or scene.source.stem
+    figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center", parse_math=False)
+    return figure
+
+
+def _draw_section(near: Any, far: Any, scene: Scene, camera: Camera, colours: dict[str, str]) -> None:
+    """Draw the camera and the target from above, on axes of their own, and the light of one sub-imager per type."""
+    deepest = max(camera.depth(lens_type) for lens_type in camera.types)
+    for sub in {(sub.type.name, sub.lens[0], sub.patch[0]): sub for sub in camera.sub_imagers}.values():
+        _draw_sub_imager(near, camera, sub, colours[sub.type.name])
+    ends = [edge for sub in camera.sub_imagers for edge in (sub.lens[0], *_patch_edges(camera, sub))]
+    reach = max(max(ends) - min(ends), camera.lens_pitch)
+    low, high = min(ends) - AIR * reach, max(ends) + 1.5 * AIR * reach
+    if camera.walls:
+        _draw_walls(near, camera)
+    for lens_type in camera.types:
+        light = _light(camera, _middle(camera, lens_type))
+        for axes in (near, far):
+            for ray in light:
+                axes.plot(*zip(*ray, strict=True), color=colours[lens_type.name], linewidth=0.9, alpha=0.85)
+    near.set_xlim(-deepest * (1 + 2 * AIR), deepest * NEAR)
+    near.set_ylim(low, high)
+    _draw_target(far, scene, camera)
+    _label(near, "camera from above, and light of one sub-imager of each type", "left")
+    _label(far, "target", "right")
+    _mark_break(near, far, camera.distance)
+    near.text(0, high, " lenses", va="top", ha="left", fontsize=8)
+    near.text(-deepest, high, "sensor ", va="top", ha="right", fontsize=8)
+    for lens_type in camera.types:
+        sub = _middle(camera, lens_type)
+        words = f"{lens_type.name}: {length_words(sub.depth)} "
+        near.text(-sub.depth, sub.patch[0], words, va="center", ha="right", fontsize=8, color=colours[lens_type.name])
+
+
+def _draw_sub_imager(axes: Any, camera: Camera, sub: SubImager, colour: str) -> None:
+    """Draw a lens at z = 0, a pinhole as a dot, and its patch of the sensor behind it."""
+    edges = _patch_edges(camera, sub)
+    axes.plot([-sub.depth] * 2, edges, color=colour, linewidth=3.5, solid_capstyle="butt")
+    aperture, x = sub.type.optics.aperture, sub.lens[0]
+    if aperture is None:
+        axes.plot([0], [x], "o", color=colour, markersize=3)
+    else:
+        arrow = {
+            "arrowstyle": "<->",
+            "color": colour,
+            "linewidth": 1.2,
+            "shrinkA": 0,
+            "shrinkB": 0,
+            "mutation_scale": 5,
+        }
+        axes.annotate("", (0, x - aperture / 2), (0, x + aperture / 2), arrowprops=arrow)
+
+
+def _patch_edges(camera: Camera, sub: SubImager) -> tuple[float, float]:
+    half = sub.type.pixels[1] * camera.pixel_pitch / 2
+    return sub.patch[0] - half, sub.patch[0] + half
+
+
+def _middle(camera: Camera, lens_type: LensType) -> SubImager:
+    """Return a sub-imager in the middle of an array."""
+    members = [sub for sub in camera.sub_imagers if sub.type == lens_type]
+    return members[lens_type.array[0] // 2 * lens_type.array[1] + lens_type.array[1] // 2]
+
+
+def _light(camera: Camera, sub: SubImager) -> list[Ray]:
+    """Return the straight rays from both edges of a patch through the middle of the lens to the target."""
+    x = sub.lens[0]
+    return [
+        ((-sub.depth, edge), (0.0, x), (camera.distance, x + (x - edge) * camera.distance / sub.depth))
+        for edge in _patch_edges(camera, sub)
+    ]
+
+
+def _draw_walls(axes: Any, camera: Camera) -> None:
+    """Draw the walls between neighbouring columns of lenses, down to the shallower sensor of the two."""
+    places = sorted({(sub.lens[0], sub.depth) for sub in camera.sub_imagers})
+    if len(places) > MOST_WALLS:
+        return
+    for (x, depth), (other, other_depth) in pairwise(places):
+        if other > x:
+            axes.plot([0, -min(depth, other_depth)], [(x + other) / 2] * 2, color=GREY, linewidth=0.5, alpha=0.7)
+
+
+def _draw_target(axes: Any, scene: Scene, camera: Camera) -> None:
+    width, height = camera.columns * camera.target_pitch, camera.rows * camera.target_pitch
+    axes.plot([camera.distance] * 2, [-width / 2, width / 2], color=INK, linewidth=4, solid_capstyle="butt")
+    axes.set_xlim(camera.distance * FAR, camera.distance * (1 + (1 - FAR) * 2 * AIR))
+    seen = [abs(ray[-1][1]) for lens_type in camera.types for ray in _light(camera, _middle(camera, lens_type))]
+    across = max(width / 2, *seen) * (1 + 3 * AIR)
+    axes.set_ylim(-across, across)
+    size = f"{length_words(width)} x {length_words(height)}" if width != height else f"{length_words(width)} square"
+    what = "plane of f, " if scene.target.image is None else ""
+    grid = f"{camera.rows} x {camera.columns} pixels of {length_words(camera.target_pitch)}"
+    axes.text(0.03, 0.03, f"{what}{size}:\n{grid}", transform=axes.transAxes, fontsize=8, va="bottom")
+
+
+def _mark_break(near: Any, far: Any, distance: float) -> None:
+    """Mark where the axis is broken, with the ratios of the scales, and the distance from the lenses to the target."""
+    from matplotlib.patches import ConnectionPatch
+
+    near.spines["right"].set_visible(False)
+    far.spines["left"].set_visible(False)
+    far.yaxis.tick_right()
+    far.yaxis.set_label_position("right")
+    mark: dict[str, Any] = {
+        "marker": [(-1, -1.6), (1, 1.6)],
+        "markersize": 9,
+        "color": INK,
+        "linestyle": "none",
+        "clip_on": False,
+    }
+    near.plot([1, 1], [0, 1], transform=near.transAxes, **mark)
+    far.plot([0, 0], [0, 1], transform=far.transAxes, **mark)
+    figure, before, after = near.figure, near.get_position(), far.get_position()
+    middle, along, across = (before.x1 + after.x0) / 2, _scale_ratio(near, far, 0), _scale_ratio(near, far, 1)
+    words = f"break: to the right, z is drawn\n{_times(along)} and x {_times(across)}"
+    figure.text(
+        middle, before.y0 - 0.56 / figure.get_figheight(), words, ha="center", va="top", fontsize=8, style="italic"
+    )
+    systems = near.get_xaxis_transform(), far.get_xaxis_transform()
+    figure.add_artist(ConnectionPatch((0, 1.05), (distance, 1.05), *systems, axesA=near, axesB=far, **ARROW))
+    words = f"{length_words(distance)} from lenses to target"
+    figure.text(middle, before.y1 + 0.17 / figure.get_figheight(), words, ha="center", va="bottom", fontsize=9)
+
+
+def _scale_ratio(near: Any, far: Any, axis: int) -> float:
+    """Return how many times more millimetres an inch of the target's axes has than one of the camera's."""
+    lengths: list[float] = []
+    for axes in (near, far):
+        low, high = axes.get_xlim() if axis == 0 else axes.get_ylim()
+        box = axes.get_position()
+        inches = (box.width if axis == 0 else box.height) * axes.figure.get_size_inches()[axis]
+        lengths.append((high - low) / inches)
+    return lengths[1] / lengths[0]
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.3g} times smaller" if ratio >= 1 else f"{1 / ratio:.3g} times larger"
+
+
+def _label(axes: Any, title: str, side: str) -> None:
+    axes.set_xlabel("z, along the axis (mm)", fontsize=9)
+    axes.set_ylabel("x (mm)", fontsize=9)
+    axes.set_title(title, fontsize=10, loc=side, pad=24)
+    axes.tick_params(labelsize=8)

@@ -1,0 +1,83 @@
+"""Files of figures: PNG for screens and slides, SVG and PDF for print, and SVG inside a page.
+
+All files of a figure have one name and the suffixes of their formats. Equal figures give equal bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import write_whole
+
+FORMATS = ("png", "svg", "pdf")
+SCREEN, SLIDE = 110, 300  # dots per inch of PNG files
+COARSEST, FINEST = 20, 1200
+INK = "#000000"  # of text and axes, which a page replaces by its own colour
+# Text stays text, which a drawing program can edit; names in SVG and dates in PDF do not differ from run to run.
+SETTINGS: dict[str, Any] = {"svg.fonttype": "none", "svg.hashsalt": "ommatid", "pdf.fonttype": 42}
+DATE = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+
+
+@dataclass(frozen=True)
+class FigureFiles:
+    """The formats in which a command writes each of its figures, and the dots per inch of PNG files."""
+
+    formats: tuple[str, ...] = ("png",)
+    resolution: int = SCREEN
+
+    def paths(self, path: Path) -> list[Path]:
+        """Return the files of a figure, one per format; the suffix of `path` is replaced."""
+        return [path.with_suffix(f".{name}") for name in self.formats]
+
+    def save(self, figure: Any, path: Path) -> None:
+        """Write a figure in every format. Raises InputError or MachineError."""
+        save_figure(figure, path, self.formats, self.resolution)
+
+
+def figure_formats(text: str) -> tuple[str, ...]:
+    """Read the names of formats, such as "png,svg". Raises InputError."""
+    names = tuple(dict.fromkeys(name.strip().lower() for name in text.split(",")))
+    for name in names:
+        if name not in FORMATS:
+            raise InputError(f"--figure-format {text}: expected some of {', '.join(FORMATS)}, got '{name}'")
+    return names
+
+
+def save_figure(figure: Any, path: Path, formats: Sequence[str] = ("png",), resolution: int = SCREEN) -> None:
+    """Write a figure beside `path` in each format; the suffix of `path` is replaced. Raises InputError or MachineError.
+
+    resolution : of PNG files, and of pictures inside the others, in dots per inch
+    """
+    with _settings():
+        for name in formats:
+            options: dict[str, Any] = {"format": name, "dpi": resolution, "metadata": DATE[name]}
+            write_whole(path.with_suffix(f".{name}"), lambda file, options=options: figure.savefig(file, **options))
+
+
+def svg_text(figure: Any) -> str:
+    """Return a figure as an `svg` element for a page: transparent, with black in the colour of the page's text.
+
+    Its width is that of the element around it.
+    """
+    file = io.StringIO()
+    with _settings():
+        figure.savefig(file, format="svg", transparent=True, metadata=DATE["svg"])
+    text = re.sub(r"\A.*?(?=<svg)|<metadata>.*?</metadata>|<!--.*?-->", "", file.getvalue(), flags=re.DOTALL)
+    text = re.sub(r' id="[a-z]+[0-9.]*_[0-9]+"', "", text)  # of groups; several figures of a page share these names
+    head, rest = text.split(">", 1)
+    head = re.sub(r' (width|height)="[^"]*"', "", head)
+    return f'{head} role="img" fill="currentColor">{rest.replace(INK, "currentColor")}'
+
+
+def _settings() -> AbstractContextManager[None]:
+    import matplotlib
+
+    context: Any = matplotlib.rc_context  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    return context(SETTINGS)

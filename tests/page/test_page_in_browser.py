@@ -327,7 +327,7 @@ def test_the_pointer_and_the_keyboard_read_values(letter: Path, run: Run, shown:
         assert form.locator("[name=row]").input_value() == "5"
         assert form.locator("[name=column]").input_value() == "7"
         read = form.locator("output").inner_text()
-        values = dict(re.match(r"(.*) (\S+)$", part).groups() for part in read.split(", "))  # type: ignore[union-attr]
+        values = dict(part.rsplit(" ", 1) for part in read.split(", "))
         # Four digits are shown.
         for name, value in (("truth", run.truth), ("estimate", run.estimate), ("error bar", np.sqrt(run.variance))):
             assert float(values[name]) == pytest.approx(float(value[5, 7]), rel=5e-4)

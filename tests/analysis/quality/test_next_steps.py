@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ def run_of(lenses: Lenses = LENSES, **noise: Any) -> tuple[Scene, RunReport]:
 def report_of(described: Scene) -> RunReport:
     """The report of a run, taken for trusted: these tests concern its predictions."""
     stack, model = record(described, IMAGE)
-    report = reconstruct(stack, model, IMAGE.ravel(), ("stack", "model"))[1]
+    report = reconstruct(stack, model, IMAGE.ravel(), (Path("stack"), Path("model")))[1]
     return report.with_changes(verdict=VerdictReport(trusted=True, reasons=()))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ def window_of(shape: tuple[int, int], lenses: Lenses, noise: float, **tables: An
     described = scene(shape, lenses, **tables)
     image = np.full(shape, 127.5)
     stack, model = record(described, image)
-    report = reconstruct(stack, model, None, ("stack", "model"))[1]
+    report = reconstruct(stack, model, None, (Path("stack"), Path("model")))[1]
     window = error_window(replace(stack, values=model.forward(image)), model, image, report)
     assert window is not None
     return window

@@ -21,6 +21,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
 from .formats.picture import target_shape
+from .layout.sensor_extent import check_sensor
 from .layout.windows import check_overlap, whole_pixels, with_steering
 from .lens_type import LensOptics, LensType, SubImager, adjacent_slices
 from .optics.spectrum import wavelengths_of
@@ -126,9 +127,7 @@ class Camera:
     @property
     def is_ideal_pinhole(self) -> bool:
         """True for well-aligned pinholes without distortion, whose H is a product of overlaps of intervals."""
-        return self.tolerance is None and all(
-            lens_type.optics.is_pinhole and not lens_type.is_rotated for lens_type in self.types
-        )
+        return self.tolerance is None and all(lens.optics.is_pinhole and not lens.is_rotated for lens in self.types)
 
     @property
     def has_box_footprints(self) -> bool:
@@ -273,6 +272,7 @@ def derive(scene: Scene) -> Camera:
             f"{scene.source}: the lens arrays have {camera.measurements} pixels, expected at most 2^30; use fewer"
         )
     check_overlap(camera.types, camera.sub_imager, camera.pixel_pitch, scene.source)
+    check_sensor(scene, camera.sub_imagers)
     return camera
 
 

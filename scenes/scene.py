@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, PrivateAttr, ValidationError, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 
+from .geometry.solution import complete
 from .tables import toml
 from .tables.camera import CameraTable
 from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
@@ -23,7 +25,7 @@ from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.overrides import apply_overrides, keep_lenses
 from .tables.sensor import LightTable, NoiseTable, SensorTable
-from .tables.table import Table
+from .tables.table import Table, allow_absent
 from .tables.units import Corner, FileName, Length, Pair, Samples, Time
 
 TRUTH = "truth.exr"
@@ -35,9 +37,11 @@ IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where
 class TargetTable(Table):
     """The flat picture that the camera looks at, and the grid on which the image is reconstructed."""
 
+    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("pixel_pitch", "distance")))
+
     image: FileName | None = Field(
         default=None,
-        description='"photo:NAME" for a picture of scikit-image, or a PNG, TIFF, EXR or NPY file; absent: a [world]',
+        description='"photo:NAME" for a picture of scikit-image, or a PNG, TIFF, EXR or NPY file; absent: none',
     )
     origin: Corner | None = Field(
         default=None, description="row and column where the crop starts; absent: the whole picture"
@@ -155,8 +159,6 @@ class Scene(Table):
             )
         if self.light is not None and self.camera.wavelength is not None:
             raise ValueError("expected camera.wavelength or light.spectrum, got both; remove one")
-        if self.target.image is None and self.world is None:
-            raise ValueError("expected a picture, target.image, or a Mitsuba scene, world.file, got neither")
         if self.target.image is None and self.target.shape is None:
             raise ValueError("a target without a picture needs target.shape, the grid to reconstruct, got none")
         if self.estimator.prior_variance is not None and (self.prior.kind == "fit" or self.target.detail > 1):
@@ -214,10 +216,14 @@ def with_tables(scene: Scene, **tables: Any) -> Scene:
 
 def parse(data: dict[str, Any], source: Path) -> Scene:
     """Validate a scene's tables. Raises InputError that names the file, the key and what was expected."""
+    completed, contradiction = complete(data)
     try:
-        scene = Scene.model_validate(data)
+        scene = Scene.model_validate(completed)
     except ValidationError as error:
-        raise InputError(f"{source}: {explain(error, data, Scene)}") from error
+        absent = all(problem["type"] == "missing" for problem in error.errors())
+        raise InputError(f"{source}: {(absent and contradiction) or explain(error, completed, Scene)}") from error
+    if contradiction:
+        raise InputError(f"{source}: {contradiction}")
     return _with_source(scene, source)
 
 

@@ -8,6 +8,8 @@ import numpy as np
 
 from ommatid.reconstruct.method_choice import MethodChoice
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.geometry.camera_warnings import camera_warnings
+from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -35,6 +37,7 @@ def describe(
     light : collected electrons, of a scene with a [sensor]
     """
     scene, camera = setup.scene, setup.camera
+    terms = optical_terms(scene, camera)
     seen = camera.types_seeing()
     counts = range(len(camera.types))
     return {
@@ -47,7 +50,11 @@ def describe(
             "distance": camera.distance,
         },
         "light_as": _light_words(camera),
-        "lens_types": [_lens_type(camera, lens_type) for lens_type in camera.types],
+        "camera": terms.describe(),
+        "lens_types": [
+            _lens_type(camera, lens_type) | lens.describe()
+            for lens_type, lens in zip(camera.types, terms.types, strict=True)
+        ],
         "measurements": camera.measurements,
         "unknowns": camera.unknowns,
         "pixels_seen_by_fewer_types": {
@@ -58,6 +65,7 @@ def describe(
         **({"light": light} if light is not None else {}),
         "plan": _plan(scene, camera, variant, choice),
         "skipped": [skipped.describe() for skipped in setup.skipped],
+        "warnings": camera_warnings(camera, terms),
     }
 
 
@@ -81,7 +89,6 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "sees_columns": [float(end) for end in lens_type.bounds[1]],
         "off_centre": [float(before - after) / 2 for before, after in lens_type.gaps(camera.shape)],
         "sensor_depth": camera.depth(lens_type),
-        "focal_length": camera.focal_length(lens_type),
         "sub_image_width": lens_type.pixels[1] * camera.pixel_pitch,
         "measurements": lens_type.measurements,
     }
@@ -132,6 +139,7 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
         ("target", f"{target['rows']} x {target['columns']} pixels, {target['height']:g} x {target['width']:g} mm"),
         ("distance", f"{target['distance']:g} mm"),
         ("light", description["light_as"]),
+        *_camera_rows(description["camera"]),
         ("measurements", f"{description['measurements']} for {description['unknowns']} unknowns"),
     ]
     if description["pixels_seen_by_fewer_types"]:
@@ -140,8 +148,10 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
         geometry += [("edges", words) for words in description["where"]]
     else:
         geometry.append(("edges", "every pixel is seen by every lens type"))
+    wavelength = description["camera"]["wavelength"]
     lenses = [
-        (f"lens type {lens['name']}, {lens['magnification']}", _lens_words(lens)) for lens in description["lens_types"]
+        (f"lens type {lens['name']}, {lens['magnification']}", _lens_words(lens, wavelength))
+        for lens in description["lens_types"]
     ]
     stages = [
         (stage, ", ".join(f"{key} {value}" for key, value in plan.items()))
@@ -161,12 +171,42 @@ def skipped_words(why: str, bound: float | None) -> str:
     return why if bound is None else f"{why}; no measurement changes by more than {bound:.2g}"
 
 
-def _lens_words(lens: dict[str, Any]) -> str:
+def _camera_rows(camera: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return lenses and sensor area; the size of the sensor where the scene gives it."""
+    height, width = camera["sensor_extent"]
+    area = f"{camera['sensor_area']:.3g} mm² of pixels, in {height:.4g} x {width:.4g} mm (height x width)"
+    if camera["sensor_size"] is not None:
+        rows, columns = camera["sensor_size"]
+        held = height * width / (rows * columns)
+        area += (
+            f"\n{camera['sensor_share'] * 100:.2g} % of the sensor of {rows:.4g} x {columns:.4g} mm;"
+            f" the arrays take {held * 100:.2g} % of it"
+        )
+    return [
+        ("lenses", f"{camera['lenses']}, total track {camera['total_track']:.4g} mm"),
+        ("sensor area", area),
+    ]
+
+
+def _lens_words(lens: dict[str, Any], wavelength: float) -> str:
     array, pixels = lens["array"], lens["pixels"]
-    return (
-        f"{array[0]} x {array[1]} sub-imagers of {pixels[0]} x {pixels[1]} pixels,"
-        f" {lens['sub_image_width']:.3g} mm wide,"
-        f" focal length {lens['focal_length']:.4g} mm, sensor {lens['sensor_depth']:.4g} mm behind the lens,"
-        f" rows {lens['sees_rows'][0]:g} to {lens['sees_rows'][1]:g}"
-        + (f", {lens['steered']} of them steered" if "steered" in lens else "")
+    across, down = (f"{angle:.3g}" for angle in (lens["field_of_view"][1], lens["field_of_view"][0]))
+    view = f"{across} degrees" if across == down else f"{down} x {across} degrees (height x width)"
+    aperture, disk = "", ""
+    if lens["f_number"] is not None:
+        aperture = f" f/{lens['f_number']:.3g},"
+        disk = f", Airy disk {lens['airy_pixels']:.3g} pixels at {wavelength * 1e6:.4g} nm"
+    return "\n".join(
+        [
+            f"{array[0]} x {array[1]} sub-imagers of {pixels[0]} x {pixels[1]} pixels,"
+            f" {lens['sub_image_width']:.3g} mm wide, rows {lens['sees_rows'][0]:g} to {lens['sees_rows'][1]:g}"
+            + (f", {lens['steered']} of them steered" if "steered" in lens else ""),
+            f"  optical magnification {_ratio(lens['optical_magnification'])}, focal length"
+            f" {lens['focal_length']:.4g} mm,{aperture} sensor {lens['total_track']:.4g} mm behind the lens",
+            f"  field of view {view}{disk}",
+        ]
     )
+
+
+def _ratio(magnification: float) -> str:
+    return f"{magnification:.4g}" if magnification >= 1 else f"1/{1 / magnification:.4g}"

@@ -170,7 +170,7 @@ def prepare(setup: Setup, folder: Path) -> None:
 
     The true image of a world is rendered later.
     """
-    scene = setup.scene
+    scene, picture = setup.scene, setup.picture  # first, since a scene without a picture leaves no folder behind
     make_folder(folder)
     clear_abandoned(folder)
     for name in ("scene.toml", TRUTH, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
@@ -179,7 +179,7 @@ def prepare(setup: Setup, folder: Path) -> None:
     if scene.world is None:
         write_truth(folder / TRUTH, setup.image)
         if setup.camera.detail > 1:
-            write_truth(folder / WORLD_PICTURE, setup.picture)
+            write_truth(folder / WORLD_PICTURE, picture)
 
 
 def _raise(error: Exception) -> Description:

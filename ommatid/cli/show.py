@@ -16,13 +16,15 @@ NewFile = Annotated[Path, typer.Argument(metavar="FILE", help="The scene file to
 def show(
     scene: SceneFile, sets: Sets = None, lens: Lenses = "", complete: Complete = False, as_json: Json = False
 ) -> None:
-    """Show the geometry, the plan, and the skipped effects."""
+    """Show the camera in the terms of optics, the plan, and the skipped effects."""
     from ommatid.pipeline.descriptions import describe_scene
     from ommatid.pipeline.sections import scene_sections
     from ommatid.scenes.scene import read
 
     description = describe_scene(read(scene, options.changes(sets, complete), options.lens_names(lens)))
     output.print_result(description, scene_sections(description), as_json)
+    for sentence in description["warnings"]:
+        output.say(f"warning: {sentence}")
 
 
 def export(scene: SceneFile, file: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:

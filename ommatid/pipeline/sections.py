@@ -30,9 +30,9 @@ def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
 
 
 def scene_sections(description: dict[str, Any]) -> list[Section]:
-    """Tabulate the description of a scene: geometry, optics, electrons, plan, skipped effects."""
-    geometry, *others = summary.sections(description)
-    return [geometry, *_optics_sections(description.get("optics", ())), *_light_sections(description), *others]
+    """Tabulate the description of a scene: geometry, lens types, optics, electrons, plan, skipped effects."""
+    geometry, lenses, *others = summary.sections(description)
+    return [geometry, lenses, *_optics_sections(description.get("optics", ())), *_light_sections(description), *others]
 
 
 def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:

@@ -36,13 +36,14 @@ def open_scene(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = 
 
 
 def checked_setup(scene: Scene) -> Setup:
-    """Derive the camera of a scene and load its image. Raises InputError if either cannot be done."""
+    """Derive the camera of a scene and load its image, if it names one. Raises InputError if either cannot be done."""
     camera = derive(scene)  # first, since it is fast and finds most errors
     if scene.world is not None:
         from ommatid.simulate.renderer.world import files
 
         files(scene)
-    return Setup(scene, camera, load(scene))
+    without_picture = scene.target.image is None and scene.world is None
+    return Setup(scene, camera, None if without_picture else load(scene))
 
 
 def open_member(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:

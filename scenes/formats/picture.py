@@ -30,13 +30,19 @@ def load(scene: Scene) -> FloatArray:
     """Load the target's picture, cropped as the scene says and rounded to float32: (detail rows, detail columns).
 
     A target without a picture, of a scene with a world, is zero: its image is not known before it is rendered.
-    Raises InputError if the picture is missing, unreadable, too small for the crop or contains NaN.
+    Raises InputError if there is neither picture nor world, or the picture is unreadable, too small for the crop or
+    contains NaN.
     """
     target = scene.target
     where = f"{scene.source}: target.image"
     if target.image is None:
         if target.shape is None:
             raise InputError(f"{where} and target.shape are absent; name a picture, or give the shape for a [world]")
+        if scene.world is None:
+            raise InputError(
+                f"{where} is absent, so there is nothing to render; name a picture such as photo:camera, or a [world]"
+                " (show, predict, design and calibrate need none)"
+            )
         check_memory(
             prod(target.shape) * target.detail**2 * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one"
         )

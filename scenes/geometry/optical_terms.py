@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from math import atan, cos, degrees, sin
+from math import atan, degrees
 from typing import Any
 
 from ..camera import Camera
 from ..constants import AIRY_FIRST_ZERO, GREEN
-from ..lens_type import LensType, SubImager
+from ..layout.sensor_extent import sensor_extent
+from ..lens_type import LensType
 from ..scene import Scene
 
 
@@ -95,38 +96,17 @@ def optical_terms(scene: Scene, camera: Camera) -> OpticalTerms:
     wavelength = camera.wavelength or GREEN
     types = tuple(_lens_terms(camera, lens_type, wavelength) for lens_type in camera.types)
     area = camera.measurements * camera.pixel_pitch**2
-    size = sensor_size(scene)
+    size = None if scene.camera.sensor is None else scene.camera.sensor.size
     return OpticalTerms(
         types=types,
         wavelength=wavelength,
         lenses=sum(lens.lenses for lens in types),
         total_track=max(lens.total_track for lens in types),
-        sensor_extent=sensor_extent(camera),
+        sensor_extent=sensor_extent(camera.sub_imagers, camera.pixel_pitch),
         sensor_area=area,
         sensor_size=size,
         sensor_share=None if size is None else area / (size[0] * size[1]),
     )
-
-
-def sensor_size(scene: Scene) -> tuple[float, float] | None:
-    """Height and width of the sensor in mm; None if the scene does not give them."""
-    del scene
-    return None
-
-
-def sensor_extent(camera: Camera) -> tuple[float, float]:
-    """Height and width of the smallest upright rectangle on the sensor that holds all sub-images, in mm."""
-    boxes = [_box(sub, camera.pixel_pitch) for sub in camera.sub_imagers]
-    left, right, bottom, top = (list(ends) for ends in zip(*boxes, strict=True))
-    return max(top) - min(bottom), max(right) - min(left)
-
-
-def _box(sub: SubImager, pitch: float) -> tuple[float, float, float, float]:
-    """Ends of the upright box around a patch: left, right, bottom, top."""
-    (rows, columns), (x, y) = sub.type.pixels, sub.patch
-    along, aside = abs(cos(sub.rotation)) * pitch / 2, abs(sin(sub.rotation)) * pitch / 2
-    wide, tall = along * columns + aside * rows, along * rows + aside * columns
-    return x - wide, x + wide, y - tall, y + tall
 
 
 def _lens_terms(camera: Camera, lens_type: LensType, wavelength: float) -> LensTerms:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from functools import partial
 from typing import Annotated, Literal, cast
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from ommatid.runtime.errors import shortened_repr
 
+from ..geometry.quantities import FieldOfView, FNumber, SensorSize
 from ..zemax.dispersion import Dispersion
-from .table import Table
+from .table import Table, allow_absent
 from .units import (
     Angle,
     Corner,
@@ -104,8 +106,23 @@ class SubImagerTable(Table):
 class LensTable(Table):
     """One lens type: an array of equal sub-imagers."""
 
+    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("magnification", "pixels")))
+
     name: str = Field(pattern=LENS_NAME)
-    magnification: Magnification = Field(description="image size over object size, at most 1")
+    magnification: Magnification = Field(
+        description="1 over the number of target pixels that a sensor pixel spans along an axis, at most 1"
+    )
+    focal_length: Length | None = Field(
+        default=None, exclude=True, description="focal length; with the other distances it gives the magnification"
+    )
+    f_number: FNumber | None = Field(
+        default=None, exclude=True, description="focal length over aperture, in place of the aperture"
+    )
+    field_of_view: FieldOfView | None = Field(
+        default=None,
+        exclude=True,
+        description="angle that the width of a sub-image sees, or height and width, in place of pixels or focal_length",
+    )
     array: Pair = Field(description="rows and columns of sub-imagers")
     pixels: Literal["fit"] | Pair = Field(description='rows and columns of a sub-image, or "fit"')
     step: Step = Field(
@@ -169,11 +186,12 @@ class LensTable(Table):
     @model_validator(mode="after")
     def _check_kind_of_lens(self) -> LensTable:
         if self.surfaces is not None:
-            for name in ("aperture", "distortion"):
+            for name in ("aperture", "distortion", "f_number"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} belongs to a thin lens, and surfaces imply it; remove one, got both")
-            if self.focus is not None and isinstance(self.scale, float | int):
-                raise ValueError('a number as scale fixes the focus; take scale "fit", got focus too')
+            for name in ("focus", "focal_length"):
+                if getattr(self, name) is not None and isinstance(self.scale, float | int):
+                    raise ValueError(f'a number as scale fixes the focus; take scale "fit", got {name} too')
         else:
             for name in ("scale", "coating"):
                 if getattr(self, name) is not None:
@@ -183,8 +201,16 @@ class LensTable(Table):
         return self
 
 
+class CameraSensorTable(Table):
+    """The outline of the sensor, which all sub-images must fit."""
+
+    size: SensorSize = Field(description='height and width, or a format such as "1/2.3"')
+
+
 class CameraTable(Table):
     """A flat sensor behind arrays of micro-lenses."""
+
+    model_config = ConfigDict(json_schema_extra=partial(allow_absent, keys=("pixel_pitch",)))
 
     pixel_pitch: Length = Field(description="side of one sensor pixel")
     lens_pitch: Length = Field(description="distance between the centres of neighbouring lenses")
@@ -201,6 +227,9 @@ class CameraTable(Table):
         description="glass catalogue (AGF) with glasses of surfaces beside the built-in ones",
     )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
+    sensor: CameraSensorTable | None = Field(
+        default=None, description="outline of the sensor; absent: as large as needed"
+    )
     lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -229,6 +258,6 @@ class CameraTable(Table):
             if lens.aperture is not None and lens.aperture > self.lens_pitch * (1 + 1e-9):
                 raise ValueError(
                     f"expected lens.{lens.name}.aperture of at most lens_pitch, {self.lens_pitch:g} mm, got"
-                    f" {lens.aperture:g} mm; make the aperture smaller or lens_pitch larger"
+                    f" {lens.aperture:g} mm; make the aperture smaller, or f_number or lens_pitch larger"
                 )
         return self

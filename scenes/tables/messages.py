@@ -10,15 +10,22 @@ from pydantic_core import ErrorDetails
 
 from ommatid.runtime.errors import shortened, shortened_repr
 
+DERIVED = {  # keys that may follow from others
+    "magnification": ", or focal_length with target.distance and both pixel pitches",
+    "pixels": ', or "fit", or field_of_view',
+    **dict.fromkeys(("pixel_pitch", "distance"), ", or magnification and focal_length of a lens type with the others"),
+}
+
 
 def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]) -> str:
     """Describe the first error in `data` in one sentence, without the file's name."""
     problems = error.errors()
-    # A misspelt key is also reported as a missing one: prefer the misspelling.
+    # A misspelt key is also reported as a missing one, as is a key that follows from a wrong value: prefer these two.
     unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
-    first = (unknown or problems)[0]
-    sentence = _sentence(first, data, model)
-    others = len(problems) - 1
+    present = [problem for problem in problems if problem["type"] != "missing"]
+    chosen = unknown or present or problems
+    sentence = _sentence(chosen[0], data, model)
+    others = len(chosen) - 1
     return sentence + (f" (and {others} more to correct)" if others else "")
 
 
@@ -51,7 +58,8 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
         nearest = (elsewhere or near or difflib.get_close_matches(bare, keys, n=1, cutoff=0.0))[0]
         return f"unknown key '{key}'; the nearest known key is '{nearest}'"
     if error_type == "missing":
-        return f"the key '{key}' is missing and has no default; add it"
+        from_others = DERIVED.get(key.rsplit(".", 1)[-1], "")
+        return f"the key '{key}' is missing and has no default; add it{from_others}"
     message = problem["msg"].removeprefix("Value error, ")
     message = message.replace("Input should be", "expected").replace(
         "String should match", "expected text that matches"

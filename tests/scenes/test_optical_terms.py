@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from math import radians, tan
+from math import radians, sqrt, tan
 from pathlib import Path
 
 import pytest
 
+from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import OpticalTerms, optical_terms
 from ommatid.scenes.scene import read
@@ -64,3 +65,43 @@ def test_the_extent_is_that_of_the_patches_of_all_lens_types() -> None:
     height, width = optical_terms(scene, derive(scene)).sensor_extent
     assert width == pytest.approx(1.0 + 0.066 + (1.0 - 2.0) / 500, rel=1e-9)
     assert height == pytest.approx(width)
+
+
+def test_a_sensor_of_a_named_format_is_used_in_part() -> None:
+    """A 1/2.3 inch sensor has 4.55 x 6.17 mm."""
+    terms = terms_of("tile19", 'camera.sensor.size="1/2.3"')
+    assert terms.sensor_size == (4.55, 6.17)
+    assert terms.sensor_share == pytest.approx(706 * 0.006**2 / (4.55 * 6.17))
+
+
+def test_a_rotated_patch_takes_the_upright_box_around_it() -> None:
+    """59 x 59 pixels of 6 um, turned by 45 degrees, are sqrt(2) times as wide."""
+    turned = 'camera.lens.I.sub_imager=[{at = [0, 0], rotation = "45 deg"}]'
+    scene = read(Path("single"), [turned])
+    assert optical_terms(scene, derive(scene)).sensor_extent == pytest.approx([59 * 0.006 * sqrt(2)] * 2)
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        ('["4.55 mm", "5 mm"]', ("height x width", "4.55 x 5 mm", "smaller camera.lens_pitch")),
+        ('["6.17 mm", "4.55 mm"]', ("6.17 x 4.55 mm", "its height comes first")),
+        ('"1/2.4"', ("1/2.3", "got '1/2.4'", 'the nearest format is "1/2.5"')),
+        ('"APSC"', ('the nearest format is "APS-C"',)),
+        ('["4.55 mm"]', ("camera.sensor.size",)),
+        ("5", ("camera.sensor.size", "got 5")),
+    ],
+)
+def test_sensors_that_do_not_hold_the_arrays_are_refused(size: str, words: tuple[str, ...]) -> None:
+    """Twelve lenses side by side, 0.5 mm apart, take 5.5 mm and the patches at their ends."""
+    with pytest.raises(InputError) as caught:
+        terms_of("tile19", f"camera.sensor.size={size}")
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_a_sensor_as_large_as_the_arrays_holds_them() -> None:
+    height, width = terms_of("tile19").sensor_extent
+    exact = f'camera.sensor.size=["{height!r} mm", "{width!r} mm"]'
+    assert terms_of("tile19", exact).sensor_size == (height, width)
+    with pytest.raises(InputError, match="the sub-images of all arrays"):
+        terms_of("tile19", f'camera.sensor.size=["{height * 0.999!r} mm", "{width!r} mm"]')

@@ -58,7 +58,7 @@ def read_model(path: str | Path) -> Model:
     return model_file.read(Path(path))
 
 
-def read_run(folder: str | Path) -> Result:
+def read_result(folder: str | Path) -> Result:
     """Read the folder of a finished run; its maps are float32.
 
     Raises InputError if a file is missing or damaged.
@@ -187,7 +187,7 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
     Raises InputError for a wrong scene, MachineError for a full disk.
     """
     stages.run(_setup(scene), Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
-    return read_run(folder)
+    return read_result(folder)
 
 
 def _scene(scene: Scene | str | Path) -> Scene:

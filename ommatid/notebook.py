@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.verdict_words import grounds, heading
+from ommatid.reconstruct.output.verdict_words import error_words, grounds, heading
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -77,10 +77,10 @@ def result_html(
     values = 0.0, 255.0
     pictures: list[Picture] = [("image", image, values), ("posterior standard deviation", deviation, None)]
     rows = [("verdict", f"{heading(summary)}: {grounds(summary)}")]
-    rows += [("expected mean squared error", f"{summary.error.predicted_mse:.4g}")]
-    if truth is not None:
+    rows += [("expected mean squared error", error_words(summary.error.predicted_mse))]
+    if truth is not None and summary.error.mse is not None:
         pictures = [("truth", truth, values), *pictures, ("error", image - truth, None)]
-        rows.append(("measured mean squared error", f"{summary.error.mse:.4g}"))
+        rows.append(("measured mean squared error", error_words(summary.error.mse)))
     rows += [
         ("degrees of freedom", f"{summary.diagnostics.degrees_of_freedom:.4g} of {image.size}"),
         ("method", f"{summary.solver.way}, {summary.solver.method}"),

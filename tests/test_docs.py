@@ -49,7 +49,8 @@ from .modules import modules
 
 DOCS = ROOT / "docs"
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
-COMMANDS: dict[str, Any] = dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+PROGRAM: Any = typer.main.get_command(app)
+COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
 # Commands that another test runs, named with a string that the test contains: they take too long to run twice.
 TESTED_ELSEWHERE = {
     "stability": ("stability/test_stability.py", "write_stability"),
@@ -152,7 +153,7 @@ def run_command(line: str, comment: str, folder: Path, ommatid: Command) -> None
     result = shell(*command, cwd=folder) if "--workers" in arguments else ommatid(*command)
     assert result.code == 0, f"{line}: {result.err}"
     if stated_error:  # stated with four digits
-        assert json.loads(result.out)["mse"] == pytest.approx(float(stated_error[1]), rel=1e-3), line
+        assert json.loads(result.out)[0]["mse"] == pytest.approx(float(stated_error[1]), rel=1e-3), line
     for output in re.findall(r"prints `([^`]+)`", comment):
         assert output in result.err, line
     if arguments[0] == "init":
@@ -360,7 +361,8 @@ def test_every_command_and_option_is_documented_and_has_help(command: str, ommat
 
 
 def test_every_documented_option_exists() -> None:
-    parameters = [parameter for command in COMMANDS.values() for parameter in command.params]
+    commands = [PROGRAM, *COMMANDS.values()]
+    parameters = [parameter for command in commands for parameter in command.params]
     known = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", prose(DOCS / "commands.md")):
         assert option in known | {"--help"}, option

@@ -106,7 +106,7 @@ def test_it_yields_the_numbers_of_the_commands(
     assert before.keys() == after.keys()
     for name in before:
         np.testing.assert_array_equal(before[name], after[name])
-    finished = ommatid.read_run(folder)
+    finished = ommatid.read_result(folder)
     assert finished.summary.error == result.summary.error
     np.testing.assert_array_equal(finished.image, result.image.astype(np.float32))
     np.testing.assert_array_equal(finished.truth, result.truth)
@@ -275,7 +275,7 @@ def test_a_title_is_text_and_a_picture_that_is_gone_is_said(tmp_path: Path) -> N
         (lambda: ommatid.read_scene("tile19", lens=["X"]), "no lens type is called 'X'"),
         (lambda: ommatid.read_stack("none.exr"), "no such file"),
         (lambda: ommatid.read_model("none.npz"), "no such file"),
-        (lambda: ommatid.read_run("none"), "none"),
+        (lambda: ommatid.read_result("none"), "none"),
     ],
 )
 def test_what_is_wrong_is_said(wrong: Callable[[], object], words: str) -> None:
@@ -315,7 +315,7 @@ def test_a_run_with_another_estimate_is_said(tmp_path: Path) -> None:
     ommatid.run(ommatid.read_scene("tile19", set=FEW), tmp_path)
     (tmp_path / "estimate.exr").write_bytes((tmp_path / "stack.exr").read_bytes())
     with pytest.raises(ommatid.InputError, match=r"estimate\.exr: expected the estimate and its variance"):
-        ommatid.read_run(tmp_path)
+        ommatid.read_result(tmp_path)
 
 
 @pytest.fixture(name="ommatid_command")

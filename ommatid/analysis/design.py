@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.skipped import ignores_detail
 
-from .prediction_table import json_of
+from .prediction_table import DIGITS, json_of
 
 ADDED = "added"  # name of the lens type
 MAX_CANDIDATES = 1000
@@ -46,7 +47,7 @@ def ranked(candidates: list[DesignCandidate]) -> list[DesignCandidate]:
 
 def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[str, str]]:
     """Return magnification and expected error, one row per candidate after that of the camera itself."""
-    lines = [("unchanged", f"{before.mse:.6g} per pixel, {before.null_space} dimensions unseen")]
+    lines = [("unchanged", f"{error_words(before.mse, DIGITS)}, {before.null_space} dimensions unseen")]
     for candidate in candidates:
         after, name = candidate.expected, f"+ {candidate.magnification}"
         if after is None:
@@ -55,7 +56,7 @@ def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[st
         gain = f"{before.mse / after.mse:.3g} times less" if after.mse > 0 else "no error is left"
         added = after.measurements - before.measurements
         unseen = f"{after.null_space} dimensions unseen, {added} measurements more"
-        lines.append((name, f"{after.mse:.6g} per pixel, {gain}; {unseen}"))
+        lines.append((name, f"{error_words(after.mse, DIGITS)}, {gain}; {unseen}"))
     return lines
 
 

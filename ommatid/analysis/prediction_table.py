@@ -6,8 +6,10 @@ from dataclasses import asdict
 from typing import Any
 
 from ommatid.reconstruct.measured_error import TRIM
+from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.prediction import Prediction
 
+DIGITS = 6  # of an expected error
 OPTIONAL = ("misalignment", "prior_variance", "mse_for_picture", "interval", "budget", "as_designed", "calibrated")
 
 
@@ -27,8 +29,8 @@ def json_of(prediction: Prediction) -> dict[str, Any]:
 
 def rows(prediction: Prediction) -> list[tuple[str, str]]:
     """Return names and values, in the order in which they are printed: first what the prediction takes for granted."""
-    deviation = prediction.mse**0.5
-    inner = "the target is too small" if prediction.trimmed_mse is None else f"{prediction.trimmed_mse:.6g}"
+    trimmed = prediction.trimmed_mse
+    inner = "the target is too small" if trimmed is None else error_words(trimmed, DIGITS)
     width = "nothing is resolved" if prediction.resolution is None else f"{prediction.resolution:.3g} pixels of f"
     lines = [("assumes", "; ".join(prediction.assumes))] if prediction.assumes else []
     if prediction.recovers_nothing:
@@ -43,11 +45,11 @@ def rows(prediction: Prediction) -> list[tuple[str, str]]:
             ("null space", f"{prediction.null_space} dimensions"),
             ("condition of H", condition),
         ]
-    expected = f"{prediction.mse:.6g} per pixel, a deviation of {deviation:.3g} of 255"
-    lines.append(("expected squared error (Eq. 5)", expected))
+    lines.append(("expected squared error (Eq. 5)", error_words(prediction.mse, DIGITS)))
     lines += _parts(prediction)
     if prediction.budget is None and prediction.misalignment is not None:
-        share = f"{prediction.misalignment:.6g}, within camera.tolerance, for an estimator that takes H as designed"
+        share = error_words(prediction.misalignment, DIGITS)
+        share += ", within camera.tolerance, for an estimator that takes H as designed"
         lines.append(("  of it by misalignment", share))
     return [
         *lines,
@@ -66,15 +68,18 @@ def _parts(prediction: Prediction) -> list[tuple[str, str]]:
         if part != 0
     ]
     if prediction.mse_for_picture is not None:
-        words = (
-            f"{prediction.mse_for_picture:.6g}, of which the run's interval knows nothing: it takes H for the camera's"
-        )
-        if prediction.interval is not None:
-            low, high = prediction.interval
-            words = f"{prediction.mse_for_picture:.6g} (99 %: {low:.4g} to {high:.4g})"
+        words = error_words(prediction.mse_for_picture, DIGITS)
+        if prediction.interval is None:
+            words += ", of which the run's interval knows nothing: it takes H for the camera's"
+        else:
+            words += f", 99 %: {prediction.interval[0]:.4g} to {prediction.interval[1]:.4g}"
         lines.append(("  expected for this picture", words))
     if prediction.as_designed is not None:
-        lines.append(("  with H as designed", f"{prediction.as_designed:.6g}, within camera.tolerance"))
+        lines.append(
+            ("  with H as designed", f"{error_words(prediction.as_designed, DIGITS)}, within camera.tolerance")
+        )
     if prediction.calibrated is not None:
-        lines.append(("  with a calibrated H", f"{prediction.calibrated:.6g}, with calibration.samples"))
+        lines.append(
+            ("  with a calibrated H", f"{error_words(prediction.calibrated, DIGITS)}, with calibration.samples")
+        )
     return lines

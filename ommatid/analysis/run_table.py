@@ -15,7 +15,7 @@ from ommatid.reconstruct.output.run_json import (
     TimeReport,
 )
 from ommatid.reconstruct.output.solver_report import SolverReport
-from ommatid.reconstruct.output.verdict_words import grounds, heading, is_trusted
+from ommatid.reconstruct.output.verdict_words import error_words, grounds, heading, is_trusted
 
 from .summary import skipped_words
 
@@ -32,7 +32,7 @@ def rows(report: RunReport) -> list[Row]:
         *(("assumed", assumption) for assumption in report.assumes),
         *_stage_rows(report),
         *_error_rows(report.error),
-        *(_region_row(region) for region in report.regions),
+        *(region_row(region) for region in report.regions),
         *_image_quality_rows(report.error),
         *_solver_rows(report.solver),
         *_diagnostic_rows(report.diagnostics, report.unknowns),
@@ -45,8 +45,8 @@ def rows(report: RunReport) -> list[Row]:
 def frame_row(name: str, report: RunReport) -> Row:
     """Return the name of a frame of many, and its verdict, error and time in words."""
     error, difference = report.error, report.diagnostics.noise_difference
-    words = [heading(report), f"expected error {error.predicted_mse:.4g}"]
-    words += [] if error.mse is None else [f"measured {error.mse:.4g}"]
+    words = [heading(report), f"expected error {error_words(error.predicted_mse)}"]
+    words += [] if error.mse is None else [f"measured {error_words(error.mse)}"]
     words.append(f"{report.stages['reconstruct'].seconds:.2f} s")
     if difference is None:
         words.append("error bars computed")
@@ -98,12 +98,14 @@ def _method(solver: SolverReport) -> str:
 def _error_rows(error: ErrorReport) -> list[Row]:
     lines: list[Row] = []
     if error.mse is not None:
-        lines.append(("mean squared error, measured", f"{error.mse:.4g}"))
+        lines.append(("mean squared error, measured", error_words(error.mse)))
     given = error.expected_given_truth
     if given is not None:
-        lines.append(("  expected for this picture", f"{given.mse:.4g} (99 %: {given.low:.4g} to {given.high:.4g})"))
+        lines.append(
+            ("  expected for this picture", f"{error_words(given.mse)}, 99 %: {given.low:.4g} to {given.high:.4g}")
+        )
     total = error.predicted_mse
-    lines.append(("  predicted (Eq. 5)", f"{total:.4g}"))
+    lines.append(("  predicted (Eq. 5)", error_words(total)))
     return lines + [
         (f"    from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / total:.1f} %)")
         for name, part in error.budget.items()
@@ -111,7 +113,8 @@ def _error_rows(error: ErrorReport) -> list[Row]:
     ]
 
 
-def _region_row(region: RegionReport) -> Row:
+def region_row(region: RegionReport) -> Row:
+    """Return the place of a region, and the mean of the estimate in it with its standard deviation."""
     (row, column), (rows, columns) = region.corner, region.size
     return f"mean of {rows} x {columns} pixels at {row}, {column}", f"{region.mean:.4f} +/- {region.deviation:.2g}"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.output.run_json import Record, StudyCase
+from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -108,9 +109,9 @@ def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:
     """Return the model and its errors, one row per case."""
     lines: list[tuple[str, str]] = []
     for case in cases:
-        words = f"predicted {case.predicted:.4g}"
+        words = f"predicted {error_words(case.predicted)}"
         if case.mse is not None:
-            words = f"mean squared error {case.mse:.4g}, {words}"
+            words = f"mean squared error {error_words(case.mse)}, {words}"
         if case.mse is not None and case.low is not None and case.high is not None:
             position = "inside" if case.low <= case.mse <= case.high else "OUTSIDE"
             words += f"; for this picture {case.expected:.4g}, {position} {case.low:.4g} to {case.high:.4g}"

@@ -19,8 +19,10 @@ import numpy as np
 
 from ommatid.reconstruct.methods.prepared import Prepared
 from ommatid.reconstruct.output import figures, result_files
-from ommatid.reconstruct.output.run_json import RegionReport, RunReport
-from ommatid.reconstruct.restore import Reconstruction, check_camera, check_region
+from ommatid.reconstruct.output.estimate_formats import Format, write_formats
+from ommatid.reconstruct.output.result_files import Region, region_reports
+from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, make_folder
 from ommatid.runtime.pool import worker_pool
@@ -33,19 +35,22 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE
 from ommatid.scenes.stack import Stack
 
-Region = tuple[tuple[int, int], tuple[int, int]]
-
 SENT = "preconditioner", "errors"  # what the first frame prepared and other processes take over; they make the rest
 
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """What the frames have in common: the file of H, changes (KEY=VALUE), names of lens types, and regions."""
+    """What the frames have in common: the file of H, changes (KEY=VALUE), names of lens types, regions and formats.
+
+    force : True to reconstruct also frames that are up to date
+    """
 
     model: Path
     changes: tuple[str, ...] = ()
     lenses: tuple[str, ...] = ()
     regions: tuple[Region, ...] = ()
+    formats: tuple[Format, ...] = ()
+    force: bool = False
 
     def read_model(self) -> Model:
         """Read H of the lens types."""
@@ -145,10 +150,11 @@ def _reports(
     """Yield the frames that are up to date, then the others as they end."""
     missing: list[Frame] = []
     for frame in frames:
-        report = frame.finished()
+        report = None if options.force else frame.finished()
         if report is None:
             missing.append(frame)
         else:
+            write_formats(frame.output, options.formats)
             yield frame, partial(_returned, (report, False))
     shared = _here(missing, prepared, options)
     if workers is not None and workers > 1:
@@ -184,20 +190,12 @@ def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunR
     truth = result_files.truth_beside(frame.stack, stack)
     names = frame.stack, options.model
     outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, prepared=prepared)
-    report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **_region_reports(outcome, options.regions))
+    report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
     figures.write_estimate(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
     record = {"title": stack.scene.title, "fingerprint": frame.fingerprint, "report": report.plain()}
     result_files.write_estimate(frame.output, outcome, record)
+    write_formats(frame.output, options.formats)
     return report, True
-
-
-def _region_reports(outcome: Reconstruction, regions: Sequence[Region]) -> dict[str, Any]:
-    reports = tuple(
-        RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
-        for corner, size in regions
-        for mean, deviation in [outcome.region(corner, size)]
-    )
-    return {"region": reports[0], "regions": reports} if reports else {}
 
 
 Outcome = tuple[RunReport, bool] | Exception

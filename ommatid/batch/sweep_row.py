@@ -25,7 +25,8 @@ class SweepRow(BaseModel):
 
     values : of the swept keys; in memory as they were written, in sweep.json as the scene file has them
     expected_mse, expected_low, expected_high : expectation given the true image, and its 99 % interval
-    predicted_mse : Eq. 5;  trusted : the verdict
+    predicted_mse : Eq. 5;  rms, predicted_rms : roots of the mean squared errors, in grey levels
+    gain : dB over the best single sub-image;  trusted : the verdict
     The order of the fields is that of the columns of sweep.csv.
     """
 
@@ -36,12 +37,15 @@ class SweepRow(BaseModel):
     values: dict[str, Any]
     trusted: bool | None = None
     mse: float | None = None
+    rms: float | None = None
     expected_mse: float | None = None
     expected_low: float | None = None
     expected_high: float | None = None
     predicted_mse: float | None = None
+    predicted_rms: float | None = None
     psnr: float | None = None
     ssim: float | None = None
+    gain: float | None = None
     budget: dict[str, float] = Field(default_factory=dict[str, float])
     rank: int | None = None
     null_space: int | None = None
@@ -89,7 +93,8 @@ def summary(document: Mapping[str, Any]) -> SweepRow:
     if "seconds" in document:
         seconds["render"] = document["seconds"]
     numbers: dict[str, Any] = {
-        **{name: error.get(name) for name in ("mse", "predicted_mse", "psnr", "ssim")},
+        **{name: error.get(name) for name in ("mse", "predicted_mse", "psnr", "ssim", "gain")},
+        **{f"{kind}rms": _root(error.get(f"{kind}mse")) for kind in ("", "predicted_")},
         **{f"expected_{name}": value for name, value in error.get("expected_given_truth", {}).items()},
         **{name: document.get(name) for name in ("rank", "null_space", "condition", "measurements", "unknowns")},
     }
@@ -100,6 +105,10 @@ def summary(document: Mapping[str, Any]) -> SweepRow:
         budget=error.get("budget", {}),
         seconds={name: value for name, value in seconds.items() if value is not None},
     )
+
+
+def _root(mse: float | None) -> float | None:
+    return None if mse is None else mse**0.5
 
 
 def write_rows(path: Path, rows: Sequence[SweepRow]) -> None:

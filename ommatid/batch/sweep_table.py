@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.runtime.files import clear_abandoned, make_folder, write_csv
 
 from .sweep_figure import write_figure
@@ -33,7 +34,7 @@ def lines(rows: Sequence[SweepRow]) -> list[tuple[str, str]]:
         label = [Path(row.scene).stem] if several else []
         label += [f"{key} = {value}" for key, value in row.values.items()]
         errors = {"mse": row.mse, "predicted mse": row.predicted_mse}
-        result = [f"{name} {error:.4g}" for name, error in errors.items() if error is not None]
+        result = [f"{name} {error_words(error)}" for name, error in errors.items() if error is not None]
         result += ["not to be trusted"] if row.trusted is False else []
         result += [] if row.null_space is None else [f"null space {row.null_space}"]
         printed.append((", ".join(label), row.failed or ", ".join(result) or "done"))

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import sys
 from functools import partial
+from importlib.metadata import version as version_of
+from typing import Annotated
 
 import typer
 
@@ -17,24 +19,43 @@ from . import calibrate, predict, reconstruct, run, show, studies
 from .failures import exit_code_of
 
 app = typer.Typer(
-    add_completion=False,
+    no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Simulate, calibrate and reconstruct the images of flat compound-eye cameras, with error bars.",
 )
-for command in (run.run, run.render, calibrate.calibrate, reconstruct.reconstruct, reconstruct.check):
+with_arguments = partial(app.command, no_args_is_help=True)  # without any, they print their help
+for command in (
+    run.run,
+    run.render,
+    calibrate.calibrate,
+    reconstruct.reconstruct,
+    reconstruct.report,
+    reconstruct.check,
+):
+    with_arguments()(command)
+with_arguments("import")(calibrate.import_frames)
+with_arguments("export-model")(calibrate.export_model)
+for command in (predict.predict, predict.design, studies.bench, show.show, show.export, show.init):
+    with_arguments()(command)
+for command in (studies.paper, studies.stability, show.schema, show.doctor):
     app.command()(command)
-app.command("import")(calibrate.import_frames)
-app.command("export-model")(calibrate.export_model)
-for command in (predict.predict, predict.design, studies.paper, studies.stability, studies.bench):
-    app.command()(command)
-for command in (show.show, show.export, show.init, show.schema, show.doctor):
-    app.command()(command)
+
+
+Version = Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)]
+
+
+@app.callback(invoke_without_command=True)
+def start(version: Version = False) -> None:
+    """Simulate, calibrate and reconstruct the images of flat compound-eye cameras, with error bars."""
+    if version:
+        print(f"ommatid {version_of('ommatid')}")
+        raise typer.Exit
 
 
 def main() -> None:
     """Run the command line and exit."""
     with command_line(["ommatid", *sys.argv[1:]]):
-        code = exit_code_of(partial(app, standalone_mode=False))
+        code = exit_code_of(partial(app, prog_name="ommatid", standalone_mode=False))
     sys.exit(code)

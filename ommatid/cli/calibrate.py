@@ -64,7 +64,7 @@ def calibrate(
     asked = options.changes(sets, complete), options.lens_names(lens)
     with output.progress_bar("calibrate") as progress:
         outcome = calibrate_file(scene, file, *asked, recording, progress)
-    output.say_all("calibrate", outcome.warnings)
+    output.warn_all(outcome.warnings)
     output.say_done("calibrate", outcome.made, file)
     output.print_result({"file": str(file), **outcome.describe()}, [], as_json)
 
@@ -103,6 +103,6 @@ def import_frames(
 
     settings = options.acquisition(dark, flat, flat_value, origin, upright)
     outcome = import_file(scene, images, file, settings, options.changes(sets), options.lens_names(lens))
-    output.say_all("import", outcome.warnings)
+    output.warn_all(outcome.warnings)
     output.say_done("import", True, file)
     output.print_result({"file": str(file), **outcome.describe()}, [], as_json)

@@ -46,7 +46,8 @@ def report(error: Exception) -> int:
     if isinstance(error, BatchError):
         return error.exit_code
     if hasattr(error, "format_message"):  # raised by the parser of the command line
-        say(f"ommatid: {cast(Any, error).format_message()}")
+        message = cast(Any, error).format_message()
+        say(message if type(error).__name__ == "NoArgsIsHelpError" else f"ommatid: {message}")
         return 2
     if isinstance(error, InputError | MachineError):
         say("ommatid: " + " ".join(str(error).splitlines()))

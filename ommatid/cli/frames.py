@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,51 +12,85 @@ from ommatid.runtime.errors import InputError
 from . import failures, output
 
 if TYPE_CHECKING:
-    from ommatid.batch.frames import Frame, Region
+    from ommatid.batch.frames import Frame
+    from ommatid.reconstruct.output.estimate_formats import Format
+    from ommatid.reconstruct.output.result_files import Region
     from ommatid.reconstruct.output.run_json import RunReport
 
 
+@dataclass(frozen=True)
+class FrameRequest:
+    """Stacks and their model, with the options that they share."""
+
+    stacks: Sequence[Path]
+    model: Path
+    changes: tuple[str, ...]
+    lenses: tuple[str, ...]
+    regions: tuple[Region, ...]
+    formats: tuple[Format, ...]
+    force: bool
+
+
 def reconstruct(
-    stacks: Sequence[Path],
-    model: Path,
+    request: FrameRequest,
     folder: Path,
-    changes: tuple[str, ...],
-    lenses: tuple[str, ...],
-    regions: tuple[Region, ...],
     scheduler: str,
     workers: int | None,
     strict: bool,
-    as_json: bool,
+    detail: output.Detail | None,
 ) -> None:
-    """Reconstruct every stack with one model, and print a row or a JSON object for each.
+    """Reconstruct every stack with one model, and print a row, a table or a verdict for each; None: as JSON.
 
     Raises InputError before anything is written if a stack is not of the model's camera, and BatchError at the end if a
     frame failed or, if `strict`, if one is not to be trusted.
     """
     from ommatid.batch.frames import FrameOptions, reconstruct_frames
 
+    stacks, model = request.stacks, request.model
     if not stacks:
         raise InputError(f"{model}: expected stacks and then their model, got one file; name a stack before it")
     if scheduler:
         raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
-    documents: dict[Path, dict[str, Any]] = {}
-    rows: dict[Path, tuple[str, str]] = {}
-    codes = [0]
+    described: dict[Path, DescribedFrame] = {}
     with output.progress_bar("reconstruct") as progress:
-        asked = FrameOptions(model, changes, lenses, regions)
+        asked = FrameOptions(
+            model, request.changes, request.lenses, request.regions, request.formats, force=request.force
+        )
         for frame, work in reconstruct_frames(stacks, folder, asked, workers, progress):
-            documents[frame.stack], rows[frame.stack], code = _described(frame, work, strict)
-            codes.append(code)
-    section = f"{len(stacks)} frames: {folder}", [rows[stack] for stack in stacks]
-    output.print_result([documents[stack] for stack in stacks], [section], as_json)
-    if max(codes):
-        raise failures.BatchError(max(codes))
+            described[frame.stack] = _described(frame, work, strict, quiet=detail == "verdict")
+    _print(folder, [described[stack] for stack in stacks], detail)
+    worst = max(frame.code for frame in described.values())
+    if worst:
+        raise failures.BatchError(worst)
 
 
-def _described(
-    frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict: bool
-) -> tuple[dict[str, Any], tuple[str, str], int]:
-    """Finish a frame, and return its JSON object, its row and its exit code."""
+@dataclass(frozen=True)
+class DescribedFrame:
+    """A frame's JSON object, its row, its exit code, and its report; None for one that failed."""
+
+    document: dict[str, Any]
+    row: tuple[str, str]
+    code: int
+    report: RunReport | None
+
+
+def _print(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
+    from ommatid.analysis import run_table
+    from ommatid.pipeline.summary_lines import verdict_line
+
+    if detail is None:
+        output.print_json([frame.document for frame in frames])
+    elif detail == "verdict":
+        output.print_lines(verdict_line(frame.row[0], frame.report) for frame in frames if frame.report is not None)
+    elif detail == "table":
+        pairs = [(frame.row[0], frame.report) for frame in frames if frame.report is not None]
+        output.print_tables((name, run_table.rows(report)) for name, report in pairs)
+    else:
+        output.print_tables([(f"{len(frames)} frames: {folder}", [frame.row for frame in frames])])
+
+
+def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict: bool, quiet: bool) -> DescribedFrame:
+    """Finish a frame, and return what is printed of it."""
     from ommatid.analysis.run_table import frame_row
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
@@ -64,7 +99,9 @@ def _described(
         report, made = work()
     except Exception as error:
         code = failures.report(error)
-        return {**heading, "error": str(error), "exit_code": code}, (name, f"failed: {error}"), code
-    output.say_done("reconstruct", made, frame.output)
+        document = {**heading, "error": str(error), "exit_code": code}
+        return DescribedFrame(document, (name, f"failed: {error}"), code, None)
+    if not quiet:
+        output.say_done("reconstruct", made, frame.output)
     code = failures.NOT_TRUSTED if strict and not is_trusted(report) else 0
-    return {**heading, **report.plain()}, frame_row(name, report), code
+    return DescribedFrame({**heading, **report.plain()}, frame_row(name, report), code, report)

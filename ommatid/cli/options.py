@@ -15,14 +15,26 @@ if TYPE_CHECKING:
 
 _SCENE = f"A scene file, or a scene of the gallery by name: {', '.join(gallery_names())}."
 
-SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help=_SCENE)]
-SceneFiles = Annotated[list[Path], typer.Argument(metavar="SCENE...", help=_SCENE)]
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help=_SCENE, autocompletion=gallery_names)]
+SceneFiles = Annotated[list[Path], typer.Argument(metavar="SCENE...", help=_SCENE, autocompletion=gallery_names)]
 Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
 Output = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
 Sets = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a key, as in noise.variance=1e-6; empty removes it."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a key, as in noise.variance=1e-6; empty removes it. Files are relative to the current folder.",
+    ),
+]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print the whole table of every result.")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print the verdict alone, and no progress.")]
+Force = Annotated[bool, typer.Option("--force", help="Make everything again, even if it is up to date.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be done; write nothing.")]
+Formats = Annotated[
+    str,
+    typer.Option("--format", metavar="NAME,...", help="Write the estimate also as npy, tiff16 or tiff32."),
 ]
 Lenses = Annotated[
     str, typer.Option("--lens", metavar="NAME,...", help="Use these lens types only; a type named twice is used twice.")

@@ -5,14 +5,21 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Generator, Iterable
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+import typer
+
+from ommatid.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from ommatid.batch.remote import RunObserver
     from ommatid.pipeline.sections import Section
+    from ommatid.reconstruct.output.run_json import RunReport
     from ommatid.runtime.progress import Progress
+
+Detail = Literal["table", "summary", "verdict"]
 
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
 
@@ -22,10 +29,15 @@ def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def say_all(command: str, sentences: Iterable[str]) -> None:
-    """Print the warnings of a command on stderr, a line each."""
+def warn(sentence: str) -> None:
+    """Print a warning on stderr."""
+    say(f"warning: {sentence}")
+
+
+def warn_all(sentences: Iterable[str]) -> None:
+    """Print warnings on stderr, a line each."""
     for sentence in sentences:
-        say(f"{command}: {sentence}")
+        warn(sentence)
 
 
 def say_done(command: str, made: bool, file: Path | None = None) -> None:
@@ -73,15 +85,50 @@ def progress_bar(stage: str) -> Generator[Progress]:
         yield lambda fraction: bar.update(task, completed=fraction)
 
 
-def observer(folder: Path, *, alone: bool = False) -> RunObserver:
+def print_lines(lines: Iterable[str], *, alarm: bool = False) -> None:
+    """Print lines on stdout; with `alarm` the first in red where stdout is a terminal."""
+    for number, line in enumerate(lines):
+        typer.secho(line, fg="red" if alarm and number == 0 else None, bold=alarm and number == 0)
+
+
+def detail(verbose: bool, quiet: bool) -> Detail:
+    """Return how much is printed of a result. Raises InputError if both options are given."""
+    if verbose and quiet:
+        raise InputError("-v and -q: expected one of them, got both")
+    return "table" if verbose else "verdict" if quiet else "summary"
+
+
+def print_report(name: str, page: Path | None, report: RunReport, sections: Iterable[Section], detail: Detail) -> None:
+    """Print the tables, the six lines or the verdict of a result.
+
+    name : of the scene;  page : its report.html, None without one;  sections : its tables
+    """
+    from ommatid.pipeline.summary_lines import summary_lines, verdict_line
+    from ommatid.reconstruct.output.verdict_words import is_trusted
+
+    if detail == "table":
+        print_tables(sections)
+        return
+    lines = [verdict_line(name, report)] if detail == "verdict" else summary_lines(name, report, page)
+    print_lines(lines, alarm=not is_trusted(report))
+
+
+def observer(folder: Path, *, alone: bool = False, quiet: bool = False) -> RunObserver:
     """Create the observer that shows the progress of a run in `folder`, and says which stages are done.
 
     alone : True if the process runs this scene alone, so that its start belongs to the run
+    quiet : True to show and say nothing
     """
     from ommatid.batch.remote import RunObserver
     from ommatid.runtime.processors import seconds_since_start
+    from ommatid.runtime.progress import no_progress
 
     def done(stage: str, made: bool) -> None:
-        say_done(stage, made, folder / FILE_OF_STAGE[stage] if stage in FILE_OF_STAGE else None)
+        if not quiet:
+            say_done(stage, made, folder / FILE_OF_STAGE[stage] if stage in FILE_OF_STAGE else None)
 
-    return RunObserver(progress_bar, done, seconds_since_start if alone else None)
+    def no_bar(stage: str) -> AbstractContextManager[Progress]:
+        del stage
+        return nullcontext(no_progress)
+
+    return RunObserver(no_bar if quiet else progress_bar, done, seconds_since_start if alone else None)

@@ -46,12 +46,15 @@ def predict(
         raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
     from ommatid.pipeline.descriptions import describe_prediction, predict_with_light
     from ommatid.pipeline.sections import prediction_sections
+    from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
 
     described = read(scene, *asked)
+    output.warn_all(conversions(described))
     prediction, light = predict_with_light(described, rays=not no_rays)
     sections = prediction_sections(described, prediction, light)
-    output.print_result(describe_prediction(prediction, light), sections, as_json)
+    document = {"scene": str(scene), **describe_prediction(prediction, light)}
+    output.print_result([document], sections, as_json)
 
 
 def design(

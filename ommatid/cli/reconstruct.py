@@ -1,14 +1,18 @@
-"""The commands that need no scene file: reconstruct and check."""
+"""The commands that need no scene file: reconstruct, report and check."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from . import failures, frames, options, output
-from .options import Json, Lenses, Sets, Strict
+from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, Verbose
+
+if TYPE_CHECKING:
+    from ommatid.pipeline.reconstruction import ReconstructionRequest
+    from ommatid.reconstruct.output.estimate_formats import Format
 
 StackAndModel = Annotated[
     list[Path],
@@ -19,10 +23,24 @@ StackAndModel = Annotated[
 ]
 Estimates = Annotated[
     Path,
-    typer.Option("-o", "--output", metavar="FILE", help="File to write; of several stacks the folder of their files."),
+    typer.Option(
+        "-o",
+        "--output",
+        metavar="DIR|FILE",
+        help="Folder of all results, or an EXR file for the estimate alone; of several stacks the folder of these.",
+    ),
 ]
 StackFile = Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")]
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Their observation model, model.npz.")]
+StackOrFolder = Annotated[
+    Path, typer.Argument(metavar="STACK|DIR", help="A folder of results, a folder of such folders, or a stack.")
+]
+ResultFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--output", metavar="DIR", help="Folder of the results of a stack (default: beside it, of its name)."
+    ),
+]
 Regions = Annotated[
     list[str] | None,
     typer.Option(
@@ -58,25 +76,73 @@ def reconstruct(
     region: Regions = None,
     scheduler: TileScheduler = "",
     workers: TileWorkers = None,
+    formats: Formats = "",
+    force: Force = False,
     strict: Strict = False,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct from files alone: one frame, or several of one camera."""
-    from ommatid.analysis import run_table
-    from ommatid.pipeline.reconstruction import reconstruct_files
-    from ommatid.reconstruct.output.verdict_words import is_trusted
+    """Reconstruct from files: one frame, or several of one camera."""
+    from ommatid.pipeline import reconstruction
+    from ommatid.reconstruct.output.estimate_formats import formats_of
 
+    detail, others = output.detail(verbose, quiet), formats_of(formats)
     *stacks, model = files
     asked = options.changes(sets), options.lens_names(lens), options.regions(region)
-    if len(stacks) != 1 or file.is_dir():
-        frames.reconstruct(stacks, model, file, *asked, scheduler, workers, strict, as_json)
+    if len(stacks) != 1:
+        request = frames.FrameRequest(stacks, model, *asked, others, force)
+        frames.reconstruct(request, file, scheduler, workers, strict, None if as_json else detail)
         return
-    stack = stacks[0]
+    request = reconstruction.ReconstructionRequest(stacks[0], model, *asked)
+    _reconstruct_one(request, file, (scheduler, workers), others, force, None if as_json else detail, strict)
+
+
+def _reconstruct_one(
+    request: ReconstructionRequest,
+    file: Path,
+    pool: tuple[str, int | None],
+    formats: tuple[Format, ...],
+    force: bool,
+    detail: output.Detail | None,
+    strict: bool,
+) -> None:
+    """Reconstruct one stack into a folder or a file, and print the result; None for `detail`: as JSON."""
+    from ommatid.analysis import run_table
+    from ommatid.pipeline import reconstruction
+    from ommatid.reconstruct.output.estimate_formats import write_formats
+    from ommatid.reconstruct.output.verdict_words import is_trusted
+
+    whole = reconstruction.is_folder(file)
     with output.progress_bar("reconstruct") as progress:
-        report = reconstruct_files(stack, model, file, *asked, progress, scheduler, workers)
-    output.print_result({"file": str(file), **report.plain()}, [(str(file), run_table.rows(report))], as_json)
+        if whole:
+            if force:
+                (file / "run.json").unlink(missing_ok=True)
+            report, made = reconstruction.reconstruct_folder(request, file, progress, *pool)
+        else:
+            report, made = reconstruction.reconstruct_files(request, file, progress, *pool), True
+    write_formats(file / "estimate.exr" if whole else file, formats)
+    if detail != "verdict":
+        output.say_done("reconstruct", made, file)
+    if detail is None:
+        output.print_json({"folder" if whole else "file": str(file), **report.plain()})
+    else:
+        page = file / "report.html" if whole else None
+        output.print_report(str(file), page, report, [(str(file), run_table.rows(report))], detail)
     if strict and not is_trusted(report):
         raise failures.BatchError(failures.NOT_TRUSTED)
+
+
+def report(path: StackOrFolder, folder: ResultFolder = None, as_json: Json = False) -> None:
+    """Write the page of what is there: a run, a folder of runs, or a stack."""
+    from ommatid.pipeline.reconstruction import report_path
+
+    with output.progress_bar("report") as progress:
+        outcome = report_path(path, folder, progress)
+    output.warn_all(outcome.warnings)
+    pages = [str(reported / "report.html") for reported in outcome.folders]
+    index = {} if outcome.index is None else {"index": str(outcome.index)}
+    output.print_json({"pages": pages, **index}) if as_json else output.print_lines([*pages, *index.values()])
 
 
 def check(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -10,14 +11,19 @@ from typing import TYPE_CHECKING, Any
 from . import failures, output
 from .options import (
     Complete,
+    DryRun,
     Folder,
+    Force,
+    Formats,
     Json,
     Lenses,
+    Quiet,
     SceneFiles,
     Scheduler,
     Sets,
     Strict,
     Sweeps,
+    Verbose,
     Within,
     Workers,
     changes,
@@ -41,26 +47,63 @@ def run(
     workers: Workers = None,
     complete: Complete = False,
     within: Within = "",
+    formats: Formats = "",
+    force: Force = False,
+    dry_run: DryRun = False,
     strict: Strict = False,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
-    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
-    from ommatid.pipeline.sections import run_sections
+    from ommatid.batch.stage_options import with_options
+    from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch
     from ommatid.pipeline.time_budget import stages_within
+    from ommatid.reconstruct.output.estimate_formats import formats_of
 
-    def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
-        output.print_tables([] if as_json else run_sections(member.folder, description))
-        return description
-
+    detail, others = output.detail(verbose, quiet), formats_of(formats)
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
-    stages, workers = stages_within(within, members, STARTED, output.say, scheduler, workers)
-    observer = partial(output.observer, alone=len(members) == 1)
-    batch = scene_batch(*asked, stages, observer, report)
+    output.warn_all(batch_warnings(members, *asked))
+    if dry_run:
+        _print_plans(members, *asked, as_json)
+        return
+    stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
+    observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
+    report = partial(_print_run, None if as_json else detail)
+    batch = scene_batch(*asked, with_options(stages, force, others), observer, report)
     pool = scheduler, workers
     outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, index_folder=folder)
     finish_batch(outcome, as_json, strict)
+
+
+def _print_run(detail: output.Detail | None, member: Member, description: dict[str, Any]) -> dict[str, Any]:
+    """Print a finished scene, unless `detail` is None, and return its description."""
+    from ommatid.pipeline.sections import run_sections
+    from ommatid.reconstruct.output.run_json import RunReport
+
+    if detail is not None:
+        report = RunReport.model_validate(description)
+        page, sections = member.folder / "report.html", run_sections(member.folder, description)
+        output.print_report(member.folder.name, page, report, sections, detail)
+        if detail == "summary" and report.study:  # asked for by the scene
+            output.print_tables(sections[-1:])
+    return description
+
+
+def _print_plans(members: Sequence[Member], asked: tuple[str, ...], lenses: tuple[str, ...], as_json: bool) -> None:
+    """Print what a run would do. Raises InputError for the first scene that would fail."""
+    from ommatid.batch import plan
+    from ommatid.pipeline.stages import open_member
+
+    plans = [plan.plan(member, open_member(asked, lenses, member), asked, lenses) for member in members]
+    if as_json:
+        output.print_json(
+            [{"scene": str(member.scene), **described} for member, described in zip(members, plans, strict=True)]
+        )
+        return
+    for member, described in zip(members, plans, strict=True):
+        output.print_lines(plan.lines(member.folder.name, described))
 
 
 def render(
@@ -72,18 +115,21 @@ def render(
     scheduler: Scheduler = "",
     workers: Workers = None,
     complete: Complete = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Render the sub-images alone."""
+    from ommatid.batch.stage_options import with_options
     from ommatid.pipeline import stages
-    from ommatid.pipeline.batches import batch_members, run_batch, scene_batch
+    from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch
 
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         return {"file": str(member.folder / "stack.exr"), **description}
 
     asked = changes(sets, complete), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
-    batch = scene_batch(*asked, stages.render, output.observer, report)
+    output.warn_all(batch_warnings(members, *asked))
+    batch = scene_batch(*asked, with_options(stages.render, force, ()), output.observer, report)
     finish_batch(run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder), as_json)
 
 

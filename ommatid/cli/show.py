@@ -7,10 +7,20 @@ from typing import Annotated
 
 import typer
 
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.tables.gallery import gallery_names
+
 from . import options, output
 from .options import Complete, Json, Lenses, Output, SceneFile, Sets
 
-NewFile = Annotated[Path, typer.Argument(metavar="FILE", help="The scene file to write.")]
+NewFile = Annotated[Path | None, typer.Argument(metavar="FILE", help="The scene file to write.", show_default=False)]
+Source = Annotated[
+    str,
+    typer.Option(
+        "--from", metavar="NAME", help="Scene of the gallery to copy, with its files.", autocompletion=gallery_names
+    ),
+]
+ListScenes = Annotated[bool, typer.Option("--list", help="List the scenes of the gallery with their titles.")]
 
 
 def show(
@@ -19,9 +29,12 @@ def show(
     """Show the camera in the terms of optics, the plan, and the skipped effects."""
     from ommatid.pipeline.descriptions import describe_scene
     from ommatid.pipeline.sections import scene_sections
+    from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
 
-    description = describe_scene(read(scene, options.changes(sets, complete), options.lens_names(lens)))
+    described = read(scene, options.changes(sets, complete), options.lens_names(lens))
+    output.warn_all(conversions(described))
+    description = describe_scene(described)
     output.print_result(description, scene_sections(description), as_json)
     for sentence in description["warnings"]:
         output.say(f"warning: {sentence}")
@@ -37,13 +50,24 @@ def export(scene: SceneFile, file: Output, sets: Sets = None, lens: Lenses = "",
     output.print_result(description, [], as_json)
 
 
-def init(file: NewFile, as_json: Json = False) -> None:
+def init(
+    file: NewFile = None, source: Source = "starter", list_scenes: ListScenes = False, as_json: Json = False
+) -> None:
     """Write a scene file to start from."""
-    from ommatid.scenes.tables.gallery import write_starter
+    from ommatid.scenes.tables.gallery import gallery_titles, write_starter
 
-    write_starter(file)
-    output.say(f"{file}: written; next: ommatid run {file} -o out")
-    output.print_result({"file": str(file)}, [], as_json)
+    if list_scenes:
+        titles = gallery_titles()
+        width = max(map(len, titles))
+        scenes = [{"name": name, "title": title} for name, title in titles.items()]
+        lines = [f"{name:{width}}  {title}" for name, title in titles.items()]
+        output.print_json(scenes) if as_json else output.print_lines(lines)
+        return
+    if file is None:
+        raise InputError("init: expected the name of the scene file to write, such as mine.toml, got none")
+    written = [str(path) for path in write_starter(file, source)]
+    output.say(f"{', '.join(written)}: written; next: ommatid run {file} -o out")
+    output.print_result({"file": str(file), "files": written}, [], as_json)
 
 
 def schema(as_json: Json = False) -> None:

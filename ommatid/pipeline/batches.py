@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,9 @@ from ommatid.batch.remote import RunObserver, Stages
 from ommatid.batch.sweep_row import summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.page.batch_index import cached_index
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.formats import picture
+from ommatid.scenes.scene import read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
@@ -39,6 +43,18 @@ def batch_members(
     for scene in scenes:
         sweep.check_keys(scene, axes, changes, lenses)
     return sweep.members(scenes, axes, folder)
+
+
+def batch_warnings(members: Sequence[Member], changes: Sequence[str], lenses: Sequence[str]) -> list[str]:
+    """Return what is lost when the pictures of the scenes are read, a sentence each.
+
+    Scenes with errors have none; their errors are reported when they are run.
+    """
+    sentences: list[str] = []
+    for member in members:
+        with suppress(InputError):
+            sentences += picture.conversions(read(member.scene, (*changes, *member.changes), lenses))
+    return list(dict.fromkeys(sentences))
 
 
 def scene_batch(

@@ -1,67 +1,221 @@
-"""A reconstruction from the files of a stack and a model, written together with its picture."""
+"""A reconstruction from the files of a stack and a model: the estimate alone, or a folder as `run` writes it."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from ommatid.reconstruct.output import figures, result_files
-from ommatid.reconstruct.output.run_json import RegionReport, RunReport
-from ommatid.reconstruct.restore import check_region
+from ommatid.page.batch_index import INDEX, cached_index
+from ommatid.page.cached import cached_page
+from ommatid.reconstruct.output import figures, result_files, run_json
+from ommatid.reconstruct.output.result_files import Region, region_reports
+from ommatid.reconstruct.output.run_json import RUN, RunReport
+from ommatid.reconstruct.restore import check_match, check_region
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import check_output
+from ommatid.runtime.files import check_output, file_digest, make_folder, write_whole
 from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.runtime.workers import Workers
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
-from ommatid.scenes.scene import TRUTH
+from ommatid.scenes.model import Model
+from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, CalibrationTable, with_tables
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.stack import Stack
 
-Region = tuple[tuple[int, int], tuple[int, int]]
+STACK, MODEL = "stack.exr", "model.npz"
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
+
+
+@dataclass(frozen=True)
+class ReconstructionRequest:
+    """The files of a stack and its model, changes (KEY=VALUE), names of lens types, and regions to average."""
+
+    stack: Path
+    model: Path
+    changes: tuple[str, ...] = ()
+    lenses: tuple[str, ...] = ()
+    regions: tuple[Region, ...] = ()
+
+    def read(self) -> tuple[Stack, Model]:
+        """Read both files. Raises InputError for wrong files and options."""
+        recorded, calibrated = stack_file.read(self.stack), model_file.read(self.model)
+        if self.lenses:
+            recorded, calibrated = recorded.restrict(self.lenses), calibrated.restrict(self.lenses)
+        for region in self.regions:
+            check_region(*region, recorded.camera.shape)
+        return result_files.with_estimator_changes(recorded, list(self.changes), self.stack), calibrated
+
+
+def is_folder(output: Path) -> bool:
+    """Return True if `-o` names a folder, not an OpenEXR file. Raises InputError for the name of another file."""
+    if output.is_dir():
+        return True
+    if output.suffix.lower() in PICTURES:
+        advice = output.with_suffix(".exr")
+        raise InputError(f"{output}: expected the name of an OpenEXR file, such as {advice}, or of a folder")
+    return output.suffix.lower() != ".exr"
 
 
 def reconstruct_files(
-    stack: Path,
-    model: Path,
+    request: ReconstructionRequest,
     output: Path,
-    changes: Sequence[str],
-    lenses: Sequence[str],
-    regions: Sequence[Region],
     progress: Progress,
     scheduler: str = "",
     workers: int | None = None,
 ) -> RunReport:
     """Reconstruct a stack with a model, and write the estimate (OpenEXR) and its picture.
 
-    Returns the content of run.json, with the means of `regions`: row and column of the corner, rows and columns.
+    Returns the content of run.json, with the means of the regions.
     Raises InputError for wrong files and options, MachineError for a full disk.
     """
-    if output.suffix == ".png":
-        raise InputError(f"{output}: expected the name of an OpenEXR file, such as {output.with_suffix('.exr')}")
     check_options(scheduler, workers)
-    check_output(output, stack, model, stack.parent / TRUTH)
-    recorded, calibrated = stack_file.read(stack), model_file.read(model)
-    if lenses:
-        recorded, calibrated = recorded.restrict(tuple(lenses)), calibrated.restrict(tuple(lenses))
-    for region in regions:
-        check_region(*region, recorded.camera.shape)
-    recorded = result_files.with_estimator_changes(recorded, list(changes), stack)
-    truth = result_files.truth_beside(stack, recorded)
+    check_output(output, request.stack, request.model, request.stack.parent / TRUTH)
+    recorded, calibrated = request.read()
+    truth, names = result_files.truth_beside(request.stack, recorded), (request.stack, request.model)
     with _tile_workers(scheduler, workers) as pool:
-        result, report = result_files.reconstruct(recorded, calibrated, truth, (stack, model), pool, progress)
-    averages = tuple(
-        RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
-        for corner, size in regions
-        for mean, deviation in [result.region(corner, size)]
-    )
-    if averages:
-        report = report.with_changes(region=averages[0], regions=averages)
+        result, report = result_files.reconstruct(recorded, calibrated, truth, names, pool, progress)
+    report = report.with_changes(**region_reports(result, request.regions))
     result_files.write_estimate(output, result, {"title": recorded.scene.title})
     figures.write_estimate(output.with_suffix(".png"), result.estimate.reshape(result.shape))
     return report
+
+
+def reconstruct_folder(
+    request: ReconstructionRequest,
+    folder: Path,
+    progress: Progress,
+    scheduler: str = "",
+    workers: int | None = None,
+) -> tuple[RunReport, bool]:
+    """Reconstruct into a folder that then holds what a run writes, with copies of the stack, the model and the truth.
+
+    Returns the content of run.json, and False if it was up to date. Raises InputError for wrong files and options, also
+    for a folder that holds the stack or the model, and MachineError for a full disk.
+    """
+    check_options(scheduler, workers)
+    recorded, calibrated = request.read()
+    check_match(recorded, calibrated, (request.stack, request.model))
+    sources = {path.resolve() for path in (request.stack, request.model, request.stack.parent / TRUTH)}
+    for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
+        if (folder / name).resolve() in sources:
+            raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
+    make_folder(folder)
+    if result_files.truth_beside(request.stack, recorded) is not None:
+        for name in (TRUTH, WORLD_PICTURE):
+            _copy(request.stack.parent / name, folder / name)
+    if request.changes or request.lenses:
+        stack_file.write(folder / STACK, recorded)
+    else:
+        _copy(request.stack, folder / STACK)
+    if request.lenses:
+        model_file.write(folder / MODEL, calibrated)
+    else:
+        _copy(request.model, folder / MODEL)
+    return finish_folder(folder, progress, request.regions, scheduler, workers)
+
+
+def finish_folder(
+    folder: Path,
+    progress: Progress,
+    regions: Sequence[Region] = (),
+    scheduler: str = "",
+    workers: int | None = None,
+) -> tuple[RunReport, bool]:
+    """Reconstruct the stack in a folder with the model in it, and write the page, unless they are up to date."""
+    names = folder / STACK, folder / MODEL
+    recorded, calibrated = stack_file.read(names[0]), model_file.read(names[1])
+    with _tile_workers(scheduler, workers) as pool:
+        _, made = result_files.cached_results(folder, recorded, calibrated, names, progress, pool, tuple(regions))
+    _write_page(folder)
+    return run_json.read(folder), made
+
+
+def _write_page(folder: Path) -> None:
+    from ommatid.simulate.ideal import matrix_as_designed
+
+    _, camera = stack_file.read_header(folder / STACK)
+    cached_page(folder, partial(matrix_as_designed, camera))
+
+
+@dataclass(frozen=True)
+class ReportOutcome:
+    """Folders with a page, the page of the batch if there are several, and warnings."""
+
+    folders: tuple[Path, ...]
+    index: Path | None
+    warnings: tuple[str, ...]
+
+
+def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOutcome:
+    """Write the page of a finished run, of a folder of runs, or of a stack.
+
+    path : a folder of results; a folder of such folders; a folder with stack.exr; or a stack
+    output : for a stack the folder of its results, None: a folder beside it of its name
+
+    A stack is reconstructed with model.npz beside it, or without one with H as designed. Raises InputError if there is
+    nothing to report.
+    """
+    if path.is_file():
+        in_run = path.name == STACK and output is None
+        return _report_stack(path, path.parent if in_run else output or path.with_suffix(""), progress)
+    if output is not None:
+        raise InputError(f"{path}: -o is the folder of a stack's results; a folder is reported in place, leave out -o")
+    if (path / STACK).is_file():
+        if (path / RUN).is_file():
+            _write_page(path)
+            return ReportOutcome((path,), None, ())
+        return _report_stack(path / STACK, path, progress)
+    folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
+    if not folders:
+        raise InputError(f"{path}: expected a stack, or a folder with stack.exr or with folders of runs, got none")
+    for number, folder in enumerate(folders):
+        _write_page(folder)
+        progress((number + 1) / len(folders))
+    cached_index(path, dict.fromkeys(folders, ""))
+    return ReportOutcome(folders, path / INDEX, ())
+
+
+def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcome:
+    """Reconstruct a stack with the model beside it, or with H as designed, and write the page."""
+    model = stack.with_name(MODEL)
+    if folder.resolve() == stack.parent.resolve():
+        warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
+        finish_folder(folder, progress)
+        return ReportOutcome((folder,), None, warnings)
+    with TemporaryDirectory(prefix="ommatid-") as scratch:
+        warnings = ()
+        if not model.is_file():
+            model = Path(scratch) / MODEL
+            warnings = (_write_designed_model(stack, model, progress),)
+        reconstruct_folder(ReconstructionRequest(stack, model), folder, progress)
+    return ReportOutcome((folder,), None, warnings)
+
+
+def _write_designed_model(stack: Path, model: Path, progress: Progress) -> str:
+    """Write H as designed for the camera of a stack, and return a warning. Raises InputError without a closed form."""
+    from .stages import calibrated_model
+
+    scene, _ = stack_file.read_header(stack)
+    ideal = CalibrationTable(method="ideal")
+    calibrated_model(Setup.from_scene(with_tables(scene, calibration=ideal)), model, progress)
+    return f"{stack}: there is no {MODEL} beside it, so H as designed is taken; `ommatid calibrate` yields the camera's"
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file, if there is one, unless the same is there."""
+
+    def write(beside: Path) -> None:
+        shutil.copyfile(source, beside)
+
+    if source.is_file() and not (target.is_file() and file_digest(source) == file_digest(target)):
+        write_whole(target, write)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,9 @@ from ..methods.prepared import Prepared
 from ..restore import Reconstruction, check_match, restore
 from . import figures, run_json
 from .report import report_of
-from .run_json import RunReport
+from .run_json import RegionReport, RunReport
+
+Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the corner, rows and columns
 
 ESTIMATE, PICTURE, OVERVIEW = "estimate.exr", "estimate.png", "overview.png"
 ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
@@ -124,14 +127,32 @@ def _read_results(folder: Path) -> tuple[RunReport, str | None]:
     return report, made_from if whole and not earlier else None
 
 
+def region_reports(outcome: Reconstruction, regions: Sequence[Region]) -> dict[str, Any]:
+    """Return `region` and `regions` of run.json: the means over parts of the estimate; nothing without regions."""
+    reports = tuple(
+        RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
+        for corner, size in regions
+        for mean, deviation in [outcome.region(corner, size)]
+    )
+    return {"region": reports[0], "regions": reports} if reports else {}
+
+
 def cached_results(
-    folder: Path, stack: Stack, model: Model, names: tuple[Path, Path], progress: Progress = no_progress
+    folder: Path,
+    stack: Stack,
+    model: Model,
+    names: tuple[Path, Path],
+    progress: Progress = no_progress,
+    workers: Workers | None = None,
+    regions: tuple[Region, ...] = (),
 ) -> tuple[RunReport, bool]:
     """Return run.json of a folder, and True if the reconstruction had to be made for it."""
     current = fingerprint_of(stack, model)
+    current = fingerprint([current, regions]) if regions else current
 
     def make() -> tuple[Reconstruction, RunReport]:
-        restoration, report = reconstruct(stack, model, truth_beside(names[0], stack), names, None, progress)
-        return restoration, report.with_changes(fingerprint=current, **origin())
+        restoration, report = reconstruct(stack, model, truth_beside(names[0], stack), names, workers, progress)
+        added = {"fingerprint": current, **origin(), **region_reports(restoration, regions)}
+        return restoration, report.with_changes(**added)
 
     return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 from .run_json import ErrorReport, RunReport, TimeReport
 
 TIMES = 4  # as many samples, in the sentence on more samples
@@ -42,15 +44,34 @@ def remedy(report: RunReport) -> str:
 
     Empty where the verdict is against trust, since the parts then belong to assumptions that do not hold.
     """
-    error = report.error
     if not is_trusted(report):
         return ""
-    if error.predicted_mse <= 0:
+    if report.error.predicted_mse <= 0:
         return "The predicted error is zero."
+    name, share, change = _largest_part(report)
+    return f"Largest part of the predicted squared error: {name}, {share:.0f} %{change}."
+
+
+def limit(report: RunReport) -> str:
+    """Return what limits the error in half a sentence: the cause, its share, and a change that would reduce it."""
+    if not is_trusted(report):
+        return "unknown as long as the result is not to be trusted"
+    if report.error.predicted_mse <= 0:
+        return "nothing: the predicted error is zero"
+    name, share, change = _largest_part(report)
+    return f"{name}, {share:.0f} % of the predicted MSE{change}"
+
+
+def error_words(mse: float, digits: int = 4) -> str:
+    """Return a mean squared error with its root in grey levels: "4.399 (2.1 grey levels RMS)"."""
+    return f"{mse:.{digits}g} ({sqrt(mse):.3g} grey levels RMS)"
+
+
+def _largest_part(report: RunReport) -> tuple[str, float, str]:
+    """Return the name of the largest part of the predicted error, its share in per cent, and a change in words."""
+    error = report.error
     name, part = max(error.budget.items(), key=lambda item: item[1])
-    share = 100 * part / error.predicted_mse
-    change = _change(name, part, error, report.spent)
-    return f"Largest part of the predicted squared error: {cause(name)}, {share:.0f} %{change}."
+    return cause(name), 100 * part / error.predicted_mse, _change(name, part, error, report.spent)
 
 
 def cause(name: str) -> str:

@@ -23,6 +23,7 @@ from ..scene import Scene
 from . import npz, tiff
 from .exr import Part, read_channels, write
 
+STEPS = 257.0  # of a 16-bit value per grey level: 65535 is 255
 LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
 
 
@@ -65,6 +66,46 @@ def load(scene: Scene) -> FloatArray:
     return rounded
 
 
+def conversions(scene: Scene) -> list[str]:
+    """Return what is lost or rescaled when the target's picture is read, a sentence each.
+
+    Raises InputError if the picture is missing or unreadable.
+    """
+    image = scene.target.image
+    if image is None:
+        return []
+    path = _picture_path(image, f"{scene.source}: target.image")
+    dtype, _ = _stored(path)
+    sentences = colour_lost(path, image)
+    if dtype.kind == "u" and dtype.itemsize == 2:
+        sentences.append(f"{image} has 16-bit values: they are divided by {STEPS:g}, to the range from 0 to 255")
+    return sentences
+
+
+def colour_lost(path: Path, name: str) -> list[str]:
+    """Return a sentence about the colours of a picture file of that name; nothing for a grey one. Raises InputError."""
+    if _stored(path)[1] < 3:
+        return []
+    weights = " + ".join(f"{weight} {colour}" for weight, colour in zip(LUMINANCE, "RGB", strict=True))
+    return [f"{name} is a colour picture: only its luminance is used, {weights}"]
+
+
+def _stored(path: Path) -> tuple[np.dtype[Any], int]:
+    """Return type and number of channels of a picture file, of PNG and JPEG from the header alone."""
+    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        from PIL import Image
+
+        try:
+            with Image.open(path, formats=("PNG", "JPEG")) as opened:
+                wide = opened.mode.startswith("I")
+                colours = 3 if opened.mode in ("P", "PA") else len(opened.getbands())
+                return np.dtype(np.uint16 if wide else np.uint8), colours
+        except Exception as error:
+            raise InputError(f"{path} could not be read as a picture; it is damaged or another kind of file") from error
+    pixels = decode(path, str(path))
+    return pixels.dtype, pixels.shape[2] if pixels.ndim == 3 and pixels.shape[2] <= len("RGBA") else 1
+
+
 def target_shape(scene: Scene) -> tuple[int, int]:
     """Rows and columns of the target; the picture is read only if the scene does not say."""
     if scene.target.shape is not None:
@@ -102,7 +143,7 @@ def luminance(pixels: NDArray[Any], where: str) -> FloatArray:
     if pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
         return values
     if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
-        return values / 257.0
+        return values / STEPS
     raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
 
 
@@ -139,12 +180,17 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
 
 def _pixels(image: str, where: str) -> NDArray[Any]:
     """Read the picture that `target.image` names."""
+    return decode(_picture_path(image, where), where)
+
+
+def _picture_path(image: str, where: str) -> Path:
+    """Return the file of a picture. Raises InputError if there is none."""
     if image.startswith("photo:"):
-        return decode(_photo_path(image.removeprefix("photo:"), where), where)
+        return _photo_path(image.removeprefix("photo:"), where)
     path = Path(image)
     if not path.is_file():
         raise InputError(f"{where}: there is no picture {path}; name a PNG, TIFF, EXR or NPY file, or photo:camera")
-    return decode(path, where)
+    return path
 
 
 def _photo_path(name: str, where: str) -> Path:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 GALLERY = Path(__file__).parents[1]
 STARTER = "starter"
@@ -30,11 +32,42 @@ def missing_scene(path: Path) -> str:
     return f"{path}: no such scene file; {listed}; `ommatid init {path.stem}.toml` writes a scene to start from"
 
 
-def write_starter(path: Path) -> None:
-    """Write a scene file to start from. Raises InputError if `path` exists, MachineError for a full disk."""
-    from ommatid.runtime.errors import InputError
-    from ommatid.runtime.files import write_text
+def gallery_titles() -> dict[str, str]:
+    """Return the title of each scene of the gallery by its name."""
+    return {name: str(_tables(name).get("title", "")) for name in gallery_names()}
 
+
+def write_starter(path: Path, name: str = STARTER) -> list[Path]:
+    """Write a scene file to start from, with the files that it names beside it, and return all of them.
+
+    name : of the scene of the gallery to copy
+    Raises InputError if there is no such scene or if a file of another content is in the way, MachineError for a full
+    disk.
+    """
+    from ommatid.runtime.errors import InputError
+    from ommatid.runtime.files import make_folder, write_text
+
+    if name != STARTER and name not in gallery_names():
+        raise InputError(f"--from {name}: expected a scene of the gallery, {', '.join(gallery_names())}")
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or remove it first")
-    write_text(path, (GALLERY / f"{STARTER}.toml").read_text(encoding="utf-8"))
+    texts = {path.parent / file: (GALLERY / file).read_text(encoding="utf-8") for file in _files(name)}
+    for target, text in texts.items():
+        if target.exists() and target.read_text(encoding="utf-8", errors="replace") != text:
+            raise InputError(f"{target}: exists already and differs from the file of '{name}'; choose another folder")
+    for target, text in texts.items():
+        make_folder(target.parent)
+        write_text(target, text)
+    write_text(path, (GALLERY / f"{name}.toml").read_text(encoding="utf-8"))
+    return [path, *texts]
+
+
+def _tables(name: str) -> dict[str, Any]:
+    return tomllib.loads((GALLERY / f"{name}.toml").read_text(encoding="utf-8"))
+
+
+def _files(name: str) -> list[str]:
+    """Return the files, relative to the gallery, that a scene of it names: its world and its lenses."""
+    tables = _tables(name)
+    named = [tables.get("world", {}).get("file"), *(lens.get("surfaces") for lens in tables["camera"]["lens"])]
+    return list(dict.fromkeys(file for file in named if isinstance(file, str)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from ommatid.runtime.errors import InputError, shortened
@@ -11,12 +12,21 @@ from ommatid.runtime.errors import InputError, shortened
 from . import toml
 
 MOST_NAMED = 10  # lens types in a message
+FILES = {  # first and last part of the keys that name files
+    ("target", "image"),
+    ("world", "file"),
+    ("light", "spectrum"),
+    ("sensor", "quantum_efficiency"),
+    ("camera", "glass_catalogue"),
+    ("camera", "surfaces"),
+}
 
 
 def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
     """A copy with keys set, such as `noise.variance=1e-6` or `camera.lens.II.pixels=[2,2]`; an empty value removes one.
 
-    Values are read as by `value_of`. Raises InputError if a lens type of a key does not exist.
+    Values are read as by `value_of`; names of files are relative to the current folder. Raises InputError if a lens
+    type of a key does not exist.
     """
     changed = copy.deepcopy(data)
     for assignment in overrides:
@@ -33,7 +43,7 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str,
         if not isinstance(table, dict):
             raise InputError(f"--set {override}: '{'.'.join(tables)}' is not a table, so it has no key '{last}'")
         if text.strip():
-            table[last] = value_of(text)
+            table[last] = _from_here([*tables, last], value_of(text))
         else:
             table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
     return changed
@@ -48,6 +58,14 @@ def _inside(table: Any, name: str, override: str) -> Any:
     if not isinstance(table, dict):
         raise InputError(f"--set {override}: '{name}' is not in a table")
     return table.setdefault(name, {})  # type: ignore[return-value]
+
+
+def _from_here(key: list[str], value: Any) -> Any:
+    """Return the name of a file relative to the current folder as an absolute one, other values as they are."""
+    if not isinstance(value, str) or not value or (key[0], key[-1]) not in FILES:
+        return value
+    is_name = value.startswith("photo:") or (key[-1] == "spectrum" and (value.endswith("nm") or not Path(value).suffix))
+    return value if is_name else str(Path.cwd() / value)
 
 
 def value_of(text: str) -> Any:

@@ -153,7 +153,7 @@ def test_uncalibrated_tolerances_cost_a_picture_the_mean_over_assemblies() -> No
 def test_a_tolerance_as_designed_and_calibrated_side_by_side(ommatid: Command) -> None:
     needs("llvm_ad_mono")
     loose = ("--set", 'camera.tolerance.position="41 nm"', "--set", "calibration.samples=1024")
-    ideal = document(ommatid("predict", TILE, *loose, "--set", "calibration.method=ideal", "--json"))
+    (ideal,) = document(ommatid("predict", TILE, *loose, "--set", "calibration.method=ideal", "--json"))
     assert ideal["mse"] == ideal["as_designed"]["mse"] > 5 * ideal["calibrated"]["mse"]
     assert sum(ideal["budget"].values()) == pytest.approx(ideal["mse"], rel=1e-9)
     assert "mean over assemblies" in " ".join(ideal["assumes"])
@@ -175,7 +175,7 @@ def test_without_mitsuba_it_is_the_closed_form(monkeypatch: pytest.MonkeyPatch) 
 
 def test_it_says_where_nothing_is_recovered(ommatid: Command) -> None:
     dark = ("--set", "noise.variance=1e8", "--no-rays")
-    assert document(ommatid("predict", TILE, *dark, "--json"))["recovers_nothing"]
+    assert document(ommatid("predict", TILE, *dark, "--json"))[0]["recovers_nothing"]
     assert "nothing is recovered" in ommatid("predict", TILE, *dark).out
     assert "nothing is recovered" not in ommatid("predict", TILE, "--no-rays").out
 

@@ -67,6 +67,7 @@ def test_a_batch_gives_the_same_files_wherever_it_is_done(
     assert shared.code == 0, shared.err
     assert sorted(shared.err.splitlines()) == sorted(expected.err.splitlines())
     assert documents(shared.out) == documents(expected.out)
+    assert all(document["command"][:2] == ["ommatid", "run"] for document in json.loads(shared.out))
     names = [Path(scene).stem for scene in scenes]
     for name in names:
         assert {path.name for path in (here / "out" / name).iterdir()} == FILES

@@ -160,6 +160,7 @@ def test_predictions_of_a_sweep_are_those_of_each_scene(here: Path, ommatid: Com
         assert {name: shown[name] for name in expected} == expected
         assert shown["values"] == {"noise.variance": noise}
         assert float(line["predicted_mse"]) == expected["mse"]
+        assert float(line["predicted_rms"]) ** 2 == pytest.approx(expected["mse"])
         assert "mse" not in line, "nothing was measured"
     assert ommatid("predict", "tiny.toml", *swept).out.count("predicted mse") == len(NOISES)
     assert sorted(path.name for path in here.iterdir()) == ["out", "tiny.toml"]

@@ -77,7 +77,8 @@ def test_predict_gives_the_values_of_the_reference(
     ended = ommatid(
         "predict", GALLERY / f"{scene}.toml", "--no-rays", "--set", "noise.variance=1e-6", *options, "--json"
     )
-    predicted = document(ended)
+    (predicted,) = document(ended)
+    assert predicted.pop("scene") == str(GALLERY / f"{scene}.toml")
     keys = ["measurements", "unknowns", "rank", "null_space", "condition", "mse", "trimmed_mse", "trim"]
     assert list(predicted)[:8] == keys
     others = {"degrees_of_freedom", "resolution", "method", "prior_variance", "assumes", "recovers_nothing"}
@@ -104,19 +105,19 @@ def arguments(command: str, finished: Path) -> list[str | Path]:
 def test_json_is_the_only_output_on_stdout(command: str, here: Path, finished: Path) -> None:
     # A new process, since libraries may print when they are loaded and unloaded.
     ended = shell(*arguments(command, finished), "--json", cwd=here)
-    assert isinstance(document(ended), list if command in ("run", "render") else dict)
+    assert isinstance(document(ended), list if command in ("run", "render", "predict") else dict)
     assert "Traceback" not in ended.err
 
 
 @pytest.mark.parametrize("command", ["run", "predict", "show", "reconstruct"])
-def test_without_json_there_is_a_table_with_the_title(
+def test_without_json_the_results_are_printed_for_reading(
     command: str, here: Path, finished: Path, ommatid: Command
 ) -> None:
     assert here.is_dir()
     ended = ommatid(*arguments(command, finished))
     assert ended.code == 0
-    assert ("estimate.exr" if command == "reconstruct" else "Tiny") in ended.out
-    assert "measure" in ended.out
+    assert {"run": "tiny", "reconstruct": "estimate.exr"}.get(command, "Tiny") in ended.out
+    assert ("grey levels RMS" if command != "show" else "measurements") in ended.out
 
 
 @pytest.mark.parametrize("title", ["[/x]", "[red]hot", ":smile: and [[brackets]]"])

@@ -17,9 +17,7 @@ def test_strict_exits_with_3_where_results_are_not_to_be_trusted(kept: Path, omm
     plain, strict = (ommatid("run", "tiny.toml", "-o", "out", *options) for options in ((), ("--strict",)))
     assert (plain.code, strict.code) == (0, 3)
     assert plain.out == strict.out, "the results are written and printed all the same"
-    first = next(line for line in plain.out.splitlines() if "│" in line)
-    assert first.startswith("│ verdict")
-    assert "not to be trusted" in first
+    assert plain.out.startswith("tiny: not to be trusted: ")
     assert run_json.read(kept).verdict is not None
     files = kept / "stack.exr", kept / "model.npz", "-o", "again.exr"
     assert ommatid("reconstruct", *files).code == 0

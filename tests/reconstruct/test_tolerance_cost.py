@@ -125,15 +125,18 @@ def test_vanishing_tolerances_change_nothing(tolerance: dict[str, float | str]) 
 def test_predict_includes_the_cost(tmp_path: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     tile = (GALLERY / "tile19.toml", "--no-rays", "--set", "noise.variance=1e-2")
-    strict = document(ommatid("predict", *tile, "--json"))
-    loose = document(ommatid("predict", *tile, "--set", 'camera.tolerance.position="10 nm"', "--json"))
+    (strict,) = document(ommatid("predict", *tile, "--json"))
+    (loose,) = document(ommatid("predict", *tile, "--set", 'camera.tolerance.position="10 nm"', "--json"))
     assert "misalignment" not in strict
     assert loose["mse"] == pytest.approx(strict["mse"] + loose["misalignment"], rel=1e-6)
     assert loose["misalignment"] > 1
     assert "by misalignment" in ommatid("predict", *tile, "--set", 'camera.tolerance.position="10 nm"').out
     robust = ("--set", 'camera.tolerance.position="41 nm"', "--set", "estimator.misalignment=robust", "--json")
     trusting = ("--set", 'camera.tolerance.position="41 nm"', "--json")
-    assert document(ommatid("predict", *tile, *robust))["mse"] < document(ommatid("predict", *tile, *trusting))["mse"]
+    assert (
+        document(ommatid("predict", *tile, *robust))[0]["mse"]
+        < document(ommatid("predict", *tile, *trusting))[0]["mse"]
+    )
     ended = ommatid("predict", *tile, *robust[:2], "--set", "estimator.misalignment=fit")
     assert ended.code == 2
     assert "recorded stack" in ended.err
@@ -145,7 +148,7 @@ def test_predict_with_saturated_pixels_and_with_blurred_lenses(ommatid: Command)
     aperture = [part for name in ["I", "II", "III"] for part in ("--set", f'camera.lens.{name}.aperture="0.4 mm"')]
     aperture += ["--set", 'camera.wavelength="none"']
     sensor = ("--set", "noise=", "--set", 'sensor.illuminance="500 lux"', "--set", 'sensor.exposure="10 ms"')
-    bright = document(ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
+    (bright,) = document(ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
     assert bright["measurements"] < 706
     assert bright["misalignment"] > 0
     known = ("--set", "prior.kind=independent")  # a fitted prior takes a stack

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.gallery import GALLERY, gallery_names, write_starter
 
 from ..conftest import TINY, Command
+from ..runs import document
 
 
 @pytest.fixture(autouse=True)
@@ -56,6 +58,39 @@ def test_a_starter_is_a_scene_of_its_own() -> None:
     assert Setup.from_scene(read(Path("mine.toml"))).image.ndim == 2
     with pytest.raises(InputError, match="exists already"):
         write_starter(Path("mine.toml"))
+
+
+def test_init_copies_a_scene_of_the_gallery_with_its_files(ommatid: Command) -> None:
+    Path("copy").mkdir()
+    for name, files in (("corridor", ["worlds/corridor.xml"]), ("doublet", ["lenses/doublet.toml"]), ("tile19", [])):
+        file = Path("copy") / f"{name}.toml"
+        written = document(ommatid("init", file, "--from", name, "--json"))
+        assert written["files"] == [str(file), *(f"copy/{other}" for other in files)]
+        assert read(file).plain() == read(GALLERY / f"{name}.toml").plain() | without_paths(file)
+    assert ommatid("init", "copy/again.toml", "--from", "corridor").code == 0
+    Path("copy/worlds/corridor.xml").write_text("<scene/>", encoding="utf-8")
+    for arguments, words in (
+        (("copy/third.toml", "--from", "corridor"), "differs from the file of 'corridor'"),
+        (("copy/third.toml", "--from", "tile18"), "expected a scene of the gallery, corridor"),
+        ((), "Usage"),
+        (("--json",), "expected the name of the scene file"),
+    ):
+        ended = ommatid("init", *arguments)
+        assert ended.code == 2
+        assert words in ended.err
+    assert not Path("copy/third.toml").exists()
+
+
+def without_paths(file: Path) -> dict[str, Any]:
+    """The tables of a copied scene that name files, whose folder differs from the gallery's."""
+    return {key: value for key, value in read(file).plain().items() if key == "world"}
+
+
+def test_init_lists_the_gallery(ommatid: Command) -> None:
+    listed = ommatid("init", "--list").out.splitlines()
+    assert [line.split()[0] for line in listed] == gallery_names()
+    assert "The paper's 19 x 19 tile, three lens types" in next(line for line in listed if "tile19" in line)
+    assert [scene["name"] for scene in document(ommatid("init", "--list", "--json"))] == gallery_names()
 
 
 @pytest.mark.parametrize("command", ["run", "render", "predict", "show", "calibrate", "design", "bench", "export"])

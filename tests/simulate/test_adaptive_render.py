@@ -313,7 +313,7 @@ def test_without_a_stack_the_prior_decides() -> None:
 
 def test_a_whole_run(here: Path, ommatid: Command) -> None:
     told = ["--set", "render.samples=auto", "--set", "calibration.samples=auto"]
-    ended = ommatid("run", "tiny.toml", "-o", "out", *told)
+    ended = ommatid("run", "tiny.toml", "-o", "out", *told, "-v")
     assert ended.code == 0, ended.err
     assert "samples per pixel" in " ".join(ended.out.replace("│", " ").split())
     run = json.loads((here / "out/tiny/run.json").read_text("utf-8"))

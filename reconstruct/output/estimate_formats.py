@@ -1,0 +1,68 @@
+"""The estimate as a NumPy file or as TIFF, beside estimate.exr, for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+
+from ommatid.runtime.arrays import Float32Array
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import write_whole
+from ommatid.scenes.constants import WHITE
+from ommatid.scenes.formats import exr
+
+Format = Literal["npy", "tiff16", "tiff32"]
+STEPS = 257  # of a 16-bit value per grey level: 65535 stands for 255, as in pictures that are read
+DESCRIPTIONS = {
+    "tiff16": f"ommatid estimate: value = pixel / {STEPS}, in grey levels from 0 to 255; others are clipped",
+    "tiff32": "ommatid estimate: pixels are values in grey levels, 0 to 255, not clipped",
+}
+
+
+def formats_of(text: str) -> tuple[Format, ...]:
+    """Read "npy,tiff16". Raises InputError for an unknown name, and for both kinds of TIFF, which are one file."""
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    for name in names:
+        if name not in get_args(Format):
+            raise InputError(f"--format {text}: expected names of {', '.join(get_args(Format))}, got '{name}'")
+    if {"tiff16", "tiff32"} <= set(names):
+        raise InputError(f"--format {text}: tiff16 and tiff32 are one file, estimate.tiff; name one of them")
+    return cast(tuple[Format, ...], names)
+
+
+def write_formats(estimate: Path, formats: Sequence[Format]) -> list[Path]:
+    """Write the estimate of an OpenEXR file beside it, as .npy or .tiff, and return the files.
+
+    Raises InputError if `estimate` cannot be read, MachineError for a full disk.
+    """
+    if not formats:
+        return []
+    image = exr.read(estimate)[0].channels["estimate"]
+    return [_write(estimate, image, name) for name in formats]
+
+
+def _write(estimate: Path, image: Float32Array, name: Format) -> Path:
+    if name == "npy":
+        path = estimate.with_suffix(".npy")
+
+        def save(beside: Path) -> None:
+            with beside.open("wb") as stream:
+                np.save(stream, image)
+
+        write_whole(path, save)
+        return path
+    path = estimate.with_suffix(".tiff")
+    pixels = np.round(np.clip(image.astype(np.float64), 0, WHITE) * STEPS).astype(np.uint16)
+    write_whole(path, lambda beside: _write_tiff(beside, image if name == "tiff32" else pixels, DESCRIPTIONS[name]))
+    return path
+
+
+def _write_tiff(path: Path, pixels: Any, description: str) -> None:
+    import tifffile
+
+    imwrite: Any = tifffile.imwrite  # pyright: ignore[reportUnknownMemberType]
+    with path.open("wb") as stream:
+        imwrite(stream, pixels, photometric="minisblack", description=description, metadata=None)

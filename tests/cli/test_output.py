@@ -1,0 +1,207 @@
+"""What is printed, and the options of the command line that every tool has."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from ommatid.reconstruct.output.estimate_formats import write_formats
+from ommatid.reconstruct.output.verdict_words import error_words
+from ommatid.scenes.formats import exr, picture
+from ommatid.scenes.scene import read
+
+from ..conftest import Command
+from ..runs import document
+
+RUN = ("run", "tiny.toml", "-o", "out")
+QUICK = ("--set", "calibration.method=ideal")
+
+
+def stored(folder: Path) -> Any:
+    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
+
+
+# --- a result
+
+
+def test_six_lines_are_printed_of_a_scene(kept: Path, ommatid: Command) -> None:
+    lines = ommatid(*RUN).out.splitlines()
+    run = stored(kept)
+    error, baseline = run["error"], run["error"]["baseline"]
+    assert len(lines) == 6
+    assert lines[0] == f"tiny: not to be trusted: {'; '.join(run['verdict']['reasons'])}"
+    assert [line.split()[0] for line in lines[1:]] == ["error", "quality", "limit", "time", "page"]
+    assert f"{sqrt(error['mse']):.3g} grey levels RMS (MSE {error['mse']:.4g})" in lines[1]
+    given = error["expected_given_truth"]
+    assert f"expected {sqrt(given['mse']):.3g} (MSE {given['mse']:.4g}, 99 %: {given['low']:.4g} to" in lines[1]
+    assert f"PSNR {error['psnr']:.1f} dB, SSIM {error['ssim']:.4f}; {-error['gain']:.1f} dB worse than" in lines[2]
+    assert f"({baseline['sub_imager']}: PSNR {baseline['psnr']:.1f} dB" in lines[2]
+    assert f" {sum(stage['seconds'] for stage in run['stages'].values()):.1f} s: render " in lines[4]
+    assert lines[5].split()[1] == "out/tiny/report.html"
+
+
+@pytest.mark.usefixtures("kept")
+def test_quiet_prints_the_verdict_alone_and_verbose_the_table(ommatid: Command) -> None:
+    summary, quiet, verbose = (ommatid(*RUN, *options) for options in ((), ("-q",), ("-v",)))
+    assert quiet.out.splitlines() == summary.out.splitlines()[:1]
+    assert (quiet.err, summary.err.count("up to date")) == ("", 4)
+    first = next(line for line in verbose.out.splitlines() if "│" in line)
+    assert first.startswith("│ verdict")
+    assert "PSNR (peak 255)" in verbose.out
+    both = ommatid(*RUN, "-q", "-v")
+    assert both.code == 2
+    assert "-v and -q" in both.err
+
+
+def test_the_error_of_a_grey_level_is_a_grey_level() -> None:
+    assert error_words(4.0) == "4 (2 grey levels RMS)"
+    assert error_words(1.28553, 6) == "1.28553 (1.13 grey levels RMS)"
+
+
+# --- help, version, completion
+
+
+def test_the_version_is_that_of_the_package(ommatid: Command) -> None:
+    from importlib.metadata import version
+
+    assert ommatid("--version").out == f"ommatid {version('ommatid')}\n"
+
+
+@pytest.mark.parametrize("command", [(), ("run",), ("reconstruct",), ("init",)])
+def test_a_bare_call_prints_the_help(command: tuple[str, ...], ommatid: Command) -> None:
+    ended = ommatid(*command)
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.err.startswith("Usage: ")
+    assert "Missing" not in ended.err
+
+
+def test_commands_and_scenes_of_the_gallery_are_completed(ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_OMMATID_COMPLETE", "complete_bash")
+    for words, number, expected in (
+        ("ommatid re", "1", "render\nreconstruct"),
+        ("ommatid run still", "2", "still_life"),
+    ):
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", number)
+        assert expected in ommatid().out
+
+
+# --- the plan, and everything again
+
+
+def test_a_dry_run_writes_nothing_and_tells_what_is_up_to_date(kept: Path, ommatid: Command) -> None:
+    def states(*options: str) -> dict[str, str]:
+        (plan,) = document(ommatid(*RUN, "--dry-run", "--json", *options))
+        assert (plan["measurements"], plan["unknowns"]) == (81, 144)
+        return {name: stage["state"] for name, stage in plan["plan"].items()}
+
+    made, current = "to be made", "up to date"
+    assert states() == {"render": current, "calibrate": current, "reconstruct": current}
+    assert states("--set", "prior.mean=100") == {"render": current, "calibrate": current, "reconstruct": made}
+    assert states("--set", "calibration.samples=17") == {"render": current, "calibrate": made, "reconstruct": made}
+    assert states("--set", "noise.variance=2e-2") == {"render": made, "calibrate": made, "reconstruct": made}
+    shutil.rmtree(kept.parent)
+    assert ommatid(*RUN, "--dry-run").out.count(made) == 3
+    assert not kept.parent.exists()
+
+
+def test_force_makes_everything_again(kept: Path, ommatid: Command) -> None:
+    before, values = stored(kept), exr.read(kept / "estimate.exr")[0].channels["estimate"]
+    forced = ommatid(*RUN, "--force")
+    assert (forced.code, forced.err.count(": done")) == (0, 4)
+    after = stored(kept)
+    assert after["command"] == ["ommatid", *RUN, "--force"]
+    assert after["date"] >= before["date"]
+    np.testing.assert_array_equal(exr.read(kept / "estimate.exr")[0].channels["estimate"], values)
+    assert ommatid(*RUN).err.count("up to date") == 4
+    assert stored(kept) == after, "a run that is up to date keeps its command and its date"
+
+
+# --- formats
+
+
+@pytest.mark.usefixtures("kept")
+def test_the_estimate_is_written_in_other_formats(kept: Path, ommatid: Command) -> None:
+    assert ommatid(*RUN, "--format", "npy,tiff16").code == 0
+    estimate = exr.read(kept / "estimate.exr")[0].channels["estimate"]
+    np.testing.assert_array_equal(np.load(kept / "estimate.npy"), estimate)
+    with tifffile.TiffFile(kept / "estimate.tiff") as file:
+        assert "value = pixel / 257" in file.pages[0].tags["ImageDescription"].value
+        assert file.pages[0].dtype == np.uint16
+    scene = read(Path("tiny.toml"), ["target.image=out/tiny/estimate.tiff", "target.origin="])
+    np.testing.assert_allclose(picture.load(scene), np.clip(estimate, 0, 255), atol=0.5 / 257 + 1e-4)
+    write_formats(kept / "estimate.exr", ("tiff32",))
+    np.testing.assert_array_equal(tifffile.imread(kept / "estimate.tiff"), estimate)
+
+
+@pytest.mark.parametrize(("names", "words"), [("png", "npy, tiff16, tiff32"), ("tiff16,tiff32", "one file")])
+def test_unknown_formats_are_refused(names: str, words: str, here: Path, ommatid: Command) -> None:
+    ended = ommatid(*RUN, "--format", names)
+    assert (ended.code, (here / "out").exists()) == (2, False)
+    assert words in ended.err
+
+
+# --- what is read
+
+
+def save(name: str, pixels: Any) -> None:
+    Image.fromarray(pixels).save(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "words"),
+    [
+        ("colour.png", np.full((12, 12, 3), 9, np.uint8), "is a colour picture"),
+        ("deep.png", np.full((12, 12), 9, np.uint16), "divided by 257"),
+        ("grey.png", np.full((12, 12), 9, np.uint8), ""),
+    ],
+)
+def test_what_is_lost_of_a_picture_is_said_in_one_warning(
+    name: str, pixels: Any, words: str, here: Path, ommatid: Command
+) -> None:
+    assert here.is_dir()
+    save(name, pixels)
+    changes = "--set", f"target.image={name}", "--set", "target.origin="
+    for command in (("predict", "tiny.toml", "--no-rays"), (*RUN, "--dry-run")):
+        ended = ommatid(*command, *changes)
+        assert ended.code == 0, ended.err
+        assert [words in line for line in ended.err.splitlines()] == ([True] if words else [])
+        assert all(line.startswith("warning: ") for line in ended.err.splitlines())
+
+
+def test_colours_of_recorded_frames_are_said_to_be_lost(here: Path, ommatid: Command) -> None:
+    assert here.is_dir()
+    for shape, name in (((3, 3, 3), "colour"), ((3, 3), "grey")):
+        Path(name).mkdir()
+        for number in range(9):
+            save(f"{name}/{number}.png", np.full(shape, 9, np.uint8))
+        ended = ommatid("import", "tiny.toml", name, "-o", f"{name}.exr")
+        assert ended.code == 0, ended.err
+        assert ("warning: colour/0.png is a colour picture" in ended.err) == (name == "colour")
+
+
+def test_files_named_by_set_are_relative_to_the_current_folder(here: Path, ommatid: Command) -> None:
+    folder = here / "scenes"
+    folder.mkdir()
+    shutil.move("tiny.toml", folder / "tiny.toml")
+    save("here.png", np.full((12, 12), 200, np.uint8))
+    scene = "scenes/tiny.toml"
+    read_here = read(Path(scene), ["target.image=here.png", "target.origin="])
+    assert read_here.target.image == str(here / "here.png")
+    assert (picture.load(read_here) == 200).all()
+    ended = ommatid("show", scene, "--set", "target.image=missing.png", "--set", "target.shape=")
+    assert str(here / "missing.png") in ended.err
+    curves = read(Path(scene), ["light.spectrum=D65"]), read(Path(scene), ["light.spectrum=450-650 nm"])
+    assert [curve.light.spectrum for curve in curves if curve.light] == ["D65", "450-650 nm"]
+    Path("led.csv").write_text("wavelength,power\n450,1\n550,2\n650,1\n", encoding="utf-8")
+    lit = read(Path(scene), ["light.spectrum=led.csv"]).light
+    assert lit is not None
+    assert not isinstance(lit.spectrum, str)

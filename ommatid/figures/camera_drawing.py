@@ -42,27 +42,32 @@ ARROW: dict[str, Any] = {
 Ray = tuple[tuple[float, float], ...]  # points (z, x)
 
 
-def camera_drawing(scene: Scene, camera: Camera) -> Any:
-    """Draw a camera to scale, with its lengths, as a Matplotlib figure."""
+def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True) -> Any:
+    """Draw a camera to scale, with its lengths, as a Matplotlib figure.
+
+    described : False leaves out the title and the table of the lens types, where both stand beside the drawing
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     colours = {lens_type.name: COLOURS[index % len(COLOURS)] for index, lens_type in enumerate(camera.types)}
     terms = optical_terms(scene, camera)
     face = min(HIGHEST, max(LOWEST, NEAR_WIDTH / sensor_aspect(camera, terms)))
-    key = LINE * (len(camera.types) + 2.5)
-    height = ABOVE + SECTION + BETWEEN + face + BELOW + key
+    key, above = (LINE * (len(camera.types) + 2.5), ABOVE) if described else (0.0, ABOVE - 2 * LINE)
+    height = above + SECTION + BETWEEN + face + BELOW + key
     figure: Any = Figure(figsize=(WIDTH, height))
     FigureCanvasAgg(figure)
 
     def axes(left: float, bottom: float, width: float, tall: float) -> Any:
         return figure.add_axes((left / WIDTH, bottom / height, width / WIDTH, tall / height))
 
-    section, lower = height - ABOVE - SECTION, BELOW + key
+    section, lower = height - above - SECTION, BELOW + key
     near, far = axes(LEFT, section, NEAR_WIDTH, SECTION), axes(FAR_LEFT, section, FAR_WIDTH, SECTION)
     _draw_section(near, far, scene, camera, colours)
     draw_sensor(axes(LEFT, lower, NEAR_WIDTH, face), camera, terms, colours)
     draw_sub_images(axes(FAR_LEFT, lower, FAR_WIDTH + 0.25, face), camera, terms, colours)
+    if not described:
+        return figure
     write_key(figure, camera, terms, colours, key - 1.5 * LINE, LINE)
     name = scene.title or scene.source.stem
     figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center", parse_math=False)

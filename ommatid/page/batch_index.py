@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
-from math import isfinite
+from math import isfinite, sqrt
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
+from markupsafe import Markup
 
 from ommatid.batch.sweep_row import NUMBERS, read_rows
 from ommatid.reconstruct.output import run_json
@@ -20,9 +22,12 @@ from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
-from ommatid.runtime.versions import versions
+from ommatid.scenes.camera import derive
+from ommatid.scenes.geometry.optical_terms import optical_terms
+from ommatid.scenes.scene import read as read_scene
 
 from .cached import REPORT, read_stamp, sources_digest
+from .panels.charts import COLOURS, ChartAxis, ChartSeries, chart
 from .words import agreement
 
 INDEX = "index.html"
@@ -30,11 +35,15 @@ INDEX = "index.html"
 
 @dataclass(frozen=True)
 class BatchEntry:
-    """Results of one scene of a batch, or the reason of its failure."""
+    """Results of one scene of a batch, or the reason of its failure.
+
+    sensor_area : of all recorded pixels, mm^2; None if it is not known
+    """
 
     name: str
     report: RunReport | None = None
     failure: str = ""
+    sensor_area: float | None = None
 
     @property
     def title(self) -> str:
@@ -50,6 +59,11 @@ class BatchEntry:
     def heading(self) -> str:
         """The verdict in two or three words."""
         return heading(self.report) if self.report else ""
+
+    @property
+    def root(self) -> float | None:
+        """Measured RMS error, None if the truth is not known."""
+        return None if self.report is None or self.report.error.mse is None else sqrt(self.report.error.mse)
 
     @property
     def seconds(self) -> float:
@@ -83,9 +97,11 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     others = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
     entries = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *others)]
     sweep = read_sweep(output / NUMBERS)
-    described = [[entry.name, entry.failure, entry.report and entry.report.plain()] for entry in entries]
+    described = [
+        [entry.name, entry.failure, entry.sensor_area, entry.report and entry.report.plain()] for entry in entries
+    ]
     content = [described, None if sweep is None else asdict(sweep)]
-    stamp = fingerprint([content, versions("bokeh"), sources_digest()])
+    stamp = fingerprint([content, sources_digest()])
     name = output.resolve().name
     return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
 
@@ -94,9 +110,17 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
         return BatchEntry(folder.name, failure=failure)
     try:
-        return BatchEntry(folder.name, run_json.read(folder))
+        return BatchEntry(folder.name, run_json.read(folder), sensor_area=_sensor_area(folder / "scene.toml"))
     except InputError as error:
         return BatchEntry(folder.name, failure=str(error))
+
+
+def _sensor_area(path: Path) -> float | None:
+    try:
+        scene = read_scene(path)
+        return optical_terms(scene, derive(scene)).sensor_area
+    except InputError:  # a folder of an earlier version, or of recorded frames
+        return None
 
 
 def read_sweep(path: Path) -> SweepTable | None:
@@ -130,14 +154,10 @@ def page(entries: list[BatchEntry], sweep: SweepTable | None, name: str, stamp: 
         "words": words(entries),
         "page_file": REPORT,
         "picture_file": PICTURE,
-        "drawn": {figure.name for figure in figures},
+        "figures": figures,
         "document": "",
         "stamp": stamp,
     }
-    if figures:
-        from . import plots
-
-        content["document"] = plots.document(figures)
     return fill("index.html", content)
 
 
@@ -155,28 +175,31 @@ def words(entries: list[BatchEntry]) -> str:
     return f"{sentence}."
 
 
-def _figures(entries: list[BatchEntry], sweep: SweepTable | None) -> list[Any]:
+def _figures(entries: list[BatchEntry], sweep: SweepTable | None) -> dict[str, Markup]:
     errors = [(entry.title, entry.report.error) for entry in entries if entry.report]
     known = [(title, error) for title, error in errors if error.mse and error.predicted_mse]
-    figures = [_scenes_figure(known)] if len(known) > 1 else []
+    figures = {"scenes": _scenes_figure(known)} if len(known) > 1 else {}
     series = {} if sweep is None else _series(sweep)
-    return [*figures, _sweep_figure(sweep.keys[0], series)] if sweep is not None and series else figures
+    return figures if sweep is None or not series else figures | {"sweep": _sweep_figure(sweep.keys[0], series)}
 
 
-def _scenes_figure(scenes: list[tuple[str, ErrorReport]]) -> Any:
-    from . import plots
-
-    errors = [error for _, error in scenes]
-    intervals = [error.expected_given_truth for error in errors]
-    columns = {
-        "title": [title for title, _ in scenes],
-        "measured": [error.mse for error in errors],
-        "predicted": [error.predicted_mse for error in errors],
-        "low": [error.mse if given is None else given.low for error, given in zip(errors, intervals, strict=True)],
-        "high": [error.mse if given is None else given.high for error, given in zip(errors, intervals, strict=True)],
-    }
-    axes = "predicted mean squared error", "measured mean squared error"
-    return plots.comparison("scenes", axes, plots.source(columns, "scenes"), [("scene", "@title")], size=10)
+def _scenes_figure(scenes: list[tuple[str, ErrorReport]]) -> Markup:
+    points = [(title, error.predicted_mse, error.mse or 0.0, error.expected_given_truth) for title, error in scenes]
+    dots = ChartSeries(
+        "measured, with the 99 % interval expected for the image",
+        [predicted for _, predicted, _, _ in points],
+        [measured for _, _, measured, _ in points],
+        "dots",
+        low=[measured if given is None else given.low for _, _, measured, given in points],
+        high=[measured if given is None else given.high for _, _, measured, given in points],
+        tips=[
+            f"{title}: predicted {predicted:.4g}, measured {measured:.4g}" for title, predicted, measured, _ in points
+        ],
+    )
+    ends = [min(dots.x), max(dots.x)]
+    equal = ChartSeries("measured equals predicted", ends, ends, "dashed", 0)
+    x, y = (ChartAxis(f"{name} mean squared error", True) for name in ("predicted", "measured"))
+    return chart("scenes", x, y, [equal, dots], "measured against predicted error of the scenes")
 
 
 def _series(sweep: SweepTable) -> dict[str, list[tuple[float, float, float]]]:
@@ -205,17 +228,13 @@ def _positive_number(text: str) -> float | None:
     return number if isfinite(number) and number > 0 else None
 
 
-def _sweep_figure(key: str, series: dict[str, list[tuple[float, float, float]]]) -> Any:
-    from . import plots
-
-    chart = plots.chart("sweep", (key, "mean squared error"), x_axis_type="log", y_axis_type="log")
+def _sweep_figure(key: str, series: dict[str, list[tuple[float, float, float]]]) -> Markup:
+    drawn: list[ChartSeries] = []
     for index, (name, points) in enumerate(series.items()):
         values, measured, predicted = map(list, zip(*points, strict=True))
-        columns = {"value": values, "mse": measured, "predicted": predicted, "series": [name] * len(points)}
-        data, colour = plots.source(columns), plots.SERIES[index % len(plots.SERIES)]
-        chart.line("value", "predicted", source=data, line_color=colour, line_dash="6 4", legend_label=name)
-        marks = chart.scatter("value", "mse", source=data, color=colour, size=9, legend_label=name)
-        tips = [("", "@series"), (key, "@value"), ("measured", "@mse{%.4g}"), ("predicted", "@predicted{%.4g}")]
-        plots.hover(chart, [marks], tips, ("predicted", "mse"))
-    plots.legend(chart, "top_left")
-    return chart
+        colour = 1 + index % COLOURS
+        tips = [f"{name}, {key} {x:.4g}: {y:.4g}, predicted {z:.4g}" for x, y, z in points]
+        drawn.append(ChartSeries("", values, predicted, "dashed", colour))
+        drawn.append(ChartSeries(name, values, measured, "dots", colour, tips=tips))
+    axes = ChartAxis(key, True), ChartAxis("mean squared error", True)
+    return chart("sweep", *axes, drawn, "the values are in the table beside the figure")

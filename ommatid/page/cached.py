@@ -13,16 +13,16 @@ from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.time_spent import PAGE, before_page, with_stage, without_page
 from ommatid.runtime.files import cached, fingerprint, write_text
-from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
 
 from .data import read_run
 
 if TYPE_CHECKING:
-    from .point_response import IdealMatrix  # imports Bokeh
+    from .panels.point_response import IdealMatrix
 
 REPORT = "report.html"
 HERE = Path(__file__).parent
+QUALITY = HERE.parent / "analysis" / "quality"
 HEAD = 4096  # characters at the beginning of a page that contain its stamp
 
 
@@ -37,11 +37,11 @@ def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
     recorded, report = stack.read(folder / "stack.exr"), run_json.read(folder)
     bench = next(bench_tables(folder, recorded.camera.describe()), None)
     described = None if bench is None else bench.describe()
-    stamp = fingerprint([without_page(report), described, versions("bokeh"), sources_digest()])
+    stamp = fingerprint([without_page(report), described, sources_digest()])
 
     def make() -> str:
         begun = perf_counter()
-        from .document import page  # imports Bokeh
+        from .document import page
         from .tables import with_page_time
 
         run = read_run(folder, recorded)
@@ -63,8 +63,8 @@ def read_stamp(path: Path) -> tuple[None, str | None]:
 
 
 def sources_digest() -> str:
-    """Return the SHA-256 of the modules and templates of this package: a new version redraws the pages."""
+    """Return the SHA-256 of the modules and templates of the pages: a new version redraws the pages."""
     total = hashlib.sha256()
-    for path in sorted((*HERE.glob("*.py"), *(HERE / "templates").iterdir())):
+    for path in sorted((*HERE.rglob("*.py"), *QUALITY.glob("*.py"), *(HERE / "templates").iterdir())):
         total.update(path.read_bytes())
     return total.hexdigest()

@@ -49,14 +49,16 @@ class ResultMaps:
     """Maps of a run as the page shows them: means over blocks of `block` x `block` pixels.
 
     deviation : posterior standard deviation of a pixel, the square root of the mean variance in a block
+    single : the best single sub-image on the grid of the image, None where the truth is not known
     """
 
     rows: int
     columns: int
     block: int
     estimate: Float32Array
-    deviation: Float32Array
+    deviation: Float32Array | None
     truth: Float32Array | None
+    single: Float32Array | None = None
 
     @property
     def error(self) -> Float32Array | None:
@@ -86,17 +88,61 @@ def read_run(folder: Path, recorded: Stack | None = None, calibrated: Model | No
     )
 
 
-def maps(run: Run) -> ResultMaps:
-    """Return the maps of a run, reduced to at most MOST_PIXELS blocks (a few more with partial blocks at the edges)."""
-    rows, columns = run.estimate.shape
+@dataclass(frozen=True)
+class Contents:
+    """What a folder holds of a run; parts that are absent are None."""
+
+    folder: Path
+    report: RunReport | None
+    stack: Stack | None
+    model: Model | None
+    estimate: Float32Array | None
+    variance: Float32Array | None
+    truth: Float32Array | None
+
+    @property
+    def run(self) -> Run | None:
+        """The complete run, None if a part is missing."""
+        parts = self.report, self.stack, self.model, self.estimate, self.variance
+        if any(part is None for part in parts):
+            return None
+        return read_run(self.folder, self.stack, self.model)
+
+    @property
+    def title(self) -> str:
+        """Title of the scene, or the name of the folder if it has none."""
+        described = self.stack or self.model
+        return (described.scene.title if described is not None else "") or self.folder.resolve().name
+
+
+def read_contents(folder: Path) -> Contents:
+    """Read what a folder holds of a run. Raises InputError for damaged files."""
+    channels = exr.read(folder / ESTIMATE)[0].channels if (folder / ESTIMATE).exists() else {}
+    return Contents(
+        folder=folder,
+        report=run_json.read(folder) if (folder / run_json.RUN).exists() else None,
+        stack=stack.read(folder / "stack.exr") if (folder / "stack.exr").exists() else None,
+        model=model_file.read(folder / "model.npz") if (folder / "model.npz").exists() else None,
+        estimate=channels.get("estimate"),
+        variance=channels.get("variance"),
+        truth=channels.get("truth"),
+    )
+
+
+def maps(
+    estimate: Float32Array, variance: Float32Array | None, truth: Float32Array | None, single: FloatArray | None = None
+) -> ResultMaps:
+    """Return the maps of an estimate with at most MOST_PIXELS blocks (a few more with partial blocks at the edges)."""
+    rows, columns = estimate.shape
     block = max(1, ceil(sqrt(rows * columns / MOST_PIXELS)))
     return ResultMaps(
         rows=rows,
         columns=columns,
         block=block,
-        estimate=reduced(run.estimate, block),
-        deviation=np.sqrt(reduced(run.variance, block)),
-        truth=None if run.truth is None else reduced(run.truth, block),
+        estimate=reduced(estimate, block),
+        deviation=None if variance is None else np.sqrt(reduced(variance, block)),
+        truth=None if truth is None else reduced(truth, block),
+        single=None if single is None else reduced(single, block),
     )
 
 

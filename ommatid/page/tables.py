@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from ommatid.analysis import depth_error, run_table, study
 from ommatid.analysis.summary import describe, skipped_words
-from ommatid.reconstruct.output.run_json import StageReport
+from ommatid.reconstruct.output.run_json import RunReport, StageReport
 from ommatid.reconstruct.output.time_spent import FILES, PAGE
 from ommatid.reconstruct.output.verdict_words import is_trusted
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.geometry.optical_terms import optical_terms
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
 from .data import Run
@@ -96,30 +100,35 @@ def skipped(run: Run) -> PageTable:
     return PageTable("Skipped effects", ("effect", "reason"), rows)
 
 
-def geometry(run: Run) -> tuple[PageTable, list[tuple[str, str]]]:
+def geometry(scene: Scene, camera: Camera) -> tuple[PageTable, list[tuple[str, str]]]:
     """Return a table of the lens types, and names and values of the other dimensions."""
-    camera = run.stack.camera
-    described = describe(Setup(run.stack.scene, camera), "", None)
-    header = ("lens type", "magnification", "array", "pixels per sub-image", "rows seen", "columns seen")
-    header += ("focal length", "lens to sensor", "measurements")
+    described, terms = describe(Setup(scene, camera), "", None), optical_terms(scene, camera)
+    header = ("lens type", "magnification", "on the pixel grid", "array", "pixels per sub-image", "rows seen")
+    header += ("columns seen", "focal length", "f-number", "field of view", "Airy disk", "lens to sensor")
+    header += ("measurements",)
     rows = [
         (
             lens["name"],
+            f"1/{1 / optics.magnification:.4g}",
             lens["magnification"],
             _product(lens["array"]),
             _product(lens["pixels"]),
             _range(lens["sees_rows"]),
             _range(lens["sees_columns"]),
-            f"{lens['focal_length']:.4g} mm",
+            f"{optics.focal_length:.4g} mm",
+            "pinhole" if optics.f_number is None else f"f/{optics.f_number:.3g}",
+            f"{optics.field_of_view[0]:.3g}° × {optics.field_of_view[1]:.3g}°",
+            "" if optics.airy_diameter is None else f"{optics.airy_diameter:.3g} pixels",
             f"{lens['sensor_depth']:.4g} mm",
             str(lens["measurements"]),
         )
-        for lens in described["lens_types"]
+        for lens, optics in zip(described["lens_types"], terms.types, strict=True)
     ]
     target = described["target"]
     facts = [
         ("target", f"{target['rows']} × {target['columns']} pixels, {target['height']:g} × {target['width']:g} mm"),
         ("distance of the target", f"{target['distance']:g} mm"),
+        ("area of the sensor that records", f"{terms.sensor_area:.4g} mm², {camera.measurements} pixels"),
         ("pitch of the sensor pixels", f"{1000 * camera.pixel_pitch:g} µm"),
         ("pitch of the lenses", f"{camera.lens_pitch:g} mm"),
         *(
@@ -174,3 +183,19 @@ def origins(run: Run) -> list[PageTable]:
         PageTable("Seeds", ("random numbers", "seed"), seeds),
         PageTable("Versions", ("package", "version"), versions),
     ]
+
+
+def made(report: RunReport) -> list[tuple[str, str]]:
+    """Return date, command and host of a run, as far as run.json has them."""
+    known = [("date", report.date), ("command", " ".join(report.command)), ("host", report.host)]
+    return [(name, value) for name, value in known if value]
+
+
+def scene_text(folder: Path, scene: Scene) -> str:
+    """Return the scene file of a run: that of its folder, or the scene of its stack."""
+    try:
+        return (folder / "scene.toml").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        import tomli_w
+
+        return tomli_w.dumps(scene.plain())

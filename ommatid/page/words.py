@@ -6,21 +6,25 @@ from math import sqrt
 
 from ommatid.reconstruct.output import verdict_words
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
-from ommatid.reconstruct.output.verdict_words import cause, is_trusted, remedy
+from ommatid.reconstruct.output.verdict_words import cause, is_trusted
+
+from .data import Contents
 
 SCALE = "on a scale of 0 to 255"
 
 
-def summary(report: RunReport) -> str:
-    """Return the main results in three sentences: measured against expected error, resolution, largest cause.
-
-    Where the verdict is against trust, only the first, and nothing of limits or remedies.
-    """
+def sentence(report: RunReport) -> str:
+    """Return the main result: the error, whether it is as expected, and the gain over a single sub-image."""
     if not report.diagnostics.pixels_used:
         return "No sensor pixel could be used: the estimate is the prior, not an image."
+    words = _error(report.error)
     if not is_trusted(report):
-        return f"{_error(report.error)} The figures below rest on assumptions that do not hold; resolve this first."
-    return f"{_error(report.error)} {_resolution(report)} {remedy(report)}"
+        return f"{words} The figures below rest on assumptions that do not hold; resolve this first."
+    baseline, gain = report.error.baseline, report.error.gain
+    if baseline is None or gain is None:
+        return words
+    compared = "better" if gain >= 0 else "worse"
+    return f"{words} That is {abs(gain):.1f} dB {compared} than the best single sub-image, {baseline.sub_imager}."
 
 
 def grounds(report: RunReport) -> list[str]:
@@ -66,16 +70,6 @@ def agreement(error: ErrorReport) -> str:
     return "agrees" if error.mse >= given.low else "better"
 
 
-def _resolution(report: RunReport) -> str:
-    width = report.diagnostics.resolution
-    if width is None:
-        return "Nothing is resolved."
-    pixels = f"{width:.2g} {'pixel' if f'{width:.2g}' == '1' else 'pixels'}"
-    if width < 1.05:
-        return f"The median resolution is that of the target's pixel grid ({pixels})."
-    return f"The median resolution is {pixels} of the target."
-
-
 def cautions(report: RunReport) -> list[str]:
     """Return warnings that a reader needs before the numbers, one sentence each."""
     warnings: list[str] = []
@@ -86,24 +80,60 @@ def cautions(report: RunReport) -> list[str]:
         warnings.append(
             f"{diagnostics.pixels_saturated} saturated sensor pixels count as readings of at least the limit."
         )
-    return warnings + [f"Assumed: {assumption}." for assumption in report.assumes]
+    return warnings
+
+
+def assumptions(report: RunReport) -> list[str]:
+    """Return what the run assumed, one sentence each."""
+    return [f"Assumed: {assumption}." for assumption in report.assumes]
 
 
 def key_numbers(report: RunReport) -> list[tuple[str, str, str]]:
     """Return the numbers at the top of the page: name, value, and the value to compare it with."""
-    error = report.error
+    error, predicted = report.error, sqrt(report.error.predicted_mse)
     numbers: list[tuple[str, str, str]] = []
     if error.mse is None:
-        numbers.append(("Predicted mean squared error", f"{error.predicted_mse:.4g}", "Eq. 5"))
+        numbers.append(("Predicted RMS error", f"{predicted:.3g}", f"of 255; MSE {error.predicted_mse:.4g}"))
     else:
-        numbers.append(("Mean squared error", f"{error.mse:.4g}", f"predicted: {error.predicted_mse:.4g}"))
-        psnr = "exact" if error.psnr is None else f"{error.psnr:.2f} dB"
-        numbers.append(("PSNR", psnr, "for a peak of 255"))
+        expected = error.predicted_mse if error.expected_given_truth is None else error.expected_given_truth.mse
+        against = f"of 255; expected {sqrt(expected):.3g}"
+        numbers.append(("RMS error", f"{sqrt(error.mse):.3g}", against))
+        numbers.append(("Mean squared error", f"{error.mse:.4g}", f"expected {expected:.4g}"))
+        psnr = "exact" if error.psnr is None else f"{error.psnr:.1f} dB"
+        numbers.append(("PSNR", psnr, _beside(error, "psnr", "{:.1f} dB", "for a peak of 255")))
         if error.ssim is not None:
-            numbers.append(("Structural similarity", f"{error.ssim:.4f}", "1 for identical images"))
+            numbers.append(("SSIM", f"{error.ssim:.4f}", _beside(error, "ssim", "{:.4f}", "1 if identical")))
     seconds = sum(stage.seconds for stage in report.stages.values())
     sizes = f"{report.measurements} measurements, {report.unknowns} unknowns"
     return [*numbers, ("Run time", f"{seconds:.3g} s", sizes)]
+
+
+def _beside(error: ErrorReport, name: str, form: str, otherwise: str) -> str:
+    value = None if error.baseline is None else getattr(error.baseline, name)
+    return otherwise if value is None else f"single sub-image: {form.format(value)}"
+
+
+def numbers_beside(report: RunReport) -> dict[str, str]:
+    """Return the figures beside the titles of the maps, by the name of the map."""
+    error = report.error
+    numbers = {"deviation": f"RMS {sqrt(error.predicted_mse):.3g}"}
+    if error.mse is not None:
+        numbers["error"] = f"RMS {sqrt(error.mse):.3g}"
+    if error.psnr is not None:
+        gain = "" if error.gain is None else f" ({error.gain:+.1f} dB)"
+        numbers["estimate"] = f"{error.psnr:.1f} dB{gain}"
+    if error.baseline is not None and error.baseline.psnr is not None:
+        numbers["single"] = f"{error.baseline.psnr:.1f} dB"
+    return numbers
+
+
+def contents(contents: Contents) -> str:
+    """Return what a folder without a complete run holds."""
+    parts = {"a stack": contents.stack, "a model of H": contents.model, "an estimate": contents.estimate}
+    held = [name for name, part in parts.items() if part is not None]
+    missing = [name for name, part in parts.items() if part is None]
+    words = f"This folder holds {' and '.join(held)}, and no finished run: there is no verdict"
+    return f"{words}. Missing: {', '.join([*missing, 'run.json'])}."
 
 
 def budget(error: ErrorReport) -> list[tuple[str, float, float]]:

@@ -11,13 +11,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ommatid.page.batch_index import INDEX, cached_index
-from ommatid.page.cached import cached_page
+from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import figures, result_files, run_json
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import check_output, file_digest, make_folder, write_whole
+from ommatid.runtime.files import check_output, file_digest, make_folder, write_text, write_whole
 from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
@@ -159,8 +159,8 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
     path : a folder of results; a folder of such folders; a folder with stack.exr; or a stack
     output : for a stack the folder of its results, None: a folder beside it of its name
 
-    A stack is reconstructed with model.npz beside it, or without one with H as designed. Raises InputError if there is
-    nothing to report.
+    A stack is reconstructed with model.npz beside it, or without one with H as designed. A folder with nothing but a
+    model or an estimate gets a page of these. Raises InputError if there is nothing to report.
     """
     if path.is_file():
         in_run = path.name == STACK and output is None
@@ -173,6 +173,11 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
             return ReportOutcome((path,), None, ())
         return _report_stack(path / STACK, path, progress)
     folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
+    if not folders and any((path / name).is_file() for name in (MODEL, result_files.ESTIMATE)):
+        from ommatid.page.document import page_of
+
+        write_text(path / REPORT, page_of(path))
+        return ReportOutcome((path,), None, ())
     if not folders:
         raise InputError(f"{path}: expected a stack, or a folder with stack.exr or with folders of runs, got none")
     for number, folder in enumerate(folders):

@@ -77,13 +77,13 @@ def test_a_run_stores_its_check_and_the_page_shows_it(altered: Path, ommatid: Co
     assert wrong is not None
     run = read_run(altered)
     shown = page(replace(run, report=run.report.with_changes(held_out=wrong)), None, None, "stamp")
-    section = shown.split('<section id="held-out"')[1].split("</section>")[0]
+    section = shown.split('<details id="held-out"')[1].split("</details>")[0]
     assert "Not to be trusted: sub-imager I.01.01 contradicts the others" in section
     cells = re.findall(r'<td( class="named")? style[^>]*title="([^"]*)"', section)
     assert len(cells) == 9
     assert [words.split(":")[0] for named, words in cells if named] == ["I.01.01"]
     without = page(replace(run, report=run.report.with_changes(held_out=None)), None, None, "stamp")
-    assert "ommatid check stack.exr model.npz" in without.split('<section id="held-out"')[1].split("</section>")[0]
+    assert "ommatid check stack.exr model.npz" in without.split('<details id="held-out"')[1].split("</details>")[0]
 
 
 def test_the_map_of_a_lens_type_has_its_sub_imagers_in_order(kept: Path) -> None:

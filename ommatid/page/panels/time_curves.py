@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+
+from markupsafe import Markup
 
 from ommatid.analysis.pareto import pareto_front
 from ommatid.bench.table import BenchTable, Cell
 
-from . import plots
-from .data import Run
+from ..data import Run
+from .charts import ChartAxis, ChartSeries, chart
 
-COLOURS = {"render": "#d9660b", "calibrate": "#1b9e77", "reconstruct": "#7570b3"}
-MARKS = {"render": "circle", "calibrate": "triangle", "reconstruct": "square"}
+COLOURS = {"render": 2, "calibrate": 3, "reconstruct": 4}
 
 
 @dataclass(frozen=True)
@@ -53,26 +54,28 @@ def _point(cell: Cell) -> TimePoint | None:
     return TimePoint(cell.stage, setting, cell.seconds.median, cell.mse.median)
 
 
-def figure(curves: TimeCurves) -> Any:
+def figure(curves: TimeCurves) -> Markup:
     """Draw mean squared error against time, one colour per stage, with Pareto fronts and this run's points."""
-    axes = "time of the stage (s)", "mean squared error"
-    chart = plots.chart("effort", axes, x_axis_type="log", y_axis_type="log")
-    marks: list[Any] = []
+    series: list[ChartSeries] = []
     for stage, colour in COLOURS.items():
         points = [point for point in curves.points if point.stage == stage]
         if not points:
             continue
         front = pareto_front(points, lambda point: point.seconds, lambda point: point.mse)
-        style: dict[str, Any] = {"color": colour, "legend_label": stage}
-        chart.line([point.seconds for point in front], [point.mse for point in front], line_width=2, **style)
         own = [point for point in curves.run if point.stage == stage]
-        for listed, marker, look in ((points, MARKS[stage], {"size": 7, "alpha": 0.75}), (own, "star", {"size": 18})):
-            columns = {name: [getattr(point, name) for point in listed] for name in TimePoint.__annotations__}
-            marks.append(chart.scatter("seconds", "mse", source=plots.source(columns), marker=marker, **style, **look))
-    tips = [("stage", "@stage"), ("setting", "@setting"), ("time (s)", "@seconds{%.3g}")]
-    plots.hover(chart, marks, [*tips, ("mean squared error", "@mse{%.4g}")], ("seconds", "mse"))
-    plots.legend(chart, "top_right")
-    return chart
+        series.append(ChartSeries("", *_columns(front), "line", colour))
+        series.append(ChartSeries(stage, *_columns(points), "dots", colour, tips=_tips(points)))
+        series.append(ChartSeries("", *_columns(own), "stars", colour, tips=_tips(own)))
+    axes = ChartAxis("time of the stage (s)", True), ChartAxis("mean squared error", True)
+    return chart("effort", *axes, series, words(curves))
+
+
+def _columns(points: Sequence[TimePoint]) -> tuple[list[float], list[float]]:
+    return [point.seconds for point in points], [point.mse for point in points]
+
+
+def _tips(points: Sequence[TimePoint]) -> list[str]:
+    return [f"{point.stage}, {point.setting}: {point.mse:.4g} in {point.seconds:.3g} s" for point in points]
 
 
 def words(curves: TimeCurves) -> str:

@@ -19,9 +19,8 @@ from ommatid.scenes.hardware.frames import patches
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.stack import Stack
 
-from . import plots
-from .data import reduced
-from .plots import ColourScale
+from ..data import reduced
+from .embedded import ColourScale, encoded
 
 LEVELS = 65534  # codes of values on a page
 MISSING = 65535  # code of a pixel without a value
@@ -30,10 +29,7 @@ MOST_SUB_IMAGERS = 2000
 GAP = 0.12  # between packed sub-images, as a fraction of their size
 
 DIGITAL = "digital number (DN)"
-AXES = {
-    "packed": ("packed column", "packed row"),
-    "place": ("column from the axis (sensor pixels)", "row from the axis"),
-}
+VIEWS = ("packed", "place")  # without the gaps between the sub-images, and at their positions
 
 
 @dataclass(frozen=True)
@@ -68,6 +64,11 @@ class Mosaic:
         known = np.concatenate([patch.image[np.isfinite(patch.image)] for patch in self.patches])
         low, high = (float(known.min()), float(known.max())) if known.size else (0.0, WHITE)
         return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+    @property
+    def colours(self) -> ColourScale:
+        """Grey between the smallest and the largest value."""
+        return ColourScale("grey", *self.ends, self.unit)
 
     def extent(self, name: str) -> tuple[float, float, float, float]:
         """Return left, right, top and bottom of a view, "packed" or "place", with a margin."""
@@ -147,53 +148,23 @@ def _packed_corners(camera: Camera) -> list[tuple[float, float]]:
     return corners
 
 
-def figures(mosaic: Mosaic) -> list[Any]:
-    """Return the packed view and the one with true positions, from one source."""
+def group(mosaic: Mosaic) -> dict[str, Any]:
+    """Return the patches for the page's program: their values as codes, one after the other, and their corners."""
     low, high = mosaic.ends
     step = (high - low) / LEVELS
-    columns: dict[str, list[Any]] = {
-        "image": [np.ascontiguousarray(_codes(patch.image, low, step)) for patch in mosaic.patches],
-        "lens": [patch.lens for patch in mosaic.patches],
-        "k": [patch.k for patch in mosaic.patches],
-        "l": [patch.l for patch in mosaic.patches],
-        "height": [patch.image.shape[0] * mosaic.block for patch in mosaic.patches],
-        "width": [patch.image.shape[1] * mosaic.block for patch in mosaic.patches],
+    codes = np.concatenate([_codes(patch.image, low, step).ravel() for patch in mosaic.patches])
+    return {
+        "name": "sensor",
+        "block": mosaic.block,
+        "scale": mosaic.colours.plain(),
+        "step": step,
+        "missing": MISSING,
+        "values": encoded(codes),
+        "patches": [
+            [patch.lens, patch.k, patch.l, *patch.image.shape, *patch.packed, *patch.place] for patch in mosaic.patches
+        ],
+        "views": {name: mosaic.extent(name) for name in VIEWS},
     }
-    for name in AXES:
-        columns[f"{name}_row"] = [getattr(patch, name)[0] for patch in mosaic.patches]
-        columns[f"{name}_column"] = [getattr(patch, name)[1] for patch in mosaic.patches]
-    data = plots.source(columns, "sensor")
-    colours = ColourScale(plots.GREY, low, high, mosaic.unit)
-    return [_figure(name, mosaic, data, colours, step) for name in AXES]
-
-
-def _figure(name: str, mosaic: Mosaic, data: Any, colours: ColourScale, step: float) -> Any:
-    row, column = f"{name}_row", f"{name}_column"
-    tips = [
-        ("lens type", "@lens"),
-        ("sub-imager k, l", "@k, @l"),
-        ("sensor row in the sub-image", f"$y{{{row}}}"),
-        ("sensor column in the sub-image", f"$x{{{column}}}"),
-        ("value", "@image{value}"),
-    ]
-    formatters = {
-        "$y": plots.distance_from(row, data),
-        "$x": plots.distance_from(column, data),
-        "@image": plots.decoded(colours.low, step, MISSING),
-    }
-    return plots.map_figure(
-        name,
-        data,
-        "image",
-        colours,
-        plots.view(*mosaic.extent(name)),
-        tips,
-        area=(column, row, "width", "height"),
-        axes=AXES[name],
-        mapper=colours.mapper(0, LEVELS, high_color=plots.MISSING_COLOUR),
-        formatters=formatters,
-        background=plots.DARK if name == "place" else None,
-    )
 
 
 def _codes(image: FloatArray, low: float, step: float) -> NDArray[np.uint16]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -20,15 +19,14 @@ from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import Model
 from ommatid.scenes.optics.boxes import overlap
 
-from . import plots
-from .plots import ColourScale
+from .embedded import ColourScale
+from .maps import Panel, value_words
 
 IdealMatrix = Callable[[SubImager], sparse.csr_array]
 
 MARGIN = 2  # sensor pixels around the response
 SMALLEST_LIMIT = 3.0  # standard errors: smallest end of the colour scale of a difference
 TITLES = {"measured": "Calibrated", "ideal": "Ideal", "difference": "Difference"}
-TIPS = {"measured": "calibrated", "ideal": "ideal", "difference": "difference in standard errors"}
 
 
 @dataclass(frozen=True)
@@ -139,24 +137,19 @@ def titles(response: PointResponse) -> dict[str, str]:
     return {name: TITLES[name] for name in response.maps} | ({"measured": "Response"} if response.is_exact else {})
 
 
-def figures(response: PointResponse) -> list[Any]:
-    """Return a figure per map: calibrated and ideal with the same colours, the difference in standard errors."""
-    maps = response.maps
+def panels(response: PointResponse) -> list[Panel]:
+    """Return a panel per map: calibrated and ideal with the same colours, the difference in standard errors."""
+    maps, names = response.maps, titles(response)
     high = max(float(maps[name].max()) for name in ("measured", "ideal") if name in maps) or 1.0
-    (top, left), (rows, columns) = response.corner, maps["measured"].shape
-    view = plots.view(left, left + columns, top, top + rows)
-    data = plots.source({name: [np.ascontiguousarray(image.astype(np.float32))] for name, image in maps.items()})
-    tips = [("row of the sub-image", "$y{0}"), ("column", "$x{0}")]
-    tips += [(TIPS[name], f"@{name}{{%.4g}}") for name in maps]
-    drawn: list[Any] = []
+    shown: list[Panel] = []
     for name, image in maps.items():
-        colours = ColourScale(plots.SEQUENTIAL, 0.0, high, "fraction of the source")
+        colours = ColourScale("sequential", 0.0, high, "fraction of the source")
         if name == "difference":
             limit = max(SMALLEST_LIMIT, float(np.nanmax(np.abs(image), initial=0.0)))
-            colours = ColourScale(plots.DIVERGING, -limit, limit, "standard errors")
-        plot_name, area = f"response-{response.lens}-{name}", (left, top, columns, rows)
-        drawn.append(plots.map_figure(plot_name, data, name, colours, view, tips, area=area, formatted=tuple(maps)))
-    return drawn
+            colours = ColourScale("diverging", -limit, limit, "standard errors")
+        values = image.astype(np.float32)
+        shown.append(Panel(f"response-{response.lens}-{name}", names[name], values, colours, "", value_words(image)))
+    return shown
 
 
 def words(response: PointResponse) -> str:

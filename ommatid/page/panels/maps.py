@@ -1,0 +1,130 @@
+"""Maps of truth, best single sub-image, estimate, error and error bar, which move together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ommatid.runtime.arrays import Float32Array
+from ommatid.scenes.constants import WHITE
+
+from ..data import ResultMaps
+from .embedded import ColourScale, encoded
+
+UNIT = "pixel value"
+SHOWN = 99.5  # per cent of the pixels that a colour scale distinguishes; a few outliers would take all of its range
+TALLEST, WIDEST = 1.1, 0.4  # height over width of a picture's box, beyond which the image gets margins
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A map with its colour scale, a figure that belongs to it, and its description in words.
+
+    difference : names of two maps, of which this one is the difference; the page computes it
+    """
+
+    name: str
+    title: str
+    image: NDArray[Any]
+    colours: ColourScale
+    number: str
+    words: str
+    difference: tuple[str, str] | None = None
+
+    @property
+    def short(self) -> str:
+        """The title without what stands in brackets."""
+        return self.title.partition(" (")[0]
+
+
+def panels(maps: ResultMaps, single: str = "", numbers: dict[str, str] | None = None) -> list[Panel]:
+    """Return the panels in order; those that need the truth only if it is known.
+
+    single : title of the sub-image;  numbers : figures beside the titles, by name
+    """
+    beside = numbers or {}
+    image = maps.estimate if maps.truth is None else maps.truth
+    grey = ColourScale("grey", *_range(image, 0.0 if maps.truth is not None else (100 - SHOWN) / 2), UNIT)
+    pictures = {"truth": maps.truth, "single": maps.single, "estimate": maps.estimate}
+    titles = {"truth": "Truth", "single": single, "estimate": "Estimate"}
+    shown = [
+        Panel(name, titles[name], picture, grey, beside.get(name, ""), value_words(picture))
+        for name, picture in pictures.items()
+        if picture is not None
+    ]
+    if maps.error is not None:
+        limit = _limit(np.abs(maps.error))
+        colours = ColourScale("diverging", -limit, limit, "estimate minus truth")
+        words = _error_words(maps.error, limit)
+        shown.append(
+            Panel("error", "Error", maps.error, colours, beside.get("error", ""), words, ("estimate", "truth"))
+        )
+    if maps.deviation is not None:
+        colours = ColourScale("sequential", 0.0, _limit(maps.deviation), "posterior standard deviation")
+        words = value_words(maps.deviation)
+        shown.append(Panel("deviation", "Error bar", maps.deviation, colours, beside.get("deviation", ""), words))
+    return shown
+
+
+def group(name: str, shown: list[Panel], block: int, size: tuple[int, int], pixel: str = "") -> dict[str, Any]:
+    """Return the maps of panels for the page's program.
+
+    block : side of the pixels of a map in pixels of the image of `size`;  pixel : name of a pixel of it
+    """
+    return {
+        "name": name,
+        "block": block,
+        "rows": size[0],
+        "columns": size[1],
+        "pixel": pixel,
+        "maps": [
+            {
+                "name": panel.name,
+                "title": panel.short,
+                "scale": panel.colours.plain(),
+                "number": panel.number,
+                **({} if panel.difference is not None else {"values": encoded(np.asarray(panel.image))}),
+                **({} if panel.difference is None else {"difference": list(panel.difference)}),
+            }
+            for panel in shown
+        ],
+    }
+
+
+def ratio(rows: int, columns: int) -> float:
+    """Return height over width of the box of a picture."""
+    return min(max(rows / columns, WIDEST), TALLEST)
+
+
+def value_words(image: NDArray[Any]) -> str:
+    """Return smallest, largest and mean value, and the number of missing values, in words."""
+    known = image[np.isfinite(image)]
+    if not known.size:
+        return "no value is known"
+    missing = image.size - known.size
+    words = f"range {known.min():.4g} to {known.max():.4g}, mean {known.mean(dtype=np.float64):.4g}"
+    return words + (f"; {missing} of {image.size} are missing" if missing else "")
+
+
+def _error_words(error: Float32Array, limit: float) -> str:
+    squares = np.square(error, dtype=np.float64)
+    outside = int(np.sum(np.abs(error) > limit))
+    words = f"RMS {float(np.sqrt(np.nanmean(squares))):.3g}, largest {float(np.nanmax(np.abs(error))):.3g}"
+    return words + (f"; {outside} outside the colour scale, which ends at ±{limit:.3g}" if outside else "")
+
+
+def _range(image: Float32Array, aside: float) -> tuple[float, float]:
+    """Return the range of an image without `aside` per cent of the values at either end."""
+    known = image[np.isfinite(image)]
+    if not known.size:
+        return 0.0, WHITE
+    low, high = (float(end) for end in np.percentile(known, [aside, 100 - aside]))
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _limit(image: Float32Array) -> float:
+    known = image[np.isfinite(image)]
+    return (float(np.percentile(known, SHOWN)) if known.size else 0.0) or 1.0

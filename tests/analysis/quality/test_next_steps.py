@@ -1,0 +1,110 @@
+"""What a run's page says would reduce its error, against runs with these changes."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ommatid.analysis.design import with_lens
+from ommatid.analysis.predict import predict_ideal
+from ommatid.analysis.quality.another_type import best_other_type
+from ommatid.analysis.quality.averaging_kernel import error_window
+from ommatid.analysis.quality.next_steps import NextStep, next_steps
+from ommatid.reconstruct.output.result_files import reconstruct
+from ommatid.reconstruct.output.run_json import MoreTime, RunReport, TimeReport, VerdictReport
+from ommatid.scenes.scene import Scene, parse
+
+from ...examples import THREE, Lenses, scene
+from ...page.runs import record
+
+IMAGE = np.add.outer(np.linspace(60, 180, 19), np.linspace(0, 40, 19))
+LENSES: Lenses = tuple((magnification, array, "fit") for magnification, array, _ in THREE)
+
+
+def run_of(lenses: Lenses = LENSES, **noise: Any) -> tuple[Scene, RunReport]:
+    described = scene((19, 19), lenses, noise=noise)
+    return described, report_of(described)
+
+
+def report_of(described: Scene) -> RunReport:
+    """The report of a run, taken for trusted: these tests concern its predictions."""
+    stack, model = record(described, IMAGE)
+    report = reconstruct(stack, model, IMAGE.ravel(), (Path("stack"), Path("model")))[1]
+    return report.with_changes(verdict=VerdictReport(trusted=True, reasons=()))
+
+
+def step_of(report: RunReport, words: str) -> NextStep:
+    [step] = [step for step in next_steps(report) if words in step.change]
+    return step
+
+
+def test_half_the_noise_brings_at_least_what_is_said_and_hardly_more() -> None:
+    report = run_of(variance=4.0)[1]
+    again = run_of(variance=2.0)[1].error
+    said = step_of(report, "half the noise variance")
+    assert said.is_bound
+    # The error is concave in the noise variance, and its slope there is the part of the noise (envelope theorem): the
+    # tangents at both ends enclose the gain.
+    gain = report.error.predicted_mse - again.predicted_mse
+    least, most = report.error.budget["noise"] / 2, again.budget["noise"]
+    assert report.error.predicted_mse - said.mse == pytest.approx(least, rel=1e-12)
+    assert least <= gain <= most
+    assert most < 1.5 * least, "else this test could not tell the gain from half of it"
+
+
+def test_one_more_bit_brings_at_least_what_is_said() -> None:
+    report = run_of(variance=1e-6, bits=8)[1]
+    again = run_of(variance=1e-6, bits=9)[1].error
+    said = step_of(report, "one more bit")
+    assert again.predicted_mse <= said.mse
+    slack = 3 * again.budget["quantisation"] - 0.75 * report.error.budget["quantisation"]  # tangents, as above
+    assert said.mse - again.predicted_mse <= slack + 1e-12
+
+
+def test_another_lens_type_brings_what_the_prediction_says() -> None:
+    lenses: Lenses = (("1/3", [3, 3], "fit"), ("1/4", [4, 4], "fit"))
+    described = scene((19, 19), lenses, noise={"variance": 1.0})
+    (stack, model), report = record(described, IMAGE), report_of(described)
+    window = error_window(stack, model, IMAGE, report)
+    assert window is not None
+    other = best_other_type(described, window)
+    assert other is not None
+    tried = [Fraction(1, 2), Fraction(1, 5)]  # those with the finest pixels that the camera does not have
+    after = {ratio: predict_ideal(with_lens(described, ratio)) for ratio in tried}
+    assert other.magnification == min(tried, key=lambda ratio: after[ratio].mse)
+    chosen, before = after[other.magnification], predict_ideal(described)
+    assert other.ratio == pytest.approx(chosen.mse / before.mse, rel=1e-6)
+    assert other.measurements == chosen.measurements - before.measurements
+    step = next(step for step in next_steps(report, other) if "lens type" in step.change)
+    assert step.mse == pytest.approx(chosen.mse, rel=1e-3)
+
+
+def test_a_camera_without_a_closed_form_is_not_compared_with_other_types() -> None:
+    described, report = run_of(variance=1.0)
+    stack, model = record(described, IMAGE)
+    window = error_window(stack, model, IMAGE, report)
+    assert window is not None
+    plain = described.plain()
+    plain["camera"]["lens"][0] |= {"aperture": "0.4 mm", "focus": "600 mm"}
+    assert best_other_type(parse(plain, described.source), window) is None
+
+
+def test_steps_are_ranked_by_their_gain_and_small_ones_left_out() -> None:
+    report = run_of(variance=4.0)[1]
+    now = report.error.predicted_mse
+    known = {2: (3.0, 0.6 * now), 4: (5.0, 0.1 * now)}
+    more = tuple(MoreTime(times=n, seconds=seconds, predicted_mse=mse) for n, (seconds, mse) in known.items())
+    budget = {"noise": 0.5 * now, "quantisation": 0.06 * now, "rendering": 0.4 * now, "calibration": 0.04 * now}
+    spent = TimeReport(seconds=1.0, stages={}, noise_alone=0.0, more=more)
+    changed = report.with_changes(error=report.error.model_copy(update={"budget": budget}), spent=spent)
+    steps = next_steps(changed)
+    assert [step.change for step in steps] == ["4 times the samples", "half the noise variance"]
+    assert (steps[0].mse, steps[0].seconds) == (0.1 * now, 5.0)
+    assert steps[0].how == "`render.samples` and `calibration.samples`"
+    assert steps[1].mse == pytest.approx(0.75 * now)
+    wrong = changed.with_changes(verdict=VerdictReport(trusted=False, reasons=("H is another camera's",)))
+    assert next_steps(wrong) == []

@@ -1,0 +1,149 @@
+"""Averaging kernels, transfer functions and spectra against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ommatid.analysis.quality.averaging_kernel import ErrorWindow, error_window
+from ommatid.analysis.quality.resolution import of_sub_image, of_window
+from ommatid.analysis.quality.spectra import crossing, radial_spectrum
+from ommatid.reconstruct.output.result_files import reconstruct
+from ommatid.reconstruct.prior import exponential
+from ommatid.runtime.arrays import FloatArray
+from ommatid.simulate.ideal import ideal_matrix
+
+from ...examples import Lenses, scene
+from ...page.runs import record
+
+PRIOR = 100.0  # variance
+
+
+def window_of(shape: tuple[int, int], lenses: Lenses, noise: float, **tables: Any) -> ErrorWindow:
+    """The window of a camera of ideal pinholes, and of independent pixels unless `tables` says otherwise."""
+    tables = {"prior": {"mean": 127.5, "variance": PRIOR}, "noise": {"variance": noise}} | tables
+    described = scene(shape, lenses, **tables)
+    image = np.full(shape, 127.5)
+    stack, model = record(described, image)
+    report = reconstruct(stack, model, None, (Path("stack"), Path("model")))[1]
+    window = error_window(replace(stack, values=model.forward(image)), model, image, report)
+    assert window is not None
+    return window
+
+
+def test_pixels_seen_one_by_one_have_the_response_of_a_wiener_filter() -> None:
+    window = window_of((12, 12), (("1", [1, 1], [12, 12]),), 50.0)
+    transfer, edge = of_window(window)
+    share = PRIOR / (PRIOR + 50.0)
+    np.testing.assert_allclose(transfer.horizontal, share)
+    np.testing.assert_allclose(transfer.vertical, share)
+    assert (edge.values[0], edge.values[-1]) == pytest.approx((0, share), abs=1e-12)
+    assert edge.width == pytest.approx(0.8), "a step between two pixels, from 10 % to 90 % by linear interpolation"
+    assert window.correlated_pixels == pytest.approx(1)
+
+
+def test_blocks_of_two_pixels_have_the_response_of_a_box() -> None:
+    """Each pixel of a block is estimated by the mean of its four, times p / (p + 4 v)."""
+    window = window_of((12, 12), (("1/2", [1, 1], [6, 6]),), 10.0)
+    transfer, _ = of_window(window)
+    share = PRIOR / (PRIOR + 4 * 10.0)
+    # Pixels stand half a pixel before and after the middle of their block: exp(+-i pi u) cos(pi u), on average.
+    np.testing.assert_allclose(transfer.horizontal, share * np.cos(np.pi * transfer.frequencies) ** 2, atol=1e-12)
+    np.testing.assert_allclose(transfer.vertical, transfer.horizontal, atol=1e-12)
+    assert transfer.half == pytest.approx(np.arccos(np.sqrt(0.5 / share)) / np.pi, abs=1e-3)
+    # C = p (I - share J / 4) in a block: correlations of three pixels, -share / 4 / (1 - share / 4)
+    correlation = share / 4 / (1 - share / 4)
+    assert window.correlated_pixels == pytest.approx(1 + 3 * correlation**2)
+
+
+def test_a_sensor_pixel_has_the_response_of_its_box() -> None:
+    described = scene((16, 16), (("1/4", [2, 2], [3, 3]),), noise={"variance": 1.0})
+    stack, model = record(described, np.zeros((16, 16)))
+    window = window_of((16, 16), (("1/4", [2, 2], [3, 3]),), 1.0)
+    shown = of_sub_image(model, window, stack.camera.sub_imagers[0].name)
+    assert shown is not None
+    frequencies = shown[0].frequencies[1:]
+    box = np.abs(np.sin(4 * np.pi * frequencies) / (4 * np.sin(np.pi * frequencies)))
+    np.testing.assert_allclose(shown[0].horizontal[1:], box, atol=1e-12)
+    assert shown[1].width == pytest.approx(0.8 * 4), "from 10 % to 90 % of a ramp of four pixels"
+    assert of_sub_image(model, window, "nothing") is None
+
+
+def test_kernels_and_covariance_are_those_of_the_dense_equations() -> None:
+    lenses: Lenses = (("1/3", [3, 3], [3, 3]), ("1/2", [2, 2], [5, 5]))
+    prior = {"kind": "exponential", "mean": 127.5, "variance": PRIOR, "correlation_length": "3 mm"}
+    window = window_of((12, 12), lenses, 2.0, prior=prior)
+    matrix = ideal_matrix(record(scene((12, 12), lenses), np.zeros((12, 12)))[0].camera).toarray()
+    root = exponential(0.0, PRIOR, (12, 12), 3.0).root
+    before = root @ root.T
+    gain = before @ matrix.T @ np.linalg.inv(matrix @ before @ matrix.T + 2.0 * np.eye(len(matrix)))
+    pixels = np.array([0, 77])
+    np.testing.assert_allclose(window.kernels(pixels).reshape(2, -1), (gain @ matrix)[pixels], atol=1e-9)
+    np.testing.assert_allclose(window.covariance, before - gain @ matrix @ before, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [37, 12])
+def test_the_middle_of_a_frame_is_that_of_its_window(size: int) -> None:
+    lenses: Lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
+    window = window_of((size, size), lenses, 1.0)
+    assert window.is_whole == (size == 12)
+    transfer, edge = of_window(window)
+    assert transfer.horizontal[0] == pytest.approx(edge.values[-1], rel=0.02)
+    np.testing.assert_allclose(transfer.horizontal, transfer.vertical, rtol=1e-9)
+
+
+# --- degrees of freedom
+
+
+def test_mean_squares_of_correlated_errors_vary_as_their_degrees_of_freedom_say() -> None:
+    window = window_of((12, 12), (("1/3", [2, 2], [3, 3]),), 0.01)
+    pixels = np.arange(40)
+    freedom = window.degrees_of_freedom(pixels)
+    root = np.linalg.cholesky(window.covariance + 1e-9 * np.eye(144))
+    errors = (root @ np.random.default_rng(1).normal(size=(144, 4000)))[pixels]
+    squares = np.square(errors).mean(axis=0)
+    measured = 2 * squares.mean() ** 2 / squares.var(ddof=1)
+    # The relative standard error of a variance of n draws of chi-squared by d: sqrt((2 + 12 / d) / n).
+    assert measured == pytest.approx(freedom, rel=4 * np.sqrt((2 + 12 / freedom) / 4000))
+    assert freedom < 39
+
+
+# --- spectra
+
+
+def test_the_spectrum_of_white_noise_is_its_variance() -> None:
+    noise = np.random.default_rng(2).normal(0, 3, (128, 96))
+    spectrum = radial_spectrum(noise)
+    assert len(spectrum.powers) == 24
+    counts = np.diff(np.pi * (128 * 96) * np.square(np.linspace(0, 0.5, 25)))
+    # Powers of a ring are exponential; the window spreads each over some 2.25 neighbours along both axes.
+    scores = (spectrum.powers / 9 - 1) * np.sqrt(counts / 2.25**2)
+    assert np.abs(scores).max() < stats.norm.isf(0.001 / 24 / 2)
+
+
+def test_the_spectrum_of_a_wave_stands_at_its_frequency() -> None:
+    columns = np.arange(64)
+    spectrum = radial_spectrum(np.tile(np.cos(2 * np.pi * 0.25 * columns), (64, 1)))
+    at = int(np.argmax(spectrum.powers))
+    assert spectrum.frequencies[at] == pytest.approx(0.25, abs=0.5 / 16)
+    # Parseval: half of the squared amplitude is in the rings around it.
+    rings = np.pi * np.diff(np.square(np.linspace(0, 0.5, 17)))
+    assert float((rings * spectrum.powers).sum()) == pytest.approx(0.5, rel=0.15)
+
+
+def test_an_error_as_strong_as_the_image_ends_what_is_resolved() -> None:
+    def low_passed(limit: float) -> FloatArray:
+        waves = np.fft.fft2(np.random.default_rng(3).normal(size=(96, 96)))
+        radius = np.hypot(*np.meshgrid(np.fft.fftfreq(96), np.fft.fftfreq(96)))
+        return np.fft.ifft2(np.where(radius < limit, waves, 0)).real
+
+    signal = radial_spectrum(10 * low_passed(0.2))
+    limit = crossing(signal, radial_spectrum(low_passed(0.5)))
+    # A ring of frequencies, and the two neighbours over which the window spreads the strong signal.
+    assert limit == pytest.approx(0.2, abs=0.5 / 24 + 2 / 96)
+    assert crossing(signal, radial_spectrum(np.zeros((96, 96)))) is None

@@ -112,6 +112,22 @@ def test_which_type_to_add(ommatid: Command) -> None:
     )
 
 
+def test_a_camera_of_small_pixels(tmp_path: Path) -> None:
+    (text,) = (block.text for block in blocks(DOCS / "camera.md") if block.file_name == "phone.toml")
+    phone = tmp_path / "phone.toml"
+    phone.write_text(text, encoding="utf-8")
+    narrow = [f"camera.lens.{name}.f_number=4" for name in ("I", "II", "III")]
+    prediction = ommatid.predict(ommatid.read_scene(str(phone), set=["noise.bits=11", *narrow]), rays=False)
+    dimensions = prediction.null_space, prediction.rank + prediction.null_space
+    check_figures("camera.md", "`predict` finds a null space of {} of {} dimensions.", *dimensions)
+    ratios = {"I": "1", "II": "3/5", "III": "3/4"}
+    coarse = [f"camera.lens.{name}.magnification={ratio}" for name, ratio in ratios.items()]
+    scene = ommatid.read_scene(str(phone), set=["noise.bits=11", *narrow, *coarse])
+    pitch = derive(scene).target_pitch
+    check_figures("camera.md", "instead, whose target pitch is {} mm, there is no null space.", pitch)
+    assert ommatid.predict(scene, rays=False).null_space == 0
+
+
 @pytest.mark.parametrize(("lens", "count"), [("I", 0), ("II", 1), ("III", 2)])
 def test_electrons_of_white_pixels(lens: str, count: int) -> None:
     scene = ommatid.read_scene("sensor")

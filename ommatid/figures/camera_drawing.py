@@ -19,7 +19,7 @@ from ommatid.scenes.scene import Scene
 from .camera_key import write_key
 from .lengths import length_words
 from .saving import FORMATS, SCREEN_PNG, FigureFiles
-from .sensor_drawing import draw_sensor, draw_sub_images, sensor_aspect
+from .sensor_drawing import draw_sensor, draw_sub_images, sensor_aspect, write_beside
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
 LEFT, NEAR_WIDTH, FAR_LEFT, FAR_WIDTH = 0.75, 4.7, 6.15, 3.1
@@ -104,12 +104,13 @@ def _draw_section(near: Any, far: Any, scene: Scene, camera: Camera, colours: di
     _label(near, "camera from above, and light of one sub-imager of each type", "left")
     _label(far, "target", "right")
     _mark_break(near, far, camera.distance)
-    near.text(0, high, " lenses", va="top", ha="left", fontsize=8)
-    near.text(-deepest, high, "sensor ", va="top", ha="right", fontsize=8)
+    write_beside(near, "lenses", (0, high), (4, -4), va="top", fontsize=8)
+    write_beside(near, "sensor", (-deepest, high), (-4, -4), va="top", fontsize=8)
     for lens_type in camera.types:
         sub = _middle(camera, lens_type)
-        words = f"{lens_type.name}: {length_words(sub.depth, 3)} "
-        near.text(-sub.depth, sub.patch[0], words, va="center", ha="right", fontsize=8, color=colours[lens_type.name])
+        words = f"{lens_type.name}: {length_words(sub.depth, 3)}"
+        place = -sub.depth, sub.patch[0]
+        write_beside(near, words, place, (-6, 0), va="center", fontsize=8, color=colours[lens_type.name])
 
 
 def _draw_sub_imager(axes: Any, camera: Camera, sub: SubImager, colour: str) -> None:

@@ -122,8 +122,14 @@ def _draw_pitch(axes: Any, camera: Camera) -> None:
         "mutation_scale": 6,
     }
     axes.annotate("", (first[0], y), (second[0], y), arrowprops=arrow)
-    words = f"  lens pitch {length_words(camera.lens_pitch)}"
-    axes.text(second[0], y, words, ha="left", va="center", fontsize=8)
+    words = f"lens pitch {length_words(camera.lens_pitch)}"
+    write_beside(axes, words, (second[0], y), (6, 0), va="center", fontsize=8)
+
+
+def write_beside(axes: Any, words: str, place: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:
+    """Write words to the left or to the right of a place, at an offset in 1/72 inch."""
+    side = "left" if offset[0] > 0 else "right"
+    axes.annotate(words, place, xytext=offset, textcoords="offset points", ha=side, **style)
 
 
 def draw_sub_images(axes: Any, camera: Camera, terms: OpticalTerms, colours: dict[str, str]) -> None:

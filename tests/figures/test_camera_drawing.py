@@ -82,6 +82,22 @@ def test_all_patches_are_drawn_where_they_are(drawn: tuple[Camera, Any]) -> None
     assert left > right, "x runs to the left in a view from behind"
 
 
+def test_the_outline_of_the_sensor_is_drawn_around_the_sub_images() -> None:
+    scene = read(Path("sensor"), ['camera.sensor.size=["4.55 mm", "6.17 mm"]'])
+    camera = derive(scene)
+    face = camera_drawing(scene, camera).axes[2]
+    [outline] = face.patches
+    assert (outline.get_height(), outline.get_width()) == pytest.approx((4.55, 6.17))
+    left, low = outline.get_xy()
+    for sub in camera.sub_imagers:
+        assert left < sub.patch[0] < left + 6.17
+        assert low < sub.patch[1] < low + 4.55
+    ends = sorted(face.get_xlim())
+    assert ends[0] < left < left + 6.17 < ends[1]
+    used = 100 * camera.measurements * camera.pixel_pitch**2 / (4.55 * 6.17)
+    assert any(f"4.55 mm x 6.17 mm, {used:.2g} % used" in text.get_text() for text in face.texts)
+
+
 def test_svg_for_a_page_takes_the_page_s_colour(drawn: tuple[Camera, Any]) -> None:
     text = svg_text(drawn[1])
     root = ElementTree.fromstring(text)

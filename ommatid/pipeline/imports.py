@@ -57,5 +57,5 @@ def import_file(
     kept = whole.restrict(tuple(lenses)) if lenses else whole
     stack.write(output, kept)
     first = next(iter(files_in(images[0])))
-    lost = [] if first.suffix.lower() == ".npy" else colour_lost(first, str(first))
+    lost = [] if first.suffix.lower() == ".npy" else colour_lost(first, str(first), str(path))
     return ImportOutcome(kept, recorded.layout.beside, [*lost, *import_warnings(recorded)])

@@ -6,7 +6,8 @@ Colour becomes luminance; 8-bit and floating-point values are kept, 16-bit value
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from ..scene import Scene
 from . import npz, tiff
 from .exr import Part, read_channels, write
 
+COLOURS = 3  # channels, at least, of a colour picture
 STEPS = 257.0  # of a 16-bit value per grey level: 65535 is 255
 LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
 
@@ -74,35 +76,44 @@ def conversions(scene: Scene) -> list[str]:
     image = scene.target.image
     if image is None:
         return []
-    path = _picture_path(image, f"{scene.source}: target.image")
-    dtype, _ = _stored(path)
-    sentences = colour_lost(path, image)
+    where = f"{scene.source}: target.image"
+    path = _picture_path(image, where)
+    dtype, channels = _stored(path, where)
+    sentences = [_colour_words(image)] if channels >= COLOURS else []
     if dtype.kind == "u" and dtype.itemsize == 2:
         sentences.append(f"{image} has 16-bit values: they are divided by {STEPS:g}, to the range from 0 to 255")
     return sentences
 
 
-def colour_lost(path: Path, name: str) -> list[str]:
-    """Return a sentence about the colours of a picture file of that name; nothing for a grey one. Raises InputError."""
-    if _stored(path)[1] < 3:
-        return []
+def colour_lost(path: Path, name: str, where: str) -> list[str]:
+    """Return a sentence about the colours of a picture file of that name; nothing for a grey one.
+
+    Raises InputError that begins with `where` if it cannot be read.
+    """
+    return [_colour_words(name)] if _stored(path, where)[1] >= COLOURS else []
+
+
+def _colour_words(name: str) -> str:
     weights = " + ".join(f"{weight} {colour}" for weight, colour in zip(LUMINANCE, "RGB", strict=True))
-    return [f"{name} is a colour picture: only its luminance is used, {weights}"]
+    return f"{name} is a colour picture: only its luminance is used, {weights}"
 
 
-def _stored(path: Path) -> tuple[np.dtype[Any], int]:
+def _stored(path: Path, where: str) -> tuple[np.dtype[Any], int]:
     """Return type and number of channels of a picture file, of PNG and JPEG from the header alone."""
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
         from PIL import Image
 
         try:
-            with Image.open(path, formats=("PNG", "JPEG")) as opened:
+            with _any_size(), Image.open(path, formats=("PNG", "JPEG")) as opened:
                 wide = opened.mode.startswith("I")
-                colours = 3 if opened.mode in ("P", "PA") else len(opened.getbands())
+                colours = COLOURS if opened.mode in ("P", "PA") else len(opened.getbands())
+                opened.verify()
                 return np.dtype(np.uint16 if wide else np.uint8), colours
         except Exception as error:
-            raise InputError(f"{path} could not be read as a picture; it is damaged or another kind of file") from error
-    pixels = decode(path, str(path))
+            raise InputError(
+                f"{where}: {path} could not be read as a picture; it is damaged or another kind of file"
+            ) from error
+    pixels = decode(path, where)
     return pixels.dtype, pixels.shape[2] if pixels.ndim == 3 and pixels.shape[2] <= len("RGBA") else 1
 
 
@@ -236,8 +247,7 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
     from skimage import io
 
     imread: Any = io.imread  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
+    with _any_size():
         with Image.open(path, formats=("PNG", "JPEG")) as opened:
             needed = tiff.BYTES * prod(opened.size) * len(opened.getbands())
             is_cmyk = opened.mode == "CMYK"
@@ -245,6 +255,16 @@ def _read_with_pillow(path: Path) -> NDArray[Any]:
             raise InputError(f"{path}: expected grey or RGB, got inks (CMYK); save it as RGB")
         check_memory(needed, f"{path}: to read it", "take a smaller picture, or free some memory")
         return np.asarray(imread(path))
+
+
+@contextmanager
+def _any_size() -> Generator[None]:
+    """Lift Pillow's limit on the number of pixels."""
+    from PIL import Image
+
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 

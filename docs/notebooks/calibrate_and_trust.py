@@ -42,5 +42,6 @@ for name, each in (("as designed", result), ("calibrated", better)):
 figure, axes = plt.subplots(1, 2, figsize=(7.5, 3.4), layout="constrained")
 for ax, (name, each) in zip(axes, (("H as designed", result), ("H calibrated", better)), strict=True):
     shown = ax.imshow((each.image - truth) / each.deviation, cmap="RdBu", vmin=-4, vmax=4)
+    figure.colorbar(shown, ax=ax, label="error in error bars")
     ax.set(title=name, xlabel="column", ylabel="row")
-figure.colorbar(shown, ax=axes, label="error in error bars")
+    ax.locator_params(integer=True)

@@ -47,6 +47,7 @@ pictures = {"truth": truth, "estimate": result.image, "error": error, "error bar
 for ax, (name, picture) in zip(axes, pictures.items(), strict=True):
     figure.colorbar(ax.imshow(picture, cmap="gray"), ax=ax, location="bottom", label="grey levels")
     ax.set(title=name, xlabel="column", ylabel="row")
+    ax.locator_params(integer=True)
 
 # %% [markdown]
 # Errors of neighbouring pixels are correlated. The error bar of a mean takes this into account:

@@ -15,7 +15,7 @@ cameras = {"one type": "I,I,I", "three types": "I,II,III"}
 scenes = {name: ommatid.read_scene("tile19", set=keys, lens=lens) for name, lens in cameras.items()}
 for name, scene in scenes.items():
     found = ommatid.predict(scene, rays=False)
-    print(f"{name:12} {found.measurements} measurements, {found.null_space:3} dimensions unseen, ", end="")
+    print(f"{name:12} {found.measurements} measurements, null space of {found.null_space:3} dimensions, ", end="")
     print(f"expected error {found.mse**0.5:.2f} grey levels rms")
 
 # %% [markdown]

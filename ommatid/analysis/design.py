@@ -46,7 +46,7 @@ def ranked(candidates: list[DesignCandidate]) -> list[DesignCandidate]:
 
 def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[str, str]]:
     """Return magnification and expected error, one row per candidate after that of the camera itself."""
-    lines = [("unchanged", f"{before.mse:.6g} per pixel, {before.null_space} dimensions unseen")]
+    lines = [("unchanged", f"{before.mse:.6g} per pixel, null space of {before.null_space} dimensions")]
     for candidate in candidates:
         after, name = candidate.expected, f"+ {candidate.magnification}"
         if after is None:
@@ -54,8 +54,8 @@ def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[st
             continue
         gain = f"{before.mse / after.mse:.3g} times less" if after.mse > 0 else "no error is left"
         added = after.measurements - before.measurements
-        unseen = f"{after.null_space} dimensions unseen, {added} measurements more"
-        lines.append((name, f"{after.mse:.6g} per pixel, {gain}; {unseen}"))
+        null_space = f"null space of {after.null_space} dimensions, {added} measurements more"
+        lines.append((name, f"{after.mse:.6g} per pixel, {gain}; {null_space}"))
     return lines
 
 

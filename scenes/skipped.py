@@ -46,7 +46,7 @@ def _in_rendering(scene: Scene, camera: Camera) -> list[SkippedEffect]:
     if camera.has_width and not camera.wavelengths:
         skipped.append(_without_waves(camera))
     if camera.has_width and camera.walls:
-        why = "walls between the channels keep it out (camera.walls)"
+        why = "walls between the sub-imagers keep it out (camera.walls)"
         skipped.append(SkippedEffect("light through neighbouring lenses", why))
     if scene.world is None:
         why = "there is nothing but the luminous target: paths have one segment"

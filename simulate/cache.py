@@ -24,7 +24,7 @@ from .sampling.checkpoint import open_checkpoint
 def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:
     """Return the stack at `path` as it is on disk, and True if it had to be rendered.
 
-    The ground truth of a world is stored beside the stack. Raises what `render` raises.
+    The truth of a world is stored beside the stack. Raises what `render` raises.
     """
     truth = setup.image
     if setup.scene.world is not None:
@@ -38,7 +38,7 @@ def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, b
         )
     record = {**result.record, "truth": digest(truth.astype(np.float32))}
     if result.scene.plain() != setup.resolved.plain() or result.record != record:
-        # The estimator's tables or the ground truth may have changed; the values have not.
+        # The estimator's tables or the truth may have changed; the values have not.
         stack.write(path, replace(result, scene=setup.resolved, record=record))
         result = stack.read(path)
     return result, made

@@ -1,4 +1,4 @@
-"""The ground truth of a world: its image through an ideal camera in the centre of the array.
+"""The truth of a world: its image through an ideal camera in the centre of the array.
 
 A pinhole at the origin, whose pixels are those of f: each is the mean over its square on the target's plane. It is
 rendered with the same integrator as the sub-images, with separate seeds, and with more samples.

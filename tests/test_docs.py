@@ -278,7 +278,9 @@ def test_every_page_is_in_the_index_and_fits_a_terminal() -> None:
 def test_every_page_is_in_the_navigation_of_the_site() -> None:
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
     listed = re.findall(r"[\w./-]+\.md", navigation)
-    assert sorted(listed) == sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+    pages = [path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")]
+    notebooks = [path.with_suffix(".md").relative_to(DOCS).as_posix() for path in DOCS.glob("notebooks/*.py")]
+    assert sorted(listed) == sorted(pages + notebooks)
 
 
 def test_make_targets_exist() -> None:

@@ -47,7 +47,7 @@ def ranked(candidates: list[DesignCandidate]) -> list[DesignCandidate]:
 
 def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[str, str]]:
     """Return magnification and expected error, one row per candidate after that of the camera itself."""
-    lines = [("unchanged", f"{error_words(before.mse, DIGITS)}, {before.null_space} dimensions unseen")]
+    lines = [("unchanged", f"{error_words(before.mse, DIGITS)}, null space of {before.null_space} dimensions")]
     for candidate in candidates:
         after, name = candidate.expected, f"+ {candidate.magnification}"
         if after is None:
@@ -55,8 +55,8 @@ def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[st
             continue
         gain = f"{before.mse / after.mse:.3g} times less" if after.mse > 0 else "no error is left"
         added = after.measurements - before.measurements
-        unseen = f"{after.null_space} dimensions unseen, {added} measurements more"
-        lines.append((name, f"{error_words(after.mse, DIGITS)}, {gain}; {unseen}"))
+        null_space = f"null space of {after.null_space} dimensions, {added} measurements more"
+        lines.append((name, f"{error_words(after.mse, DIGITS)}, {gain}; {null_space}"))
     return lines
 
 

@@ -1,0 +1,40 @@
+"""The notebooks of the documentation: the first is executed, and all are text notebooks that the site lists."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import matplotlib as mpl
+import pytest
+
+from .documentation import DOCS
+
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.py"))
+
+
+def test_the_first_notebook_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A text notebook is a script; `make docs` executes all of them in kernels."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    with mpl.rc_context({"backend": "Agg"}):
+        exec(compile((DOCS / "notebooks" / "first_camera.py").read_text(encoding="utf-8"), "notebook", "exec"), names)
+    assert "trusted" in capsys.readouterr().out.splitlines()
+    assert list(tmp_path.iterdir()) == [], "files that it would leave behind"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_have_cells_and_a_title(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    ast.parse(text)
+    assert text.startswith("# %% [markdown]\n# # ")
+    assert text.count("\n# %%\n") >= 2, "cells of code"
+    assert f"({path.name})" in (DOCS / "notebooks" / "README.md").read_text(encoding="utf-8")
+    site = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
+    assert f"notebooks/{path.stem}.md" in site
+
+
+def test_there_are_five() -> None:
+    assert len(NOTEBOOKS) == 5

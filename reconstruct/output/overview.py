@@ -106,7 +106,9 @@ def _draw_budget(axes: Any, report: RunReport) -> None:
     parts = {name: part for name, part in report.error.budget.items() if part > LEAST_PART * mse}
     shares = {verdict_words.cause(name): 100 * part / mse for name, part in parts.items()}
     bars = axes.barh(range(len(shares)), list(shares.values()), height=0.45, color="tab:blue")
-    axes.bar_label(bars, [f"{share:.2g} %" for share in shares.values()], padding=3, fontsize=8)
+    axes.bar_label(
+        bars, [f"{share:.2g} %" if share < 10 else f"{share:.0f} %" for share in shares.values()], padding=3, fontsize=8
+    )
     for place, cause in enumerate(shares):
         axes.text(0, place - 0.3, f" {cause}", fontsize=8, va="bottom")
     axes.set_ylim(max(len(shares), 2) - 0.6, -0.75)

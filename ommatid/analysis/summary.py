@@ -65,7 +65,7 @@ def describe(
         **({"light": light} if light is not None else {}),
         "plan": _plan(scene, camera, variant, choice),
         "skipped": [skipped.describe() for skipped in setup.skipped],
-        "warnings": camera_warnings(camera, terms),
+        "warnings": camera_warnings(scene, camera, terms),
     }
 
 

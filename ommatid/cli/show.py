@@ -52,8 +52,7 @@ def show(
         for path in write_drawing(figure, described, files):
             output.say(f"{path}: written")
     output.print_result(description, scene_sections(description), as_json)
-    for sentence in description["warnings"]:
-        output.say(f"warning: {sentence}")
+    output.warn_all(description["warnings"])
 
 
 def export(scene: SceneFile, file: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:

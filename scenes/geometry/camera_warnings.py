@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import sqrt
 
 from ..camera import Camera
-from ..constants import AIRY_FIRST_ZERO, GREEN
+from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
+from ..scene import Scene
 from .optical_terms import LensTerms, OpticalTerms
 
 WIDEST = 1.0  # sensor pixels, of an Airy disk that may be left out
 FASTEST = 0.5  # f-number of a sharp lens in air: 1 / (2 sin(angle)) of a cone of 90 degrees to the axis (Abbe)
+FULL_WELL = 10000  # electrons of a common pixel, the default of [sensor]
 WIDEST_VIEW = 120.0  # degrees: beyond, the cos^4 law leaves less than 1/16 of the light at the edge
 
 
-def camera_warnings(camera: Camera, terms: OpticalTerms) -> list[str]:
+def camera_warnings(scene: Scene, camera: Camera, terms: OpticalTerms) -> list[str]:
     """Return one sentence per warning, which names the keys to change."""
-    return [*_left_out(camera, terms), *_absurd(camera, terms)]
+    return [*_without_noise(scene), *_left_out(camera, terms), *_absurd(camera, terms)]
+
+
+def _without_noise(scene: Scene) -> list[str]:
+    """The least noise that a sensor has is that of its electrons: the root of their number."""
+    if scene.noise is not None or scene.sensor is not None:
+        return []
+    return [
+        "sensor noise is not modelled: add [noise] or [sensor]; photons alone bring a deviation of"
+        f" {WHITE / sqrt(FULL_WELL):.3g} of {WHITE:g} to a pixel of {FULL_WELL} electrons"
+    ]
 
 
 def _left_out(camera: Camera, terms: OpticalTerms) -> list[str]:

@@ -7,16 +7,17 @@ from pathlib import Path
 import pytest
 
 from ommatid.scenes.camera import derive
-from ommatid.scenes.geometry.camera_warnings import camera_warnings
+from ommatid.scenes.geometry.camera_warnings import FULL_WELL, camera_warnings
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.scene import read
 from ommatid.scenes.tables.gallery import gallery_names
+from ommatid.scenes.tables.sensor import SensorTable
 
 
 def warnings_of(name: str, *changes: str) -> list[str]:
     scene = read(Path(name), changes)
     camera = derive(scene)
-    return camera_warnings(camera, optical_terms(scene, camera))
+    return camera_warnings(scene, camera, optical_terms(scene, camera))
 
 
 @pytest.mark.parametrize("name", gallery_names())
@@ -39,12 +40,18 @@ SINGLE = ("target.pixel_pitch=1 mm", "camera.lens_pitch=9 mm")
         (("target.pixel_pitch=1 um",), ("lens type I enlarges the target 2 times", "target.pixel_pitch")),
         (("target.distance=4 mm", *SINGLE), ("field of view of 124 degrees", "target.distance longer")),
         (("camera.lens.I.f_number=0.4", "camera.lens_pitch=20 mm"), ("lens type I is f/0.4", "f/0.5")),
+        # the root of 10000 electrons, of which 255 stands for all
+        (("noise=",), ("sensor noise is not modelled: add [noise] or [sensor]", "deviation of 2.55 of 255")),
         (("camera.pixel_pitch=0.2 um",), ("camera.pixel_pitch is 0.2 um", "550 nm")),
     ],
 )
 def test_each_warning_names_the_number_and_the_key(changes: tuple[str, ...], words: tuple[str, ...]) -> None:
     said = warnings_of("tile19", *changes)
     assert any(all(word in sentence for word in words) for sentence in said), said
+
+
+def test_the_full_well_is_the_default_of_a_sensor() -> None:
+    assert SensorTable.model_fields["full_well"].default == FULL_WELL
 
 
 def test_diffraction_that_is_modelled_or_narrow_is_no_warning() -> None:

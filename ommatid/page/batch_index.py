@@ -25,12 +25,14 @@ from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.scene import read as read_scene
+from ommatid.scenes.tables.units import length
 
 from .cached import REPORT, read_stamp, sources_digest
 from .panels.charts import COLOURS, ChartAxis, ChartSeries, chart
 from .words import agreement
 
 INDEX = "index.html"
+SweepPoint = tuple[float, float | None, float]  # value of the first key, measured error, predicted error
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ def _figures(entries: list[BatchEntry], sweep: SweepTable | None) -> dict[str, M
     known = [(title, error) for title, error in errors if error.mse and error.predicted_mse]
     figures = {"scenes": _scenes_figure(known)} if len(known) > 1 else {}
     series = {} if sweep is None else _series(sweep)
-    return figures if sweep is None or not series else figures | {"sweep": _sweep_figure(sweep.keys[0], series)}
+    return figures if sweep is None or not series else figures | {"sweep": _sweep_figure(sweep, series)}
 
 
 def _scenes_figure(scenes: list[tuple[str, ErrorReport]]) -> Markup:
@@ -202,39 +204,45 @@ def _scenes_figure(scenes: list[tuple[str, ErrorReport]]) -> Markup:
     return chart("scenes", x, y, [equal, dots], "measured against predicted error of the scenes")
 
 
-def _series(sweep: SweepTable) -> dict[str, list[tuple[float, float, float]]]:
-    """Return (value of the first key, measured error, predicted error) of the scenes, by values of the other keys.
+def _series(sweep: SweepTable) -> dict[str, list[SweepPoint]]:
+    """Return the points of the scenes by the values of the keys after the first.
 
-    The dictionary is empty if the values of the first key are not positive numbers, or all the same.
+    The dictionary is empty if the values of the first key are not positive numbers or lengths, or all the same.
     """
-    series: dict[str, list[tuple[float, float, float]]] = {}
+    series: dict[str, list[SweepPoint]] = {}
+    units: set[str] = set()
     for _, values, mse, predicted in sweep.rows:
         if not predicted:
             continue
-        number = _positive_number(values[0])
+        number, unit = _quantity(values[0])
         if number is None:
             return {}
+        units.add(unit)
         others = ", ".join(f"{key} {value}" for key, value in zip(sweep.keys[1:], values[1:], strict=True))
-        series.setdefault(others or "measured", []).append((number, mse or predicted, predicted))
+        series.setdefault(others or "measured", []).append((number, mse, predicted))
     varies = len({number for points in series.values() for number, _, _ in points}) > 1
-    return {name: sorted(points) for name, points in series.items()} if varies else {}
+    return {name: sorted(points) for name, points in series.items()} if varies and len(units) == 1 else {}
 
 
-def _positive_number(text: str) -> float | None:
+def _quantity(text: str) -> tuple[float | None, str]:
+    """Return a positive number and its unit, which is "" or millimetres; None for everything else."""
     try:
-        number = float(Fraction(text))
+        number, unit = float(Fraction(text)), ""
     except (ValueError, ZeroDivisionError):
-        return None
-    return number if isfinite(number) and number > 0 else None
+        try:
+            number, unit = length(text), "mm"
+        except ValueError:
+            return None, ""
+    return (number if isfinite(number) and number > 0 else None), unit
 
 
-def _sweep_figure(key: str, series: dict[str, list[tuple[float, float, float]]]) -> Markup:
+def _sweep_figure(sweep: SweepTable, series: dict[str, list[SweepPoint]]) -> Markup:
+    key, unit = sweep.keys[0], _quantity(sweep.rows[0][1][0])[1]
     drawn: list[ChartSeries] = []
     for index, (name, points) in enumerate(series.items()):
-        values, measured, predicted = map(list, zip(*points, strict=True))
-        colour = 1 + index % COLOURS
-        tips = [f"{name}, {key} {x:.4g}: {y:.4g}, predicted {z:.4g}" for x, y, z in points]
-        drawn.append(ChartSeries("", values, predicted, "dashed", colour))
-        drawn.append(ChartSeries(name, values, measured, "dots", colour, tips=tips))
-    axes = ChartAxis(key, True), ChartAxis("mean squared error", True)
+        colour, known = 1 + index % COLOURS, [(x, mse, predicted) for x, mse, predicted in points if mse]
+        tips = [f"{name}, {key} {x:.4g} {unit}: {mse:.4g}, predicted {predicted:.4g}" for x, mse, predicted in known]
+        drawn.append(ChartSeries(name, [x for x, _, _ in points], [z for _, _, z in points], "dashed", colour))
+        drawn.append(ChartSeries("", [x for x, _, _ in known], [y for _, y, _ in known], "dots", colour, tips=tips))
+    axes = ChartAxis(f"{key} ({unit})" if unit else key, True), ChartAxis("mean squared error", True)
     return chart("sweep", *axes, drawn, "the values are in the table beside the figure")

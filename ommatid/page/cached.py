@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 REPORT = "report.html"
 HERE = Path(__file__).parent
-QUALITY = HERE.parent / "analysis" / "quality"
+DRAWN = HERE.parent / "analysis" / "quality", HERE.parent / "figures"  # folders of what the pages draw
 HEAD = 4096  # characters at the beginning of a page that contain its stamp
 
 
@@ -65,6 +65,8 @@ def read_stamp(path: Path) -> tuple[None, str | None]:
 def sources_digest() -> str:
     """Return the SHA-256 of the modules and templates of the pages: a new version redraws the pages."""
     total = hashlib.sha256()
-    for path in sorted((*HERE.rglob("*.py"), *QUALITY.glob("*.py"), *(HERE / "templates").iterdir())):
+    sources = [*HERE.rglob("*.py"), *(HERE / "templates").iterdir()]
+    sources += [path for folder in DRAWN for path in folder.glob("*.py")]
+    for path in sorted(sources):
         total.update(path.read_bytes())
     return total.hexdigest()

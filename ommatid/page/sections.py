@@ -53,7 +53,7 @@ def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dic
         "further": tables.further(run),
         "origins": tables.origins(run),
         "made": tables.made(run.report),
-        "scene_text": tables.scene_text(run.folder, run.stack.scene),
+        "scene_text": tables.scene_text(run.stack.scene),
     }
 
 
@@ -83,7 +83,7 @@ def of_contents(contents: Contents) -> dict[str, Any]:
         content |= responses
     if described is not None:
         content |= _camera(described.scene, described.camera)
-        content["scene_text"] = tables.scene_text(contents.folder, described.scene)
+        content["scene_text"] = tables.scene_text(described.scene)
     content["document"] = embedded.document(groups)
     return content if contents.stack is None else content | of_sensor(contents.stack, groups, sensor.MOST_VALUES)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from ommatid.analysis import depth_error, run_table, study
 from ommatid.analysis.summary import describe, skipped_words
@@ -191,11 +190,8 @@ def made(report: RunReport) -> list[tuple[str, str]]:
     return [(name, value) for name, value in known if value]
 
 
-def scene_text(folder: Path, scene: Scene) -> str:
-    """Return the scene file of a run: that of its folder, or the scene of its stack."""
-    try:
-        return (folder / "scene.toml").read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        import tomli_w
+def scene_text(scene: Scene) -> str:
+    """Return a scene as the text of a scene file, defaults included."""
+    import tomli_w
 
-        return tomli_w.dumps(scene.plain())
+    return tomli_w.dumps(scene.plain())

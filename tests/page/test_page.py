@@ -657,6 +657,16 @@ def test_an_index_of_a_sweep_shows_its_values_and_errors(finished: Path, tmp_pat
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "noise.variance" in parsed(text).text["th"]
     assert 'id="chart-sweep"' in text
+    lengths = [
+        row | {"values": {"camera.tolerance.position": value}, "mse": mse}
+        for row, value, mse in zip(listed, ("1 nm", "1 um"), (2.0, None), strict=True)
+    ]
+    (tmp_path / "sweep.json").write_text(json.dumps(lengths), encoding="utf-8")
+    assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": ""})
+    drawn = (tmp_path / "index.html").read_text(encoding="utf-8").split('id="chart-sweep"')[1]
+    assert "camera.tolerance.position (mm)" in drawn
+    assert ">1e-6<" in drawn
+    assert drawn.count("<circle") == 1, "an error that was not measured has no dot"
     failed = {"scene": "a.toml", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"}
     listed.append({"folder": "c", **failed})
     (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")

@@ -2,7 +2,8 @@
 
 The key with most values is the x axis, numeric where its values are numbers or quantities. The key with the second
 most is shown by colour; every combination of the rest (and of scenes, if there are several) has its own marker and line
-style. The value at which a curve crosses twice the smallest predicted error is written beside it.
+style. Predictions that the verdict of a run is against are not drawn, and its measured error is a hollow point. The
+value at which a curve crosses twice the smallest predicted error is written beside it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ SCENE = "scene"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 LINES = ("-", "--", ":", "-.")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B", "#56B4E9")  # of names; Okabe and Ito
+HOLLOW: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 1.5}
 WORDS = {
     ("calibration.method", "ideal"): "H as designed, not calibrated",
     ("calibration.method", "points"): "calibrated by point sources",
@@ -42,7 +44,7 @@ Combination = tuple[str, ...]  # values of the keys that share a style
 class Crossing:
     """Where a curve crosses twice the smallest predicted error of the sweep.
 
-    values : of the keys other than the one along x;  position : along x;  error : the predicted error there
+    values : of the keys other than the one along x;  position : along x;  error : the level that is crossed
     """
 
     values: dict[str, str]
@@ -90,18 +92,20 @@ def _axis(key: str, settings: Sequence[Mapping[str, str]]) -> QuantityAxis:
 def crossings(rows: Sequence[SweepRow]) -> tuple[QuantityAxis, list[Crossing]]:
     """Return the axis along x, and where each curve crosses twice the smallest predicted error of the sweep.
 
-    Between two values of the key the logarithm of the error is interpolated. Empty where the key has names as values,
+    A curve is the predicted error, or the measured one where a run is not to be trusted. Between two values of the key
+    its logarithm is interpolated. Empty where the key has names as values,
     and for curves that stay on one side, or have a single value below.
     """
     settings = _settings(rows)
     key = _roles(settings)[0]
     axis = _axis(key, settings)
-    known = [row.predicted_mse for row in rows if row.predicted_mse]
+    known = [error for error in map(_predicted, rows) if error]
     curves: dict[Combination, list[tuple[float, float]]] = {}
     others = [name for name in settings[0] if name != key and len({setting[name] for setting in settings}) > 1]
     for row, setting in zip(rows, settings, strict=True):
-        if row.predicted_mse:
-            point = axis.positions[setting[key]], row.predicted_mse
+        error = row.mse if row.trusted is False else row.predicted_mse
+        if error:
+            point = axis.positions[setting[key]], error
             curves.setdefault(tuple(setting[name] for name in others), []).append(point)
     if axis.categories or not known:
         return axis, []
@@ -139,20 +143,27 @@ def _draw_curve(panel: Any, rows: Sequence[SweepRow], axis: QuantityAxis, colour
     """Draw one curve; failed scenes leave a gap."""
     rows = sorted(rows, key=lambda row: axis.positions[row.values[axis.key]])
     x = [axis.positions[row.values[axis.key]] for row in rows]
-    predicted = [_or_nan(row.predicted_mse) for row in rows]
-    measured = [_or_nan(row.mse) for row in rows]
+    predicted = [_or_nan(_predicted(row)) for row in rows]
     marker, line = style
     panel.plot(x, predicted, linestyle=line, color=colour, linewidth=1.6)
     if all(row.mse is None for row in rows):
         panel.plot(x, predicted, ".", color=colour, markersize=7)
     low, high = ([_or_nan(_interval(row)[end]) for row in rows] for end in (0, 1))
     panel.vlines(x, low, high, color=colour, linewidth=5, alpha=0.3)
-    points = {"marker": marker, "markersize": 6, "markeredgecolor": "white"}
-    panel.plot(x, measured, linestyle="none", color=colour, **points)
+    for trusted, points in ((True, {"markeredgecolor": "white"}), (False, HOLLOW)):
+        measured = [_or_nan(row.mse if (row.trusted is not False) == trusted else None) for row in rows]
+        if not trusted and all(row.trusted is not False for row in rows):
+            continue
+        panel.plot(x, measured, linestyle="none", marker=marker, markersize=6, color=colour, **points)
+
+
+def _predicted(row: SweepRow) -> float | None:
+    """Return the predicted error, None if the verdict is against it."""
+    return None if row.trusted is False else row.predicted_mse
 
 
 def _interval(row: SweepRow) -> tuple[float | None, float | None]:
-    return row.expected_low, row.expected_high
+    return (None, None) if row.trusted is False else (row.expected_low, row.expected_high)
 
 
 def _or_nan(number: float | None) -> float:
@@ -166,7 +177,7 @@ def _label_axes(panel: Any, rows: Sequence[SweepRow], axis: QuantityAxis) -> Non
     panel.set_title(f"Sweep of {scenes}{note}", fontsize=11)
     panel.set_ylabel(f"mean squared error ({GREY_LEVELS} squared)")
     axis.draw(panel.xaxis)
-    numbers = [number for row in rows for number in (row.mse, row.predicted_mse, *_interval(row))]
+    numbers = [number for row in rows for number in (row.mse, _predicted(row), *_interval(row))]
     errors = [number for number in numbers if number is not None]
     if spans_decade(errors):
         panel.set_yscale("log")
@@ -230,6 +241,9 @@ def _legend(
     handles: list[Any] = [handle([], [], **grey, label="predicted (Eq. 5)")]
     if any(row.mse is not None for row in rows):
         handles.append(handle([], [], **grey, linestyle="none", marker="o", label="measured"))
+    if any(row.mse is not None and row.trusted is False for row in rows):
+        words = "measured, not to be trusted"
+        handles.append(handle([], [], **grey, linestyle="none", marker="o", **HOLLOW, label=words))
     if any(row.expected_low is not None for row in rows):
         handles.append(handle([], [], **grey, linewidth=3, alpha=0.3, label="99 % for this picture"))
     key, colours = coloured

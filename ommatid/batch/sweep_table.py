@@ -49,7 +49,7 @@ def _crossing_lines(rows: Sequence[SweepRow]) -> list[tuple[str, str]]:
     for crossing in found:
         others = "".join(f", {key} = {value}" for key, value in crossing.values.items())
         words = f"at {axis.key} = {axis.words(crossing.position)}{others}"
-        printed.append((f"predicted mse {crossing.error:.4g}, twice the smallest", words))
+        printed.append((f"twice the smallest error, mse {crossing.error:.4g}", words))
     return printed
 
 

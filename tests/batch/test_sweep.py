@@ -240,6 +240,28 @@ def test_a_sweep_says_where_the_error_is_twice_the_smallest(rows_of_tolerance: l
     assert bits.position == pytest.approx(4), "the error of 4 bits is twice that of 6 and 8"
 
 
+def test_a_run_that_is_not_to_be_trusted_has_a_hollow_point_and_no_prediction(
+    rows_of_tolerance: list[SweepRow], tmp_path: Path
+) -> None:
+    """The curve without calibration predicts too little from 100 nm on; what is measured there counts."""
+    doubted = [
+        row.model_copy(update={"trusted": False, "predicted_mse": 0.1, "expected_low": 0.05, "expected_high": 0.2})
+        if (row.mse or 0) > 1 and row.values["calibration.method"] == "ideal"
+        else row.model_copy(update={"trusted": True})
+        for row in rows_of_tolerance
+    ]
+    figure = drawn(doubted, tmp_path)
+    hollow = [line for line in figure.axes[0].lines if line.get_markerfacecolor() == "white"]
+    heights = np.concatenate([line.get_ydata() for line in hollow])
+    assert sorted(heights[np.isfinite(heights)]) == sorted(row.mse or 0 for row in doubted if row.trusted is False)
+    lines_drawn = [line for line in figure.axes[0].lines if line.get_marker() == "None" and len(line.get_xdata()) == 4]
+    assert [int(np.isfinite(line.get_ydata()).sum()) for line in lines_drawn] == [2, 4]
+    assert "measured, not to be trusted" in [text.get_text() for text in figure.legends[0].get_texts()]
+    ideal, _ = sweep_figure.crossings(doubted)[1]
+    measured = 11  # at 100 nm; 0.1 is predicted at 10 nm, and 0.2 is between them
+    assert ideal.position == pytest.approx(10 ** (1 + np.log(2) / np.log(measured / 0.1)))
+
+
 POSITIONS = ("1 nm", "10 nm", "100 nm", "1 um")
 NAMED = [SweepRow(scene="a.toml", values={}, predicted_mse=float(error)) for error in (1, 2, 4)]
 

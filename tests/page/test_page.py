@@ -584,7 +584,8 @@ def test_a_page_of_a_complete_run_is_its_report(finished: Path, tmp_path: Path) 
 
 def test_next_steps_are_those_of_a_trusted_run(run: data.Run, finished: Path) -> None:
     text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()))
-    assert "<strong>Half the noise variance</strong>" in text
+    assert "<strong>Another lens type, of magnification 1/" in text, "the null space is nearly all of its error"
+    assert "Half the noise variance" not in text
     assert "instead of" in text
     untrusted = page(data.read_run(finished), None, None, "0")
     assert "First remove the cause named in the verdict" in untrusted

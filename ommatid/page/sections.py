@@ -122,12 +122,14 @@ def _error(run: Run, window: ErrorWindow | None) -> dict[str, Any]:
     trusted = verdict_words.is_trusted(run.report)
     groups = error_groups.groups(run, window)
     other = best_other_type(run.stack.scene, window) if window is not None and trusted else None
+    budget = run.report.error.budget
+    largest = max(budget, key=lambda name: budget[name], default="")
     return {
         "budget": words.budget(run.report.error),
         "steps": next_steps(run.report, other),
         "now": run.report.error.predicted_mse,
         "root": sqrt,
-        "remedy": verdict_words.remedy(run.report) if other is None else "",
+        "remedy": verdict_words.remedy(run.report) if other is None and largest == "null_space" else "",
         "trusted": trusted,
         "error_groups": groups,
         "error_chart": error_groups.figure(groups) if groups else "",

@@ -582,6 +582,16 @@ def test_a_page_of_a_complete_run_is_its_report(finished: Path, tmp_path: Path) 
         page_of(tmp_path)
 
 
+def test_next_steps_are_those_of_a_trusted_run(run: data.Run, finished: Path) -> None:
+    text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()))
+    assert "<strong>Another lens type, of magnification 1/" in text, "the null space is nearly all of its error"
+    assert "Half the noise variance" not in text
+    assert "instead of" in text
+    untrusted = page(data.read_run(finished), None, None, "0")
+    assert "First remove the cause named in the verdict" in untrusted
+    assert "instead of" not in untrusted.split('id="next"')[1].split("</section>")[0]
+
+
 def test_a_page_names_its_scene_file_command_and_seeds(run: data.Run) -> None:
     text = html_of(run, command=("ommatid", "run", "a<b.toml"), date="2031-02-03T04:05:06+00:00", host="lab7")
     assert "<code>ommatid run a&lt;b.toml</code>" in text

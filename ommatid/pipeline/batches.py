@@ -59,11 +59,13 @@ def batch_warnings(members: Sequence[Member], changes: Sequence[str], lenses: Se
 
     Scenes with errors have none; their errors are reported when they are run.
     """
-    sentences: list[str] = []
+    of_picture: dict[str | None, list[str]] = {}  # each is read once
     for member in members:
         with suppress(InputError):
-            sentences += picture.conversions(read(member.scene, (*changes, *member.changes), lenses))
-    return list(dict.fromkeys(sentences))
+            scene = read(member.scene, (*changes, *member.changes), lenses)
+            if scene.target.image not in of_picture:
+                of_picture[scene.target.image] = picture.conversions(scene)
+    return [sentence for sentences in of_picture.values() for sentence in sentences]
 
 
 def scene_batch(

@@ -62,7 +62,7 @@ def _inside(table: Any, name: str, override: str) -> Any:
 
 def _from_here(key: list[str], value: Any) -> Any:
     """Return the name of a file relative to the current folder as an absolute one, other values as they are."""
-    if not isinstance(value, str) or not value or (key[0], key[-1]) not in FILES:
+    if not isinstance(value, str) or not value.strip() or (key[0], key[-1]) not in FILES:
         return value
     is_name = value.startswith("photo:") or (key[-1] == "spectrum" and (value.endswith("nm") or not Path(value).suffix))
     return value if is_name else str(Path.cwd() / value)

@@ -122,14 +122,15 @@ def _error(run: Run, window: ErrorWindow | None) -> dict[str, Any]:
     trusted = verdict_words.is_trusted(run.report)
     groups = error_groups.groups(run, window)
     other = best_other_type(run.stack.scene, window) if window is not None and trusted else None
-    budget = run.report.error.budget
+    budget, steps = run.report.error.budget, next_steps(run.report, other)
+    is_reduced = other is not None and any(str(other.magnification) in step.change for step in steps)
     largest = max(budget, key=lambda name: budget[name], default="")
     return {
         "budget": words.budget(run.report.error),
-        "steps": next_steps(run.report, other),
+        "steps": steps,
         "now": run.report.error.predicted_mse,
         "root": sqrt,
-        "remedy": verdict_words.remedy(run.report) if other is None and largest == "null_space" else "",
+        "remedy": verdict_words.remedy(run.report) if largest == "null_space" and not is_reduced else "",
         "trusted": trusted,
         "error_groups": groups,
         "error_chart": error_groups.figure(groups) if groups else "",

@@ -584,9 +584,13 @@ def test_a_page_of_a_complete_run_is_its_report(finished: Path, tmp_path: Path) 
 
 def test_next_steps_are_those_of_a_trusted_run(run: data.Run, finished: Path) -> None:
     text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()))
-    assert "<strong>Another lens type, of magnification 1/" in text, "the null space is nearly all of its error"
-    assert "Half the noise variance" not in text
+    assert "null space of H, 97 %; neither samples nor less noise reduce it" in text, "nor does another lens type"
+    budget = {"null_space": 0.0, "noise": run.report.error.predicted_mse}
+    noisy = run.report.error.model_copy(update={"budget": budget})
+    text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()), error=noisy)
+    assert "<strong>Half the noise variance</strong>" in text
     assert "instead of" in text
+    assert "null space of H" not in text.split('id="next"')[1].split("</section>")[0]
     untrusted = page(data.read_run(finished), None, None, "0")
     assert "First remove the cause named in the verdict" in untrusted
     assert "instead of" not in untrusted.split('id="next"')[1].split("</section>")[0]

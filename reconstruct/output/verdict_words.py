@@ -102,4 +102,4 @@ def _change(name: str, part: float, error: ErrorReport, spent: TimeReport) -> st
 
 
 def _fall(now: float, then: float) -> str:
-    return f"{now:.3g} to {then:.3g}"
+    return f"RMS {sqrt(now):.3g} to {sqrt(then):.3g} grey levels"

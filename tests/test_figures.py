@@ -1,6 +1,6 @@
 """Figures that the pages state: those of the commands that print them, and no others.
 
-Those marked `figures` take minutes: `make figures` runs them, and `make docs` does before it builds the pages.
+Those marked `figures` take minutes: `make figures` runs them.
 """
 
 from __future__ import annotations

@@ -118,6 +118,8 @@ def test_a_camera_of_small_pixels(tmp_path: Path) -> None:
     phone.write_text(text, encoding="utf-8")
     narrow = [f"camera.lens.{name}.f_number=4" for name in ("I", "II", "III")]
     prediction = ommatid.predict(ommatid.read_scene(str(phone), set=["noise.bits=11", *narrow]), rays=False)
+    assert prediction.rank is not None
+    assert prediction.null_space is not None
     dimensions = prediction.null_space, prediction.rank + prediction.null_space
     check_figures("camera.md", "`predict` finds a null space of {} of {} dimensions.", *dimensions)
     ratios = {"I": "1", "II": "3/5", "III": "3/4"}

@@ -20,9 +20,11 @@ from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.render import light
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose
+from ommatid.simulate.renderer.worlds.placement import MILLIMETRES_AT_ORIGIN
 from ommatid.simulate.sampling.passes import Plan
 
 from ..examples import OPTICS, TWO, assert_student, familywise, needs, with_optics
+from .world_files import distance_to_target
 
 SAMPLES = 2**14
 DIFFRACTS = {"wavelength": "550 nm", "lens_pitch": "1 mm"}
@@ -96,7 +98,7 @@ def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str)
     renderer = Renderer(camera, choose("auto"), "independent", together=False)
     group, work = next(iter(renderer.groups)), Plan(64, SAMPLES // 64)
     for generator in renderer._generators.values():  # pyright: ignore[reportPrivateUsage]
-        generator.follow(renderer._distance)  # pyright: ignore[reportPrivateUsage]
+        generator.follow(distance_to_target(renderer), MILLIMETRES_AT_ORIGIN)
     rows = renderer.rows(group)
     total = sparse.csr_array((rows.stop - rows.start, camera.unknowns))
     (block,) = renderer.blocks(group, work.samples)

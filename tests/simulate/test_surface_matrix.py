@@ -119,11 +119,13 @@ def test_rays_that_follow_the_distance_of_what_they_meet(kind: str) -> None:
     needs("llvm_ad_mono")
     from ommatid.simulate.renderer.renderer import Renderer
 
+    from .world_files import distance_to_target
+
     surfaces, wavelength, more = CASES[kind]
     camera = setup_of(surfaces, wavelength, **more).camera
     renderer = Renderer(camera, "llvm_ad_mono", "independent", together=False)
     scene: Any = renderer
-    scene._generators["A"].lens.follow(scene._distance)
+    scene._generators["A"].lens.follow(distance_to_target(renderer))
     texels, weights = renderer.hits("A", 4 * SAMPLES, lambda index: index + 7, slice(0, camera.measurements))
     assert weights is not None
     found = np.zeros((camera.measurements, camera.unknowns + 1))

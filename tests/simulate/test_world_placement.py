@@ -81,12 +81,11 @@ def test_a_world_reads_the_same_in_millimetres_and_inches(tmp_path: Path) -> Non
 
 def test_the_blur_behind_an_aperture_is_the_same_in_millimetres_and_metres(tmp_path: Path) -> None:
     needs(FAST)
-    readings: list[FloatArray] = []
-    for unit in ("mm", "m"):
-        blurred = with_aperture(in_unit(tmp_path, unit, FAST))
-        readings.append(light(Setup.from_scene(blurred)).mean)
-    assert np.ptp(readings[0]) > 20
-    assert_same(*readings, 256)
+    in_millimetres, in_metres = (
+        light(Setup.from_scene(with_aperture(in_unit(tmp_path, unit, FAST)))).mean for unit in ("mm", "m")
+    )
+    assert np.ptp(in_millimetres) > 20
+    assert_same(in_millimetres, in_metres, 256)
 
 
 def moved(shape: str, mirrored: bool) -> str:

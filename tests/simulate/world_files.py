@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +15,10 @@ from ommatid.simulate.sampling.passes import rounding_variance
 
 from ..examples import Lenses
 from ..examples import scene as flat_scene
+
+if TYPE_CHECKING:
+    from ommatid.simulate.renderer.lens import Distance
+    from ommatid.simulate.renderer.renderer import Renderer
 
 Z = 1000.0
 FAST = "llvm_ad_mono"
@@ -54,3 +59,13 @@ def world(
 
 def floored(rendering: Rendering) -> Any:
     return np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
+
+
+def distance_to_target(renderer: Renderer) -> Distance:
+    """Return the distance of the flat target as lenses find that of a world's surfaces."""
+    from ommatid.simulate.renderer.world import StagedWorld
+    from ommatid.simulate.renderer.worlds.placement import MILLIMETRES_AT_ORIGIN
+
+    scene, integrator = renderer._scene, renderer._integrator  # pyright: ignore[reportPrivateUsage]
+    staged = StagedWorld(scene, integrator, MILLIMETRES_AT_ORIGIN, 0)
+    return partial(staged.distance, far=2 * renderer.camera.distance)

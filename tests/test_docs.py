@@ -73,6 +73,7 @@ SHORTER = {
     "bench": ["--seconds", "5"],
     "run tile19 -o sweep": [*QUICK, *SCALAR, "--set", "calibration.method=ideal", "--workers", "1"],
     "run tile19 -o auto": SCALAR,
+    "run tile19 -o displaced": QUICK,
     "run tile19 -o within": [*SCALAR, "--within", "5 s"],
     "predict sensor": TILE,
     "predict tile19 -o tolerance": ["--no-rays"],
@@ -89,7 +90,7 @@ def shortened(arguments: list[str]) -> list[str]:
 
 
 def needs_fast_backend(arguments: list[str]) -> bool:
-    return any("misaligned" in argument for argument in arguments)
+    return any(word in argument for argument in arguments for word in ("misaligned", "camera.tolerance"))
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,6 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.world import FROM_FILE, MILLIMETRES, WorldTable
 
 from .renderer.variant import choose
-from .renderer.world import describe, world_of
 
 SUB_IMAGERS, SIDE = 64, 4  # from which views are followed, at most, and how many views along each side of one
 COARSE, SAMPLES = 48, 64  # pixels along the longer side, and samples of each, of the picture that finds white
@@ -95,6 +94,7 @@ _known: dict[str, WorldView] = {}
 def world_view(setup: Setup) -> WorldView:
     """Look at the world of a scene; computed once per process. Raises InputError for one that cannot be built."""
     from .renderer.renderer import Renderer
+    from .renderer.world import describe, world_of
     from .renderer.worlds.surfaces import box_of, depths_met, has_surroundings
 
     scene, camera, table = setup.scene, setup.camera, world_of(setup.scene)
@@ -147,6 +147,8 @@ def check_world(setup: Setup) -> WorldView:
 
 
 def _check_surfaces(setup: Setup, view: WorldView) -> None:
+    from .renderer.world import world_of
+
     scene = setup.scene
     where = f"{scene.source}: world.file: {world_of(scene).file}"
     if view.depths is None or (not view.sky and view.met < ENOUGH * view.views):
@@ -273,6 +275,8 @@ def _brightest(renderer: Any, seed: int) -> float:
 
 
 def _check_white(scene: Scene, white: float) -> None:
+    from .renderer.world import world_of
+
     if not white:
         raise InputError(
             f"{scene.source}: world.file: {world_of(scene).file}: world.white 'auto' needs light that the camera sees,"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ommatid.analysis import run_table
+from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.output.result_files import with_estimator_changes
 from ommatid.reconstruct.restore import Reconstruction, check_match, restore
@@ -27,7 +28,8 @@ from ..examples import GALLERY, THREE, scene
 
 def chain(described: Scene) -> tuple[Stack, Model, Reconstruction]:
     camera, image = derive(described), load(described)
-    stack, model = render(Setup(described, camera, image)), calibrate(Setup(described, camera))
+    stack = render(Setup(described, camera, image))
+    model = calibrate(Setup(described, camera), stopping_rule=for_stack(stack))
     return stack, model, restore(stack, model, image.ravel())
 
 

@@ -127,6 +127,8 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
         cases, made = _studied(setup, stack, folder, observer)
         complete = complete.with_changes(study=cases)
         complete = with_stage(complete, "study", perf_counter() - begun) if made else complete
+    else:
+        study.remove_study(folder)
     if complete.plain() != report.plain():
         run_json.write(folder, complete)
     return complete

@@ -24,6 +24,7 @@ from ommatid.scenes.stack import Stack
 from ..methods.prepared import Prepared
 from ..restore import Reconstruction, check_match, restore
 from . import figures, run_json
+from .estimate_formats import format_file
 from .overview import ESTIMATE, OVERVIEW, write_overview
 from .report import report_of
 from .run_json import RegionReport, RunReport
@@ -103,7 +104,13 @@ def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, An
 
 
 def write_results(folder: Path, stack: Stack, restoration: Reconstruction, report: RunReport) -> None:
-    """Write the four files of a run. run.json comes last: where it is, all are there. Raises MachineError."""
+    """Write the four files of a run. run.json comes last: where it is, all are there. Raises MachineError.
+
+    The estimate of an earlier result in other formats is removed.
+    """
+    if any((folder / name).exists() for name in (ESTIMATE, run_json.RUN)):
+        for name in ("npy", "tiff16"):
+            format_file(folder / ESTIMATE, name).unlink(missing_ok=True)
     record = {"title": stack.scene.title, "fingerprint": report.fingerprint}
     write_estimate(folder / ESTIMATE, restoration, record)
     figures.write_estimate(folder / PICTURE, restoration.estimate.reshape(restoration.shape))

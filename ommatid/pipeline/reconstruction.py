@@ -38,13 +38,17 @@ PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", "
 
 @dataclass(frozen=True)
 class ReconstructionRequest:
-    """The files of a stack and its model, changes (KEY=VALUE), names of lens types, and regions to average."""
+    """The files of a stack and its model, changes (KEY=VALUE), names of lens types, and regions to average.
+
+    force : True to reconstruct into a folder even if its result is up to date
+    """
 
     stack: Path
     model: Path
     changes: tuple[str, ...] = ()
     lenses: tuple[str, ...] = ()
     regions: tuple[Region, ...] = ()
+    force: bool = False
 
     def read(self) -> tuple[Stack, Model]:
         """Read both files. Raises InputError for wrong files and options."""
@@ -123,21 +127,21 @@ def reconstruct_folder(
         model_file.write(folder / MODEL, calibrated)
     else:
         _copy(request.model, folder / MODEL)
-    return finish_folder(folder, progress, request.regions, scheduler, workers)
+    with _tile_workers(scheduler, workers) as pool:
+        return finish_folder(folder, progress, request.regions, pool, request.force)
 
 
 def finish_folder(
     folder: Path,
     progress: Progress,
     regions: Sequence[Region] = (),
-    scheduler: str = "",
-    workers: int | None = None,
+    workers: Workers | None = None,
+    force: bool = False,
 ) -> tuple[RunReport, bool]:
     """Reconstruct the stack in a folder with the model in it, and write the page, unless they are up to date."""
     names = folder / STACK, folder / MODEL
-    recorded, calibrated = stack_file.read(names[0]), model_file.read(names[1])
-    with _tile_workers(scheduler, workers) as pool:
-        report, made = result_files.cached_results(folder, recorded, calibrated, names, progress, pool, tuple(regions))
+    files = stack_file.read(names[0]), model_file.read(names[1]), names
+    report, made = result_files.cached_results(folder, *files, progress, workers, tuple(regions), force)
     if not report.study:
         remove_study(folder)
     _write_page(folder)

@@ -153,8 +153,9 @@ def cached_results(
     progress: Progress = no_progress,
     workers: Workers | None = None,
     regions: tuple[Region, ...] = (),
+    force: bool = False,
 ) -> tuple[RunReport, bool]:
-    """Return run.json of a folder, and True if the reconstruction had to be made for it."""
+    """Return run.json of a folder, and True if the reconstruction was made for it: if needed, or by `force`."""
     current = fingerprint_of(stack, model)
     current = fingerprint([current, regions]) if regions else current
 
@@ -163,4 +164,4 @@ def cached_results(
         added = {"fingerprint": current, **origin(), **region_reports(restoration, regions)}
         return restoration, report.with_changes(**added)
 
-    return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made))
+    return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made), force)

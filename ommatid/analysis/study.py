@@ -99,6 +99,12 @@ def cached_study(
     return cached(folder, current, _read_study, make, write)
 
 
+def remove_study(folder: Path) -> None:
+    """Remove the study of an earlier result in a folder; its calibrated models stay."""
+    for name in (NUMBERS, TABLE):
+        (folder / name).unlink(missing_ok=True)
+
+
 def _read_study(folder: Path) -> tuple[tuple[StudyCase, ...], str | None]:
     """Return the cases in study.json, and its fingerprint if study.csv is there too."""
     study = StudyFile.model_validate_json((folder / NUMBERS).read_bytes())

@@ -24,6 +24,12 @@ from .remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, 
 
 Description = dict[str, Any]
 
+# What a run writes that could be the picture of its target.
+PICTURES = (
+    *("stack.exr", "estimate.exr", "estimate.png", "estimate.npy", "estimate.tiff", "overview.png", "depth.png"),
+    *("scene.toml", TRUTH),
+)
+
 
 @dataclass(frozen=True)
 class Member:
@@ -161,21 +167,28 @@ class _ScenePackages:
             yield package
 
 
+def check_files(setup: Setup, folder: Path) -> None:
+    """Raise InputError if a scene has no picture, or if its results would replace a file that it is read from."""
+    scene, _ = setup.scene, setup.picture
+    if folder.is_dir():
+        read = scene.source, *([Path(scene.target.image)] if scene.target.image else [])
+        for name in (*PICTURES, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
+            check_output(folder / name, *read)
+
+
 def prepare(setup: Setup, folder: Path) -> None:
     """Make the folder of a scene and write the scene and its target image. Raises InputError or MachineError.
 
     The true image of a world is rendered later.
     """
-    scene, picture = setup.scene, setup.picture  # first, since a scene without a picture leaves no folder behind
+    check_files(setup, folder)  # first, since a scene without a picture leaves no folder behind
     make_folder(folder)
     clear_abandoned(folder)
-    for name in ("scene.toml", TRUTH, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
-        check_output(folder / name, scene.source, *([Path(scene.target.image)] if scene.target.image else []))
     write(folder / "scene.toml", setup.resolved)
-    if scene.world is None:
+    if setup.scene.world is None:
         write_truth(folder / TRUTH, setup.image)
         if setup.camera.detail > 1:
-            write_truth(folder / WORLD_PICTURE, picture)
+            write_truth(folder / WORLD_PICTURE, setup.picture)
 
 
 def _raise(error: Exception) -> Description:

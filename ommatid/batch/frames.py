@@ -19,7 +19,7 @@ import numpy as np
 
 from ommatid.reconstruct.methods.prepared import Prepared
 from ommatid.reconstruct.output import figures, result_files
-from ommatid.reconstruct.output.estimate_formats import Format, write_formats
+from ommatid.reconstruct.output.estimate_formats import Format, clear_formats, write_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
@@ -191,6 +191,7 @@ def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunR
     names = frame.stack, options.model
     outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, prepared=prepared)
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
+    clear_formats(frame.output)
     figures.write_estimate(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
     record = {"title": stack.scene.title, "fingerprint": frame.fingerprint, "report": report.plain()}
     result_files.write_estimate(frame.output, outcome, record)

@@ -20,22 +20,28 @@ from ommatid.simulate import calibrate, render
 from ommatid.simulate.renderer import variant
 from ommatid.simulate.validation import check_scene
 
-from .batch import Member
+from .batch import Member, check_files
 from .cost_model import estimate_cost
 
 TO_MAKE, CURRENT = "to be made", "up to date"
+STAGES = "render", "calibrate", "reconstruct"
 
 
-def plan(member: Member, setup: Setup, changes: Sequence[str], lenses: Sequence[str]) -> dict[str, Any]:
+def plan(
+    member: Member, setup: Setup, changes: Sequence[str], lenses: Sequence[str], force: bool = False
+) -> dict[str, Any]:
     """Describe what a run of a scene would do, in JSON's types.
 
     Each stage has a `state`, "to be made" or "up to date"; `seconds` and `memory` (bytes) are those of a run from the
-    beginning, to within a factor of about two. Raises InputError as the run would.
+    beginning, to within a factor of about two. With `force` all stages are to be made.
+    Raises InputError as the run would.
     """
     check_scene(setup)
+    check_files(setup, member.folder)
     choice = choose_method(setup.scene, setup.camera, setup.may_have_boxes)
     described = summary.describe(setup, variant.choose(setup.scene.render.variant), choice)
-    states, cost = _states(member.folder, setup), estimate_cost(member, changes, lenses)
+    states = dict.fromkeys(STAGES, TO_MAKE) if force else _states(member.folder, setup)
+    cost = estimate_cost(member, changes, lenses)
     return {
         "folder": str(member.folder),
         "title": setup.scene.title,
@@ -60,7 +66,7 @@ def lines(name: str, described: dict[str, Any]) -> list[str]:
 
 def _states(folder: Path, setup: Setup) -> dict[str, str]:
     """Return the state of each stage. A stage is up to date only if those before it are."""
-    states: dict[str, str] = dict.fromkeys(("render", "calibrate", "reconstruct"), TO_MAKE)
+    states: dict[str, str] = dict.fromkeys(STAGES, TO_MAKE)
     with suppress(OSError, ValueError, KeyError, TypeError, InputError):
         record = exr.read_first_record(folder / "stack.exr")["record"]
         if record["fingerprint"] != render.made_from(setup):

@@ -65,12 +65,16 @@ class ScenePackage:
 
 @dataclass(frozen=True)
 class SceneOutcome:
-    """New and changed files, the stages with True if they were executed, and a description or an error."""
+    """New and changed files, the stages with True if they were executed, and a description or an error.
+
+    removed : names of files that the stages removed
+    """
 
     files: dict[str, bytes]
     done: dict[str, bool]
     description: dict[str, Any]
     error: Exception | None = None
+    removed: tuple[str, ...] = ()
 
 
 def packed(setup: Setup, folder: Path) -> ScenePackage:
@@ -100,8 +104,9 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
             if package.world is not None:
                 message = message.replace(str(folder / WORLD), package.world.root)
             error = type(error)(message.replace(temporary, package.folder))
-        files = {name: content for name, content in _contents(folder).items() if package.files.get(name) != content}
-        return replace(outcome, files=files, error=error)
+        contents = _contents(folder)
+        files = {name: content for name, content in contents.items() if package.files.get(name) != content}
+        return replace(outcome, files=files, error=error, removed=tuple(package.files.keys() - contents.keys()))
 
 
 def outcome_of(work: Callable[[RunObserver], dict[str, Any]]) -> SceneOutcome:
@@ -114,7 +119,9 @@ def outcome_of(work: Callable[[RunObserver], dict[str, Any]]) -> SceneOutcome:
 
 
 def unpack(outcome: SceneOutcome, folder: Path) -> None:
-    """Write the returned files, run.json last. Raises InputError or MachineError."""
+    """Remove the removed files and write the returned ones, run.json last. Raises InputError or MachineError."""
+    for name in outcome.removed:
+        (folder / name).unlink(missing_ok=True)
     for name in sorted(outcome.files, key=LAST.__eq__):
         write_whole(folder / name, partial(_write_bytes, outcome.files[name]))
 

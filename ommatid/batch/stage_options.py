@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,25 @@ from ommatid.scenes.setup import Setup
 from .remote import RunObserver, Stages
 
 # What the stages write; the calibrated models of a study and interrupted work are beside them.
-RESULTS = ("stack.exr", "model*.npz", "run.json", "estimate.exr", "study.json", "report.html", ".*.partial.npz")
+ESTIMATES = ("estimate.exr", "estimate.npy", "estimate.tiff")
+RESULTS = ("stack.exr", "model*.npz", "run.json", *ESTIMATES, "study.json", "report.html", ".*.partial.npz")
+
+Check = Callable[[Setup, Path], None]  # raises InputError where the stages would, and writes nothing
 
 
-def with_options(stages: Stages, force: bool, formats: tuple[Format, ...]) -> Stages:
-    """Return stages that first remove the results of an earlier run, if `force`, and last write `formats`."""
-    return partial(_with_options, stages, force, formats) if force or formats else stages
+def with_options(stages: Stages, force: Check | None, formats: tuple[Format, ...]) -> Stages:
+    """Return stages that last write `formats`, and first remove the results of an earlier run if `force` is given.
+
+    force : check of the stages, which comes before anything is removed; None: what is up to date stays
+    """
+    return stages if force is None and not formats else partial(_with_options, stages, force, formats)
 
 
 def _with_options(
-    stages: Stages, force: bool, formats: tuple[Format, ...], setup: Setup, folder: Path, observer: RunObserver
+    stages: Stages, force: Check | None, formats: tuple[Format, ...], setup: Setup, folder: Path, observer: RunObserver
 ) -> dict[str, Any]:
-    if force:
+    if force is not None:
+        force(setup, folder)
         clear_results(folder, setup)
     description = stages(setup, folder, observer)
     write_formats(folder / "estimate.exr", formats)

@@ -94,8 +94,8 @@ def reconstruct(
         request = frames.FrameRequest(stacks, model, *asked, others, force)
         frames.reconstruct(request, file, scheduler, workers, strict, None if as_json else detail)
         return
-    request = reconstruction.ReconstructionRequest(stacks[0], model, *asked)
-    _reconstruct_one(request, file, (scheduler, workers), others, force, None if as_json else detail, strict)
+    request = reconstruction.ReconstructionRequest(stacks[0], model, *asked, force)
+    _reconstruct_one(request, file, (scheduler, workers), others, None if as_json else detail, strict)
 
 
 def _reconstruct_one(
@@ -103,7 +103,6 @@ def _reconstruct_one(
     file: Path,
     pool: tuple[str, int | None],
     formats: tuple[Format, ...],
-    force: bool,
     detail: output.Detail | None,
     strict: bool,
 ) -> None:
@@ -116,8 +115,6 @@ def _reconstruct_one(
     whole = reconstruction.is_folder(file)
     with output.progress_bar("reconstruct") as progress:
         if whole:
-            if force:
-                (file / "run.json").unlink(missing_ok=True)
             report, made = reconstruction.reconstruct_folder(request, file, progress, *pool)
         else:
             report, made = reconstruction.reconstruct_files(request, file, progress, *pool), True

@@ -66,8 +66,8 @@ def run(
     """Render, calibrate, reconstruct and report."""
     from ommatid.batch.stage_options import with_options
     from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch, share_of_job
-    from ommatid.pipeline.stages import with_figures
-    from ommatid.pipeline.time_budget import stages_within
+    from ommatid.pipeline.stages import check_run, with_figures
+    from ommatid.pipeline.time_budget import check_within, stages_within
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
@@ -79,12 +79,13 @@ def run(
     members = members if share is None else share.members
     output.warn_all(batch_warnings(members, *asked))
     if dry_run:
-        _print_plans(members, *asked, as_json)
+        _print_plans(members, *asked, force, as_json)
         return
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
     report = partial(_print_run, None if as_json else detail)
-    batch = scene_batch(*asked, with_options(with_figures(stages, figures), force, others), observer, report)
+    check = (check_within if within else check_run) if force else None
+    batch = scene_batch(*asked, with_options(with_figures(stages, figures), check, others), observer, report)
     files: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures, "share": share}
     finish_batch(run_batch(batch, members, failures.report, scheduler, workers, **files), as_json, strict)
 
@@ -103,12 +104,14 @@ def _print_run(detail: output.Detail | None, member: Member, description: dict[s
     return description
 
 
-def _print_plans(members: Sequence[Member], asked: tuple[str, ...], lenses: tuple[str, ...], as_json: bool) -> None:
+def _print_plans(
+    members: Sequence[Member], asked: tuple[str, ...], lenses: tuple[str, ...], force: bool, as_json: bool
+) -> None:
     """Print what a run would do. Raises InputError for the first scene that would fail."""
     from ommatid.batch import plan
     from ommatid.pipeline.stages import open_member
 
-    plans = [plan.plan(member, open_member(asked, lenses, member), asked, lenses) for member in members]
+    plans = [plan.plan(member, open_member(asked, lenses, member), asked, lenses, force) for member in members]
     if as_json:
         output.print_json(
             [{"scene": str(member.scene), **described} for member, described in zip(members, plans, strict=True)]
@@ -150,7 +153,8 @@ def render(
     share = share_of_job(job, members, folder, ("render",), *asked, scheduler)
     members = members if share is None else share.members
     output.warn_all(batch_warnings(members, *asked))
-    batch = scene_batch(*asked, with_options(stages.render, force, ()), output.observer, report)
+    check = stages.check_render if force else None
+    batch = scene_batch(*asked, with_options(stages.render, check, ()), output.observer, report)
     outcome = run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder, share=share)
     finish_batch(outcome, as_json)
 

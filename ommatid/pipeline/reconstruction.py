@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import shutil
+import tomllib
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from ommatid.analysis.study import remove_study
 from ommatid.page.batch_index import INDEX, cached_index
 from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import figures, result_files, run_json
+from ommatid.reconstruct.output.estimate_formats import clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
@@ -35,13 +38,17 @@ PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", "
 
 @dataclass(frozen=True)
 class ReconstructionRequest:
-    """The files of a stack and its model, changes (KEY=VALUE), names of lens types, and regions to average."""
+    """The files of a stack and its model, changes (KEY=VALUE), names of lens types, and regions to average.
+
+    force : True to reconstruct into a folder even if its result is up to date
+    """
 
     stack: Path
     model: Path
     changes: tuple[str, ...] = ()
     lenses: tuple[str, ...] = ()
     regions: tuple[Region, ...] = ()
+    force: bool = False
 
     def read(self) -> tuple[Stack, Model]:
         """Read both files. Raises InputError for wrong files and options."""
@@ -82,6 +89,7 @@ def reconstruct_files(
     with _tile_workers(scheduler, workers) as pool:
         result, report = result_files.reconstruct(recorded, calibrated, truth, names, pool, progress)
     report = report.with_changes(**region_reports(result, request.regions))
+    clear_formats(output)
     result_files.write_estimate(output, result, {"title": recorded.scene.title})
     figures.write_estimate(output.with_suffix(".png"), result.estimate.reshape(result.shape))
     return report
@@ -107,6 +115,7 @@ def reconstruct_folder(
         if (folder / name).resolve() in sources:
             raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
     make_folder(folder)
+    _remove_other_scene(folder, recorded)
     if result_files.truth_beside(request.stack, recorded) is not None:
         for name in (TRUTH, WORLD_PICTURE):
             _copy(request.stack.parent / name, folder / name)
@@ -118,21 +127,23 @@ def reconstruct_folder(
         model_file.write(folder / MODEL, calibrated)
     else:
         _copy(request.model, folder / MODEL)
-    return finish_folder(folder, progress, request.regions, scheduler, workers)
+    with _tile_workers(scheduler, workers) as pool:
+        return finish_folder(folder, progress, request.regions, pool, request.force)
 
 
 def finish_folder(
     folder: Path,
     progress: Progress,
     regions: Sequence[Region] = (),
-    scheduler: str = "",
-    workers: int | None = None,
+    workers: Workers | None = None,
+    force: bool = False,
 ) -> tuple[RunReport, bool]:
     """Reconstruct the stack in a folder with the model in it, and write the page, unless they are up to date."""
     names = folder / STACK, folder / MODEL
-    recorded, calibrated = stack_file.read(names[0]), model_file.read(names[1])
-    with _tile_workers(scheduler, workers) as pool:
-        _, made = result_files.cached_results(folder, recorded, calibrated, names, progress, pool, tuple(regions))
+    files = stack_file.read(names[0]), model_file.read(names[1]), names
+    report, made = result_files.cached_results(folder, *files, progress, workers, tuple(regions), force)
+    if not report.study:
+        remove_study(folder)
     _write_page(folder)
     return run_json.read(folder), made
 
@@ -211,6 +222,15 @@ def _write_designed_model(stack: Path, model: Path, progress: Progress) -> str:
     ideal = CalibrationTable(method="ideal")
     calibrated_model(Setup.from_scene(with_tables(scene, calibration=ideal)), model, progress)
     return f"{stack}: there is no {MODEL} beside it, so H as designed is taken; `ommatid calibrate` yields the camera's"
+
+
+def _remove_other_scene(folder: Path, recorded: Stack) -> None:
+    """Remove the scene.toml that an earlier run wrote beside its stack, unless `recorded` is of the same scene."""
+    with suppress(OSError, ValueError, KeyError, InputError):
+        written = tomllib.loads((folder / "scene.toml").read_text("utf-8"))
+        earlier, _ = stack_file.read_header(folder / STACK)
+        if written == earlier.plain() != recorded.scene.plain():
+            (folder / "scene.toml").unlink()
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from ommatid.batch.batch import Member, prepare
+from ommatid.batch.batch import Member, check_files, prepare
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.output.run_json import RunReport, StudyCase, TimeReport
@@ -87,14 +87,10 @@ def _and_figures(
     return description
 
 
-@one_thread()
-def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
-    """Execute all stages of a scene except the page. What is left of the time is that of its files."""
-    from ommatid.analysis import study
-    from ommatid.analysis.calibration_goal import for_stack
+def check_run(setup: Setup, folder: Path) -> None:
+    """Raise InputError for what would stop a run of a scene after some work. Nothing is written."""
+    from ommatid.analysis.study import check_study
     from ommatid.reconstruct.method_choice import choose_method
-    from ommatid.reconstruct.output import run_json
-    from ommatid.reconstruct.output.result_files import cached_results
 
     scene, camera = setup.scene, setup.camera
     check_scene(setup)
@@ -102,7 +98,26 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
         with naming_source(scene.source):
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
     choose_method(scene, camera, setup.may_have_boxes)  # checks the memory before any work
-    study.check_study(scene, camera)
+    check_study(scene, camera)
+    check_files(setup, folder)
+
+
+def check_render(setup: Setup, folder: Path) -> None:
+    """Raise InputError for what would stop a rendering of a scene after some work. Nothing is written."""
+    check_scene(setup, calibrates=False)
+    check_files(setup, folder)
+
+
+@one_thread()
+def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
+    """Execute all stages of a scene except the page. What is left of the time is that of its files."""
+    from ommatid.analysis import study
+    from ommatid.analysis.calibration_goal import for_stack
+    from ommatid.reconstruct.output import run_json
+    from ommatid.reconstruct.output.result_files import cached_results
+
+    scene, camera = setup.scene, setup.camera
+    check_run(setup, folder)
     start_up, begun = None if observer.start_up is None else observer.start_up(), perf_counter()
     stack, rendered = _rendered(setup, folder, observer)
     with observer.progress("calibrate") as progress:
@@ -127,6 +142,8 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
         cases, made = _studied(setup, stack, folder, observer)
         complete = complete.with_changes(study=cases)
         complete = with_stage(complete, "study", perf_counter() - begun) if made else complete
+    else:
+        study.remove_study(folder)
     if complete.plain() != report.plain():
         run_json.write(folder, complete)
     return complete

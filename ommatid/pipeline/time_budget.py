@@ -64,6 +64,11 @@ def stages_within(
         raise InputError(f"--within: {error}") from error
 
 
+def check_within(setup: Setup, folder: Path) -> None:
+    """Raise InputError for what would stop a run within a time after some work. Nothing is written."""
+    stages.check_run(_with_samples(setup, FEW, FEW), folder)
+
+
 @dataclass(frozen=True)
 class TimeRequest:
     """Seconds for a number of scenes together."""

@@ -139,6 +139,7 @@ def cached(
     read: Callable[[Path], tuple[Content, str | None]],
     make: Callable[[], Made],
     write: Callable[[Path, Made], None],
+    force: bool = False,
 ) -> tuple[Content, bool]:
     """Return the result at `path` and False if it was made from what `wanted` names; else make it, and True.
 
@@ -147,10 +148,12 @@ def cached(
     read : yields the result and its fingerprint; may raise OSError, ValueError, KeyError, TypeError or AttributeError
         for a file that is missing, damaged or of another kind, which is then made again
     write : writes what `make` returns; the result is read back, so that it is the same in this run and the next
+    force : True to make it in any case
     """
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        content, made_from = read(path)
-        if made_from == wanted:
-            return content, False
+    if not force:
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            content, made_from = read(path)
+            if made_from == wanted:
+                return content, False
     write(path, make())
     return read(path)[0], True

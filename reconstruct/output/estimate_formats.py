@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -16,9 +17,10 @@ from ommatid.scenes.formats import exr
 
 Format = Literal["npy", "tiff16", "tiff32"]
 STEPS = 257  # of a 16-bit value per grey level: 65535 stands for 255, as in pictures that are read
+MARK = "ommatid estimate: "
 DESCRIPTIONS = {
-    "tiff16": f"ommatid estimate: value = pixel / {STEPS}, in grey levels from 0 to 255; others are clipped",
-    "tiff32": "ommatid estimate: pixels are values in grey levels, 0 to 255, not clipped",
+    "tiff16": f"{MARK}value = pixel / {STEPS}, in grey levels from 0 to 255; others are clipped",
+    "tiff32": f"{MARK}pixels are values in grey levels, 0 to 255, not clipped",
 }
 
 
@@ -44,9 +46,37 @@ def write_formats(estimate: Path, formats: Sequence[Format]) -> list[Path]:
     return [_write(estimate, image, name) for name in formats]
 
 
+def format_file(estimate: Path, name: Format) -> Path:
+    """Return the file of a format beside an estimate."""
+    return estimate.with_suffix(".npy" if name == "npy" else ".tiff")
+
+
+def clear_formats(estimate: Path) -> None:
+    """Remove the files that show the estimate in an OpenEXR file, before that is replaced. Other files stay."""
+    for name in ("npy", "tiff16"):
+        path = format_file(estimate, name)
+        if shows_estimate(path, estimate):
+            path.unlink()
+
+
+def shows_estimate(path: Path, estimate: Path) -> bool:
+    """Whether a .npy file holds the estimate of an OpenEXR file, or a .tiff file was written for one."""
+    if not path.is_file():
+        return False
+    from tifffile import TiffFile, TiffFileError
+
+    with suppress(OSError, ValueError, KeyError, IndexError, EOFError, InputError, TiffFileError):
+        if path.suffix == ".npy":
+            image = exr.read(estimate)[0].channels["estimate"]
+            return np.array_equal(np.load(path, allow_pickle=False), image, equal_nan=True)
+        with TiffFile(path) as file:
+            return str(file.pages.first.description).startswith(MARK)
+    return False
+
+
 def _write(estimate: Path, image: Float32Array, name: Format) -> Path:
+    path = format_file(estimate, name)
     if name == "npy":
-        path = estimate.with_suffix(".npy")
 
         def save(beside: Path) -> None:
             with beside.open("wb") as stream:
@@ -54,7 +84,6 @@ def _write(estimate: Path, image: Float32Array, name: Format) -> Path:
 
         write_whole(path, save)
         return path
-    path = estimate.with_suffix(".tiff")
     pixels = np.round(np.clip(image.astype(np.float64), 0, WHITE) * STEPS).astype(np.uint16)
     write_whole(path, lambda beside: _write_tiff(beside, image if name == "tiff32" else pixels, DESCRIPTIONS[name]))
     return path

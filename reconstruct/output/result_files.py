@@ -24,6 +24,7 @@ from ommatid.scenes.stack import Stack
 from ..methods.prepared import Prepared
 from ..restore import Reconstruction, check_match, restore
 from . import figures, run_json
+from .estimate_formats import format_file
 from .overview import ESTIMATE, OVERVIEW, write_overview
 from .report import report_of
 from .run_json import RegionReport, RunReport
@@ -103,7 +104,13 @@ def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, An
 
 
 def write_results(folder: Path, stack: Stack, restoration: Reconstruction, report: RunReport) -> None:
-    """Write the four files of a run. run.json comes last: where it is, all are there. Raises MachineError."""
+    """Write the four files of a run. run.json comes last: where it is, all are there. Raises MachineError.
+
+    The estimate of an earlier result in other formats is removed.
+    """
+    if any((folder / name).exists() for name in (ESTIMATE, run_json.RUN)):
+        for name in ("npy", "tiff16"):
+            format_file(folder / ESTIMATE, name).unlink(missing_ok=True)
     record = {"title": stack.scene.title, "fingerprint": report.fingerprint}
     write_estimate(folder / ESTIMATE, restoration, record)
     figures.write_estimate(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
@@ -146,8 +153,9 @@ def cached_results(
     progress: Progress = no_progress,
     workers: Workers | None = None,
     regions: tuple[Region, ...] = (),
+    force: bool = False,
 ) -> tuple[RunReport, bool]:
-    """Return run.json of a folder, and True if the reconstruction had to be made for it."""
+    """Return run.json of a folder, and True if the reconstruction was made for it: if needed, or by `force`."""
     current = fingerprint_of(stack, model)
     current = fingerprint([current, regions]) if regions else current
 
@@ -156,4 +164,4 @@ def cached_results(
         added = {"fingerprint": current, **origin(), **region_reports(restoration, regions)}
         return restoration, report.with_changes(**added)
 
-    return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made))
+    return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made), force)

@@ -108,6 +108,7 @@ def test_a_dry_run_writes_nothing_and_tells_what_is_up_to_date(kept: Path, ommat
     assert states("--set", "prior.mean=100") == {"render": current, "calibrate": current, "reconstruct": made}
     assert states("--set", "calibration.samples=17") == {"render": current, "calibrate": made, "reconstruct": made}
     assert states("--set", "noise.variance=2e-2") == {"render": made, "calibrate": made, "reconstruct": made}
+    assert states("--force") == {"render": made, "calibrate": made, "reconstruct": made}
     shutil.rmtree(kept.parent)
     assert ommatid(*RUN, "--dry-run").out.count(made) == 3
     assert not kept.parent.exists()

@@ -1,0 +1,151 @@
+"""The files of a result: none of an earlier result stays beside a new one, and no other file is touched."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from ommatid.analysis import study
+from ommatid.batch.remote import RunObserver, carry_out, packed, unpack
+from ommatid.scenes.formats import exr
+from ommatid.scenes.scene import read
+from ommatid.scenes.setup import Setup
+
+from ..conftest import TINY, Command
+
+RUN = ("run", "tiny.toml", "-o", "out", "-q")
+CHANGED = ("--set", "prior.mean=100")
+FORMATS = {"estimate.npy", "estimate.tiff"}
+STUDY = {study.NUMBERS, study.TABLE}
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def write_old(folder: Path) -> None:
+    for name in FORMATS | STUDY:
+        (folder / name).write_text("of an earlier run", encoding="utf-8")
+
+
+# --- a new result
+
+
+def test_a_new_result_removes_the_formats_and_the_study_of_the_old_one(kept: Path, ommatid: Command) -> None:
+    write_old(kept)
+    assert ommatid(*RUN).code == 0
+    assert names(kept) >= FORMATS, "the result is up to date, and so are they"
+    assert not names(kept) & STUDY
+    write_old(kept)
+    assert ommatid(*RUN, *CHANGED).code == 0
+    assert not names(kept) & (FORMATS | STUDY)
+
+
+def test_a_reconstruction_removes_what_an_earlier_run_left_in_its_folder(
+    kept: Path, finished: Path, ommatid: Command
+) -> None:
+    command = "reconstruct", finished / "stack.exr", finished / "model.npz", "-o", kept, "-q"
+    write_old(kept)
+    assert ommatid(*command, *CHANGED).code == 0
+    assert not names(kept) & (FORMATS | STUDY | {"scene.toml"})
+    (kept / "scene.toml").write_text(TINY, encoding="utf-8")
+    assert ommatid(*command).code == 0
+    assert (kept / "scene.toml").read_text(encoding="utf-8") == TINY, "a scene that no run wrote stays"
+
+
+def test_a_reconstruction_keeps_the_scene_of_its_stack(kept: Path, finished: Path, ommatid: Command) -> None:
+    before = (kept / "scene.toml").read_bytes()
+    assert ommatid("reconstruct", finished / "stack.exr", finished / "model.npz", "-o", kept, "-q").code == 0
+    assert (kept / "scene.toml").read_bytes() == before
+
+
+def test_a_new_estimate_alone_removes_its_old_formats(finished: Path, here: Path, ommatid: Command) -> None:
+    command = "reconstruct", finished / "stack.exr", finished / "model.npz", "-o", "a.exr", "-q"
+    assert ommatid(*command, "--format", "npy,tiff16").code == 0
+    assert ommatid(*command, *CHANGED).code == 0
+    assert names(here) == {"tiny.toml", "a.exr", "a.png"}
+    np.save("a.npy", np.zeros((2, 2)))
+    tifffile.imwrite("a.tiff", np.zeros((2, 2)))
+    before = content(here)
+    assert ommatid(*command, *CHANGED).code == 0
+    others = [str(here / name) for name in ("a.npy", "a.tiff")]
+    assert [content(here)[name] for name in others] == [before[name] for name in others], "they show something else"
+
+
+def test_one_of_many_frames_removes_its_old_formats(finished: Path, here: Path, ommatid: Command) -> None:
+    stacks = [shutil.copy(finished / "stack.exr", here / f"{name}.exr") for name in "ab"]
+    command = "reconstruct", *stacks, finished / "model.npz", "-o", "film", "-q"
+    assert ommatid(*command, "--format", "npy,tiff16").code == 0
+    assert ommatid(*command, *CHANGED).code == 0
+    assert names(here / "film") == {"a.exr", "a.png", "b.exr", "b.png"}
+
+
+def _removes_the_stack(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, str]:
+    del setup, observer
+    (folder / "stack.exr").unlink()
+    return {}
+
+
+def test_what_a_worker_removes_is_removed_here(kept: Path, here: Path) -> None:
+    before = names(kept)
+    unpack(carry_out(_removes_the_stack, packed(Setup.from_scene(read(here / "tiny.toml")), kept)), kept)
+    assert names(kept) == before - {"stack.exr"}
+
+
+# --- a command that is refused
+
+
+def sets(*changes: str) -> tuple[str, ...]:
+    return tuple(word for change in changes for word in ("--set", change))
+
+
+@pytest.mark.parametrize("command", [("run",), ("run", "--within", "1 s"), ("render",)])
+@pytest.mark.parametrize("name", ["truth.exr", "estimate.npy", "estimate.png"])
+def test_a_picture_in_the_folder_of_the_results_is_refused(
+    command: tuple[str, ...], name: str, kept: Path, ommatid: Command
+) -> None:
+    np.save(kept / "estimate.npy", exr.read(kept / "estimate.exr")[0].channels["estimate"])
+    before = content(kept)
+    for force in ((), ("--force",)):
+        ended = ommatid(
+            *command, "tiny.toml", "-o", "out", *sets(f"target.image={kept / name}", "target.origin="), *force
+        )
+        assert ended.code == 2
+        assert f"{name}: would replace" in ended.err
+        assert content(kept) == before
+
+
+@pytest.mark.parametrize("change", ['study.models=["transport"]', 'study.models=["fitted"]', "estimator.memory=1 kB"])
+def test_a_run_that_is_refused_removes_nothing(change: str, kept: Path, ommatid: Command) -> None:
+    before = content(kept)
+    for more in ((), ("--within", "1 s")):
+        assert ommatid("run", "tiny.toml", "-o", "out", "--force", *sets(change), *more).code == 2
+        assert content(kept) == before
+
+
+def test_a_scene_among_its_results_keeps_them(kept: Path, ommatid: Command) -> None:
+    folder = kept.rename(kept.with_name("scene"))
+    before = content(folder)
+    ended = ommatid("run", folder / "scene.toml", "-o", "out", "--force")
+    assert ended.code == 2
+    assert "scene.toml: would replace" in ended.err
+    assert content(folder) == before
+
+
+def test_a_reconstruction_that_is_refused_removes_nothing(kept: Path, finished: Path, ommatid: Command) -> None:
+    before = content(kept)
+    ended = ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", kept, "--force")
+    assert ended.code == 2
+    assert "would replace" in ended.err
+    assert content(kept) == before
+    again = "reconstruct", finished / "stack.exr", finished / "model.npz", "-o", kept
+    assert "reconstruct: up to date" in ommatid(*again).err
+    assert "reconstruct: done" in ommatid(*again, "--force").err

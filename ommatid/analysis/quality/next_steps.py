@@ -57,8 +57,8 @@ def next_steps(report: RunReport, other: AnotherType | None = None) -> list[Next
 
 
 def _with_other_type(report: RunReport, other: AnotherType) -> float:
-    """Return the error with another type, which changes nothing of detail finer than f and of misalignment."""
-    fixed = sum(report.error.budget.get(name, 0.0) for name in ("detail", "misalignment"))
+    """Return the error with another type, which changes nothing of detail finer than f."""
+    fixed = report.error.budget.get("detail", 0.0)
     return fixed + other.ratio * (report.error.predicted_mse - fixed)
 
 

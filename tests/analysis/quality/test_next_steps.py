@@ -71,7 +71,7 @@ def test_one_more_bit_brings_at_least_what_is_said() -> None:
 def exposed(gain: float, bits: int) -> RunReport:
     """The report of a run with a [sensor] of 5 electrons per unit of f."""
     sensor = {"illuminance": "500 lux", "exposure": "1 ms", "full_well": 2000, "read_noise": 30}
-    plain = scene((19, 19), LENSES).plain() | {"sensor": sensor | {"gain": gain, "bits": bits}}
+    plain: dict[str, Any] = scene((19, 19), LENSES).plain() | {"sensor": sensor | {"gain": gain, "bits": bits}}
     plain["camera"]["wavelength"] = "none"
     for lens in plain["camera"]["lens"]:
         lens |= {"aperture": "0.1 mm", "focus": "1 m"}

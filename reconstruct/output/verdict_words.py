@@ -8,10 +8,13 @@ from .run_json import ErrorReport, RunReport, TimeReport
 
 TIMES = 4  # as many samples, in the sentence on more samples
 LEAST_GAIN = 0.05  # relative fall of the error from which a change is worth a sentence
+HALF_STEP = "half the quantisation step"
+# The step of a [sensor] is 1 DN, that is 1 / gain electrons: bits alone raise the range, and the gain alone halves it.
+HALF_STEP_HOW = "one more of `noise.bits`, or `sensor.gain` doubled with one more of `sensor.bits`"
 # Causes with a simple law: the change, the factor on their part of the error, and its name
 CHANGES = {
     "noise": ("half the noise variance", 0.5),
-    "quantisation": ("one more bit", 0.25),
+    "quantisation": (f"{HALF_STEP} ({HALF_STEP_HOW})", 0.25),
     "misalignment": ("a camera without misalignment", 0.0),
 }
 SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}

@@ -401,6 +401,25 @@ def test_intervals_allow_for_correlated_errors(run: data.Run) -> None:
     assert independent / total < 0.9
 
 
+@pytest.mark.parametrize("misalignment", ["robust", "fit"])
+def test_what_a_trusting_estimator_alone_has_is_left_out_of_others(misalignment: str, run: data.Run) -> None:
+    """Kernels, correlations and other types are computed with H as it is and independent noise."""
+    plain: dict[str, Any] = run.stack.scene.plain() | {"estimator": {"misalignment": misalignment}}
+    plain["camera"]["tolerance"] = {"position": "400 nm"}
+    stack = replace(run.stack, scene=parse(plain, run.stack.scene.source))
+    text = html_of(replace(run, stack=stack), verdict=VerdictReport(trusted=True, reasons=()))
+    plots = ("Modulation transfer function", "Response to an edge", '"col">99 % interval', "nother lens type, of")
+    reader = parsed(text)
+    assert (reader.open, reader.mismatched) == ([], [])
+    assert text.count(f"not computed for <code>estimator.misalignment = &#39;{misalignment}&#39;</code>") == 1
+    assert [words for words in plots if words in text] == []
+    assert "Radial spectrum of the error" in text
+    assert "groups without intervals" in text
+    trusting = html_of(run)
+    assert all(words in trusting for words in plots[:3])
+    assert "not computed for <code>estimator" not in trusting
+
+
 def test_pixels_of_equal_deviation_are_one_group(run: data.Run) -> None:
     deviation = np.full((40, 40), 2**0.5)
     [group] = error_groups.groups(with_errors(1, deviation, deviation, run))

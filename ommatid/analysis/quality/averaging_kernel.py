@@ -88,10 +88,12 @@ class ErrorWindow:
 
 @one_thread()
 def error_window(stack: Stack, model: Model, estimate: FloatArray, report: RunReport) -> ErrorWindow | None:
-    """Return the window of a run with its known noise, None where no measurement lies inside it.
+    """Return the window of a run with its known noise, None where no measurement lies inside it or `why_none` says so.
 
     model : of f;  estimate : (rows, columns), at which the noise by the uncertainty of H is taken
     """
+    if why_none(stack.scene):
+        return None
     rows, columns = (_window(size, *stack.camera.shape) for size in stack.camera.shape)
     inside = model.measurements_inside(rows, columns)
     noise = _noise(stack, model, estimate, report)[inside]
@@ -112,6 +114,20 @@ def error_window(stack: Stack, model: Model, estimate: FloatArray, report: RunRe
     covariance = posterior_covariance(root, information)
     mean = float(1 / np.mean(1 / variances))
     return ErrorWindow(rows, columns, stack.camera.shape, covariance, information, root, mean)
+
+
+def why_none(scene: Scene) -> str:
+    """Return what is left out without the kernels of an estimator, as a sentence, "" where they are known.
+
+    Robust and fitted estimators have another H, and noise or errors that are correlated within a sub-imager.
+    """
+    misalignment = scene.estimator.misalignment
+    if misalignment == "trust":
+        return ""
+    return (
+        "Transfer function, response to an edge, intervals of the measured errors and the effect of another lens type"
+        f" are not computed for `estimator.misalignment = '{misalignment}'`, whose errors are correlated otherwise."
+    )
 
 
 def posterior_covariance(root: FloatArray, information: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.verdict_words import LEAST_GAIN, TIMES, is_trusted
+from ommatid.reconstruct.output.verdict_words import HALF_STEP, HALF_STEP_HOW, LEAST_GAIN, TIMES, is_trusted
 
 from .another_type import AnotherType
 
@@ -33,7 +33,7 @@ class NextStep:
 # Cause, change, how to make it, and the factor on the cause's part of the error
 CHANGES = (
     ("noise", "half the noise variance", "twice the light, or the mean of two frames", 0.5),
-    ("quantisation", "one more bit", "`noise.bits` or `sensor.bits`", 0.25),
+    ("quantisation", HALF_STEP, HALF_STEP_HOW, 0.25),
     ("misalignment", "positions of the lenses calibrated", "`ommatid calibrate`, then `estimator.misalignment`", 0.0),
 )
 SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}
@@ -57,8 +57,8 @@ def next_steps(report: RunReport, other: AnotherType | None = None) -> list[Next
 
 
 def _with_other_type(report: RunReport, other: AnotherType) -> float:
-    """Return the error with another type, which changes nothing of detail finer than f and of misalignment."""
-    fixed = sum(report.error.budget.get(name, 0.0) for name in ("detail", "misalignment"))
+    """Return the error with another type, which changes nothing of detail finer than f."""
+    fixed = report.error.budget.get("detail", 0.0)
     return fixed + other.ratio * (report.error.predicted_mse - fixed)
 
 

@@ -83,16 +83,17 @@ def transfer(kernels: FloatArray, centres: FloatArray) -> Transfer:
 def edge_response(kernels: FloatArray, centres: FloatArray) -> EdgeResponse:
     """Return the mean response to an edge between two columns and between two rows, at positions beside the edge.
 
-    A pixel of f has one value, so that an edge lies between pixels: kernels are summed beyond half-integer distances.
+    A pixel of f has one value: that of an edge through it is the share of its width beyond the edge.
     """
-    distances = np.arange(-HALF_WIDTH, HALF_WIDTH, dtype=np.float64) + 0.5
+    distances = np.arange(1 - 2 * HALF_WIDTH, 2 * HALF_WIDTH, dtype=np.float64) / 2
     responses: list[FloatArray] = []
     for axis in (1, 0):
         lines = kernels.sum(axis=2 - axis)
         places = np.arange(lines.shape[1], dtype=np.float64)
         for line, centre in zip(lines, centres[:, axis], strict=True):
-            # At distance d the edge lies at centre - d: pixels beyond it are 1.
-            responses.append(np.array([line[places > centre - distance].sum() for distance in distances]))
+            # At distance d the edge lies at centre - d: what is beyond it is 1.
+            shares = np.clip(places - (centre - distances[:, None]) + 0.5, 0, 1)
+            responses.append(shares @ line)
     return EdgeResponse(distances, np.mean(responses, axis=0))
 
 

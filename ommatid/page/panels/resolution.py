@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ommatid.analysis.quality import resolution, spectra
-from ommatid.analysis.quality.averaging_kernel import ErrorWindow
+from ommatid.analysis.quality.averaging_kernel import ErrorWindow, why_none
 from ommatid.analysis.quality.resolution import EdgeResponse, Transfer
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.model import Model
@@ -22,7 +22,7 @@ FREQUENCY = ChartAxis("cycles per pixel", low=0.0, high=0.5)
 
 
 def content(run: Run, model: Model, window: ErrorWindow | None, single: ShownSubImage) -> dict[str, Any]:
-    """Return the charts with their titles and sentences, those that the run has.
+    """Return the charts with their titles and sentences, those that the run has, and what is left out.
 
     model : of f;  window : of the estimate's errors;  single : the sub-image that is shown
     """
@@ -35,7 +35,7 @@ def content(run: Run, model: Model, window: ErrorWindow | None, single: ShownSub
         charts.append(("Response to an edge", _edge(edge, sub), edge_words(edge, sub)))
     if run.truth is not None:
         charts.append(("Radial spectrum of the error", *_spectrum(run, single)))
-    return {"resolution": charts}
+    return {"resolution": charts, "left_out": why_none(run.stack.scene)}
 
 
 def _transfer(estimate: Transfer, sub: tuple[Transfer, EdgeResponse] | None) -> Markup:

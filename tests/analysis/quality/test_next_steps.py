@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from ommatid.analysis.quality.averaging_kernel import error_window
 from ommatid.analysis.quality.next_steps import NextStep, next_steps
 from ommatid.reconstruct.output.result_files import reconstruct
 from ommatid.reconstruct.output.run_json import MoreTime, RunReport, TimeReport, VerdictReport
+from ommatid.reconstruct.output.verdict_words import limit
+from ommatid.scenes.recording import expected_recording
 from ommatid.scenes.scene import Scene, parse
 
 from ...examples import THREE, Lenses, scene
@@ -59,10 +62,39 @@ def test_half_the_noise_brings_at_least_what_is_said_and_hardly_more() -> None:
 def test_one_more_bit_brings_at_least_what_is_said() -> None:
     report = run_of(variance=1e-6, bits=8)[1]
     again = run_of(variance=1e-6, bits=9)[1].error
-    said = step_of(report, "one more bit")
+    said = step_of(report, "half the quantisation step")
     assert again.predicted_mse <= said.mse
     slack = 3 * again.budget["quantisation"] - 0.75 * report.error.budget["quantisation"]  # tangents, as above
     assert said.mse - again.predicted_mse <= slack + 1e-12
+
+
+def exposed(gain: float, bits: int) -> RunReport:
+    """The report of a run with a [sensor] of 5 electrons per unit of f."""
+    sensor = {"illuminance": "500 lux", "exposure": "1 ms", "full_well": 2000, "read_noise": 30}
+    plain: dict[str, Any] = scene((19, 19), LENSES).plain() | {"sensor": sensor | {"gain": gain, "bits": bits}}
+    plain["camera"]["wavelength"] = "none"
+    for lens in plain["camera"]["lens"]:
+        lens |= {"aperture": "0.1 mm", "focus": "1 m"}
+    described = parse(plain, Path("test.toml"))
+    stack, model = record(described, IMAGE)
+    assert described.sensor is not None
+    response = np.full(stack.values.size, 5.0)
+    recording = expected_recording(described.sensor, stack.camera, response, model.forward(IMAGE))
+    stack = replace(stack, values=recording.values, recording=recording)
+    report = reconstruct(stack, model, IMAGE.ravel(), (Path("stack"), Path("model")))[1]
+    return report.with_changes(verdict=VerdictReport(trusted=True, reasons=()))
+
+
+def test_half_the_step_of_a_sensor_is_twice_its_gain_with_one_more_bit() -> None:
+    report, again = exposed(0.01, 5), exposed(0.02, 6).error
+    said = step_of(report, "half the quantisation step")
+    assert said.how == "one more of `noise.bits`, or `sensor.gain` doubled with one more of `sensor.bits`"
+    assert again.predicted_mse <= said.mse
+    slack = 3 * again.budget["quantisation"] - 0.75 * report.error.budget["quantisation"]  # tangents, as above
+    assert said.mse - again.predicted_mse <= slack
+    assert exposed(0.01, 6).error.budget == pytest.approx(report.error.budget), "bits alone change nothing"
+    changed = report.with_changes(error=report.error.model_copy(update={"budget": {"quantisation": 1.0}}))
+    assert f"; {said.change} ({said.how}): RMS" in limit(changed)
 
 
 def test_another_lens_type_brings_what_the_prediction_says() -> None:

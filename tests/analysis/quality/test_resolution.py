@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from ommatid.analysis.quality.averaging_kernel import ErrorWindow, error_window
-from ommatid.analysis.quality.resolution import of_sub_image, of_window
+from ommatid.analysis.quality.resolution import edge_response, of_sub_image, of_window
 from ommatid.analysis.quality.spectra import crossing, radial_spectrum
 from ommatid.reconstruct.output.result_files import reconstruct
 from ommatid.reconstruct.prior import exponential
@@ -72,6 +72,17 @@ def test_a_sensor_pixel_has_the_response_of_its_box() -> None:
     np.testing.assert_allclose(shown[0].horizontal[1:], box, atol=1e-12)
     assert shown[1].width == pytest.approx(0.8 * 4), "from 10 % to 90 % of a ramp of four pixels"
     assert of_sub_image(model, window, "nothing") is None
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 5])
+def test_an_edge_in_a_box_is_a_ramp_of_its_size(size: int) -> None:
+    """Odd and even boxes, whose middle is that of a pixel or between two, as the mean of the pixels under them."""
+    box = np.zeros((1, 16, 16))
+    box[0, 5 : 5 + size, 5 : 5 + size] = 1 / size**2
+    middle = 5 + (size - 1) / 2
+    edge = edge_response(box, np.array([[middle, middle]]))
+    np.testing.assert_allclose(edge.values, np.clip(edge.distances / size + 0.5, 0, 1), atol=1e-12)
+    assert edge.width == pytest.approx(0.8 * size)
 
 
 def test_kernels_and_covariance_are_those_of_the_dense_equations() -> None:

@@ -50,9 +50,11 @@ def _one_or_two(value: object) -> object:
 
 def _size(value: object) -> object:
     """Replace the name of a format by its height and width. Raises ValueError for an unknown one."""
-    if not isinstance(value, str):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)  # --set reads the format "1" as 1
+    text = f"{value:g}" if is_number else value
+    if not isinstance(text, str):
         return pair(value)
-    name = value.removesuffix('"').removesuffix(" inch").casefold()
+    name = text.removesuffix('"').removesuffix(" inch").casefold()
     named = {known.casefold(): size for known, size in FORMATS.items()}
     if name in named:
         return named[name]

@@ -61,7 +61,11 @@ def _inside(table: Any, name: str, override: str) -> Any:
 
 
 def _from_here(key: list[str], value: Any) -> Any:
-    """Return the name of a file relative to the current folder as an absolute one, other values as they are."""
+    """Return names of files relative to the current folder as absolute ones, also those inside tables."""
+    if isinstance(value, dict):
+        return {name: _from_here([*key, name], inner) for name, inner in value.items()}  # type: ignore[union-attr]
+    if isinstance(value, list):  # names of files are in lists of tables only; a curve's list may hold "450 nm"
+        return [_from_here(key, item) if isinstance(item, dict) else item for item in value]  # type: ignore[union-attr]
     if not isinstance(value, str) or not value.strip() or (key[0], key[-1]) not in FILES:
         return value
     is_name = value.startswith("photo:") or (key[-1] == "spectrum" and (value.endswith("nm") or not Path(value).suffix))

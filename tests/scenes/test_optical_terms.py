@@ -89,7 +89,8 @@ def test_a_rotated_patch_takes_the_upright_box_around_it() -> None:
         ('"1/2.4"', ("1/2.3", "got '1/2.4'", 'the nearest format is "1/2.5"')),
         ('"APSC"', ('the nearest format is "APS-C"',)),
         ('["4.55 mm"]', ("camera.sensor.size",)),
-        ("5", ("camera.sensor.size", "got 5")),
+        ("5", ("camera.sensor.size", "one of the formats", "got 5;")),
+        ("true", ("camera.sensor.size", "got True")),
     ],
 )
 def test_sensors_that_do_not_hold_the_arrays_are_refused(size: str, words: tuple[str, ...]) -> None:
@@ -97,6 +98,12 @@ def test_sensors_that_do_not_hold_the_arrays_are_refused(size: str, words: tuple
     with pytest.raises(InputError) as caught:
         terms_of("tile19", f"camera.sensor.size={size}")
     assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+@pytest.mark.parametrize("size", ["1", "1.0", '"1"', '"1 inch"'])
+def test_the_format_of_one_inch_needs_no_quotation_marks(size: str) -> None:
+    """TOML reads 1 as a number, but 1/2.3 as text."""
+    assert terms_of("tile19", f"camera.sensor.size={size}").sensor_size == (8.8, 13.2)
 
 
 def test_a_sensor_as_large_as_the_arrays_holds_them() -> None:

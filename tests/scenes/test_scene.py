@@ -5,6 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 from math import radians
 from pathlib import Path
+from typing import Any
 
 import pint
 import pytest
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import Scene, read, resolved, with_changes, write
+from ommatid.scenes.tables import toml
+from ommatid.scenes.tables.overrides import apply_overrides
 from ommatid.scenes.tables.units import FACTORS
 
 from ..examples import GALLERY, scene
@@ -81,6 +84,34 @@ def test_overrides_set_create_and_remove() -> None:
     assert removed.noise is not None
     assert removed.noise.bits is None
     assert removed.estimator.noise_variance is None
+
+
+@pytest.mark.parametrize(
+    ("override", "keys", "expected"),
+    [
+        ('target={image="pic.npy", shape=[2, 2]}', ("target", "image"), "pic.npy"),
+        ('target={image="photo:camera"}', ("target", "image"), None),
+        ('world={file="room.xml"}', ("world", "file"), "room.xml"),
+        ('light={spectrum="lamp.csv"}', ("light", "spectrum"), "lamp.csv"),
+        ('light={spectrum="D65"}', ("light", "spectrum"), None),
+        ('light={spectrum=[["450 nm", 1]]}', ("light", "spectrum"), None),
+        ('sensor={quantum_efficiency="qe.csv"}', ("sensor", "quantum_efficiency"), "qe.csv"),
+        ('camera={glass_catalogue="a.agf"}', ("camera", "glass_catalogue"), "a.agf"),
+        ('camera={lens=[{name="I", surfaces="a.zmx"}]}', ("camera", "lens", 0, "surfaces"), "a.zmx"),
+        ('camera.lens=[{name="I", surfaces="a.zmx"}]', ("camera", "lens", 0, "surfaces"), "a.zmx"),
+        ('camera={lens=[{surfaces=[{glass="N-BK7"}]}]}', ("camera", "lens", 0, "surfaces", 0, "glass"), None),
+    ],
+)
+def test_files_named_inside_tables_are_relative_to_the_current_folder(
+    override: str, keys: tuple[str | int, ...], expected: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of dotted keys are; other values, and names that are no files, stay as they are."""
+    monkeypatch.chdir(tmp_path)
+    found: Any = apply_overrides({}, [override])
+    plain: Any = toml.loads(override)
+    for key in keys:
+        found, plain = found[key], plain[key]
+    assert found == (plain if expected is None else str(tmp_path / expected))
 
 
 def test_lens_types_are_kept_in_the_order_named_and_doubled() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from ommatid.reconstruct.methods.prepared import Prepared
 from ommatid.reconstruct.output import figures, result_files
-from ommatid.reconstruct.output.estimate_formats import Format, clear_formats, write_formats
+from ommatid.reconstruct.output.estimate_formats import Format, check_formats, clear_formats, write_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
@@ -90,12 +90,15 @@ def reconstruct_frames(
     """Yield the frames as they end; estimates and pictures are in `folder` under the names of the stacks.
 
     workers : processes that share the frames, None for this one
-    Raises InputError, before anything is written, if two stacks have one name, or if one is not of the model's camera.
+    Raises InputError, before anything is written, if two stacks have one name, if one is not of the model's camera, or
+    if another file is in the way.
     """
     outputs = _outputs(stacks, folder, options.model)
     model = options.read_model()
     for stack in stacks:
         _check(stack, model, options)
+    for output in outputs:
+        check_formats(output, options.formats)
     make_folder(folder)
     clear_abandoned(folder)
     common = [file_digest(options.model), options.changes, options.lenses, options.regions]

@@ -117,7 +117,7 @@ def _reconstruct_one(
         if whole:
             report, made = reconstruction.reconstruct_folder(request, file, progress, *pool)
         else:
-            report, made = reconstruction.reconstruct_files(request, file, progress, *pool), True
+            report, made = reconstruction.reconstruct_files(request, file, progress, *pool, formats), True
     write_formats(file / "estimate.exr" if whole else file, formats)
     if detail != "verdict":
         output.say_done("reconstruct", made, file)

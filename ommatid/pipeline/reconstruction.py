@@ -15,7 +15,7 @@ from ommatid.analysis.study import remove_study
 from ommatid.page.batch_index import INDEX, cached_index
 from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import figures, result_files, run_json
-from ommatid.reconstruct.output.estimate_formats import clear_formats
+from ommatid.reconstruct.output.estimate_formats import Format, check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
@@ -28,7 +28,7 @@ from ommatid.runtime.workers import Workers
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, CalibrationTable, with_tables
+from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, CalibrationTable, Scene, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 
@@ -76,14 +76,20 @@ def reconstruct_files(
     progress: Progress,
     scheduler: str = "",
     workers: int | None = None,
+    formats: Sequence[Format] = (),
 ) -> RunReport:
     """Reconstruct a stack with a model, and write the estimate (OpenEXR) and its picture.
 
+    formats : that the caller will write beside it
     Returns the content of run.json, with the means of the regions.
-    Raises InputError for wrong files and options, MachineError for a full disk.
+    Raises InputError for wrong files and options, and for other files in the way, MachineError for a full disk.
     """
     check_options(scheduler, workers)
-    check_output(output, request.stack, request.model, request.stack.parent / TRUTH)
+    check_output(
+        output, request.stack, request.model, *(request.stack.parent / name for name in (TRUTH, WORLD_PICTURE))
+    )
+    check_picture(output)
+    check_formats(output, formats)
     recorded, calibrated = request.read()
     truth, names = result_files.truth_beside(request.stack, recorded), (request.stack, request.model)
     with _tile_workers(scheduler, workers) as pool:
@@ -144,8 +150,31 @@ def finish_folder(
     report, made = result_files.cached_results(folder, *files, progress, workers, tuple(regions), force)
     if not report.study:
         remove_study(folder)
+    _note_design(folder, report, files[0].scene)
     _write_page(folder)
     return run_json.read(folder), made
+
+
+def _design_instead(report: RunReport, scene: Scene) -> str:
+    """Return a note if H is the one as designed, but the stack's scene asks for another; else ""."""
+    asked = scene.calibration.method
+    if report.stages["calibrate"].method != "ideal" or asked == "ideal":
+        return ""
+    return f"H as designed was taken, although the scene asks for calibration.method '{asked}'"
+
+
+def _note_design(folder: Path, report: RunReport, scene: Scene) -> None:
+    """Add the note to the verdict in run.json, once."""
+    note, verdict = _design_instead(report, scene), report.verdict
+    if note and verdict is not None and note not in verdict.notes:
+        noted = verdict.model_copy(update={"notes": (*verdict.notes, note)})
+        run_json.write(folder, report.with_changes(verdict=noted))
+
+
+def _design_warnings(folder: Path) -> tuple[str, ...]:
+    """Return the note on a finished run as a warning, nothing without one."""
+    note = _design_instead(run_json.read(folder), stack_file.read_header(folder / STACK)[0])
+    return (f"{folder / STACK}: {note}; `ommatid calibrate` yields the camera's",) if note else ()
 
 
 def _write_page(folder: Path) -> None:
@@ -181,7 +210,7 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
     if (path / STACK).is_file():
         if (path / RUN).is_file():
             _write_page(path)
-            return ReportOutcome((path,), None, ())
+            return ReportOutcome((path,), None, _design_warnings(path))
         return _report_stack(path / STACK, path, progress)
     folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
     if not folders and any((path / name).is_file() for name in (MODEL, result_files.ESTIMATE)):
@@ -195,7 +224,8 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
         _write_page(folder)
         progress((number + 1) / len(folders))
     cached_index(path, dict.fromkeys(folders, ""))
-    return ReportOutcome(folders, path / INDEX, ())
+    warnings = tuple(warning for folder in folders for warning in _design_warnings(folder))
+    return ReportOutcome(folders, path / INDEX, warnings)
 
 
 def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcome:
@@ -204,14 +234,14 @@ def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcom
     if folder.resolve() == stack.parent.resolve():
         warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
         finish_folder(folder, progress)
-        return ReportOutcome((folder,), None, warnings)
+        return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
     with TemporaryDirectory(prefix="ommatid-") as scratch:
         warnings = ()
         if not model.is_file():
             model = Path(scratch) / MODEL
             warnings = (_write_designed_model(stack, model, progress),)
         reconstruct_folder(ReconstructionRequest(stack, model), folder, progress)
-    return ReportOutcome((folder,), None, warnings)
+    return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
 
 
 def _write_designed_model(stack: Path, model: Path, progress: Progress) -> str:

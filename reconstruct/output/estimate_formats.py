@@ -59,6 +59,31 @@ def clear_formats(estimate: Path) -> None:
             path.unlink()
 
 
+def check_formats(estimate: Path, formats: Sequence[Format]) -> None:
+    """Raise InputError if a file that holds something else would be replaced by an estimate in other formats."""
+    for name in formats:
+        path = format_file(estimate, name)
+        if path.exists() and not shows_estimate(path, estimate):
+            raise _in_the_way(path)
+
+
+def check_picture(estimate: Path) -> None:
+    """Raise InputError if the PNG file beside an estimate would be replaced, but there is no estimate that it shows."""
+    picture = estimate.with_suffix(".png")
+    if picture.exists() and not _is_estimate(estimate):
+        raise _in_the_way(picture)
+
+
+def _in_the_way(path: Path) -> InputError:
+    return InputError(f"{path}: would be replaced, but holds something else; remove it, or choose another name with -o")
+
+
+def _is_estimate(path: Path) -> bool:
+    with suppress(OSError, ValueError, KeyError, InputError):
+        return {"estimate", "variance"} <= exr.read(path)[0].channels.keys()
+    return False
+
+
 def shows_estimate(path: Path, estimate: Path) -> bool:
     """Whether a .npy file holds the estimate of an OpenEXR file, or a .tiff file was written for one."""
     if not path.is_file():

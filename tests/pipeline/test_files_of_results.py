@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -149,3 +150,56 @@ def test_a_reconstruction_that_is_refused_removes_nothing(kept: Path, finished: 
     again = "reconstruct", finished / "stack.exr", finished / "model.npz", "-o", kept
     assert "reconstruct: up to date" in ommatid(*again).err
     assert "reconstruct: done" in ommatid(*again, "--force").err
+
+
+# --- files that hold something else
+
+
+def test_an_estimate_replaces_no_file_that_shows_something_else(finished: Path, here: Path, ommatid: Command) -> None:
+    command = "reconstruct", finished / "stack.exr", finished / "model.npz", "-o", "mosaic.exr", "-q"
+    (here / "mosaic.png").write_bytes(b"mine")
+    before = content(here)
+    ended = ommatid(*command)
+    assert (ended.code, content(here)) == (2, before)
+    assert "mosaic.png: would be replaced" in ended.err
+    (here / "mosaic.png").unlink()
+    assert ommatid(*command, "--format", "npy,tiff16").code == 0
+    assert ommatid(*command, "--format", "npy,tiff32").code == 0, "its own files are replaced"
+    for name, write in (("mosaic.tiff", tifffile.imwrite), ("mosaic.npy", np.save)):
+        write(name, np.zeros((12, 12), np.float32))
+        before = content(here)
+        ended = ommatid(*command, *CHANGED, "--format", "npy,tiff16")
+        assert (ended.code, content(here)) == (2, before)
+        assert f"{name}: would be replaced" in ended.err
+        (here / name).unlink()
+
+
+def test_frames_replace_no_file_that_shows_something_else(finished: Path, here: Path, ommatid: Command) -> None:
+    stacks = [shutil.copy(finished / "stack.exr", here / f"{name}.exr") for name in "ab"]
+    (here / "film").mkdir()
+    np.save("film/b.npy", np.zeros((12, 12), np.float32))
+    ended = ommatid("reconstruct", *stacks, finished / "model.npz", "-o", "film", "--format", "npy")
+    assert (ended.code, names(here / "film")) == (2, {"b.npy"})
+    assert "b.npy: would be replaced" in ended.err
+
+
+# --- H as designed instead of the camera's
+
+
+def test_every_report_says_that_h_as_designed_was_taken(
+    kept: Path, finished: Path, here: Path, ommatid: Command
+) -> None:
+    (here / "rp").mkdir()
+    shutil.copy(finished / "stack.exr", here / "rp")
+    asked = read(here / "tiny.toml").calibration.method
+    assert ommatid("report", "rp/stack.exr").err.startswith("warning: rp/stack.exr: there is no model.npz beside it")
+    note = f"H as designed was taken, although the scene asks for calibration.method '{asked}'"
+    for path in ("rp/stack.exr", "rp", "."):
+        assert f"warning: rp/stack.exr: {note}" in ommatid("report", path).err
+    shutil.copy(here / "rp" / "stack.exr", "alone.exr")
+    shutil.copy(here / "rp" / "model.npz", here)
+    assert f"warning: alone/stack.exr: {note}" in ommatid("report", "alone.exr").err
+    for folder in ("rp", "alone"):
+        assert json.loads((here / folder / "run.json").read_text(encoding="utf-8"))["verdict"]["notes"][-1] == note
+        assert "although the scene asks for" in (here / folder / "report.html").read_text(encoding="utf-8")
+    assert ommatid("report", kept).err == ""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from math import sqrt
 
-from .run_json import ErrorReport, RunReport, TimeReport
+from ..verdict.verdict import SPURIOUS_SHARE
+from .run_json import RunReport
 
 TIMES = 4  # as many samples, in the sentence on more samples
 LEAST_GAIN = 0.05  # relative fall of the error from which a change is worth a sentence
@@ -23,6 +24,15 @@ SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples
 def is_trusted(report: RunReport) -> bool:
     """Return True unless the verdict says that the error bars are not to be trusted."""
     return report.verdict is None or report.verdict.trusted
+
+
+def follows_samples(report: RunReport) -> bool:
+    """Return True if the parts of the error by the samples fall as their variances with more samples.
+
+    They do not where the noise of H may have produced a notable share of the information: as it falls, so does what the
+    measurements seem to tell, and the other parts grow.
+    """
+    return report.model.spurious_information <= SPURIOUS_SHARE
 
 
 def heading(report: RunReport) -> str:
@@ -74,7 +84,7 @@ def _largest_part(report: RunReport) -> tuple[str, float, str]:
     """Return the name of the largest part of the predicted error, its share in per cent, and a change in words."""
     error = report.error
     name, part = max(error.budget.items(), key=lambda item: item[1])
-    return cause(name), 100 * part / error.predicted_mse, _change(name, part, error, report.spent)
+    return cause(name), 100 * part / error.predicted_mse, _change(name, part, report)
 
 
 def cause(name: str) -> str:
@@ -90,15 +100,17 @@ def cause(name: str) -> str:
     return words.get(name, name.replace("_", " "))
 
 
-def _change(name: str, part: float, error: ErrorReport, spent: TimeReport) -> str:
-    now = error.predicted_mse
+def _change(name: str, part: float, report: RunReport) -> str:
+    error, now = report.error, report.error.predicted_mse
     if name == "null_space":
         return "; neither samples nor less noise reduce it (`ommatid design` computes what another lens type brings)"
     if name in CHANGES:
         words, factor = CHANGES[name]
         return f"; {words}: {_fall(now, now - (1 - factor) * part)}"
-    more = next((more for more in spent.more if more.times == TIMES), None)
-    if name in SAMPLES and more is not None and more.predicted_mse < (1 - LEAST_GAIN) * now:
+    if name not in SAMPLES or not follows_samples(report):
+        return ""
+    more = next((more for more in report.spent.more if more.times == TIMES), None)
+    if more is not None and more.predicted_mse < (1 - LEAST_GAIN) * now:
         keys = " and ".join(key for part_name, key in SAMPLES.items() if error.budget.get(part_name))
         return f"; four times the samples ({keys}): {_fall(now, more.predicted_mse)}"
     return ""

@@ -11,7 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.verdict_words import HALF_STEP, HALF_STEP_HOW, LEAST_GAIN, TIMES, is_trusted
+from ommatid.reconstruct.output.verdict_words import (
+    HALF_STEP,
+    HALF_STEP_HOW,
+    LEAST_GAIN,
+    TIMES,
+    follows_samples,
+    is_trusted,
+)
 
 from .another_type import AnotherType
 
@@ -44,7 +51,7 @@ def next_steps(report: RunReport, other: AnotherType | None = None) -> list[Next
     now, budget = report.error.predicted_mse, report.error.budget
     if not is_trusted(report) or now <= 0:
         return []
-    steps = [_samples(report)] if report.spent.more else []
+    steps = [_samples(report)] if report.spent.more and follows_samples(report) else []
     for name, change, how, factor in CHANGES:
         part = budget.get(name, 0.0)
         steps.append(NextStep(change, how, now - (1 - factor) * part, is_bound=True))

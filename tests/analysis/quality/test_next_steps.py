@@ -133,10 +133,16 @@ def test_steps_are_ranked_by_their_gain_and_small_ones_left_out() -> None:
     budget = {"noise": 0.5 * now, "quantisation": 0.06 * now, "rendering": 0.4 * now, "calibration": 0.04 * now}
     spent = TimeReport(seconds=1.0, stages={}, noise_alone=0.0, more=more)
     changed = report.with_changes(error=report.error.model_copy(update={"budget": budget}), spent=spent)
+    by_samples = changed.error.model_copy(update={"budget": {"rendering": 0.9 * now}})
+    sampled = changed.with_changes(error=by_samples)
+    assert "; four times the samples (`render.samples`): RMS" in limit(sampled)
     steps = next_steps(changed)
     assert [step.change for step in steps] == ["4 times the samples", "half the noise variance"]
     assert (steps[0].mse, steps[0].seconds) == (0.1 * now, 5.0)
     assert steps[0].how == "`render.samples` and `calibration.samples`"
     assert steps[1].mse == pytest.approx(0.75 * now)
+    noisy = changed.with_changes(model=changed.model.model_copy(update={"spurious_information": 0.097}))
+    assert [step.change for step in next_steps(noisy)] == ["half the noise variance"]
+    assert limit(sampled.with_changes(model=noisy.model)).endswith("of the predicted MSE")
     wrong = changed.with_changes(verdict=VerdictReport(trusted=False, reasons=("H is another camera's",)))
     assert next_steps(wrong) == []

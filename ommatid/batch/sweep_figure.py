@@ -227,7 +227,12 @@ def _draw_crossings(
     for crossing in found:
         colour = colours.get(crossing.values.get(colour_key, ""), COLOURS[0])
         panel.plot([crossing.position], [level], "x", color=colour, markersize=8, markeredgewidth=2, zorder=6)
-        place: dict[str, Any] = {"xytext": (7, -5), "textcoords": "offset points", "va": "top", "fontsize": 9}
+        side = (
+            {"xytext": (7, 5), "va": "bottom"}
+            if crossing.good > crossing.position
+            else {"xytext": (7, -5), "va": "top"}
+        )
+        place: dict[str, Any] = {**side, "textcoords": "offset points", "fontsize": 9}
         panel.annotate(axis.limit(crossing.position, crossing.good), (crossing.position, level), color=colour, **place)
 
 

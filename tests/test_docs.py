@@ -76,6 +76,8 @@ SHORTER = {
     "run tile19 -o displaced": QUICK,
     "run tile19 -o within": [*SCALAR, "--within", "5 s"],
     "predict sensor": TILE,
+    "predict tile19 --set camera.lens.II": QUICK,
+    "predict tile19 --set camera.tolerance": QUICK,
     "predict tile19 -o tolerance": ["--no-rays"],
     "run": [*QUICK, *SCALAR],
     "render": [*QUICK, *SCALAR],

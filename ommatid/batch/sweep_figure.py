@@ -23,6 +23,7 @@ from .sweep_row import SweepRow
 NAN = float("nan")
 MARGIN = 1.5  # of a logarithmic error axis, beyond the largest and the smallest error
 TWICE = 2.0
+TINY = 1e-300
 MOST_CROSSINGS = 6
 WIDEST = 130  # characters of a line of the legend
 SCENE = "scene"
@@ -45,10 +46,12 @@ class Crossing:
     """Where a curve crosses twice the smallest predicted error of the sweep.
 
     values : of the keys other than the one along x;  position : along x;  error : the level that is crossed
+    good : the next position with a smaller error
     """
 
     values: dict[str, str]
     position: float
+    good: float
     error: float
 
 
@@ -93,30 +96,30 @@ def crossings(rows: Sequence[SweepRow]) -> tuple[QuantityAxis, list[Crossing]]:
     """Return the axis along x, and where each curve crosses twice the smallest predicted error of the sweep.
 
     A curve is the predicted error, or the measured one where a run is not to be trusted. Between two values of the key
-    its logarithm is interpolated. Empty where the key has names as values,
+    its logarithm is interpolated. Empty where the key has names as values or the smallest error is 0,
     and for curves that stay on one side, or have a single value below.
     """
     settings = _settings(rows)
     key = _roles(settings)[0]
     axis = _axis(key, settings)
-    known = [error for error in map(_predicted, rows) if error]
+    known = [error for error in map(_predicted, rows) if error is not None]
     curves: dict[Combination, list[tuple[float, float]]] = {}
     others = [name for name in settings[0] if name != key and len({setting[name] for setting in settings}) > 1]
     for row, setting in zip(rows, settings, strict=True):
         error = row.mse if row.trusted is False else row.predicted_mse
-        if error:
+        if error is not None:
             point = axis.positions[setting[key]], error
             curves.setdefault(tuple(setting[name] for name in others), []).append(point)
-    if axis.categories or not known:
+    if axis.categories or not known or min(known) == 0:
         return axis, []
     level, found = TWICE * min(known), list[Crossing]()
     for combination, points in curves.items():
         for (left, low), (right, high) in pairwise(sorted(points)):
             if sum(error < level for _, error in points) > 1 and (low < level) != (high < level):
-                share = (log(level) - log(low)) / (log(high) - log(low))
+                below, above = (log(max(error, TINY)) for error in (low, high))
+                position = axis.between(left, right, (log(level) - below) / (above - below))
                 values = dict(zip(others, combination, strict=True))
-                found.append(Crossing(values, axis.between(left, right, share), level))
-                break
+                found.append(Crossing(values, position, left if low < level else right, level))
     return axis, found
 
 
@@ -224,8 +227,13 @@ def _draw_crossings(
     for crossing in found:
         colour = colours.get(crossing.values.get(colour_key, ""), COLOURS[0])
         panel.plot([crossing.position], [level], "x", color=colour, markersize=8, markeredgewidth=2, zorder=6)
-        place: dict[str, Any] = {"xytext": (7, -5), "textcoords": "offset points", "va": "top", "fontsize": 9}
-        panel.annotate(axis.words(crossing.position), (crossing.position, level), color=colour, **place)
+        side = (
+            {"xytext": (7, 5), "va": "bottom"}
+            if crossing.good > crossing.position
+            else {"xytext": (7, -5), "va": "top"}
+        )
+        place: dict[str, Any] = {**side, "textcoords": "offset points", "fontsize": 9}
+        panel.annotate(axis.limit(crossing.position, crossing.good), (crossing.position, level), color=colour, **place)
 
 
 def _legend(

@@ -43,13 +43,13 @@ def lines(rows: Sequence[SweepRow]) -> list[tuple[str, str]]:
 
 
 def _crossing_lines(rows: Sequence[SweepRow]) -> list[tuple[str, str]]:
-    """Lines that say up to which value of the key along x each curve stays below twice the smallest error."""
+    """Lines that say from or up to which value of the key along x each curve is below twice the smallest error."""
     axis, found = crossings(rows)
     printed: list[tuple[str, str]] = []
     for crossing in found:
         others = "".join(f", {key} = {value}" for key, value in crossing.values.items())
-        words = f"at {axis.key} = {axis.words(crossing.position)}{others}"
-        printed.append((f"twice the smallest error, mse {crossing.error:.4g}", words))
+        words = f"{axis.key} {axis.limit(crossing.position, crossing.good)}{others}"
+        printed.append((f"below twice the smallest error, mse {crossing.error:.4g}", words))
     return printed
 
 

@@ -10,13 +10,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import exp, isfinite, log
+from math import ceil, exp, floor, isfinite, log, log10
 from typing import Any
 
 from ommatid.scenes.tables.units import in_unit
 
 DECADE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 MOST_TICKS = 12
+SLACK = 1e-9  # of a digit, by which rounding errors may move a limit
 GREY_LEVELS = "grey levels"
 UNITS = {  # of keys that are plain numbers, by the last part of the key
     "variance": f"{GREY_LEVELS} squared",
@@ -37,6 +38,7 @@ UNITS = {  # of keys that are plain numbers, by the last part of the key
     "black_level": "DN",
 }
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_WHOLE = re.compile(r"[-+]?\d+")
 _RATIO = re.compile(r"\d+/[1-9]\d*")
 _QUANTITY = re.compile(rf"{_NUMBER.pattern}\s*([^\W\d]+|°)")
 
@@ -60,10 +62,22 @@ class QuantityAxis:
         """The key with its unit."""
         return f"{self.key} ({self.unit})" if self.unit else self.key
 
-    def words(self, position: float) -> str:
-        """Return a position that is not one of the values, with its unit."""
+    def limit(self, position: float, good: float) -> str:
+        """Return which values are on the good side of a position, with their unit, such as "from 13 bits".
+
+        The limit has two digits, rounded towards the good side, and is whole if all values were written so.
+
+        good : the next value on that side, which the limit does not pass
+        """
+        whole = all(_WHOLE.fullmatch(text) for text in self.labels.values())
+        step = 10.0 ** (floor(log10(abs(position))) - 1) if position else 1.0
+        step = max(step, 1.0) if whole else step
+        if good > position:
+            number = min(ceil(position / step - SLACK) * step, good)
+        else:
+            number = max(floor(position / step + SLACK) * step, good)
         unit = self.unit if " " not in self.unit and self.unit != "relative" else ""
-        return f"{float(f'{position:.2g}'):g} {unit}".strip()
+        return f"{'from' if good > position else 'up to'} {float(f'{number:.6g}'):g} {unit}".strip()
 
     def between(self, below: float, above: float, share: float) -> float:
         """Return the position at a share of the way between two others."""

@@ -34,6 +34,7 @@ DONE, AIM = 0.025, 0.0125  # addition at which a round is accepted, and the one 
 LEAST, MOST, MOST_FLOAT32 = 256, 2**19, 40960  # samples per pixel of a round; the last if sums are float32
 MOST_EXACT = 2**16  # samples per pixel of a pass if sums are float64
 LEAPS = (2.0, 64.0)  # least and largest growth of the samples from one round to the next
+FLAT = 0.01  # relative fall of the addition over two growths, below which more samples are of no use
 
 
 def calibrate_until(
@@ -44,6 +45,7 @@ def calibrate_until(
 ) -> Model:
     """Return the first model whose uncertainty adds little, or the one with the most samples; its record lists all.
 
+    A part that no samples reduce, such as that of views which too few centroids determine, also ends the rounds.
     Raises ValueError without a stopping rule, and what calibration raises.
     """
     if stopping_rule is None:
@@ -61,7 +63,7 @@ def calibrate_until(
         )
         spent = {name: plan.total for name, plan in plans.items()}
         tried.append({"asked": max(spent.values()), "samples": spent, "adds": stopping_rule.added_error(model)})
-        if tried[-1]["adds"] <= DONE or samples >= most:
+        if tried[-1]["adds"] <= DONE or samples >= most or _is_flat(tried):
             break  # not in the checkpoint: a run that is interrupted before the model is written repeats this round
         if checkpoint is not None:
             text = json.dumps(tried)
@@ -96,6 +98,14 @@ def _next(tried: list[dict[str, Any]], exponent: float, most: int) -> int:
         exponent = min(max(log(before["adds"] / adds) / log(asked / before["asked"]), 1.0), STEEPEST)
     fewest, largest = (leap * asked for leap in LEAPS)
     return min(ceil(min(max(asked * (adds / AIM) ** (1 / exponent), fewest), largest)), most)
+
+
+def _is_flat(tried: list[dict[str, Any]]) -> bool:
+    """Return True if the samples have grown twice, at least fourfold, and the addition has hardly changed."""
+    if len(tried) < 3:
+        return False
+    adds = [each["adds"] for each in tried[-3:]]
+    return max(adds) - min(adds) < FLAT * max(adds)
 
 
 def _with_samples(scene: Scene, samples: int | str) -> Scene:

@@ -226,9 +226,9 @@ def test_a_sweep_says_where_the_error_is_twice_the_smallest(rows_of_tolerance: l
     axis, found = sweep_figure.crossings(rows_of_tolerance)
     assert [crossing.values["calibration.method"] for crossing in found] == ["ideal", "transport"]
     assert [crossing.position for crossing in found] == pytest.approx([200**0.5, 20000**0.5], rel=1e-9)
-    assert axis.words(found[1].position) == "140 nm"
+    assert axis.limit(found[1].position, found[1].good) == "up to 140 nm"
     printed = [value for name, value in lines(rows_of_tolerance) if "twice the smallest" in name]
-    assert printed[0] == "at camera.tolerance.position = 14 nm, calibration.method = ideal"
+    assert printed[0] == "camera.tolerance.position up to 14 nm, calibration.method = ideal"
     named = [
         row.model_copy(update={"values": {"render.sampler": name}}) for name, row in zip("abc", NAMED, strict=True)
     ]
@@ -238,6 +238,26 @@ def test_a_sweep_says_where_the_error_is_twice_the_smallest(rows_of_tolerance: l
     needed = [*falling, NAMED[0].model_copy(update={"values": {"noise.bits": "8"}})]
     [bits] = sweep_figure.crossings(needed)[1]
     assert bits.position == pytest.approx(4), "the error of 4 bits is twice that of 6 and 8"
+
+
+def printed_limits(key: str, errors: dict[str, float]) -> list[str]:
+    rows = [
+        SweepRow(scene="a.toml", values={key: value}, predicted_mse=error, null_space=0)
+        for value, error in errors.items()
+    ]
+    return [value for name, value in lines(rows) if "twice the smallest" in name]
+
+
+def test_the_value_that_is_named_holds_twice_the_smallest_error() -> None:
+    """12 bits have 2.53 times the smallest error."""
+    errors = {"10": 1.515, "11": 0.4238, "12": 0.1507, "13": 0.08236, "14": 0.06528, "18": 0.05961}
+    assert printed_limits("noise.bits", errors) == ["noise.bits from 13 bits"]
+    valley = {"1": 9.0, "2": 1.0, "3": 1.1, "4": 9.0}
+    assert printed_limits("x", valley) == ["x from 2", "x up to 3"]
+
+
+def test_nothing_is_twice_an_error_of_zero() -> None:
+    assert printed_limits("noise.variance", {"0": 0.0, "1e-6": 2.8e-4, "1.5e-6": 4.2e-4, "1e-5": 2.8e-3}) == []
 
 
 def test_a_run_that_is_not_to_be_trusted_has_a_hollow_point_and_no_prediction(

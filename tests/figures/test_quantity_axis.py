@@ -51,8 +51,34 @@ def test_a_decade_is_a_factor_of_ten() -> None:
     assert not spans_decade([0.0, 100.0])
 
 
-def test_positions_between_values_are_said_with_their_unit() -> None:
-    assert quantity_axis("x", ["1 nm", "1 um"]).words(162.03) == "160 nm"
-    assert quantity_axis("noise.bits", ["6", "12"]).words(8.04) == "8 bits"
+@pytest.mark.parametrize(
+    ("values", "position", "good", "words"),
+    [
+        (["1 nm", "1 um"], 162.03, 1, "up to 160 nm"),
+        (["1 nm", "1 um"], 162.03, 1000, "from 170 nm"),
+        (["1e-6", "1e-5"], 1.29e-6, 1e-6, "up to 1.2e-06"),
+        (["1.204", "1.3"], 1.2032, 1.204, "from 1.204"),  # not past a value that is known to be good
+        (["0.1", "3"], 2.0, 0.1, "up to 2"),
+        (["-1.5", "0.5"], 0.0, 0.5, "from 0"),
+    ],
+)
+def test_limits_are_rounded_towards_the_good_side(values: list[str], position: float, good: float, words: str) -> None:
+    assert quantity_axis("x", values).limit(position, good) == words
+
+
+@pytest.mark.parametrize(
+    ("position", "good", "words"),
+    [
+        (12.34, 13, "from 13 bits"),
+        (12.34, 10, "up to 12 bits"),
+        (12.0, 16, "from 12 bits"),
+        (11.99, 12, "from 12 bits"),
+    ],
+)
+def test_limits_of_whole_numbers_are_whole(position: float, good: float, words: str) -> None:
+    assert quantity_axis("noise.bits", ["6", "12"]).limit(position, good) == words
+
+
+def test_positions_are_shared_out_between_values() -> None:
     assert quantity_axis("x", ["1 nm", "100 nm"]).between(1, 100, 0.5) == pytest.approx(10)
     assert quantity_axis("x", ["1", "3"]).between(1, 3, 0.5) == pytest.approx(2)

@@ -300,6 +300,15 @@ def test_few_rounds_reach_the_goal_and_an_unreachable_one_is_recorded() -> None:
     assert len(never["auto"]["tried"]) <= 5
 
 
+def test_rounds_end_where_more_samples_change_nothing() -> None:
+    """Views that too few centroids determine leave an uncertainty which no number of rays reduces."""
+    described, camera = endless()
+    rule = StoppingRule(lambda model: 0.05 + (model.record["samples"] / 2.0) ** -2, "floor", "a floor")
+    record = calibrate(Setup(described, camera), stopping_rule=rule).record
+    assert len(record["auto"]["tried"]) == 3
+    assert record["auto"]["reached"], "the goal is a tenth"
+
+
 def test_without_a_stack_the_prior_decides() -> None:
     """The addition to Eq. 5 falls with the precision of H, though its part of the error alone may rise at first."""
     described = auto((12, 12), (("1/3", [3, 3], [3, 3]),), sampler="independent")

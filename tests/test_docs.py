@@ -13,6 +13,7 @@ import tomllib
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import pytest
@@ -384,3 +385,10 @@ def test_messages_of_the_troubleshooting_page_occur_in_the_program() -> None:
     for message in messages:
         for piece in message.split("..."):
             assert piece.strip(" '") in program, message
+
+
+def test_names_of_the_api_page_exist() -> None:
+    names = re.findall(r"^::: (\S+)$", text_of(DOCS / "api.md"), flags=re.MULTILINE)
+    assert len(names) > 15
+    for name in names:
+        resolve_name(name)  # raises ImportError or AttributeError

@@ -130,7 +130,7 @@ def _error(run: Run, window: ErrorWindow | None) -> dict[str, Any]:
         "steps": steps,
         "now": run.report.error.predicted_mse,
         "root": sqrt,
-        "remedy": verdict_words.remedy(run.report) if largest == "null_space" and not is_reduced else "",
+        "remedy": words.largest_part(run.report) if trusted and largest == "null_space" and not is_reduced else "",
         "trusted": trusted,
         "error_groups": groups,
         "error_chart": error_groups.figure(groups) if groups else "",

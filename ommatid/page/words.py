@@ -6,7 +6,7 @@ from math import sqrt
 
 from ommatid.reconstruct.output import verdict_words
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
-from ommatid.reconstruct.output.verdict_words import cause, is_trusted
+from ommatid.reconstruct.output.verdict_words import cause, is_trusted, limit
 
 from .data import Contents
 
@@ -140,3 +140,8 @@ def budget(error: ErrorReport) -> list[tuple[str, float, float]]:
     """Return the parts of the predicted squared error, the largest first: cause, part, share in per cent."""
     parts = sorted(error.budget.items(), key=lambda item: -item[1])
     return [(cause(name), part, 100 * part / error.predicted_mse) for name, part in parts if part > 0]
+
+
+def largest_part(report: RunReport) -> str:
+    """Return the largest part of the predicted error and a change that would reduce it, as a sentence."""
+    return f"What limits the error: {limit(report)}."

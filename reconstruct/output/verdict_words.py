@@ -52,39 +52,21 @@ def grounds(report: RunReport) -> str:
     return "; ".join(verdict.reasons or verdict.passed or ("neither the residual nor the error could be checked",))
 
 
-def remedy(report: RunReport) -> str:
-    """Return the largest part of the predicted error and a change that would reduce it, as a sentence.
-
-    Empty where the verdict is against trust, since the parts then belong to assumptions that do not hold.
-    """
-    if not is_trusted(report):
-        return ""
-    if report.error.predicted_mse <= 0:
-        return "The predicted error is zero."
-    name, share, change = _largest_part(report)
-    return f"Largest part of the predicted squared error: {name}, {share:.0f} %{change}."
-
-
 def limit(report: RunReport) -> str:
     """Return what limits the error in half a sentence: the cause, its share, and a change that would reduce it."""
     if not is_trusted(report):
         return "unknown as long as the result is not to be trusted"
     if report.error.predicted_mse <= 0:
         return "nothing: the predicted error is zero"
-    name, share, change = _largest_part(report)
-    return f"{name}, {share:.0f} % of the predicted MSE{change}"
+    error = report.error
+    name, part = max(error.budget.items(), key=lambda item: item[1])
+    change = _change(name, part, report)
+    return f"{cause(name)}, {100 * part / error.predicted_mse:.0f} % of the predicted MSE{change}"
 
 
 def error_words(mse: float, digits: int = 4) -> str:
     """Return a mean squared error with its root in grey levels: "4.399 (2.1 grey levels RMS)"."""
     return f"{mse:.{digits}g} ({sqrt(mse):.3g} grey levels RMS)"
-
-
-def _largest_part(report: RunReport) -> tuple[str, float, str]:
-    """Return the name of the largest part of the predicted error, its share in per cent, and a change in words."""
-    error = report.error
-    name, part = max(error.budget.items(), key=lambda item: item[1])
-    return cause(name), 100 * part / error.predicted_mse, _change(name, part, report)
 
 
 def cause(name: str) -> str:

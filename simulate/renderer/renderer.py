@@ -80,9 +80,8 @@ class Renderer:
         if fast:
             from .rays import RayGenerator
 
-            self._generators = {
-                group: RayGenerator(camera, types, sampler, world is not None) for group, types in self.groups.items()
-            }
+            for group, types in self.groups.items():
+                self._generators[group] = RayGenerator(camera, types, sampler, world is not None)
         self._unit = 1.0  # radiance of a value of 1
         self.staged: StagedWorld | None = None
         self._placement = MILLIMETRES_AT_ORIGIN

@@ -603,7 +603,9 @@ def test_a_page_of_a_complete_run_is_its_report(finished: Path, tmp_path: Path) 
 
 def test_next_steps_are_those_of_a_trusted_run(run: data.Run, finished: Path) -> None:
     text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()))
-    assert "null space of H, 97 %; neither samples nor less noise reduce it" in text, "nor does another lens type"
+    assert "null space of H, 97 % of the predicted MSE; neither samples nor less noise reduce it" in text, (
+        "nor does another lens type"
+    )
     budget = {"null_space": 0.0, "noise": run.report.error.predicted_mse}
     noisy = run.report.error.model_copy(update={"budget": budget})
     text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()), error=noisy)

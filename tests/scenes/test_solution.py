@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from fractions import Fraction
-from math import atan, radians, tan
+from math import atan, isfinite, radians, tan
 from pathlib import Path
 from typing import Any
 
@@ -204,8 +203,16 @@ PLANE_KEYS = ("distance", "pixel_pitch")
 def test_any_values_give_a_scene_or_one_sentence(
     lens: dict[str, Any], target: dict[str, Any], camera: dict[str, Any]
 ) -> None:
-    with suppress(InputError):  # any other exception is an error of the program
-        derive(described(target, camera, **lens))
+    sentence = ""
+    try:
+        derived = derive(described(target, camera, **lens))
+    except InputError as error:  # any other exception is an error of the program
+        sentence = str(error)
+    else:
+        lengths = [derived.distance, derived.target_pitch, derived.pixel_pitch, derived.focal_length(derived.types[0])]
+        assert all(isfinite(length) and length > 0 for length in lengths)
+    assert sentence == "" or sentence.startswith("a.toml: ")
+    assert "\n" not in sentence
 
 
 def test_the_schema_allows_every_key_that_may_follow_from_others_to_be_absent() -> None:

@@ -27,7 +27,7 @@ def claimed_text(path: Path, text: str, temporary: Path) -> str:
         try:
             os.link(temporary, path)
         except FileExistsError:
-            pass
+            pass  # another job was first, and its text is what all of them read below
         except OSError:  # a file system without links, where two jobs that begin at the same moment are not kept apart
             if not path.exists():
                 temporary.replace(path)

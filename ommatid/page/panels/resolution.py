@@ -10,7 +10,7 @@ from markupsafe import Markup
 from ommatid.analysis.quality import resolution, spectra
 from ommatid.analysis.quality.averaging_kernel import ErrorWindow, why_none
 from ommatid.analysis.quality.resolution import EdgeResponse, Transfer
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.model import Model
 
 from ..data import Run
@@ -19,6 +19,8 @@ from .charts import ChartAxis, ChartSeries, chart
 
 LARGEST_SIDE = 1024  # of the part of an image whose spectrum is computed, in pixels
 FREQUENCY = ChartAxis("cycles per pixel", low=0.0, high=0.5)
+
+Image = FloatArray | Float32Array
 
 
 def content(run: Run, model: Model, window: ErrorWindow | None, single: ShownSubImage) -> dict[str, Any]:
@@ -34,7 +36,7 @@ def content(run: Run, model: Model, window: ErrorWindow | None, single: ShownSub
         charts.append(("Modulation transfer function", _transfer(sharpness, sub), transfer_words(sharpness, pitch)))
         charts.append(("Response to an edge", _edge(edge, sub), edge_words(edge, sub)))
     if run.truth is not None:
-        charts.append(("Radial spectrum of the error", *_spectrum(run, single)))
+        charts.append(("Radial spectrum of the error", *_spectrum(run.truth, run.estimate, single.image)))
     return {"resolution": charts, "left_out": why_none(run.stack.scene)}
 
 
@@ -84,15 +86,14 @@ def edge_words(estimate: EdgeResponse, sub: tuple[Transfer, EdgeResponse] | None
     return f"{words}, {sub[1].width:.2g} in a pixel of the single sub-image."
 
 
-def _spectrum(run: Run, single: ShownSubImage) -> tuple[Markup, str]:
-    assert run.truth is not None
-    truth = _central(run.truth)
-    signal, error = spectra.radial_spectrum(truth), spectra.radial_spectrum(_central(run.estimate) - truth)
+def _spectrum(truth: Image, estimate: Image, single: Image) -> tuple[Markup, str]:
+    truth = _central(truth)
+    signal, error = spectra.radial_spectrum(truth), spectra.radial_spectrum(_central(estimate) - truth)
     series = [
         ChartSeries("truth", list(signal.frequencies), list(signal.powers), "dashed", 0),
         ChartSeries("error of the estimate", list(error.frequencies), list(error.powers), "line", 1),
     ]
-    other = spectra.radial_spectrum(_central(single.image) - truth)
+    other = spectra.radial_spectrum(_central(single) - truth)
     series.append(ChartSeries("error of the single sub-image", list(other.frequencies), list(other.powers), "line", 2))
     limit = spectra.crossing(signal, error)
     words = "The error is weaker than the image at all frequencies."
@@ -101,7 +102,7 @@ def _spectrum(run: Run, single: ShownSubImage) -> tuple[Markup, str]:
     return chart("spectrum", FREQUENCY, ChartAxis("power (squared pixel values)", True), series, words), words
 
 
-def _central(image: Any) -> FloatArray:
+def _central(image: Image) -> FloatArray:
     rows, columns = (
         slice((size - shown) // 2, (size - shown) // 2 + shown)
         for size, shown in ((size, min(size, LARGEST_SIDE)) for size in image.shape)

@@ -10,9 +10,9 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.runtime.workers import Workers
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model

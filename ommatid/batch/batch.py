@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.runtime.errors import MachineError
+from ommatid.runtime.execution.pool import check_options, worker_pool
+from ommatid.runtime.execution.workers import Completed
 from ommatid.runtime.files import check_output, clear_abandoned, make_folder
-from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.processors import processors
-from ommatid.runtime.workers import Completed
 from ommatid.scenes.formats.picture import write_truth
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, write
 from ommatid.scenes.setup import Setup

@@ -24,8 +24,8 @@ from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, make_folder
-from ommatid.runtime.pool import worker_pool
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import origin
 from ommatid.scenes import model_file

@@ -15,8 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.dask_cluster import scratch_folder
 from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.execution.dask_cluster import scratch_folder
 from ommatid.runtime.files import write_whole
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import command, command_line

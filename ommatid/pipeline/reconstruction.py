@@ -20,11 +20,11 @@ from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.pool import check_options, worker_pool
+from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import check_output, file_digest, make_folder, write_text, write_whole
-from ommatid.runtime.pool import check_options, worker_pool
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
-from ommatid.runtime.workers import Workers
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
 from ommatid.scenes.model import Model

@@ -12,8 +12,8 @@ import numpy as np
 from scipy import fft, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.runtime.workers import Workers
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables import estimation
 

@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import digest
-from ommatid.runtime.pool import worker_pool
 from ommatid.runtime.processors import one_thread, processors
 
 from ..estimator.estimate import Solver

@@ -11,10 +11,10 @@ import numpy as np
 
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import origin
-from ommatid.runtime.workers import Workers
 from ommatid.scenes.formats import exr
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model

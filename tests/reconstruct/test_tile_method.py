@@ -15,7 +15,7 @@ from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
 from ommatid.reconstruct.methods.tile_solver import overlapping_tiles
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.pool import worker_pool
+from ommatid.runtime.execution.pool import worker_pool
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 

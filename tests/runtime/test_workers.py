@@ -19,10 +19,10 @@ import psutil
 import pytest
 from distributed import LocalCluster
 
-from ommatid.runtime import pool, workers
-from ommatid.runtime.dask_cluster import SILENT
 from ommatid.runtime.errors import InputError, MachineError
-from ommatid.runtime.pool import worker_pool
+from ommatid.runtime.execution import pool, workers
+from ommatid.runtime.execution.dask_cluster import SILENT
+from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.progress import no_progress
 
 from ..conftest import Command

@@ -26,7 +26,7 @@ from threading import Lock, Thread
 from time import monotonic
 from typing import Any, TypeVar
 
-from .errors import MachineError
+from ..errors import MachineError
 
 Result = TypeVar("Result")
 

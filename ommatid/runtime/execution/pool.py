@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from .errors import InputError
+from ..errors import InputError
 from .workers import Workers
 
 Result = TypeVar("Result")

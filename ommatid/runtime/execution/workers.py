@@ -14,9 +14,9 @@ from itertools import islice
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from .errors import MachineError
-from .interrupts import interrupts_remembered
-from .progress import Progress
+from ..errors import MachineError
+from ..interrupts import interrupts_remembered
+from ..progress import Progress
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -11,8 +11,8 @@ from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager
 from typing import Any
 
+from ..errors import InputError, MachineError
 from . import workers
-from .errors import InputError, MachineError
 from .workers import LOST, Workers
 
 SILENT = logging.CRITICAL + 1

@@ -1,0 +1,61 @@
+"""Files that are read: opened without waiting, only if they are regular, and never larger than a reader expects.
+
+Opening a FIFO waits for a writer, and a device may have no end.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from .errors import InputError
+
+LARGEST_TEXT = 64_000_000  # bytes of a description: a scene, a lens, a table or a report
+
+_KINDS = {
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFDIR: "a folder",
+}
+
+
+@contextmanager
+def open_input(path: Path) -> Generator[BinaryIO]:
+    """Open a regular file for reading. Raises InputError for anything else, OSError if it cannot be opened."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    with os.fdopen(descriptor, "rb") as stream:
+        _check_kind(path, os.fstat(descriptor).st_mode)
+        yield stream
+
+
+def check_regular(path: Path) -> None:
+    """Raise InputError if a path names something other than a regular file; for libraries that open files themselves.
+
+    Raises OSError if there is nothing of that name.
+    """
+    _check_kind(path, path.stat().st_mode)
+
+
+def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
+    """Read a regular file of at most `largest` bytes. Raises InputError, and OSError if it cannot be opened."""
+    with open_input(path) as stream:
+        content = stream.read(largest + 1)
+    if len(content) > largest:
+        raise InputError(f"{path}: expected a file of at most {largest / 1e6:.3g} MB, got a larger one")
+    return content
+
+
+def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
+    """Read a regular UTF-8 file. Raises as `read_bytes` does, and UnicodeDecodeError."""
+    return read_bytes(path, largest).decode("utf-8")
+
+
+def _check_kind(path: Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: expected a regular file, got {_KINDS.get(stat.S_IFMT(mode), 'something else')}")

@@ -10,20 +10,20 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
+from typing import Any, cast
 
 import numpy as np
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import open_input
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.world import FROM_FILE, WorldTable
 
 from .plugins import BLOCK
 from .variant import activate
+from .worlds.checked_world import CheckedWorld, check_world_files, reason_of
 from .worlds.placement import FINEST, Placement
 
 TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file
@@ -76,39 +76,14 @@ def white_of(scene: Scene) -> float:
     return white
 
 
+def checked(scene: Scene) -> CheckedWorld:
+    """Return the checked text of the world's file and of those that it includes. Raises InputError."""
+    return check_world_files(path_of(scene), f"{scene.source}: world.file", scene.allows_outside)
+
+
 def files(scene: Scene) -> list[Path]:
-    """Return the world's file and those beside it that it names, except by `$variables`.
-
-    Raises InputError if there is no such file or it is not XML.
-    """
-    path = path_of(scene)
-    known, waiting = [path], [path]
-    while waiting:
-        for name in _named(waiting.pop(), scene):
-            beside = path.parent / name  # also for names in included files, as Mitsuba resolves them
-            if beside.is_file() and beside not in known:
-                known.append(beside)
-                if beside.suffix.lower() == ".xml":
-                    waiting.append(beside)
-    return known
-
-
-def _named(path: Path, scene: Scene) -> list[str]:
-    where = f"{scene.source}: world.file"
-    try:
-        elements = ElementTree.parse(path).getroot().iter()
-    except FileNotFoundError as error:
-        raise InputError(f"{where}: there is no Mitsuba scene {path}; name one, beside the scene file") from error
-    except (OSError, ValueError, LookupError) as error:
-        raise InputError(f"{where}: {path} could not be read as a Mitsuba scene ({error})") from error
-    except ElementTree.ParseError as error:
-        raise InputError(f"{where}: {path} is not valid XML: {error}; correct it there") from error
-    names = [
-        element.get("value" if element.tag == "string" else "filename")
-        for element in elements
-        if element.tag in ("include", "spectrum") or (element.tag == "string" and element.get("name") == "filename")
-    ]
-    return [name for name in names if name]
+    """Return the world's file and those that it names. Raises InputError for one that may not be read."""
+    return checked(scene).files
 
 
 def describe(scene: Scene) -> dict[str, Any]:
@@ -117,8 +92,8 @@ def describe(scene: Scene) -> dict[str, Any]:
     folder = path_of(scene).parent
     sums: dict[str, str] = {}
     for path in files(scene):
-        with path.open("rb") as stream:
-            sums[os.path.relpath(path, folder)] = hashlib.file_digest(stream, "sha256").hexdigest()
+        with open_input(path) as stream:
+            sums[os.path.relpath(path, folder)] = hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
     place, has_target = world.describe_place(), scene.target.image is not None
     return {"white": world.white, "target": has_target, "files": sums, **({"place": place} if place else {})}
 
@@ -132,17 +107,13 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
     activate(variant)
     import mitsuba as mi
 
-    file = str(path_of(scene))
-    where = f"{scene.source}: world.file: {file}"
-    files(scene)  # its errors are clearer than Mitsuba's
+    where, world = f"{scene.source}: world.file: {path_of(scene)}", checked(scene)
     config = mi.parser.ParserConfig(variant)
     try:
-        state = mi.parser.parse_file(config, file)
-        if state.root.type != mi.ObjectType.Scene:
-            raise InputError(f"{where} holds a single {state.root.type.name.lower()}; expected a whole <scene>")
+        state = mi.parser.parse_string(config, world.text)
         sensors = [node.props for node in _nodes(state) if node.type == mi.ObjectType.Sensor]
         placement = _placement(scene, sensors, where)
-        has_integrator = _adapt(state, Path(file).parent)
+        has_integrator = _adapt(state)
         mi.parser.transform_all(config, state)
         if target is not None:
             shape: Any = mi.load_dict({**target, "to_world": placement.to_world(target["to_world"])})
@@ -150,8 +121,7 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
             state.root.props[TARGET] = shape
         built: Any = mi.parser.instantiate(config, state)
     except (RuntimeError, TypeError) as error:
-        reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
-        raise InputError(f"{where} is no scene that Mitsuba can build: {reason}") from error
+        raise InputError(f"{where} is no scene that Mitsuba can build: {reason_of(error, world)}") from error
     if not built.emitters():
         raise InputError(f"{where} has no emitter, so the image is black; add one, such as <emitter type='constant'/>")
     if not has_integrator:
@@ -203,8 +173,8 @@ def _pose_of_sensor(table: WorldTable, sensors: list[Any], where: str) -> Placem
     return placement
 
 
-def _adapt(state: Any, folder: Path) -> bool:
-    """Remove the sensors, make paths of files absolute, and return True if there is an integrator."""
+def _adapt(state: Any) -> bool:
+    """Remove the sensors, and return True if there is an integrator."""
     import mitsuba as mi
 
     types = mi.Properties.Type
@@ -217,13 +187,8 @@ def _adapt(state: Any, folder: Path) -> bool:
             if node_type == mi.ObjectType.Sensor:
                 del root[key]
     for node in state.nodes:
-        props = node.props
-        if "filename" in props and props.type("filename") == types.String:
-            beside = folder / props["filename"]
-            if beside.is_file():
-                props["filename"] = str(beside)
-        if node.type == mi.ObjectType.Integrator and props.plugin_name() != BACKWARDS:
-            props["block_size"] = BLOCK
+        if node.type == mi.ObjectType.Integrator and node.props.plugin_name() != BACKWARDS:
+            node.props["block_size"] = BLOCK
     return has_integrator
 
 

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from ommatid.runtime.library_caches import library_caches
 from ommatid.runtime.versions import command_line
 
 from . import calibrate, predict, reconstruct, run, show, studies
@@ -56,6 +57,6 @@ def start(version: Version = False) -> None:
 
 def main() -> None:
     """Run the command line and exit."""
-    with command_line(["ommatid", *sys.argv[1:]]):
+    with command_line(["ommatid", *sys.argv[1:]]), library_caches():
         code = exit_code_of(partial(app, prog_name="ommatid", standalone_mode=False))
     sys.exit(code)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.interpreter import python_command, python_environment
 
 from .worlds.plugin_names import mitsuba_folder
 
@@ -162,7 +163,12 @@ def probe(variant: str) -> BackendStatus:
     """Try a variant by a small rendering in a separate process, which a broken backend may kill."""
     try:
         process = subprocess.run(
-            [sys.executable, "-c", _PROBE, variant], capture_output=True, text=True, timeout=PATIENCE, check=False
+            python_command(_PROBE, variant),
+            env=python_environment(),
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return BackendStatus(variant, f"a trial rendering did not end in {PATIENCE} s", 0.0)

@@ -21,6 +21,7 @@ from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.scenes.formats import picture
 from ommatid.scenes.scene import read
@@ -144,6 +145,9 @@ def run_batch(
     share : of a job, whose scenes `members` are; the last job writes table and page
     Where all scenes are refused, neither table nor page is written.
     """
+    for folder in (index_folder, sweep_folder):
+        if folder is not None:
+            check_folder(folder)  # before any work
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]

@@ -29,8 +29,6 @@ from ommatid.scenes.scene import read
 from .sections import Section
 from .stages import library_versions, open_member, process_count
 
-REFUSED = 2  # exit code of a scene with an error
-
 
 @dataclass(frozen=True)
 class BatchOutcome:
@@ -143,7 +141,7 @@ def run_batch(
     figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     share : of a job, whose scenes `members` are; the last job writes table and page
-    Where all scenes are refused, neither table nor page is written.
+    Where all scenes fail, neither table nor page is written.
     """
     for folder in (index_folder, sweep_folder):
         if folder is not None:
@@ -170,7 +168,7 @@ def run_batch(
     ]
     describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
     if share is None:
-        if len(failures) == len(members) and set(codes[1:]) == {REFUSED}:  # leaves nothing behind
+        if len(failures) == len(members):  # leaves nothing behind
             describe = partial(_describe, None, None, figures, report_failure)
         sections, code = describe(ended)
         return BatchOutcome(documents, sections, max(*codes, code))

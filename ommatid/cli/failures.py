@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.outputs.kinds import input_error
 
 from .output import say
 
@@ -43,6 +45,8 @@ def exit_code_of(command: Callable[[], object]) -> int:
 
 def report(error: Exception) -> int:
     """Say in one sentence what went wrong, and return the exit code."""
+    if isinstance(error, OSError) and isinstance(error.filename, str):
+        error = input_error(Path(error.filename), error) or error
     if isinstance(error, BatchError):
         return error.exit_code
     if hasattr(error, "format_message"):  # raised by the parser of the command line

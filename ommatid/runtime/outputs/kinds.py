@@ -35,9 +35,8 @@ def check_output(path: Path, *inputs: Path) -> None:
     if parent is None:
         raise InputError(f"{named}: the folder {printable(path.parent, SHORT)} does not exist; create it first")
     if not stat.S_ISDIR(parent):
-        raise InputError(
-            f"{named}: expected a file in a folder, but {printable(path.parent, SHORT)} is {_kind(parent)}"
-        )
+        folder = printable(path.parent, SHORT)
+        raise InputError(f"{named}: expected a file in a folder, but {folder} is {_kind(parent)}")
     if mode is not None and stat.S_ISDIR(mode):
         raise InputError(f"{named}: expected the name of a file, got a folder")
     if mode is not None and not stat.S_ISREG(mode):

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.files import digest
 from ommatid.scenes import camera, model_file, scene, stack
 from ommatid.scenes.formats import curve, lens_file, picture
 from ommatid.scenes.hardware import frames, source_positions
 from ommatid.scenes.zemax.agf import read_catalogue
 
 from ..conftest import TINY
-from ..examples import GALLERY
 from . import mutations
 from .damage import damaged, damaged_near
+from .file_type import BASE, SCENE, FileType, Originals, fingerprint, from_folder, gallery_files
 from .formats import encoded, exr_damaged, model_resealed, npy_damaged, npz_damaged, stack_resealed
 
 EVERYTHING = (
@@ -53,49 +49,9 @@ size = 12
 overlap = 3
 """
 )
-SCENE = "tiny.toml"  # an undamaged scene in the folder
-BASE = "base.toml"  # the scene to which --set options apply
 PNG_MARKS = (b"IHDR", b"IDAT", b"IEND", b"\x89PNG\r\n\x1a\n")
 TIFF_MARKS = (b"II*\0", b"\0\1\3\0", b"\1\1\3\0", b"\2\1\3\0", b"\3\1\3\0", b"\x11\1\4\0", b"\x16\1", b"\x17\1")
 DOUBLET = b"# a doublet\n50.0\n29.475 3.76 1.67 25.2\n84.83 0.12 1 25.2\n0 4.2 0 17.1  # stop\n-25.87 2 1.603 14\n"
-Originals = Callable[[Path], list[bytes]]
-
-
-@dataclass(frozen=True)
-class FileType:
-    """A type of file.
-
-    file : its name in the folder;  originals : valid contents, from the files of that folder
-    damaged : returns damaged contents;  read : returns a value that is equal for equal contents
-    command : the command line that reads the file, if any
-    sealed : True if a checksum reveals every change
-    """
-
-    name: str
-    file: str
-    originals: Originals
-    damaged: Callable[[Random, bytes], bytes]
-    read: Callable[[Path], object]
-    command: tuple[str, ...]
-    sealed: bool = False
-
-
-def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and other values."""
-    total = hashlib.sha256()
-    for part in parts:
-        total.update((digest(part) if isinstance(part, np.ndarray) else repr(part)).encode())
-    return total.hexdigest()
-
-
-def gallery_files(pattern: str, *more: bytes) -> Originals:
-    """The files of the gallery that match, and further contents."""
-    return lambda _: [*more, *(path.read_bytes() for path in sorted(GALLERY.glob(pattern)))]
-
-
-def from_folder(name: str) -> Originals:
-    """A file of the folder, made by a finished run."""
-    return lambda folder: [(folder / name).read_bytes()]
 
 
 def marked(*marks: bytes) -> Callable[[Random, bytes], bytes]:

@@ -85,6 +85,17 @@ def record(rng: Random, original: Any) -> Any:
     return data
 
 
+def replaced(rng: Random, original: Any, value: Any) -> Any:
+    """Return a JSON document with one value exchanged for `value`."""
+    data = copy.deepcopy(original)
+    paths = _paths(data)
+    if not paths:
+        return value
+    path = rng.choice(paths)
+    _at(data, path[:-1])[path[-1]] = value
+    return data
+
+
 def deep_json(rng: Random) -> bytes:
     """Return deeply nested JSON or a very long number."""
     depth = rng.choice((100, 1000, 100000))

@@ -79,11 +79,10 @@ def _worker(inputs: list[tuple[str, int]], seed: int, folder: str) -> WorkerEnd:
                 elif monotonic() - since > STALLED:
                     os.killpg(process.pid, signal.SIGKILL)
                     stalled = True
-        texts: list[str] = []
         for stream in (out, err):
             stream.seek(0)
-            texts.append(stream.read().decode(errors="replace"))
-        return WorkerEnd(process.returncode, *texts, stalled)
+        printed, messages = (stream.read().decode(errors="replace") for stream in (out, err))
+        return WorkerEnd(process.returncode, printed, messages, stalled)
 
 
 def _seconds_of_work(process: int) -> float:

@@ -29,6 +29,7 @@ def rearranged(rng: Random, original: bytes) -> bytes:
     with zipfile.ZipFile(io.BytesIO(original)) as archive:
         members = [(name, archive.read(name)) for name in archive.namelist()]
     name, content = rng.choice(members)
+    kinds = ["twice", "twice", "texts", "other", "pickle"]
     more = {
         "twice": lambda: [(name, damaged(rng, content))],
         "large": lambda: [("extra.npy", _npy(np.zeros(LARGE, np.uint8)))],
@@ -39,7 +40,7 @@ def rearranged(rng: Random, original: bytes) -> bytes:
         "pickle": lambda: [
             ("extra.npy", b"\x93NUMPY\1\0v\0{'descr': '|O', 'fortran_order': False, 'shape': (1,)}\ncos\nsystem\n.")
         ],
-    }[rng.choice(("twice", "twice", "texts", "other", "pickle", *(["large"] if rng.random() < 0.1 else [])))]()
+    }[rng.choice(kinds) if rng.random() < 0.98 else "large"]()
     if rng.random() < 0.3:
         members = [pair for pair in members if pair[0] != name]
     stream = io.BytesIO()

@@ -230,7 +230,9 @@ def tiff(rng: Random, _: bytes) -> bytes:
     photometric = "rgb" if channels == 3 else "miniswhite" if inverted else "minisblack"
     stored = values if channels == 3 else values[..., 0]
     stream = io.BytesIO()
-    with tifffile.TiffWriter(stream, bigtiff=rng.random() < 0.2, byteorder=rng.choice("<>")) as writer:
+    with tifffile.TiffWriter(
+        stream, bigtiff=rng.random() < 0.2, byteorder="<" if rng.random() < 0.5 else ">"
+    ) as writer:
         for _page in range(pages):
             extra = [(274, "H", 1, turned, True)] if turned else []
             writer.write(stored, photometric=photometric, extratags=extra, contiguous=False, metadata=None)

@@ -90,9 +90,18 @@ def rows_damaged(rng: Random, original: bytes) -> bytes:
     if rng.random() < 0.4:
         return damaged(rng, original)
     words = original.decode().split(" ")
-    extreme = (*mutations.NUMBERS, "x", "#", "\n", "1,5", "١", "1e9", "\x00", "\x85")
+    extreme = (*mutations.NUMBERS, "x", "#", "\n", "1,5", "١", "1e9", "\x00", "\x85", "\x1b[31m", "1\n" * 20000)
     words[rng.randrange(len(words))] = rng.choice(extreme)
     return " ".join(words).encode()
+
+
+def fields_damaged(rng: Random, original: bytes) -> bytes:
+    """Return a table of comma-separated fields with extreme ones."""
+    fields = original.decode("utf-8-sig").split(",")
+    extreme = (*mutations.NUMBERS, "", '"', '"x\ny"', "\x1b[31m", "x" * 200000, "-1", "1.5", "\x00", "\u202e")
+    for _ in range(rng.choice((1, 1, 2))):
+        fields[rng.randrange(len(fields))] = rng.choice(extreme)
+    return ",".join(fields).encode()
 
 
 def read_lens(path: Path) -> str:
@@ -246,6 +255,7 @@ FILE_TYPES = {
         FileType("lens, ZMX", "lens.zmx", lambda _: [ZMX], rows_damaged, read_lens, LENS),
         FileType("glasses, AGF", "glass.agf", lambda _: [AGF], rows_damaged, read_glasses, ()),
         FileType("curve, CSV", "curve.csv", gallery_files("spectra/*5.csv"), damaged, read_curve, LIGHT),
+        FileType("curve, rows", "curve.csv", gallery_files("spectra/*5.csv"), rows_damaged, read_curve, LIGHT),
         FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
         FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
         FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),
@@ -257,6 +267,7 @@ FILE_TYPES = {
         FileType("frames, NPY", "f.npy", mosaics(".npy"), npy_damaged, read_mosaics, IMPORT),
         FileType("frames, TIFF", "f.tif", mosaics(".tif"), TIFF, read_mosaics, IMPORT),
         FileType("places, CSV", "places.csv", positions_csv, damaged, read_positions, ()),
+        FileType("places, rows", "places.csv", positions_csv, fields_damaged, read_positions, ()),
         FileType("world, XML", "world.xml", gallery_files("worlds/*.xml"), damaged, read_world, ()),
     )
 }

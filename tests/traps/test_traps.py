@@ -28,10 +28,17 @@ TIME_LIMIT = 300  # seconds, on a busy machine
 
 
 @pytest.fixture(scope="module")
-def trapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder, marks, count = trapped_folder(tmp_path_factory.mktemp("traps"))
     assert count >= 50
     return folder, marks
+
+
+@pytest.fixture
+def trapped(made: tuple[Path, Path]) -> tuple[Path, Path]:
+    for mark in made[1].iterdir():
+        mark.unlink()
+    return made
 
 
 def test_every_command_is_tried() -> None:
@@ -77,7 +84,9 @@ def test_the_traps_work(tmp_path: Path) -> None:
     folder, marks = tmp_path / "traps", tmp_path / "marks"
     make_traps(folder, marks)
     imported = (
-        "import ctypes, glob, simulate, evil, plugins\nfor file in glob.glob('plugins/*.so'): ctypes.CDLL('./' + file)"
+        "import sys; here = sys.path.pop(0); import ctypes, glob; sys.path.insert(0, here)\n"
+        "import simulate, evil, sitecustomize\n"
+        "for file in glob.glob('plugins/*.so'): ctypes.CDLL('./' + file)"
     )
     subprocess.run([sys.executable, "-c", imported], cwd=folder, check=True)
     subprocess.run(["./git"], cwd=folder, check=True)
@@ -85,5 +94,5 @@ def test_the_traps_work(tmp_path: Path) -> None:
     compiled = (
         {Path(name).name for name in LIBRARIES if name.startswith("plugins/")} if shutil.which("cc") else set[str]()
     )
-    assert found >= {"simulate", "evil", "plugins", "git", *compiled}
+    assert found >= {"simulate", "evil", "sitecustomize", "git", *compiled}
     assert {"simulate", "evil"} <= {*MODULES}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 from random import Random
 
@@ -253,6 +254,35 @@ PLY = (
 )
 
 
+def serialized(rng: Random, original: bytes) -> bytes:
+    """Return a file of Mitsuba's own meshes whose counts, indices and compressed contents may disagree."""
+    if rng.random() < 0.3:
+        return damaged(rng, original)
+    points, faces = np.array(POINTS, "<f4"), np.array(FACES, "<u4")
+    counts = [len(points), len(faces)]
+    change = rng.randrange(4)
+    if change == 0:
+        faces[rng.randrange(2), rng.randrange(3)] = rng.choice(INDICES) % 2**32
+    elif change == 1:
+        counts[rng.randrange(2)] = rng.choice(COUNTS) % 2**64
+    name, flags = rng.choice((b"", b"x" * 100, b"\x1b[31m")), rng.choice((0x1000, 0x1000, 0x2000, 0xFFFF, 0))
+    body = struct.pack("<I", flags) + name + b"\0" + struct.pack("<QQ", *counts) + points.tobytes() + faces.tobytes()
+    body += bytes(rng.choice((0, 0, 0, 10**8)) if change == 2 and rng.random() < 0.2 else 0)
+    header = struct.pack("<HH", rng.choice((0x041C, 0x041C, 0x041C, 0)), rng.choice((4, 4, 3, 99)))
+    content = header + zlib.compress(body)
+    offsets = rng.choice(([0], [0], [0, 2**62], [2**31], []))
+    return (
+        content + struct.pack(f"<{len(offsets)}Q", *offsets) + struct.pack("<I", rng.choice((len(offsets), 1, 2**31)))
+    )
+
+
+def serialized_mesh() -> bytes:
+    """Return a valid file of one mesh."""
+    body = struct.pack("<I", 0x1000) + b"x\0" + struct.pack("<QQ", len(POINTS), len(FACES))
+    body += np.array(POINTS, "<f4").tobytes() + np.array(FACES, "<u4").tobytes()
+    return struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<Q", 0) + struct.pack("<I", 1)
+
+
 def read_world(path: Path) -> str:
     """Read a world with all its checks, and build it."""
     from ommatid.scenes import scene
@@ -286,5 +316,8 @@ WORLDS = (
         ("predict", SCENE, "--set", "world.file={file}"),
     ),
     FileType("world, PLY", "mesh.ply", lambda _: [PLY], ply, read_mesh, ()),
+    FileType(
+        "world, serialized", "mesh.serialized", lambda _: [serialized_mesh()], serialized, read_mesh, (), share=0.5
+    ),
     FileType("world, OBJ", "mesh.obj", lambda _: [OBJ], obj, read_mesh, (), share=0.5),
 )

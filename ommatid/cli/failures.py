@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable
 from typing import Any, cast
 
-from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 
 from .output import say
 
@@ -45,6 +45,8 @@ def report(error: Exception) -> int:
     """Say in one sentence what went wrong, and return the exit code."""
     if isinstance(error, BatchError):
         return error.exit_code
+    if isinstance(error, NotStartedError):
+        return 1
     if hasattr(error, "format_message"):  # raised by the parser of the command line
         message = cast(Any, error).format_message()
         say(message if type(error).__name__ == "NoArgsIsHelpError" else f"ommatid: {message}")

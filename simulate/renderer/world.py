@@ -18,16 +18,17 @@ import numpy as np
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import open_input
+from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.world import FROM_FILE, WorldTable
 
-from .plugins import BLOCK
 from .variant import activate
+from .worlds.building import BLOCK, parse_world
 from .worlds.checked_world import CheckedWorld, check_world_files, reason_of
 from .worlds.placement import FINEST, Placement
+from .worlds.trial import try_world
 
 TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file
-BACKWARDS = "ptracer"  # the integrator that starts at the emitters, and takes no block size
 SENSORS_AT_ORIGIN = ("perspective", "thinlens", "orthographic")  # that stand there without a to_world
 DEEPEST = 8  # segments of a path, if the file has no integrator
 
@@ -107,38 +108,34 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
     activate(variant)
     import mitsuba as mi
 
-    where, world = f"{scene.source}: world.file: {path_of(scene)}", checked(scene)
-    config = mi.parser.ParserConfig(variant)
+    where, world = f"{scene.source}: world.file: {printable(path_of(scene))}", checked(scene)
+    try_world(world, variant, where)
     try:
-        state = mi.parser.parse_string(config, world.text)
-        sensors = [node.props for node in _nodes(state) if node.type == mi.ObjectType.Sensor]
-        placement = _placement(scene, sensors, where)
-        has_integrator = _adapt(state)
-        mi.parser.transform_all(config, state)
+        parsed = parse_world(world.text, variant)
+        placement = _placement(scene, parsed.sensors, where)
         if target is not None:
             shape: Any = mi.load_dict({**target, "to_world": placement.to_world(target["to_world"])})
             shape.set_id(TARGET)  # by which its parameters are identified
-            state.root.props[TARGET] = shape
-        built: Any = mi.parser.instantiate(config, state)
+            parsed.state.root.props[TARGET] = shape
+        built = parsed.build()
     except (RuntimeError, TypeError) as error:
-        raise InputError(f"{where} is no scene that Mitsuba can build: {reason_of(error, world)}") from error
+        raise InputError(f"{where} is no scene that Mitsuba can build: {reason_of(str(error), world)}") from error
     if not built.emitters():
         raise InputError(f"{where} has no emitter, so the image is black; add one, such as <emitter type='constant'/>")
-    if not has_integrator:
+    if not parsed.has_integrator:
         direct_only = not (scene.render.complete or has_interreflections(built))
         path = {"type": "path", "max_depth": 1 if direct_only else DEEPEST, "block_size": BLOCK}
-        return StagedWorld(built, mi.load_dict(path), placement, len(sensors), direct_only)
+        return StagedWorld(built, mi.load_dict(path), placement, len(parsed.sensors), direct_only)
     if not isinstance(built.integrator(), mi.SamplingIntegrator):
         raise InputError(f"{where}: its integrator does not follow rays from a camera; expected one such as 'path'")
-    return StagedWorld(built, built.integrator(), placement, len(sensors))
-
-
-def _nodes(state: Any) -> list[Any]:
-    """Return the nodes of a parsed file that stand in its root."""
-    import mitsuba as mi
-
-    root, resolved = state.root.props, mi.Properties.Type.ResolvedReference
-    return [state.nodes[root[key].index()] for key in list(root.keys()) if root.type(key) == resolved]
+    more = built.integrator().aov_names()
+    if more:
+        words = printable(", ".join(more), 60)
+        raise InputError(
+            f"{where}: its integrator returns {len(more)} more channels ({words}); expected the radiance alone, as of"
+            " 'path': remove 'aov' and 'moment'"
+        )
+    return StagedWorld(built, built.integrator(), placement, len(parsed.sensors))
 
 
 def _placement(scene: Scene, sensors: list[Any], where: str) -> Placement:
@@ -171,25 +168,6 @@ def _pose_of_sensor(table: WorldTable, sensors: list[Any], where: str) -> Placem
             f"{asks}: expected a to_world that moves and rotates, got one that shears or stretches; correct it there"
         )
     return placement
-
-
-def _adapt(state: Any) -> bool:
-    """Remove the sensors, and return True if there is an integrator."""
-    import mitsuba as mi
-
-    types = mi.Properties.Type
-    has_integrator = False
-    root = state.root.props
-    for key in list(root.keys()):
-        if root.type(key) == types.ResolvedReference:
-            node_type = state.nodes[root[key].index()].type
-            has_integrator |= node_type == mi.ObjectType.Integrator
-            if node_type == mi.ObjectType.Sensor:
-                del root[key]
-    for node in state.nodes:
-        if node.type == mi.ObjectType.Integrator and node.props.plugin_name() != BACKWARDS:
-            node.props["block_size"] = BLOCK
-    return has_integrator
 
 
 def has_interreflections(world: Any) -> bool:

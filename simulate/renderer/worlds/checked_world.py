@@ -45,13 +45,13 @@ class CheckedWorld:
         return f"{printable(path.name, SHOWN)} (line {number})"
 
 
-def reason_of(error: Exception, world: CheckedWorld) -> str:
+def reason_of(error: str, world: CheckedWorld) -> str:
     """Return why Mitsuba refuses a world, in one short sentence that names the place in its files."""
 
     def place(match: re.Match[str]) -> str:
         return f"in {world.place(int(match[1]))}"
 
-    reason = re.sub(r"\[[\w.]+(:\d+)?\] ", "", " ".join(str(error).split()))
+    reason = re.sub(r"\[[\w.]+(:\d+)?\] ", "", " ".join(error.split()))
     reason = re.sub(r"(?:(?:At|While loading|Error while loading) )?string \(line (\d+), col \d+\)", place, reason)
     return printable(reason, LONGEST_REASON)
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 from ommatid.runtime.outputs.kinds import input_error
 
 from .output import say
@@ -49,6 +49,8 @@ def report(error: Exception) -> int:
         error = input_error(Path(error.filename), error) or error
     if isinstance(error, BatchError):
         return error.exit_code
+    if isinstance(error, NotStartedError):
+        return 1
     if hasattr(error, "format_message"):  # raised by the parser of the command line
         message = cast(Any, error).format_message()
         say(message if type(error).__name__ == "NoArgsIsHelpError" else f"ommatid: {message}")

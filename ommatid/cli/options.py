@@ -12,6 +12,7 @@ from ommatid.scenes.tables.gallery import gallery_names
 
 if TYPE_CHECKING:
     from ommatid.figures.saving import FigureFiles
+    from ommatid.runtime.execution.cluster import Cluster
     from ommatid.scenes.hardware.frames import AcquisitionSettings
 
 _SCENE = f"A scene file, or a scene of the gallery by name: {', '.join(gallery_names())}."
@@ -54,6 +55,12 @@ Sweeps = Annotated[
 Scheduler = Annotated[
     str, typer.Option("--scheduler", metavar="ADDRESS", help="Send the scenes to this Dask cluster: tcp://host:port.")
 ]
+TlsCa = Annotated[
+    Path | None,
+    typer.Option("--tls-ca", metavar="FILE", help="Certificate of the authority of a cluster at tls://host:port."),
+]
+TlsCert = Annotated[Path | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate signed by --tls-ca.")]
+TlsKey = Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="Private key of --tls-cert.")]
 Workers = Annotated[
     int | None,
     typer.Option("--workers", metavar="N", min=1, help="Number of processes (default: chosen automatically)."),
@@ -145,6 +152,15 @@ def lens_names(lens: str) -> tuple[str, ...]:
 def changes(sets: list[str] | None, complete: bool = False) -> tuple[str, ...]:
     """Collect the changes of `--set` and `--complete`, in the order in which they apply."""
     return (*(sets or ()), *(("render.complete=true",) if complete else ()))
+
+
+def cluster(scheduler: str, authority: Path | None, certificate: Path | None, key: Path | None) -> Cluster | None:
+    """Collect the options of a cluster; None without one. Raises InputError for --tls-ca and its kin without one."""
+    from ommatid.runtime.execution.cluster import Cluster
+
+    if not scheduler and (authority or certificate or key):
+        raise InputError("--tls-ca, --tls-cert, --tls-key: expected --scheduler tls://HOST:PORT with them, got none")
+    return Cluster(scheduler, authority, certificate, key) if scheduler else None
 
 
 def figure_files(formats: str, resolution: int, always: str = "png") -> FigureFiles:

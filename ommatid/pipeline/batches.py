@@ -21,6 +21,7 @@ from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.scenes.formats import picture
@@ -126,7 +127,7 @@ def run_batch(
     batch: Batch,
     members: Sequence[Member],
     report_failure: Callable[[Exception], int],
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
     *,
     sweep_folder: Path | None = None,
@@ -149,7 +150,7 @@ def run_batch(
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]
-    for member, work in batch.run(members, scheduler, workers):
+    for member, work in batch.run(members, cluster, workers):
         document = _heading(member, with_folders)
         try:
             results[member] = {**document, **work()}

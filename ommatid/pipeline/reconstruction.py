@@ -20,6 +20,7 @@ from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import file_digest, write_text, write_whole
@@ -78,7 +79,7 @@ def reconstruct_files(
     request: ReconstructionRequest,
     output: Path,
     progress: Progress,
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
     formats: Sequence[Format] = (),
 ) -> RunReport:
@@ -88,7 +89,7 @@ def reconstruct_files(
     Returns the content of run.json, with the means of the regions.
     Raises InputError for wrong files and options, and for other files in the way, MachineError for a full disk.
     """
-    check_options(scheduler, workers)
+    check_options(cluster, workers)
     check_output(
         output, request.stack, request.model, *(request.stack.parent / name for name in (TRUTH, WORLD_PICTURE))
     )
@@ -97,7 +98,7 @@ def reconstruct_files(
     check_formats(output, formats)
     recorded, calibrated = request.read()
     truth, names = result_files.truth_beside(request.stack, recorded), (request.stack, request.model)
-    with _tile_workers(scheduler, workers) as pool:
+    with _tile_workers(cluster, workers) as pool:
         result, report = result_files.reconstruct(recorded, calibrated, truth, names, pool, progress)
     report = report.with_changes(**region_reports(result, request.regions))
     clear_formats(output)
@@ -110,7 +111,7 @@ def reconstruct_folder(
     request: ReconstructionRequest,
     folder: Path,
     progress: Progress,
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
 ) -> tuple[RunReport, bool]:
     """Reconstruct into a folder that then holds what a run writes, with copies of the stack, the model and the truth.
@@ -118,7 +119,7 @@ def reconstruct_folder(
     Returns the content of run.json, and False if it was up to date. Raises InputError for wrong files and options, also
     for a folder that holds the stack or the model, and MachineError for a full disk.
     """
-    check_options(scheduler, workers)
+    check_options(cluster, workers)
     recorded, calibrated = request.read()
     check_match(recorded, calibrated, (request.stack, request.model))
     sources = {path.resolve() for path in (request.stack, request.model, request.stack.parent / TRUTH)}
@@ -138,7 +139,7 @@ def reconstruct_folder(
             model_file.write(folder / MODEL, calibrated)
         else:
             _copy(request.model, folder / MODEL)
-        with _tile_workers(scheduler, workers) as pool:
+        with _tile_workers(cluster, workers) as pool:
             return finish_folder(folder, progress, request.regions, pool, request.force)
 
 
@@ -286,11 +287,11 @@ def _copy(source: Path, target: Path) -> None:
 
 
 @contextmanager
-def _tile_workers(scheduler: str, count: int | None) -> Generator[Workers | None]:
+def _tile_workers(cluster: Cluster | None, count: int | None) -> Generator[Workers | None]:
     """Yield workers for the tiles of a frame; None where threads of this process solve them."""
-    if not scheduler and count is None:
+    if cluster is None and count is None:
         yield None
         return
-    with worker_pool(scheduler, count) as workers:
+    with worker_pool(cluster, count) as workers:
         workers.check_versions(partial(versions, "scipy"))
         yield workers

@@ -16,6 +16,10 @@ class MachineError(OSError):
     """Failure of the machine, such as a full disk or a lost worker; exit code 1 of the command line."""
 
 
+class NotStartedError(MachineError):
+    """Failure of one of many scenes for a reason that was reported with the first; exit code 1, and no message."""
+
+
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
 _SHORT.maxlevel = 3

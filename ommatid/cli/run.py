@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from . import failures, output
 from .options import (
     SCREEN,
+    AllowOutside,
     Complete,
     DryRun,
     FigureFormats,
@@ -52,6 +53,7 @@ def run(
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     within: Within = "",
     figure_formats: FigureFormats = "",
     figure_resolution: FigureResolution = SCREEN,
@@ -72,7 +74,7 @@ def run(
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
     figures = figure_files(figure_formats, figure_resolution)
-    asked = changes(sets, complete), lens_names(lens)
+    asked = changes(sets, complete, allow_outside), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
     job = "" if dry_run else job
     share = share_of_job(job, members, folder, _job_words(within, formats, figure_formats), *asked, scheduler)
@@ -137,6 +139,7 @@ def render(
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -148,7 +151,7 @@ def render(
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         return {"file": str(member.folder / "stack.exr"), **description}
 
-    asked = changes(sets, complete), lens_names(lens)
+    asked = changes(sets, complete, allow_outside), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
     share = share_of_job(job, members, folder, ("render",), *asked, scheduler)
     members = members if share is None else share.members

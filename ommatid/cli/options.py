@@ -44,6 +44,9 @@ Lenses = Annotated[
 Complete = Annotated[
     bool, typer.Option("--complete", help="Simulate every effect, however small: render.complete=true.")
 ]
+AllowOutside = Annotated[
+    bool, typer.Option("--allow-outside", help="Let a world name files outside the folder of its own file.")
+]
 Sweeps = Annotated[
     list[str] | None,
     typer.Option(
@@ -149,9 +152,10 @@ def lens_names(lens: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in lens.split(",")) if lens else ()
 
 
-def changes(sets: list[str] | None, complete: bool = False) -> tuple[str, ...]:
-    """Collect the changes of `--set` and `--complete`, in the order in which they apply."""
-    return (*(sets or ()), *(("render.complete=true",) if complete else ()))
+def changes(sets: list[str] | None, complete: bool = False, allow_outside: bool = False) -> tuple[str, ...]:
+    """Collect the changes of `--set`, `--complete` and `--allow-outside`, in the order in which they apply."""
+    outside = ("--allow-outside",) if allow_outside else ()
+    return (*(sets or ()), *(("render.complete=true",) if complete else ()), *outside)
 
 
 def cluster(scheduler: str, authority: Path | None, certificate: Path | None, key: Path | None) -> Cluster | None:

@@ -25,7 +25,7 @@ from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.scenes.formats import picture
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import ALLOW_OUTSIDE, read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
@@ -104,7 +104,8 @@ def share_of_job(
         return None
     if scheduler:
         raise InputError("--job and --scheduler: expected one of them; both distribute the scenes over machines")
-    command = (*words, *(f"--set {change}" for change in changes), *([f"--lens {','.join(lenses)}"] if lenses else []))
+    changed = (change if change == ALLOW_OUTSIDE else f"--set {change}" for change in changes)
+    command = (*words, *changed, *([f"--lens {','.join(lenses)}"] if lenses else []))
 
     def seconds(member: Member) -> float:
         return estimate_cost(member, changes, lenses).seconds

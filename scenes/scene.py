@@ -6,6 +6,7 @@ and an unknown key are errors.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -227,10 +228,18 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     update |= _with_curves(scene)
     image, world = scene.target.image, scene.world
     if image is not None and not image.startswith("photo:"):
-        update["target"] = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
+        update["target"] = scene.target.model_copy(update={"image": str(_beside(source, image))})
     if world is not None:
         update["world"] = world.model_copy(update={"file": str((source.parent / world.file).resolve())})
     return with_tables(scene, **update)
+
+
+def _beside(source: Path, name: str) -> Path:
+    """Return the file that a scene file names.
+
+    Links in a circle, for which `Path.resolve` has an exception of its own, are refused when the file is opened.
+    """
+    return Path(os.path.realpath(source.parent / name))
 
 
 def _with_curves(scene: Scene) -> dict[str, Any]:
@@ -239,10 +248,10 @@ def _with_curves(scene: Scene) -> dict[str, Any]:
 
     update: dict[str, Any] = {}
     if scene.light is not None and scene.light.file is not None:
-        points = read_curve((scene.source.parent / scene.light.file).resolve())
+        points = read_curve(_beside(scene.source, scene.light.file))
         update["light"] = scene.light.model_copy(update={"spectrum": points})
     if scene.sensor is not None and isinstance(scene.sensor.quantum_efficiency, str):
-        points = read_curve((scene.source.parent / scene.sensor.quantum_efficiency).resolve(), 1.0)
+        points = read_curve(_beside(scene.source, scene.sensor.quantum_efficiency), 1.0)
         update["sensor"] = scene.sensor.model_copy(update={"quantum_efficiency": points})
     return update
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,8 +86,12 @@ def svg_text(figure: Any) -> str:
     return f'{head} role="img" fill="currentColor">{rest.replace(INK, "currentColor")}'
 
 
-def _settings() -> AbstractContextManager[None]:
+@contextmanager
+def _settings() -> Generator[None]:
+    """Apply SETTINGS, and draw a box, without a warning, for a character that the font lacks."""
     import matplotlib
 
     context: Any = matplotlib.rc_context  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    return context(SETTINGS)
+    with context(SETTINGS), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font", UserWarning)
+        yield

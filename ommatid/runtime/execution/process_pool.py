@@ -27,6 +27,7 @@ from time import monotonic
 from typing import Any, TypeVar
 
 from ..errors import MachineError
+from .library_warnings import library_warnings, warn_on_stderr
 
 Result = TypeVar("Result")
 
@@ -147,9 +148,10 @@ def _serve(pipe: Connection, index: int, count: int) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         _restrict_processors(index, count)
         Thread(target=_exit_with_parent, daemon=True).start()
-        while True:
-            signal.signal(signal.SIGINT, _interrupt_once)  # Mitsuba resets it to a handler that interrupts no waiting
-            pipe.send_bytes(_answer(pipe.recv_bytes()))
+        with library_warnings(warn_on_stderr):
+            while True:
+                signal.signal(signal.SIGINT, _interrupt_once)  # Mitsuba resets it to one that interrupts no waiting
+                pipe.send_bytes(_answer(pipe.recv_bytes()))
     except (EOFError, OSError, KeyboardInterrupt):
         os._exit(0)  # checkpoints are saved, and the pipe has no reader
 

@@ -21,6 +21,7 @@ from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
 from ommatid.scenes.scene import read
 
@@ -147,8 +148,9 @@ def run_batch(
             results[member] = {**document, **work()}
         except Exception as error:
             codes.append(report_failure(error))
-            failures[member] = str(error) or type(error).__name__
-            results[member] = {**document, "error": str(error), "exit_code": codes[-1]}
+            reason = printable_sentence(error)
+            failures[member] = reason or type(error).__name__
+            results[member] = {**document, "error": reason, "exit_code": codes[-1]}
     documents = [results[member] for member in members]
     ended = [
         EndedScene(

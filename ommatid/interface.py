@@ -22,6 +22,7 @@ from ommatid.reconstruct.output.held_out_report import HeldOutReport
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError, MachineError, naming_source
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file
 from ommatid.scenes import scene as scene_file
@@ -186,7 +187,9 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
 
     Raises InputError for a wrong scene, MachineError for a full disk.
     """
-    stages.run(_setup(scene), Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
+    setup = _setup(scene)
+    with occupied(Path(folder), "stack.exr"):
+        stages.run(setup, Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
     return read_result(folder)
 
 

@@ -29,6 +29,7 @@ from .tables.table import Table, allow_absent
 from .tables.units import Corner, FileName, Length, Pair
 from .tables.world import WorldTable
 
+ALLOW_OUTSIDE = "--allow-outside"  # stands among the changes of a scene, so that it goes where they go
 TRUTH = "truth.exr"
 WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
 
@@ -81,6 +82,7 @@ class Scene(Table):
 
     _source: Path = PrivateAttr(default=Path("scene"))
     _world_copy: Path | None = PrivateAttr(default=None)
+    _allow_outside: bool = PrivateAttr(default=False)
 
     @model_validator(mode="before")
     @classmethod
@@ -124,6 +126,11 @@ class Scene(Table):
     def world_copy(self) -> Path | None:
         """The file to read in place of `world.file`, if this is another machine."""
         return self._world_copy
+
+    @property
+    def allows_outside(self) -> bool:
+        """True if the world may name files outside its folder; a copy on another machine was checked before."""
+        return self._allow_outside or self._world_copy is not None
 
     @property
     def assumed_prior(self) -> PriorTable:
@@ -204,11 +211,14 @@ def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) 
 
 def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], lenses: Iterable[str]) -> Scene:
     """The scene in `data` after `--set` overrides and `--lens`, with absolute paths. Raises InputError."""
+    overrides = list(overrides)
+    keys = [override for override in overrides if override != ALLOW_OUTSIDE]
     try:
-        data = keep_lenses(apply_overrides(data, overrides), lenses)
+        data = keep_lenses(apply_overrides(data, keys), lenses)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
     scene = parse(data, source)
+    scene._allow_outside = len(keys) < len(overrides)  # pyright: ignore[reportPrivateUsage]
     update: dict[str, Any] = {}
     if any(lens.surfaces is not None for lens in scene.camera.lens):
         from .formats.lens_file import with_surfaces

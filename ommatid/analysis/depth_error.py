@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.reconstruct.output.run_json import DepthBin
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.printable import printable_label
@@ -112,6 +112,7 @@ def _distance(depth_bin: DepthBin) -> str:
     return f"{near} mm" if near == far else f"{near} to {far} mm"
 
 
+@own_style()
 def draw(
     path: Path,
     camera: Camera,

@@ -11,10 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ommatid.runtime.errors import MachineError
+from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Completed
-from ommatid.runtime.files import check_output, clear_abandoned, make_folder
+from ommatid.runtime.files import clear_abandoned, make_folder
+from ommatid.runtime.outputs.kinds import check_folder, check_output
+from ommatid.runtime.outputs.occupied import new_folder, occupied
 from ommatid.runtime.processors import processors
 from ommatid.scenes.formats.picture import write_truth
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, write
@@ -29,6 +31,7 @@ PICTURES = (
     *("stack.exr", "estimate.exr", "estimate.png", "estimate.npy", "estimate.tiff", "overview.png", "depth.png"),
     *("scene.toml", TRUTH),
 )
+OTHERS = "model.npz", "run.json", "report.html"
 
 
 @dataclass(frozen=True)
@@ -106,11 +109,12 @@ class Batch:
         for member in members:
             try:
                 setup = self.open(member)
-                prepare(setup, member.folder)
+                check_files(setup, member.folder)
+                with new_folder(member.folder):  # fails before any work if there can be none
+                    waiting.append(member)
             except Exception as error:
                 yield member, partial(_raise, error)
                 continue
-            waiting.append(member)
             auto_variant |= setup.scene.render.variant == "auto"
         if not waiting:
             return
@@ -128,12 +132,17 @@ class Batch:
             yield member, partial(_raise, packages.failed[member])
 
     def _collect(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
-        """Write the files that a worker returned, and report its stages. Raises the worker's error."""
+        """Write the files that a worker returned, and report its stages. Raises the worker's error.
+
+        A scene that was refused leaves no files.
+        """
         try:
             outcome = ended.result()
         except MachineError as error:
             raise MachineError(f"{member.scene}: {error}") from error
-        unpack(outcome, member.folder)
+        if outcome.done or not isinstance(outcome.error, InputError):
+            with occupied(member.folder):
+                unpack(outcome, member.folder)
         observer = self.observe(member.folder)
         for stage, executed in outcome.done.items():
             observer.done(stage, executed)
@@ -170,9 +179,10 @@ class _ScenePackages:
 def check_files(setup: Setup, folder: Path) -> None:
     """Raise InputError if a scene has no picture, or if its results would replace a file that it is read from."""
     scene, _ = setup.scene, setup.picture
+    check_folder(folder)
     if folder.is_dir():
         read = scene.source, *([Path(scene.target.image)] if scene.target.image else [])
-        for name in (*PICTURES, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
+        for name in (*PICTURES, *OTHERS, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
             check_output(folder / name, *read)
 
 

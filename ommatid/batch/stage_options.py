@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.reconstruct.output.estimate_formats import Format, write_formats
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.scenes.scene import TRUTH
 from ommatid.scenes.setup import Setup
 
@@ -15,7 +16,8 @@ from .remote import RunObserver, Stages
 
 # What the stages write; the calibrated models of a study and interrupted work are beside them.
 ESTIMATES = ("estimate.exr", "estimate.npy", "estimate.tiff")
-RESULTS = ("stack.exr", "model*.npz", "run.json", *ESTIMATES, "study.json", "report.html", ".*.partial.npz")
+RENDERED = "stack.exr"
+RESULTS = (RENDERED, "model*.npz", "run.json", *ESTIMATES, "study.json", "report.html", ".*.partial.npz")
 
 Check = Callable[[Setup, Path], None]  # raises InputError where the stages would, and writes nothing
 
@@ -23,20 +25,23 @@ Check = Callable[[Setup, Path], None]  # raises InputError where the stages woul
 def with_options(stages: Stages, force: Check | None, formats: tuple[Format, ...]) -> Stages:
     """Return stages that last write `formats`, and first remove the results of an earlier run if `force` is given.
 
+    One process at a time runs them in a folder. A scene that is refused before it is rendered leaves nothing there.
+
     force : check of the stages, which comes before anything is removed; None: what is up to date stays
     """
-    return stages if force is None and not formats else partial(_with_options, stages, force, formats)
+    return partial(_with_options, stages, force, formats)
 
 
 def _with_options(
     stages: Stages, force: Check | None, formats: tuple[Format, ...], setup: Setup, folder: Path, observer: RunObserver
 ) -> dict[str, Any]:
-    if force is not None:
-        force(setup, folder)
-        clear_results(folder, setup)
-    description = stages(setup, folder, observer)
-    write_formats(folder / "estimate.exr", formats)
-    return description
+    with occupied(folder, RENDERED):
+        if force is not None:
+            force(setup, folder)
+            clear_results(folder, setup)
+        description = stages(setup, folder, observer)
+        write_formats(folder / "estimate.exr", formats)
+        return description
 
 
 def clear_results(folder: Path, setup: Setup) -> None:

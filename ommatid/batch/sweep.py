@@ -16,6 +16,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.outputs.names import check_name, shortened_name
 from ommatid.scenes.scene import read
 
 from .batch import Member
@@ -53,13 +54,15 @@ def sweep_axes(options: Iterable[str]) -> tuple[SweepAxis, ...]:
 def members(scenes: Sequence[Path], axes: Sequence[SweepAxis], output: Path) -> list[Member]:
     """List every scene with every combination of values, in folders of `output` that are named after them.
 
-    Raises InputError if two of them would share a folder.
+    Raises InputError if two of them would share a folder, or if a scene has a name that no folder can have.
     """
     names = [_folder_names(axis) for axis in axes]
     by_folder: dict[Path, Member] = {}
+    for scene in scenes:
+        check_name(scene.stem, scene)
     for scene, values in product(scenes, product(*(axis.values for axis in axes))):
         parts = [f"{_safe(axis.key)}={name[value]}" for axis, name, value in zip(axes, names, values, strict=True)]
-        folder = output / "+".join([scene.stem, *parts])
+        folder = output / shortened_name("+".join([scene.stem, *parts]))
         if folder in by_folder:
             raise InputError(f"{folder}: two scenes of the batch are called '{scene.stem}'; rename one of them")
         changes = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.figures.quantity_axis import GREY_LEVELS, QuantityAxis, quantity_axis, spans_decade
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.runtime.printable import printable_label
 
 from .sweep_row import SweepRow
@@ -56,6 +56,7 @@ class Crossing:
     error: float
 
 
+@own_style()
 def write_figure(path: Path, rows: Sequence[SweepRow], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the errors of a sweep. Raises MachineError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.analysis.pareto import pareto_front
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.runtime.printable import printable_label
 
 from .labels import Label, label_points
@@ -51,6 +51,7 @@ Abscissa = Callable[[Cell], float | None]
 Ordinate = Callable[[Cell], Quantiles | None]
 
 
+@own_style()
 def write_figures(folder: Path, table: BenchTable, files: FigureFiles = SCREEN_PNG) -> None:
     """Write a PNG for each stage that has cells: render.png, calibrate.png, reconstruct.png."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from ommatid.runtime.execution.library_warnings import library_warnings
+from ommatid.runtime.library_caches import library_caches
 from ommatid.runtime.versions import command_line
 
 from . import calibrate, output, predict, reconstruct, run, show, studies
@@ -59,6 +60,6 @@ def start(version: Version = False) -> None:
 def main() -> None:
     """Run the command line and exit."""
     prepare_streams()
-    with command_line(["ommatid", *sys.argv[1:]]), library_warnings(output.warn):
+    with command_line(["ommatid", *sys.argv[1:]]), library_caches(), library_warnings(output.warn):
         code = exit_code_of(partial(app, prog_name="ommatid", standalone_mode=False))
     sys.exit(code)

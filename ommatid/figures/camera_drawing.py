@@ -19,7 +19,7 @@ from ommatid.scenes.scene import Scene
 
 from .camera_key import write_key
 from .lengths import length_words
-from .saving import FORMATS, SCREEN_PNG, FigureFiles
+from .saving import FORMATS, SCREEN_PNG, FigureFiles, own_style
 from .sensor_drawing import draw_sensor, draw_sub_images, sensor_aspect, write_beside
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
@@ -43,6 +43,7 @@ ARROW: dict[str, Any] = {
 Ray = tuple[tuple[float, float], ...]  # points (z, x)
 
 
+@own_style()
 def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True) -> Any:
     """Draw a camera to scale, with its lengths, as a Matplotlib figure.
 

@@ -23,6 +23,7 @@ from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
+from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.printable import printable
 from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
@@ -114,6 +115,7 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
         return BatchEntry(folder.name, failure=failure)
     try:
+        check_folder(folder)
         return BatchEntry(folder.name, run_json.read(folder), sensor_area=_sensor_area(folder / "scene.toml"))
     except InputError as error:
         return BatchEntry(folder.name, failure=str(error))

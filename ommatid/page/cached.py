@@ -13,6 +13,7 @@ from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.time_spent import PAGE, before_page, with_stage, without_page
 from ommatid.runtime.files import cached, fingerprint, write_text
+from ommatid.runtime.input_files import read_text
 from ommatid.scenes import stack
 
 from .data import read_run
@@ -57,7 +58,7 @@ def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
 
 def read_stamp(path: Path) -> tuple[None, str | None]:
     """Return the fingerprint of a page on disk; None for a foreign or truncated file."""
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     match = re.search(r'<meta name="ommatid" content="([0-9a-f]+)">', text[:HEAD])
     return None, match[1] if match and text.rstrip().endswith("</html>") else None
 

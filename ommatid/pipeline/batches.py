@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,12 +21,15 @@ from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
 from ommatid.scenes.scene import read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
+
+REFUSED = 2  # exit code of a scene with an error
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,14 @@ def batch_members(
 ) -> list[Member]:
     """List every scene with every combination of swept values, each with its own folder inside `folder`.
 
-    Raises InputError for a sweep that cannot be read, a key that no scene has, and two scenes of one name.
+    Raises InputError for a sweep that cannot be read, a key that no scene has, two scenes of one name, and a name
+    that no folder can have.
     """
     axes = sweep.sweep_axes(sweeps or ())
+    members = sweep.members(scenes, axes, folder)
     for scene in scenes:
         sweep.check_keys(scene, axes, changes, lenses)
-    return sweep.members(scenes, axes, folder)
+    return members
 
 
 def batch_warnings(members: Sequence[Member], changes: Sequence[str], lenses: Sequence[str]) -> list[str]:
@@ -138,6 +143,7 @@ def run_batch(
     figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     share : of a job, whose scenes `members` are; the last job writes table and page
+    Where all scenes are refused, neither table nor page is written.
     """
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
@@ -162,6 +168,8 @@ def run_batch(
     ]
     describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
     if share is None:
+        if len(failures) == len(members) and set(codes[1:]) == {REFUSED}:  # leaves nothing behind
+            describe = partial(_describe, None, None, figures, report_failure)
         sections, code = describe(ended)
         return BatchOutcome(documents, sections, max(*codes, code))
     described, jobs = share.end(ended, describe)
@@ -178,13 +186,15 @@ def _describe(
 ) -> tuple[list[Section], int]:
     """Write the table of a sweep and the page of a batch; return the printed table, and an exit code."""
     rows = [scene.row for scene in ended if scene.row is not None]
-    sections = _sweep_sections(rows, sweep_folder, figures) if rows else []
-    if index_folder is not None:
-        try:
-            cached_index(index_folder, {index_folder / scene.folder: scene.failure for scene in ended})
-        except Exception as error:
-            return sections, report_failure(error)
-    return sections, 0
+    folder = sweep_folder if rows else index_folder
+    with nullcontext() if folder is None or not (rows or folder.is_dir()) else occupied(folder):
+        sections = _sweep_sections(rows, sweep_folder, figures) if rows else []
+        if index_folder is not None:
+            try:
+                cached_index(index_folder, {index_folder / scene.folder: scene.failure for scene in ended})
+            except Exception as error:
+                return sections, report_failure(error)
+        return sections, 0
 
 
 def _heading(member: Member, with_folder: bool) -> dict[str, Any]:

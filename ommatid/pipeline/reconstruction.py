@@ -22,7 +22,10 @@ from ommatid.reconstruct.restore import check_match, check_region
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Workers
-from ommatid.runtime.files import check_output, file_digest, make_folder, write_text, write_whole
+from ommatid.runtime.files import file_digest, write_text, write_whole
+from ommatid.runtime.outputs.kinds import check_folder, check_output
+from ommatid.runtime.outputs.names import check_name
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes import model_file
@@ -63,6 +66,7 @@ class ReconstructionRequest:
 def is_folder(output: Path) -> bool:
     """Return True if `-o` names a folder, not an OpenEXR file. Raises InputError for the name of another file."""
     if output.is_dir():
+        check_folder(output)
         return True
     if output.suffix.lower() in PICTURES:
         advice = output.with_suffix(".exr")
@@ -88,6 +92,7 @@ def reconstruct_files(
     check_output(
         output, request.stack, request.model, *(request.stack.parent / name for name in (TRUTH, WORLD_PICTURE))
     )
+    check_output(output.with_suffix(".png"))
     check_picture(output)
     check_formats(output, formats)
     recorded, calibrated = request.read()
@@ -120,21 +125,21 @@ def reconstruct_folder(
     for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
         if (folder / name).resolve() in sources:
             raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
-    make_folder(folder)
-    _remove_other_scene(folder, recorded)
-    if result_files.truth_beside(request.stack, recorded) is not None:
-        for name in (TRUTH, WORLD_PICTURE):
-            _copy(request.stack.parent / name, folder / name)
-    if request.changes or request.lenses:
-        stack_file.write(folder / STACK, recorded)
-    else:
-        _copy(request.stack, folder / STACK)
-    if request.lenses:
-        model_file.write(folder / MODEL, calibrated)
-    else:
-        _copy(request.model, folder / MODEL)
-    with _tile_workers(scheduler, workers) as pool:
-        return finish_folder(folder, progress, request.regions, pool, request.force)
+    with occupied(folder, RUN):
+        _remove_other_scene(folder, recorded)
+        if result_files.truth_beside(request.stack, recorded) is not None:
+            for name in (TRUTH, WORLD_PICTURE):
+                _copy(request.stack.parent / name, folder / name)
+        if request.changes or request.lenses:
+            stack_file.write(folder / STACK, recorded)
+        else:
+            _copy(request.stack, folder / STACK)
+        if request.lenses:
+            model_file.write(folder / MODEL, calibrated)
+        else:
+            _copy(request.model, folder / MODEL)
+        with _tile_workers(scheduler, workers) as pool:
+            return finish_folder(folder, progress, request.regions, pool, request.force)
 
 
 def finish_folder(
@@ -204,26 +209,32 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
     """
     if path.is_file():
         in_run = path.name == STACK and output is None
+        if not in_run and output is None:
+            check_name(path.stem, path)
         return _report_stack(path, path.parent if in_run else output or path.with_suffix(""), progress)
     if output is not None:
         raise InputError(f"{path}: -o is the folder of a stack's results; a folder is reported in place, leave out -o")
     if (path / STACK).is_file():
         if (path / RUN).is_file():
-            _write_page(path)
+            with occupied(path):
+                _write_page(path)
             return ReportOutcome((path,), None, _design_warnings(path))
         return _report_stack(path / STACK, path, progress)
     folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
     if not folders and any((path / name).is_file() for name in (MODEL, result_files.ESTIMATE)):
         from ommatid.page.document import page_of
 
-        write_text(path / REPORT, page_of(path))
+        with occupied(path):
+            write_text(path / REPORT, page_of(path))
         return ReportOutcome((path,), None, ())
     if not folders:
         raise InputError(f"{path}: expected a stack, or a folder with stack.exr or with folders of runs, got none")
     for number, folder in enumerate(folders):
-        _write_page(folder)
+        with occupied(folder):
+            _write_page(folder)
         progress((number + 1) / len(folders))
-    cached_index(path, dict.fromkeys(folders, ""))
+    with occupied(path):
+        cached_index(path, dict.fromkeys(folders, ""))
     warnings = tuple(warning for folder in folders for warning in _design_warnings(folder))
     return ReportOutcome(folders, path / INDEX, warnings)
 
@@ -232,8 +243,9 @@ def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcom
     """Reconstruct a stack with the model beside it, or with H as designed, and write the page."""
     model = stack.with_name(MODEL)
     if folder.resolve() == stack.parent.resolve():
-        warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
-        finish_folder(folder, progress)
+        with occupied(folder, RUN):
+            warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
+            finish_folder(folder, progress)
         return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
     with TemporaryDirectory(prefix="ommatid-") as scratch:
         warnings = ()

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, MachineError
+from .outputs.kinds import check_folder, check_output, input_error
 from .printable import printable
 
 Content = TypeVar("Content")
@@ -73,17 +74,6 @@ def clear_abandoned(folder: Path, name: str | None = None) -> None:
             temporary.unlink()
 
 
-def check_output(path: Path, *inputs: Path) -> None:
-    """Raise InputError if a result could not be written to `path`, or would replace one of its `inputs`."""
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
-    if path.is_dir():
-        raise InputError(f"{path}: expected the name of a file, got a folder")
-    for source in inputs:
-        if path.resolve() == source.resolve():
-            raise InputError(f"{path}: would replace the file that is read; choose another name with -o")
-
-
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
 
@@ -121,13 +111,18 @@ def _is_number(text: str) -> bool:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents. Raises MachineError or InputError."""
+    """Create a folder and its parents. Raises MachineError, or InputError where it cannot be one of results."""
+    check_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"{path}: expected a folder to write to, but a file of that name is in the way") from error
+        raise InputError(
+            f"{printable(path)}: expected a folder to write to, but a file of that name is in the way"
+        ) from error
     except OSError as error:
-        raise MachineError(f"{path}: the folder could not be created ({error.strerror})") from error
+        raise input_error(path, error) or MachineError(
+            f"{printable(path)}: the folder could not be created ({error.strerror})"
+        ) from error
 
 
 def digest(*arrays: NDArray[Any]) -> str:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.printable import printable_label
 from ommatid.scenes.formats import exr
@@ -40,6 +40,7 @@ class OverviewPanel:
     content: Literal["values", "recorded", "error", "deviation"]
 
 
+@own_style()
 def write_overview(folder: Path, stack: Stack, report: RunReport, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the result in a folder, which has estimate.exr. Raises InputError or MachineError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

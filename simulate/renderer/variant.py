@@ -18,6 +18,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.interpreter import python_command, python_environment
+
+from .worlds.plugin_names import mitsuba_folder
 
 if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
@@ -28,12 +31,13 @@ PREFERENCE = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 
 _PROBE = """
 import json, sys, time
-from ommatid.simulate.renderer.variant import unusable_reason
+from ommatid.simulate.renderer.variant import fix_plugin_folder, unusable_reason
 variant = sys.argv[1]
 reason = unusable_reason(variant)
 speed = 0.0
 if not reason:
     import mitsuba as mi
+    fix_plugin_folder()
     mi.set_variant(variant)
     scene = mi.load_dict({
         "type": "scene", "integrator": {"type": "path", "max_depth": 1},
@@ -107,6 +111,7 @@ def activate(variant: str) -> None:
     """Make a variant Mitsuba's current one, and pass its warnings to Python's log."""
     import mitsuba as mi
 
+    fix_plugin_folder()
     if mi.variant() != variant:
         mi.set_variant(variant)
     logger = cast(Any, mi).logger()
@@ -115,6 +120,16 @@ def activate(variant: str) -> None:
         appender: Any = _log_appender()
         logger.add_appender(appender())
         logger.set_log_level(mi.LogLevel.Warn)
+
+
+def fix_plugin_folder() -> None:
+    """Make Mitsuba find its plugins and data in its own folder alone, and not in the current one."""
+    import mitsuba as mi
+
+    resolver, folder = cast(Any, mi).file_resolver(), str(mitsuba_folder())
+    if list(resolver) != [folder]:
+        resolver.clear()
+        resolver.append(folder)
 
 
 def release() -> None:
@@ -151,7 +166,12 @@ def probe(variant: str) -> BackendStatus:
     """Try a variant by a small rendering in a separate process, which a broken backend may kill."""
     try:
         process = subprocess.run(
-            [sys.executable, "-c", _PROBE, variant], capture_output=True, text=True, timeout=PATIENCE, check=False
+            python_command(_PROBE, variant),
+            env=python_environment(),
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return BackendStatus(variant, f"a trial rendering did not end in {PATIENCE} s", 0.0)

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import make_folder
+from ommatid.runtime.input_files import read_bytes, read_text
 
 from ..batch import Member
 from ..sweep_row import SweepRow
@@ -207,7 +208,7 @@ def join_jobs(
 
 def _read_plan(path: Path) -> JobPlan:
     try:
-        return JobPlan.model_validate_json(path.read_bytes())
+        return JobPlan.model_validate_json(read_bytes(path))
     except ValidationError as error:
         raise InputError(f"{path}: expected the plan of jobs, got something else; delete {path.parent}") from error
 
@@ -217,7 +218,7 @@ def _records(plan: JobPlan, folder: Path, number: int) -> dict[int, str]:
     records: dict[int, str] = {}
     for job in range(1, plan.jobs + 1):
         with suppress(FileNotFoundError):
-            records[job] = _record(folder, number, job).read_text(encoding="utf-8")
+            records[job] = read_text(_record(folder, number, job))
     return records
 
 

@@ -258,7 +258,5 @@ def _with_curves(scene: Scene) -> dict[str, Any]:
 
 def write(path: Path, scene: Scene) -> None:
     """Write a scene as TOML, defaults included. Raises InputError or MachineError."""
-    import tomli_w
-
     pair = re.compile(r"\[\s+([-+.\de]+),\s+([-+.\de]+),\s+\]")  # tomli_w spreads pairs over four lines
-    write_text(path, pair.sub(r"[\1, \2]", tomli_w.dumps(scene.plain())))
+    write_text(path, pair.sub(r"[\1, \2]", toml.dumps(scene.plain())))

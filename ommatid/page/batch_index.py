@@ -5,6 +5,7 @@ A sweep is a batch with `sweep.json`, which lists its folders with the `values` 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -23,6 +24,7 @@ from ommatid.reconstruct.output.verdict_words import heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.outputs.kinds import check_folder
+from ommatid.runtime.printable import printable
 from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.scene import read as read_scene
@@ -51,7 +53,7 @@ class BatchEntry:
     @property
     def title(self) -> str:
         """Title of the scene, or the name of its folder."""
-        return (self.report.title if self.report else "") or self.name
+        return printable((self.report.title if self.report else "") or self.name)
 
     @property
     def agreement(self) -> str:
@@ -75,7 +77,7 @@ class BatchEntry:
 
     def url(self, file: str) -> str:
         """Return the address of a file of the run, relative to the index."""
-        return quote(f"{self.name}/{file}")
+        return quote(os.fsencode(f"{self.name}/{file}"))
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,9 @@ def read_sweep(path: Path) -> SweepTable | None:
     keys = tuple(dict.fromkeys(key for scene in scenes for key in scene.values))
     rows = [
         (
-            "" if scene.failed is not None or scene.folder is None else quote(f"{Path(scene.folder).name}/{REPORT}"),
+            ""
+            if scene.failed is not None or scene.folder is None
+            else quote(os.fsencode(f"{Path(scene.folder).name}/{REPORT}")),
             tuple(str(scene.values.get(key, "")) for key in keys),
             scene.mse,
             scene.predicted_mse,

@@ -24,6 +24,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
+from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
 from ommatid.scenes.scene import ALLOW_OUTSIDE, read
 
@@ -157,8 +158,9 @@ def run_batch(
             results[member] = {**document, **work()}
         except Exception as error:
             codes.append(report_failure(error))
-            failures[member] = str(error) or type(error).__name__
-            results[member] = {**document, "error": str(error), "exit_code": codes[-1]}
+            reason = printable_sentence(error)
+            failures[member] = reason or type(error).__name__
+            results[member] = {**document, "error": reason, "exit_code": codes[-1]}
     documents = [results[member] for member in members]
     ended = [
         EndedScene(

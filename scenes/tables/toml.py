@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from typing import Any, cast
 
@@ -20,6 +21,18 @@ def loads(text: str) -> dict[str, Any]:
         raise ValueError("a number has thousands of digits") from error
     check(data)
     return data
+
+
+def dumps(data: dict[str, Any]) -> str:
+    """Return data as TOML; characters that do not print are written as escapes, which `loads` reads again."""
+    import tomli_w
+
+    return re.sub(r"[^\x00-\x7e]", _escaped, tomli_w.dumps(data))
+
+
+def _escaped(match: re.Match[str]) -> str:
+    character = match[0]
+    return character if character.isprintable() else f"\\U{ord(character):08x}"
 
 
 def check(data: dict[str, Any]) -> None:

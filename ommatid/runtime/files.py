@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, MachineError
+from .input_files import open_input, real_path
 
 Content = TypeVar("Content")
 Made = TypeVar("Made")
@@ -78,7 +79,7 @@ def check_output(path: Path, *inputs: Path) -> None:
     if path.is_dir():
         raise InputError(f"{path}: expected the name of a file, got a folder")
     for source in inputs:
-        if path.resolve() == source.resolve():
+        if real_path(path) == real_path(source):
             raise InputError(f"{path}: would replace the file that is read; choose another name with -o")
 
 
@@ -122,7 +123,7 @@ def digest(*arrays: NDArray[Any]) -> str:
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's bytes, as hexadecimal text. Raises InputError if it cannot be read."""
     try:
-        with path.open("rb") as stream:
+        with open_input(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error})") from error

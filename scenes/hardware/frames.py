@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import open_input
 
 from ..camera import Camera
 from ..constants import WHITE
@@ -268,5 +269,5 @@ def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
+    with open_input(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

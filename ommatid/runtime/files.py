@@ -28,6 +28,7 @@ Made = TypeVar("Made")
 
 LONGEST_FIELD = 1000  # characters of a text in a CSV file
 PART = ".part."  # in the name of a file that is still being written
+written: set[Path] = set()  # absolute paths of the files that this process wrote
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
@@ -43,6 +44,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
             with temporary.open("rb+") as stream:
                 os.fsync(stream.fileno())
             temporary.replace(path)
+            written.add(path.absolute())
     except OSError as error:
         reason = error.strerror or str(error)
         raise MachineError(

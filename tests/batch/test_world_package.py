@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import pytest
 from skimage.io import imsave
 
 from ommatid.batch.batch import prepare
-from ommatid.batch.remote import RunObserver, carry_out, outcome_of, packed, unpack
-from ommatid.batch.world_package import packed_world, unpacked_world
+from ommatid.batch.remote import RunObserver, SceneOutcome, carry_out, outcome_of, packed, unpack
+from ommatid.batch.world_package import WorldPackage, packed_world, unpacked_world
 from ommatid.pipeline.stages import open_scene, results, run
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr
@@ -98,3 +99,38 @@ def test_the_file_of_a_spectrum_belongs_to_its_world(deep: Path, here: Path) -> 
     (here / "places" / "wall.xml").write_text(f'<scene version="3.0.0">{lamp}</scene>', encoding="utf-8")
     (here / "places" / "lamp.spd").write_text("400 1\n700 1\n", encoding="utf-8")
     assert [path.name for path in files(open_scene(deep).scene)] == ["world.xml", "wall.xml", "lamp.spd"]
+
+
+OUTSIDE = ("../x", "a/../../x", "/tmp/x", "..", "", "a/b/../../../x")
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_no_file_of_another_machine_is_written_outside_its_folder(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    good = {"run.json": b"1", "b": b"2"}
+    with pytest.raises(InputError, match="expected one inside this folder"):
+        unpack(SceneOutcome({**good, name: b"3"}, {}, {}), folder)
+    with pytest.raises(InputError, match="expected one inside this folder"):
+        unpack(SceneOutcome(good, {}, {}, removed=(name,)), folder)
+    for package in (WorldPackage("/", "b", {**good, name: b"3"}), WorldPackage("/", name, good)):
+        with pytest.raises(InputError, match="expected one inside this folder"):
+            unpacked_world(package, folder)
+    assert [*tmp_path.iterdir()] == [folder]
+    assert [*folder.iterdir()] == []
+
+
+def test_a_package_that_leads_out_of_a_workers_folder_is_refused(
+    deep: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(here / "scratch"))
+    (here / "scratch").mkdir()
+    setup = open_scene(deep)
+    package = packed(setup, here / "out")
+    assert package.world is not None
+    world = replace(package.world, contents={**package.world.contents, "../../escaped": b"x"})
+    outcome = carry_out(run, replace(package, world=world))
+    assert isinstance(outcome.error, InputError)
+    with pytest.raises(InputError, match="expected one inside this folder"):
+        carry_out(run, replace(package, files={"../escaped": b"x"}))
+    assert [*(here / "scratch").iterdir()] == []

@@ -57,7 +57,11 @@ TileScheduler = Annotated[
 TileWorkers = Annotated[
     int | None,
     typer.Option(
-        "--workers", metavar="N", min=1, help="Distribute several stacks, or the tiles of one, over N processes."
+        "--workers",
+        metavar="N",
+        min=1,
+        max=options.MOST_WORKERS,
+        help="Distribute several stacks, or the tiles of one, over N processes.",
     ),
 ]
 ScenePrior = Annotated[

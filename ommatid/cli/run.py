@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from . import failures, output
 from .options import (
     SCREEN,
+    AllowOutside,
     Complete,
     DryRun,
     FigureFormats,
@@ -59,6 +60,7 @@ def run(
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     within: Within = "",
     figure_formats: FigureFormats = "",
     figure_resolution: FigureResolution = SCREEN,
@@ -79,7 +81,10 @@ def run(
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
     figures = figure_files(figure_formats, figure_resolution)
-    asked, words = (changes(sets, complete), lens_names(lens)), _job_words(within, formats, figure_formats)
+    asked, words = (
+        (changes(sets, complete, allow_outside), lens_names(lens)),
+        _job_words(within, formats, figure_formats),
+    )
     members = batch_members(scenes, folder, sweep, *asked)
     share = share_of_job("" if dry_run else job, members, folder, words, *asked, scheduler)
     members = members if share is None else share.members
@@ -147,6 +152,7 @@ def render(
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -158,7 +164,7 @@ def render(
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         return {"file": str(member.folder / "stack.exr"), **description}
 
-    asked = changes(sets, complete), lens_names(lens)
+    asked = changes(sets, complete, allow_outside), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
     share = share_of_job(job, members, folder, ("render",), *asked, scheduler)
     members = members if share is None else share.members

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable_label
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.lens_type import LensType, SubImager
@@ -70,8 +71,8 @@ def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True) -> A
     if not described:
         return figure
     write_key(figure, camera, terms, colours, key - 1.5 * LINE, LINE)
-    name = scene.title or scene.source.stem
-    figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center", parse_math=False)
+    name = printable_label(scene.title or scene.source.stem)
+    figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center")
     return figure
 
 

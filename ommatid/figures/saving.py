@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -61,12 +62,16 @@ def figure_formats(text: str) -> tuple[str, ...]:
 
 @contextmanager
 def own_style() -> Generator[None]:
-    """Draw with Matplotlib's defaults, whatever a matplotlibrc or a notebook has set. Also usable as a decorator."""
+    """Draw with Matplotlib's defaults, whatever a matplotlibrc or a notebook has set. Also usable as a decorator.
+
+    A character that the font lacks is drawn as a box, without a warning.
+    """
     import matplotlib
 
     module: Any = matplotlib
     defaults = {key: value for key, value in module.rcParamsDefault.items() if key != "backend"}
-    with module.rc_context({**defaults, **SETTINGS}):
+    with module.rc_context({**defaults, **SETTINGS}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font", UserWarning)
         yield
 
 

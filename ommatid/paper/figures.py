@@ -14,6 +14,7 @@ import numpy as np
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.printable import printable_label
 from ommatid.scenes.constants import WHITE
 
 from .photographs import Photograph, TileCrops, Trials
@@ -148,7 +149,7 @@ def draw_photograph(path: Path, photograph: Photograph, side: int, files: Figure
     name = (
         f"Six tiles of {Path(photograph.name).name}, {side} x {side} pixels each, reconstructed from three lens types"
     )
-    above.suptitle(name, parse_math=False)
+    above.suptitle(printable_label(name))
     _thumbnails(above, photograph.crops, side)
     panels = below.subplots(2, 2, sharex="col", sharey="row", height_ratios=(2.4, 1.0))
     experiments = (

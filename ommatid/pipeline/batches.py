@@ -22,14 +22,14 @@ from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
+from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
+from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import ALLOW_OUTSIDE, read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
-
-REFUSED = 2  # exit code of a scene with an error
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ def share_of_job(
         return None
     if scheduler:
         raise InputError("--job and --scheduler: expected one of them; both distribute the scenes over machines")
-    command = (*words, *(f"--set {change}" for change in changes), *([f"--lens {','.join(lenses)}"] if lenses else []))
+    changed = (change if change == ALLOW_OUTSIDE else f"--set {change}" for change in changes)
+    command = (*words, *changed, *([f"--lens {','.join(lenses)}"] if lenses else []))
 
     def seconds(member: Member) -> float:
         return estimate_cost(member, changes, lenses).seconds
@@ -143,8 +144,11 @@ def run_batch(
     figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     share : of a job, whose scenes `members` are; the last job writes table and page
-    Where all scenes are refused, neither table nor page is written.
+    Where all scenes fail, neither table nor page is written.
     """
+    for folder in (index_folder, sweep_folder):
+        if folder is not None:
+            check_folder(folder)  # before any work
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]
@@ -154,8 +158,9 @@ def run_batch(
             results[member] = {**document, **work()}
         except Exception as error:
             codes.append(report_failure(error))
-            failures[member] = str(error) or type(error).__name__
-            results[member] = {**document, "error": str(error), "exit_code": codes[-1]}
+            reason = printable_sentence(error)
+            failures[member] = reason or type(error).__name__
+            results[member] = {**document, "error": reason, "exit_code": codes[-1]}
     documents = [results[member] for member in members]
     ended = [
         EndedScene(
@@ -167,7 +172,7 @@ def run_batch(
     ]
     describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
     if share is None:
-        if len(failures) == len(members) and set(codes[1:]) == {REFUSED}:  # leaves nothing behind
+        if len(failures) == len(members):  # leaves nothing behind
             describe = partial(_describe, None, None, figures, report_failure)
         sections, code = describe(ended)
         return BatchOutcome(documents, sections, max(*codes, code))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tomllib
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import file_digest, write_text, write_whole
+from ommatid.runtime.input_files import read_text, real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_output
 from ommatid.runtime.outputs.names import check_name
 from ommatid.runtime.outputs.occupied import occupied
@@ -35,6 +35,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, CalibrationTable, Scene, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables import toml
 
 STACK, MODEL = "stack.exr", "model.npz"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
@@ -122,9 +123,9 @@ def reconstruct_folder(
     check_options(cluster, workers)
     recorded, calibrated = request.read()
     check_match(recorded, calibrated, (request.stack, request.model))
-    sources = {path.resolve() for path in (request.stack, request.model, request.stack.parent / TRUTH)}
+    sources = {real_path(path) for path in (request.stack, request.model, request.stack.parent / TRUTH)}
     for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
-        if (folder / name).resolve() in sources:
+        if real_path(folder / name) in sources:
             raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
     with occupied(folder, RUN):
         _remove_other_scene(folder, recorded)
@@ -243,7 +244,7 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
 def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcome:
     """Reconstruct a stack with the model beside it, or with H as designed, and write the page."""
     model = stack.with_name(MODEL)
-    if folder.resolve() == stack.parent.resolve():
+    if real_path(folder) == real_path(stack.parent):
         with occupied(folder, RUN):
             warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
             finish_folder(folder, progress)
@@ -270,7 +271,7 @@ def _write_designed_model(stack: Path, model: Path, progress: Progress) -> str:
 def _remove_other_scene(folder: Path, recorded: Stack) -> None:
     """Remove the scene.toml that an earlier run wrote beside its stack, unless `recorded` is of the same scene."""
     with suppress(OSError, ValueError, KeyError, InputError):
-        written = tomllib.loads((folder / "scene.toml").read_text("utf-8"))
+        written = toml.loads(read_text(folder / "scene.toml"))
         earlier, _ = stack_file.read_header(folder / STACK)
         if written == earlier.plain() != recorded.scene.plain():
             (folder / "scene.toml").unlink()

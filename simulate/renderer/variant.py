@@ -8,7 +8,9 @@ used. A variant is global to the process.
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -106,16 +108,16 @@ def check_transport_variant(variant: str, key: str = "calibration.method") -> No
 
 
 def activate(variant: str) -> None:
-    """Make a variant Mitsuba's current one, and redirect its log to stderr."""
+    """Make a variant Mitsuba's current one, and pass its warnings to Python's log."""
     import mitsuba as mi
 
     fix_plugin_folder()
     if mi.variant() != variant:
         mi.set_variant(variant)
     logger = cast(Any, mi).logger()
-    if logger is not None and not isinstance(logger.appender(0), _stderr_appender()):
+    if logger is not None and not isinstance(logger.appender(0), _log_appender()):
         logger.clear_appenders()
-        appender: Any = _stderr_appender()
+        appender: Any = _log_appender()
         logger.add_appender(appender())
         logger.set_log_level(mi.LogLevel.Warn)
 
@@ -138,25 +140,26 @@ def release() -> None:
 
 
 INTERRUPTED = "Received interrupt signal"  # suppressed: the command line reports Ctrl-C itself
+_HEADING = re.compile(r"\A[-\d]+ [:\d]+ \w+ +(\S+ +)?\[[^\]]*\] *")  # date, level, thread and line of a log message
 _APPENDERS: dict[str, Any] = {}
 
 
-def _stderr_appender() -> Any:
+def _log_appender() -> Any:
     import mitsuba as mi
 
-    if "stderr" not in _APPENDERS:
+    if "log" not in _APPENDERS:
 
-        class Stderr(mi.Appender):
+        class LogAppender(mi.Appender):
             def append(self, level: object, text: str) -> None:
                 del level
                 if INTERRUPTED not in text:
-                    print(text, file=sys.stderr)
+                    logging.getLogger("mitsuba").warning("%s", _HEADING.sub("", text))
 
             def log_progress(self, *arguments: object) -> None:
                 del arguments
 
-        _APPENDERS["stderr"] = Stderr
-    return _APPENDERS["stderr"]
+        _APPENDERS["log"] = LogAppender
+    return _APPENDERS["log"]
 
 
 def probe(variant: str) -> BackendStatus:

@@ -264,6 +264,7 @@ def test_wrong_options_are_refused_in_one_line(
     [line] = ended.err.splitlines()
     assert line.startswith("ommatid: ")
     assert message in line
+    assert not (here / "out").exists()
 
 
 def test_without_dask_the_message_says_what_to_install(

@@ -28,6 +28,7 @@ from typing import Any, TypeVar
 
 from ..errors import MachineError
 from .interpreter import python_command, python_environment
+from .library_warnings import library_warnings, warn_on_stderr
 
 Result = TypeVar("Result")
 
@@ -162,9 +163,10 @@ def serve(descriptor: int, parent: int, index: int, count: int) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         _restrict_processors(index, count)
         Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
-        while True:
-            signal.signal(signal.SIGINT, _interrupt_once)  # Mitsuba resets it to a handler that interrupts no waiting
-            pipe.send_bytes(_answer(pipe.recv_bytes()))
+        with library_warnings(warn_on_stderr):
+            while True:
+                signal.signal(signal.SIGINT, _interrupt_once)  # Mitsuba resets it to one that interrupts no waiting
+                pipe.send_bytes(_answer(pipe.recv_bytes()))
     except (EOFError, OSError, KeyboardInterrupt):
         os._exit(0)  # checkpoints are saved, and the pipe has no reader
 

@@ -81,10 +81,8 @@ def run(
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
     figures = figure_files(figure_formats, figure_resolution)
-    asked, words = (
-        (changes(sets, complete, allow_outside), lens_names(lens)),
-        _job_words(within, formats, figure_formats),
-    )
+    asked = changes(sets, complete, allow_outside), lens_names(lens)
+    words = _job_words(within, formats, figure_formats)
     members = batch_members(scenes, folder, sweep, *asked)
     share = share_of_job("" if dry_run else job, members, folder, words, *asked, scheduler)
     members = members if share is None else share.members

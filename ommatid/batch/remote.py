@@ -100,7 +100,7 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
             outcome = outcome_of(work)
         error = outcome.error
         if isinstance(error, InputError | MachineError):
-            message = str(error)
+            message = "".join(map(str, error.args[:1]))  # as raised: names of folders are replaced in whole
             if package.world is not None:
                 message = message.replace(str(folder / WORLD), package.world.root)
             error = type(error)(message.replace(temporary, package.folder))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
@@ -80,12 +79,13 @@ def _bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tu
     late = measure(listed, seconds, journal, measured, perf_counter() - start)
     left_out += [SkippedJob(what=name, why=why) for name, why in journal.refused.items()]
     cells = tuple(journal.cells[job.name] for job in listed if job.name in journal.cells)
+    system = os.uname().sysname, os.uname().release, os.uname().machine  # `platform` runs the command uname
     table = BenchTable(
         title=scene.title or scene.source.stem,
         scene=subject_print,
         fingerprint=made_from,
         camera=camera.describe(),
-        machine={"cores": os.cpu_count(), "system": platform.platform(), "load": os.getloadavg()[0]},
+        machine={"cores": os.cpu_count(), "system": " ".join(system), "load": os.getloadavg()[0]},
         versions=versions("mitsuba", "drjit", "scipy"),
         against=right.description,
         noise_deviation=_noise_deviation(subject),

@@ -21,10 +21,12 @@ from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
+from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import ALLOW_OUTSIDE, read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
@@ -103,7 +105,8 @@ def share_of_job(
         return None
     if scheduler:
         raise InputError("--job and --scheduler: expected one of them; both distribute the scenes over machines")
-    command = (*words, *(f"--set {change}" for change in changes), *([f"--lens {','.join(lenses)}"] if lenses else []))
+    changed = (change if change == ALLOW_OUTSIDE else f"--set {change}" for change in changes)
+    command = (*words, *changed, *([f"--lens {','.join(lenses)}"] if lenses else []))
 
     def seconds(member: Member) -> float:
         return estimate_cost(member, changes, lenses).seconds
@@ -126,7 +129,7 @@ def run_batch(
     batch: Batch,
     members: Sequence[Member],
     report_failure: Callable[[Exception], int],
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
     *,
     sweep_folder: Path | None = None,
@@ -149,14 +152,15 @@ def run_batch(
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]
-    for member, work in batch.run(members, scheduler, workers):
+    for member, work in batch.run(members, cluster, workers):
         document = _heading(member, with_folders)
         try:
             results[member] = {**document, **work()}
         except Exception as error:
             codes.append(report_failure(error))
-            failures[member] = str(error) or type(error).__name__
-            results[member] = {**document, "error": str(error), "exit_code": codes[-1]}
+            reason = printable_sentence(error)
+            failures[member] = reason or type(error).__name__
+            results[member] = {**document, "error": reason, "exit_code": codes[-1]}
     documents = [results[member] for member in members]
     ended = [
         EndedScene(

@@ -19,12 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, MachineError
+from .input_files import open_input
 from .outputs.kinds import check_folder, check_output, input_error
 from .printable import printable
 
 Content = TypeVar("Content")
 Made = TypeVar("Made")
 
+LONGEST_FIELD = 1000  # characters of a text in a CSV file
 PART = ".part."  # in the name of a file that is still being written
 
 
@@ -83,12 +85,30 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
-    """Write a CSV file atomically: a header, then one line per row; None becomes an empty field."""
+    """Write a CSV file atomically: a header, then one line per row; None becomes an empty field.
+
+    Texts are written as they are printed; one that a spreadsheet would execute as a formula begins with an apostrophe.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
+    writer.writerow(map(_field, columns))
+    writer.writerows(map(_field, row) for row in rows)
     write_text(path, text.getvalue())
+
+
+def _field(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    text = printable(value, LONGEST_FIELD)
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) and not _is_number(text) else text
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def make_folder(path: Path) -> None:
@@ -118,7 +138,7 @@ def digest(*arrays: NDArray[Any]) -> str:
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's bytes, as hexadecimal text. Raises InputError if it cannot be read."""
     try:
-        with path.open("rb") as stream:
+        with open_input(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error})") from error

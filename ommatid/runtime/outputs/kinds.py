@@ -11,6 +11,7 @@ import stat
 from pathlib import Path
 
 from ..errors import InputError
+from ..input_files import real_path
 from ..printable import printable
 
 # Suffixes of all files that are written; a folder may hold anything else.
@@ -43,7 +44,7 @@ def check_output(path: Path, *inputs: Path) -> None:
         raise InputError(f"{named}: expected the name of a file, got {_kind(mode)}; choose another name")
     _check_place(path, path.parent)
     for source in inputs:
-        if path.resolve() == source.resolve():
+        if real_path(path) == real_path(source):
             raise InputError(f"{named}: would replace the file that is read; choose another name with -o")
 
 
@@ -90,7 +91,7 @@ def _mode(path: Path) -> int | None:
 
 
 def _check_place(path: Path, folder: Path) -> None:
-    resolved = folder.resolve()
+    resolved = real_path(folder)
     if resolved == _SYSTEM[0] or any(resolved.is_relative_to(system) for system in _SYSTEM[1:]):
         raise InputError(f"{printable(path)}: expected a place for files, got one of the system's, {resolved}")
 

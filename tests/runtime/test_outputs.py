@@ -224,7 +224,11 @@ def test_a_killed_process_frees_its_folder(tmp_path: Path) -> None:
     assert tree(folder) == {"half"}
 
 
-@pytest.mark.parametrize("make", [make_fifo, link_to("/dev/null"), link_to("mine.txt"), Path.mkdir])
+def make_text(path: Path) -> None:
+    path.write_text("mine", encoding="utf-8")
+
+
+@pytest.mark.parametrize("make", [make_fifo, make_text, link_to("/dev/null"), link_to("mine.txt"), Path.mkdir])
 def test_a_lock_file_of_another_kind_is_refused(make: Callable[[Path], None], tmp_path: Path) -> None:
     make(tmp_path / LOCK)
     with pytest.raises(InputError, match="expected a lock file"), occupied(tmp_path):

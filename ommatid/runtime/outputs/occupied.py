@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..files import make_folder, written
 from ..printable import printable
 
-LOCK = ".lock"
+LOCK = ".ommatid.lock"
 
 
 def _say(sentence: str) -> None:
@@ -95,7 +95,8 @@ def _locked(folder: Path, name: str, say: Callable[[str], None], created: list[P
             yield  # nothing can be written here, so nothing needs a lock
             return
         with os.fdopen(descriptor, "rb+", buffering=0):
-            if not S_ISREG(os.fstat(descriptor).st_mode):
+            status = os.fstat(descriptor)
+            if not S_ISREG(status.st_mode) or status.st_size:  # it would be removed at the end
                 raise _in_the_way(path)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

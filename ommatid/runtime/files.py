@@ -81,7 +81,7 @@ def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
 
     def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # of names that are not UTF-8
 
     write_whole(path, write)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -10,6 +11,7 @@ from pydantic_core import ErrorDetails
 
 from ommatid.runtime.errors import shortened, shortened_repr
 
+_SHOULD_HAVE = re.compile(r"^\w+ should have")  # of pydantic
 DERIVED = {  # keys that may follow from others
     "magnification": ", or focal_length with target.distance and both pixel pitches",
     "pixels": ', or "fit", or field_of_view',
@@ -64,6 +66,7 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
     message = message.replace("Input should be", "expected").replace(
         "String should match", "expected text that matches"
     )
+    message = _SHOULD_HAVE.sub("expected", message).replace(" after validation", "")
     if "got" not in message:
         message = f"{message}, got {shortened_repr(problem['input'])}"
     return f"{key}: {message}" if key else message

@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_vali
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
+from ommatid.runtime.input_files import read_text, real_path
 
 from .geometry.solution import complete
 from .tables import toml
@@ -183,6 +184,25 @@ def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) ->
     return _with_source(scene, source)
 
 
+def parse_stored(data: dict[str, Any], source: Path) -> Scene:
+    """Validate the scene that a stack or a model stores, which needs no other file.
+
+    Raises InputError as `parse` does, and for a scene that names files of lenses, glasses or curves, which a scene has
+    only until they are read: a file that was received is not to open others.
+    """
+    scene = parse(data, source)
+    named = [f"camera.lens.{lens.name}.surfaces" for lens in scene.camera.lens if isinstance(lens.surfaces, str)]
+    named += [] if scene.camera.glass_catalogue is None else ["camera.glass_catalogue"]
+    named += [] if scene.light is None or scene.light.file is None else ["light.spectrum"]
+    efficiency = None if scene.sensor is None else scene.sensor.quantum_efficiency
+    named += ["sensor.quantum_efficiency"] if isinstance(efficiency, str) else []
+    if named:
+        raise InputError(f"{source}: expected a scene without other files, got a file as {named[0]}; make it again")
+    if scene.target.shape is None:
+        raise InputError(f"{source}: expected a scene with target.shape, got none; make it again")
+    return scene
+
+
 def _with_source(scene: Scene, source: Path) -> Scene:
     scene._source = source  # pyright: ignore[reportPrivateUsage]
     return scene
@@ -197,11 +217,13 @@ def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) 
     """
     path = find_scene(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, toml.LARGEST)
     except FileNotFoundError as error:
         raise InputError(missing_scene(path)) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: could not be read as a scene file ({error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a scene file in UTF-8, got other bytes at {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{path}: could not be read as a scene file ({error.strerror})") from error
     try:
         data = toml.loads(text)
     except ValueError as error:
@@ -227,9 +249,9 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     update |= _with_curves(scene)
     image, world = scene.target.image, scene.world
     if image is not None and not image.startswith("photo:"):
-        update["target"] = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
+        update["target"] = scene.target.model_copy(update={"image": str(real_path(source.parent / image))})
     if world is not None:
-        update["world"] = world.model_copy(update={"file": str((source.parent / world.file).resolve())})
+        update["world"] = world.model_copy(update={"file": str(real_path(source.parent / world.file))})
     return with_tables(scene, **update)
 
 
@@ -239,10 +261,10 @@ def _with_curves(scene: Scene) -> dict[str, Any]:
 
     update: dict[str, Any] = {}
     if scene.light is not None and scene.light.file is not None:
-        points = read_curve((scene.source.parent / scene.light.file).resolve())
+        points = read_curve(real_path(scene.source.parent / scene.light.file))
         update["light"] = scene.light.model_copy(update={"spectrum": points})
     if scene.sensor is not None and isinstance(scene.sensor.quantum_efficiency, str):
-        points = read_curve((scene.source.parent / scene.sensor.quantum_efficiency).resolve(), 1.0)
+        points = read_curve(real_path(scene.source.parent / scene.sensor.quantum_efficiency), 1.0)
         update["sensor"] = scene.sensor.model_copy(update={"quantum_efficiency": points})
     return update
 

@@ -22,7 +22,7 @@ from .formats import exr
 from .formats.provenance import checked
 from .lens_type import adjacent_slices
 from .recording import Recording
-from .scene import Scene, parse
+from .scene import Scene, parse_stored
 
 CHANNELS = ("Y", "variance")
 SENSOR_CHANNELS = ("dark", "flat")
@@ -137,7 +137,7 @@ def _described(path: Path, first: dict[str, Any]) -> tuple[Scene, Camera, dict[s
         record = checked(first["record"])
     except ValueError as error:
         raise InputError(f"{path}: {error}; make it again") from error
-    scene = parse(first["scene"], path)
+    scene = parse_stored(first["scene"], path)
     return scene, derive(scene), record
 
 

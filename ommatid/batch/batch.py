@@ -11,9 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError
+from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
-from ommatid.runtime.execution.workers import Completed
+from ommatid.runtime.execution.workers import LOST, Completed
 from ommatid.runtime.files import clear_abandoned, make_folder
 from ommatid.runtime.outputs.kinds import check_folder, check_output
 from ommatid.runtime.outputs.occupied import new_folder, occupied
@@ -71,15 +72,15 @@ class Batch:
     versions: Callable[[bool], dict[str, str]]
     count: Callable[[Sequence[Member]], int]
 
-    def run(self, members: Sequence[Member], scheduler: str = "", count: int | None = None) -> Runs:
+    def run(self, members: Sequence[Member], cluster: Cluster | None = None, count: int | None = None) -> Runs:
         """Yield every scene with a function that returns its description or raises its error.
 
-        Scenes run in `count` processes or on the cluster at `scheduler`; without either, in as many processes as
+        Scenes run in `count` processes or on `cluster`; without either, in as many processes as
         finish soonest, given the scenes, processors and memory. A single process is this one, which shows progress.
         """
-        check_options(scheduler, count)
-        if scheduler:
-            return self._on_cluster(members, scheduler)
+        check_options(cluster, count)
+        if cluster is not None:
+            return self._on_cluster(members, cluster)
         count = min(self._best_count(members) if count is None else count, len(members))
         return self._in_processes(members, count) if count > 1 else self._in_this_process(members)
 
@@ -102,7 +103,7 @@ class Batch:
                 member = members[ended.index]
                 yield member, partial(self._collect, member, ended)
 
-    def _on_cluster(self, members: Sequence[Member], scheduler: str) -> Runs:
+    def _on_cluster(self, members: Sequence[Member], cluster: Cluster) -> Runs:
         """Yield scenes with errors that show already here, then the others as they end."""
         waiting: list[Member] = []
         auto_variant = False
@@ -118,16 +119,19 @@ class Batch:
             auto_variant |= setup.scene.render.variant == "auto"
         if not waiting:
             return
-        with worker_pool(scheduler) as pool:
+        with worker_pool(cluster) as pool:
             pool.check_versions(partial(self.versions, auto_variant))
             packages = _ScenePackages(self.open, tuple(waiting))
             try:
                 for ended in pool.each(partial(carry_out, self.stages), packages):
+                    if ended.is_lost:
+                        raise MachineError(LOST)
                     member = packages.sent[ended.index]
                     waiting.remove(member)
                     yield member, partial(self._collect, member, ended)
             except MachineError as error:
-                packages.failed |= {member: MachineError(f"{member.scene}: {error}") for member in waiting}
+                left = [member for member in waiting if member not in packages.failed]
+                packages.failed |= _unfinished(left, error)
         for member in waiting:
             yield member, partial(_raise, packages.failed[member])
 
@@ -149,6 +153,16 @@ class Batch:
         if outcome.error is not None:
             raise outcome.error
         return self.report(member, outcome.description)
+
+
+def _unfinished(members: Sequence[Member], error: MachineError) -> dict[Member, Exception]:
+    """Return an error for each scene that is left when a cluster fails. The first one counts the others."""
+    if not members:
+        return {}
+    first, *others = members
+    count = f" and {len(others)} more" if others else ""
+    failures: dict[Member, Exception] = {first: MachineError(f"{first.scene}{count}: {error}")}
+    return failures | {member: NotStartedError(f"{member.scene}: {error}") for member in others}
 
 
 def _run_in_process(open_member: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:

@@ -26,6 +26,7 @@ from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint
+from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.names import check_name
 from ommatid.runtime.outputs.occupied import new_folder
@@ -126,9 +127,9 @@ def _outputs(stacks: Sequence[Path], folder: Path, model: Path) -> list[Path]:
             )
         first[stack.stem] = stack
     outputs = [folder / f"{stack.stem}.exr" for stack in stacks]
-    read = {path.resolve() for stack in stacks for path in (stack, stack.parent / TRUTH)} | {model.resolve()}
+    read = {real_path(path) for stack in stacks for path in (stack, stack.parent / TRUTH)} | {real_path(model)}
     for output in outputs:
-        if output.resolve() in read:
+        if real_path(output) in read:
             raise InputError(f"{output}: would replace a file that is read; choose another folder with -o")
     return outputs
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.reconstruct.output.estimate_formats import Format, write_formats
+from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.scenes.scene import TRUTH
 from ommatid.scenes.setup import Setup
@@ -48,7 +49,7 @@ def clear_results(folder: Path, setup: Setup) -> None:
     """Remove the results in a folder, so that all stages run again. Files that the scene is read from stay."""
     scene = setup.scene
     names = RESULTS if scene.world is None else (*RESULTS, TRUTH)
-    read = {scene.source.resolve(), Path(scene.target.image or "").resolve()}
+    read = {real_path(scene.source), real_path(Path(scene.target.image or ""))}
     for path in (path for name in names for path in folder.glob(name)):
-        if path.resolve() not in read:
+        if real_path(path) not in read:
             path.unlink()

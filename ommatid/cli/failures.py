@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
-from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 from ommatid.runtime.execution.library_warnings import TRACEBACK
+from ommatid.runtime.outputs.kinds import input_error
 from ommatid.runtime.printable import printable
 
 from .output import say
@@ -46,8 +48,12 @@ def exit_code_of(command: Callable[[], object]) -> int:
 
 def report(error: Exception) -> int:
     """Say in one sentence what went wrong, and return the exit code."""
+    if isinstance(error, OSError) and isinstance(error.filename, str):
+        error = input_error(Path(error.filename), error) or error
     if isinstance(error, BatchError):
         return error.exit_code
+    if isinstance(error, NotStartedError):
+        return 1
     if hasattr(error, "format_message"):  # raised by the parser of the command line
         message = cast(Any, error).format_message()
         if type(error).__name__ == "NoArgsIsHelpError":

@@ -23,6 +23,7 @@ from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
+from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.printable import printable
 from ommatid.scenes.camera import derive
@@ -107,7 +108,7 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     ]
     content = [described, None if sweep is None else asdict(sweep)]
     stamp = fingerprint([content, sources_digest()])
-    name = output.resolve().name
+    name = real_path(output).name
     return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
 
 

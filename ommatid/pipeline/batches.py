@@ -21,15 +21,15 @@ from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.cluster import Cluster
+from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import ALLOW_OUTSIDE, read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
-
-REFUSED = 2  # exit code of a scene with an error
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ def share_of_job(
         return None
     if scheduler:
         raise InputError("--job and --scheduler: expected one of them; both distribute the scenes over machines")
-    command = (*words, *(f"--set {change}" for change in changes), *([f"--lens {','.join(lenses)}"] if lenses else []))
+    changed = (change if change == ALLOW_OUTSIDE else f"--set {change}" for change in changes)
+    command = (*words, *changed, *([f"--lens {','.join(lenses)}"] if lenses else []))
 
     def seconds(member: Member) -> float:
         return estimate_cost(member, changes, lenses).seconds
@@ -128,7 +129,7 @@ def run_batch(
     batch: Batch,
     members: Sequence[Member],
     report_failure: Callable[[Exception], int],
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
     *,
     sweep_folder: Path | None = None,
@@ -143,12 +144,15 @@ def run_batch(
     figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     share : of a job, whose scenes `members` are; the last job writes table and page
-    Where all scenes are refused, neither table nor page is written.
+    Where all scenes fail, neither table nor page is written.
     """
+    for folder in (index_folder, sweep_folder):
+        if folder is not None:
+            check_folder(folder)  # before any work
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]
-    for member, work in batch.run(members, scheduler, workers):
+    for member, work in batch.run(members, cluster, workers):
         document = _heading(member, with_folders)
         try:
             results[member] = {**document, **work()}
@@ -168,7 +172,7 @@ def run_batch(
     ]
     describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
     if share is None:
-        if len(failures) == len(members) and set(codes[1:]) == {REFUSED}:  # leaves nothing behind
+        if len(failures) == len(members):  # leaves nothing behind
             describe = partial(_describe, None, None, figures, report_failure)
         sections, code = describe(ended)
         return BatchOutcome(documents, sections, max(*codes, code))

@@ -29,6 +29,10 @@ class MachineError(OSError):
         return printable_sentence(super().__str__())
 
 
+class NotStartedError(MachineError):
+    """Failure of one of many scenes for a reason that was reported with the first; exit code 1, and no message."""
+
+
 class _ShortRepr(reprlib.Repr):
     """The repr of values, shortened; of numbers that Python does not print, the count of their bits."""
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, MachineError
+from .input_files import open_input
 from .outputs.kinds import check_folder, check_output, input_error
 from .printable import printable
 
@@ -131,7 +132,7 @@ def digest(*arrays: NDArray[Any]) -> str:
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's bytes, as hexadecimal text. Raises InputError if it cannot be read."""
     try:
-        with path.open("rb") as stream:
+        with open_input(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error})") from error

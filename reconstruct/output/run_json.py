@@ -12,8 +12,10 @@ from typing import Any, Literal
 
 from pydantic import AliasChoices, Field, ValidationError
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import write_text
+from ommatid.runtime.input_files import read_bytes
+from ommatid.scenes.formats.provenance import FitRecord
 
 from .held_out_report import HeldOutReport
 from .record import Record
@@ -145,7 +147,7 @@ class ModelReport(Record):
     p_value: float | None
     # Files of earlier versions call it feigned_information.
     spurious_information: float = Field(validation_alias=AliasChoices("spurious_information", "feigned_information"))
-    fit: dict[str, Any] | None = None
+    fit: FitRecord | None = None
 
 
 class SkippedReport(Record):
@@ -277,14 +279,16 @@ def read(folder: Path) -> RunReport:
     """Read run.json of a folder. Raises InputError where there is none, or where a key is missing or wrong."""
     path = folder / RUN
     try:
-        report = RunReport.model_validate_json(path.read_bytes())
+        report = RunReport.model_validate_json(read_bytes(path))
     except OSError as error:
-        raise InputError(f"{path}: expected the results of a run, got no file that can be read ({error})") from error
+        raise InputError(
+            f"{path}: expected the results of a run, got no file that can be read ({error.strerror})"
+        ) from error
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(map(str, first["loc"])) or "the file"
+        key = shortened(".".join(map(str, first["loc"]))) or "content"
         raise InputError(
-            f"{path}: expected the results of a run, got a file whose {key} is not: {first['msg'].lower()};"
+            f"{path}: expected the results of a run, got a file whose {key} is wrong: {shortened(first['msg'])};"
             " delete it and run the scene again"
         ) from error
     if not report.fingerprint:

@@ -57,13 +57,19 @@ def write_starter(path: Path, name: str = STARTER) -> list[Path]:
     for target, text in texts.items():
         if target.parent.exists():
             check_output(target)
-        if target.exists() and target.read_text(encoding="utf-8", errors="replace") != text:
+        if target.exists() and not _holds(target, text):
             raise InputError(f"{target}: exists already and differs from the file of '{name}'; choose another folder")
     for target, text in texts.items():
         make_folder(target.parent)
         write_text(target, text)
     write_text(path, (GALLERY / f"{name}.toml").read_text(encoding="utf-8"))
     return [path, *texts]
+
+
+def _holds(path: Path, text: str) -> bool:
+    from ommatid.runtime.input_files import read_bytes
+
+    return read_bytes(path) == text.encode()
 
 
 def _tables(name: str) -> dict[str, Any]:

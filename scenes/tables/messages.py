@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 
 from ommatid.runtime.errors import shortened, shortened_repr
 
+LONGEST = 100  # characters of a key that is compared with the known ones
 _SHOULD_HAVE = re.compile(r"^\w+ should have")  # of pydantic
 DERIVED = {  # keys that may follow from others
     "magnification": ", or focal_length with target.distance and both pixel pitches",
@@ -53,7 +54,7 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
     key = shortened(_dotted(location, data))
     if error_type == "extra_forbidden":
         keys = known_keys(model)
-        bare = ".".join(part for part in location if isinstance(part, str))
+        bare = ".".join(part for part in location if isinstance(part, str))[-LONGEST:]
         near = difflib.get_close_matches(bare, keys, n=1, cutoff=0.5)
         last = bare.rsplit(".", 1)[-1]
         elsewhere = [known for known in keys if known.rsplit(".", 1)[-1] == last]

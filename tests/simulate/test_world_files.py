@@ -7,15 +7,17 @@ from pathlib import Path
 
 import pytest
 
+from ommatid.interface import read_scene
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.renderer.worlds.checked_world import check_world_files
 
+from ..conftest import TINY, Command
 from ..examples import GALLERY
 from .hostile_worlds import FAMILIES, hostile_world, mesh, ply, scene, serialized
 
 WHERE = "test.toml: world.file"
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 1 2 3\n"
-EACH = 12  # worlds of each family
+EACH = 6  # worlds of each family
 
 
 @pytest.mark.parametrize("family", range(len(FAMILIES)), ids=list(FAMILIES))
@@ -103,3 +105,28 @@ def test_a_changed_file_is_checked_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted((GALLERY / "worlds").glob("*.xml")), ids=lambda path: path.stem)
 def test_the_worlds_of_the_gallery_are_sound(path: Path) -> None:
     assert check_world_files(path, WHERE).files == [path]
+
+
+def test_the_option_reaches_every_command_that_reads_a_world(here: Path, ommatid: Command) -> None:
+    (here / "in").mkdir()
+    (here / "m.obj").write_text("v -500 -500 1000\nv 500 -500 1000\nv 0 500 1000\nf 1 3 2\n", encoding="utf-8")
+    (here / "in" / "world.xml").write_text(mesh("../m.obj"), encoding="utf-8")
+    table = TINY.replace('image = "photo:camera"\norigin = [100, 230]\n', "")
+    (here / "in" / "tiny.toml").write_text(f'{table}\n[world]\nfile = "world.xml"\n', encoding="utf-8")
+    for command in ("show", "render", "run", "calibrate"):
+        arguments = ["in/tiny.toml", *({"calibrate": ["-o", "m.npz"], "show": []}.get(command, ["-o", "out"]))]
+        refused = ommatid(command, *arguments)
+        assert (refused.code, refused.out) == (2, "")
+        assert "got '../m.obj' outside it; move it there, or add --allow-outside" in refused.err
+        assert sorted(path.name for path in here.iterdir()) == ["in", "m.obj", "tiny.toml"], "nothing is left behind"
+    shown = ommatid("show", "in/tiny.toml", "--allow-outside", "--json")
+    assert shown.code == 0, shown.err
+    rendered = ommatid("render", "in/tiny.toml", "-o", "out", "--allow-outside")
+    assert rendered.code == 0, rendered.err
+
+
+def test_the_python_interface_has_the_option(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY, encoding="utf-8")
+    assert not read_scene(path).allows_outside
+    assert read_scene(path, set="noise.variance=1e-3", allow_outside=True).allows_outside

@@ -11,6 +11,7 @@ import stat
 from pathlib import Path
 
 from ..errors import InputError
+from ..input_files import real_path
 from ..printable import printable
 
 # Suffixes of all files that are written; a folder may hold anything else.
@@ -35,16 +36,15 @@ def check_output(path: Path, *inputs: Path) -> None:
     if parent is None:
         raise InputError(f"{named}: the folder {printable(path.parent, SHORT)} does not exist; create it first")
     if not stat.S_ISDIR(parent):
-        raise InputError(
-            f"{named}: expected a file in a folder, but {printable(path.parent, SHORT)} is {_kind(parent)}"
-        )
+        folder = printable(path.parent, SHORT)
+        raise InputError(f"{named}: expected a file in a folder, but {folder} is {_kind(parent)}")
     if mode is not None and stat.S_ISDIR(mode):
         raise InputError(f"{named}: expected the name of a file, got a folder")
     if mode is not None and not stat.S_ISREG(mode):
         raise InputError(f"{named}: expected the name of a file, got {_kind(mode)}; choose another name")
     _check_place(path, path.parent)
     for source in inputs:
-        if path.resolve() == source.resolve():
+        if real_path(path) == real_path(source):
             raise InputError(f"{named}: would replace the file that is read; choose another name with -o")
 
 
@@ -91,7 +91,7 @@ def _mode(path: Path) -> int | None:
 
 
 def _check_place(path: Path, folder: Path) -> None:
-    resolved = folder.resolve()
+    resolved = real_path(folder)
     if resolved == _SYSTEM[0] or any(resolved.is_relative_to(system) for system in _SYSTEM[1:]):
         raise InputError(f"{printable(path)}: expected a place for files, got one of the system's, {resolved}")
 

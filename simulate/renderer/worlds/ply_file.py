@@ -29,7 +29,7 @@ TYPES = {
 
 
 @dataclass
-class _Rows:
+class _PlyElement:
     """An element of a PLY file: so many rows of these fields."""
 
     name: str
@@ -56,8 +56,8 @@ def check_ply(path: Path) -> None:
             _check_triangles(row, columns, vertices, shown)
 
 
-def _header(stream: BinaryIO, shown: str) -> tuple[str, list[_Rows]]:
-    order, elements = "", list[_Rows]()
+def _header(stream: BinaryIO, shown: str) -> tuple[str, list[_PlyElement]]:
+    order, elements = "", list[_PlyElement]()
     for number in range(MOST_LINES):
         words = _line(stream, shown)
         if number == 0 and words != ["ply"]:
@@ -67,7 +67,7 @@ def _header(stream: BinaryIO, shown: str) -> tuple[str, list[_Rows]]:
         if words[:1] == ["format"] and len(words) == 3 and words[1] in FORMATS and not order:
             order = FORMATS[words[1]]
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 16:
-            elements.append(_Rows(words[1], int(words[2])))
+            elements.append(_PlyElement(words[1], int(words[2])))
         elif words[:1] == ["property"] and elements:
             _add_property(elements[-1], words, shown)
         elif number and words and words[0] not in ("comment", "obj_info"):
@@ -92,7 +92,7 @@ def _line(stream: BinaryIO, shown: str) -> list[str]:
     return line.decode("latin-1").split()
 
 
-def _add_property(row: _Rows, words: list[str], shown: str) -> None:
+def _add_property(row: _PlyElement, words: list[str], shown: str) -> None:
     if len(words) == 3 and words[1] in TYPES:
         row.fields.append((f"{len(row.fields)} {words[2]}", TYPES[words[1]]))
     elif len(words) == 5 and words[1] == "list" and words[2] in TYPES and words[3] in TYPES:
@@ -103,11 +103,11 @@ def _add_property(row: _Rows, words: list[str], shown: str) -> None:
         raise InputError(f"{shown}: expected a property of PLY, got the line '{printable(' '.join(words), 80)}'")
 
 
-def _dtype(row: _Rows, order: str) -> np.dtype[Any]:
+def _dtype(row: _PlyElement, order: str) -> np.dtype[Any]:
     return np.dtype([(name, order + kind) for name, kind in row.fields])
 
 
-def _check_counts(elements: list[_Rows], shown: str, left: int, order: str) -> None:
+def _check_counts(elements: list[_PlyElement], shown: str, left: int, order: str) -> None:
     for row in elements:
         least = 2 * len(row.fields) if order == "=" else _dtype(row, order).itemsize
         if row.count * least > left + 1:
@@ -124,7 +124,7 @@ def _numbers(stream: BinaryIO, shown: str) -> Any:
 
 
 def _columns(
-    row: _Rows, order: str, stream: BinaryIO, numbers: Any, start: int, shown: str
+    row: _PlyElement, order: str, stream: BinaryIO, numbers: Any, start: int, shown: str
 ) -> tuple[dict[str, Any], int]:
     """Return the columns of an element, and where the next one starts among the numbers of a text."""
     names, missing = [name for name, _ in row.fields], f"{shown}: ends within its '{printable(row.name, 40)}'"
@@ -147,7 +147,7 @@ def _check_positions(columns: dict[str, Any], shown: str) -> None:
             raise InputError(f"{shown}: expected finite positions of vertices, got others; correct the mesh")
 
 
-def _check_triangles(row: _Rows, columns: dict[str, Any], vertices: int, shown: str) -> None:
+def _check_triangles(row: _PlyElement, columns: dict[str, Any], vertices: int, shown: str) -> None:
     for name, values in columns.items():
         _, _, rest = name.partition(" ")
         if rest.startswith("count ") and values.size and (values != 3).any():

@@ -12,14 +12,13 @@ import os
 import select
 import signal
 import subprocess
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
-import ommatid
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.interpreter import python_command, python_environment
 from ommatid.runtime.files import fingerprint
 from ommatid.runtime.memory import free_memory
 from ommatid.runtime.printable import printable
@@ -43,14 +42,13 @@ class WorldTrials:
         """Return the process, started if it has ended."""
         if self.process is None or self.process.poll() is not None:
             self.stop()
-            path = os.pathsep.join((str(Path(ommatid.__file__).parents[1]), *filter(os.path.isabs, _python_path())))
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", MODULE],
+                python_command(f"from {MODULE} import main; main()"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 cwd="/",
-                env={**os.environ, "PYTHONPATH": path},
+                env=python_environment(),
             )
         return self.process
 
@@ -140,7 +138,3 @@ def _plugins(world: CheckedWorld) -> list[list[str]]:
 def _version(path: Path) -> list[int]:
     status = path.stat()
     return [status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino]
-
-
-def _python_path() -> list[str]:
-    return os.environ.get("PYTHONPATH", "").split(os.pathsep)

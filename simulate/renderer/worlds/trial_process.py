@@ -12,7 +12,6 @@ import os
 import resource
 import select
 import signal
-import sys
 from typing import Any
 
 IDLE = 20  # seconds without a world after which the process ends
@@ -79,7 +78,3 @@ def _limit_memory(more: int | None) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     limit = size + more if hard == resource.RLIM_INFINITY else min(size + more, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

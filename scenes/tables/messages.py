@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -12,6 +13,7 @@ from ommatid.runtime.errors import shortened_repr
 from ommatid.runtime.printable import printable
 
 LONGEST = 100  # characters of a key that is compared with the known ones
+_SHOULD_HAVE = re.compile(r"^\w+ should have")  # of pydantic
 DERIVED = {  # keys that may follow from others
     "magnification": ", or focal_length with target.distance and both pixel pitches",
     "pixels": ', or "fit", or field_of_view',
@@ -66,6 +68,7 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
     message = message.replace("Input should be", "expected").replace(
         "String should match", "expected text that matches"
     )
+    message = _SHOULD_HAVE.sub("expected", message).replace(" after validation", "")
     if "got" not in message:
         message = f"{message}, got {shortened_repr(problem['input'])}"
     return f"{key}: {message}" if key else message

@@ -13,13 +13,13 @@ from stat import S_ISREG
 
 from ..errors import InputError
 from ..files import make_folder, written
-from ..printable import printable
+from ..printable import printable, printable_sentence
 
 LOCK = ".ommatid.lock"
 
 
 def _say(sentence: str) -> None:
-    print(sentence, file=sys.stderr, flush=True)
+    print(printable_sentence(sentence), file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -119,7 +119,9 @@ class CommandRunner:
         if verdict in VERDICTS and case.refused is not None and case.refused != (verdict == REFUSED):
             faults.append(f"expected {'a refusal' if case.refused else 'a result'}, got {verdict}: {ended.err[:300]!r}")
         changes = self._sandbox.changes(before)
-        strange = [name for name in changes if ended.code == 2 or not name.startswith(case.outputs)]
+        allowed = case.finished if ended.code == 2 else case.outputs
+        strange = [name for name in changes if not name.startswith(allowed)]
+        strange += [name for name in changes if name == case.kept and ended.code == 2]
         if strange:
             faults.append(f"left {', '.join(strange)[:300]}")
         if children() - alive:

@@ -134,7 +134,7 @@ def png(rng: Random, _: bytes) -> bytes:
     if colour in (GREY, RGB, PALETTE) and rng.random() < 0.15:
         transparent = values[0, 0]
         chunks += chunk(
-            b"tRNS", bytes([0]) * (1 << depth) if colour == PALETTE else transparent.astype(">u2").tobytes()
+            b"tRNS", bytes([0, 255]) * (1 << depth - 1) if colour == PALETTE else transparent.astype(">u2").tobytes()
         )
         pixels = NEVER
     turned = rng.choice((0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Detail = Literal["table", "summary", "verdict"]
 
+LEAST_WIDTH = 40  # columns of a table; in narrower ones, numbers would be cut off
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
 
 
@@ -69,7 +70,9 @@ def print_tables(sections: Iterable[Section]) -> None:
         table = Table("", "", title=title, title_justify="left", show_header=False)
         for name, value in lines:
             table.add_row(name, value, style="bold red" if (name, value[:3]) == ("verdict", "not") else None)
-        Console(markup=False, emoji=False).print(table)
+        console = Console(markup=False, emoji=False)
+        console.width = max(console.width, LEAST_WIDTH)
+        console.print(table)
 
 
 @contextmanager

@@ -30,6 +30,7 @@ OWN = {
     "ommatid.batch.remote": "results that it wrote",
     "ommatid.batch.world_package": "files of a world, which have been read before",
     "ommatid.bench.resources": "/proc",
+    "ommatid.runtime.processors": "/proc",
     "ommatid.bench.scheduler": "a journal, which it appends to",
     "ommatid.scenes.tables.gallery": "scenes of the installation",
     "ommatid.scenes.formats.npz": "a stream that is open, and members of an archive",

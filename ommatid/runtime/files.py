@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import secrets
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
@@ -27,7 +28,9 @@ Content = TypeVar("Content")
 Made = TypeVar("Made")
 
 LONGEST_FIELD = 1000  # characters of a text in a CSV file
+_SIGNED = re.compile(r"[-+](?:[\d.]+(?:[eE][-+]?\d+)?\s*[^\W\d_]*|inf|nan)")  # a number, also with a unit
 PART = ".part."  # in the name of a file that is still being written
+written: set[Path] = set()  # absolute paths of the files that this process wrote
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
@@ -43,6 +46,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
             with temporary.open("rb+") as stream:
                 os.fsync(stream.fileno())
             temporary.replace(path)
+            written.add(path.absolute())
     except OSError as error:
         reason = error.strerror or str(error)
         raise MachineError(
@@ -79,7 +83,7 @@ def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
 
     def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # of names that are not UTF-8
 
     write_whole(path, write)
 
@@ -100,15 +104,7 @@ def _field(value: object) -> object:
     if not isinstance(value, str):
         return value
     text = printable(value, LONGEST_FIELD)
-    return f"'{text}" if text.startswith(("=", "+", "-", "@")) and not _is_number(text) else text
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) and not _SIGNED.fullmatch(text) else text
 
 
 def make_folder(path: Path) -> None:

@@ -160,6 +160,18 @@ def test_a_refusal_leaves_what_was_there(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"a", "a/mine.txt", "a/b", "a/b/c", "a/b/c/scene.toml"}
 
 
+def test_a_refusal_leaves_what_others_saved_meanwhile(tmp_path: Path) -> None:
+    def work() -> None:
+        with occupied(tmp_path):
+            write_text(tmp_path / "run.json", "")
+            (tmp_path / "notes.txt").write_text("of the user, saved meanwhile", encoding="utf-8")
+            raise InputError("wrong")
+
+    with pytest.raises(InputError, match="wrong"):
+        work()
+    assert tree(tmp_path) == {"notes.txt"}
+
+
 @pytest.mark.parametrize("error", [MachineError("full"), KeyboardInterrupt()])
 def test_interrupted_work_stays(error: BaseException, tmp_path: Path) -> None:
     folder = tmp_path / "a"

@@ -122,9 +122,9 @@ def test_warnings_of_libraries_are_said_once(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_no_text_of_a_csv_file_is_a_formula(tmp_path: Path) -> None:
-    cells = ["=1+1", "@x", "+x", "-x", "-1", "+2e3", "plain", "a\x1b\u202e", "a,b", ""]
+    cells = ["=1+1", "@x", "+x", "-x", "-1", "+2e3", "-1.5 µm", "plain", "a\x1b\u202e", "a,b", ""]
     write_csv(tmp_path / "a.csv", ["=key"], ([cell] for cell in [*cells, -1.5]))
     with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as stream:
         read = [row[0] if row else "" for row in csv.reader(stream)]
-    expected = ["'=1+1", "'@x", "'+x", "'-x", "-1", "+2e3", "plain", "a\\x1b\\u202e", "a,b", ""]
+    expected = ["'=1+1", "'@x", "'+x", "'-x", "-1", "+2e3", "-1.5 µm", "plain", "a\\x1b\\u202e", "a,b", ""]
     assert read == ["'=key", *expected, "-1.5"]

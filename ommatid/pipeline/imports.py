@@ -9,7 +9,7 @@ from typing import Any
 
 from ommatid.analysis.recording_warnings import import_warnings
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import check_output
+from ommatid.runtime.outputs.kinds import check_output
 from ommatid.scenes import stack
 from ommatid.scenes.hardware.frame_files import files_in
 from ommatid.scenes.hardware.frames import AcquisitionSettings

@@ -58,8 +58,10 @@ def read_curve(path: Path, largest: float = LARGEST) -> Curve:
         lines = read_text(path, MOST_BYTES).splitlines()
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; expected a curve of wavelength in nm and value") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: could not be read as a curve of wavelength and value ({error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a curve in UTF-8, got other bytes at {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{path}: could not be read as a curve of wavelength and value ({error.strerror})") from error
     rows = [
         (number, words)
         for number, line in enumerate(lines, start=1)

@@ -73,7 +73,7 @@ def write(path: Path, parts: Sequence[Part]) -> None:
             if len(read(beside)) != len(parts):
                 raise InputError("parts are missing")
         except (RuntimeError, InputError) as error:
-            raise OSError(errno.ENOSPC, f"not all of it could be stored: {error}") from error
+            raise OSError(errno.ENOSPC, "not all of it could be stored") from error
 
     write_whole(path, fill)
 

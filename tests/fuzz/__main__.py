@@ -9,8 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ..conftest import TINY, shell
-from .campaign import REFUSED, UNCHANGED, VALID, Result, campaign, command_for, damaged, prepare
-from .file_types import FILE_TYPES, SCENE
+from .campaign import campaign, command_for
+from .families import FAMILIES, inputs_of
+from .file_type import SCENE, FileType
+from .sandbox import prepare
+from .verdicts import REFUSED, UNCHANGED, VALID
+from .worker import Result
 
 COLUMNS = ("type of input", "damaged", REFUSED, UNCHANGED, VALID, "wrong", "seconds", "slowest")
 
@@ -36,14 +40,14 @@ def row(name: str, results: list[Result]) -> tuple[str, ...]:
 def main() -> None:
     """Run the campaign over all file types, or over one."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--inputs", type=int, default=10000, help="number of inputs of all types together")
+    parser.add_argument("--inputs", type=int, default=10000, help="number of inputs of all families together")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--kind", choices=sorted(FILE_TYPES), help="only this type")
+    parser.add_argument("--kind", choices=sorted(FAMILIES), help="only this family")
     parser.add_argument("--only", type=int, metavar="NUMBER", help="only this input of --kind")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="write the damaged input of --only to this file")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
-    names = [options.kind] if options.kind else list(FILE_TYPES)
+    names = [options.kind] if options.kind else list(FAMILIES)
     with tempfile.TemporaryDirectory() as folder:
         finished = finished_run(Path(folder))
         if options.only is not None:
@@ -51,18 +55,24 @@ def main() -> None:
                 options.keep.write_bytes(_input(names[0], options.seed, options.only, finished))
             print(*campaign({names[0]: [options.only]}, options.seed, finished), sep="\n")
             return
-        each = -(-options.inputs // len(names))
-        with ThreadPoolExecutor(options.workers) as threads:
-            results = list(threads.map(lambda name: campaign({name: range(each)}, options.seed, finished), names))
-    _print(dict(zip(names, results, strict=True)), options.seed)
-    sys.exit(any(result.wrong for group in results for result in group))
+        numbers = inputs_of(names, options.inputs) if options.kind is None else {names[0]: range(options.inputs)}
+        groups = [names[start :: options.workers] for start in range(min(options.workers, len(names)))]
+        with ThreadPoolExecutor(len(groups)) as threads:
+            campaigns = threads.map(
+                lambda group: campaign({name: numbers[name] for name in group}, options.seed, finished), groups
+            )
+            every = [result for results in campaigns for result in results]
+    _print({name: [result for result in every if result.kind == name] for name in names}, options.seed)
+    sys.exit(any(result.wrong for result in every))
 
 
 def _input(name: str, seed: int, number: int, finished: Path) -> bytes:
-    file_type = FILE_TYPES[name]
+    file_type = FAMILIES[name]
+    if not isinstance(file_type, FileType):
+        raise SystemExit(f"{name}: makes command lines, --keep is for contents of files")
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder), finished)
-        return damaged(file_type, seed, number, file_type.originals(Path(folder)))[1]
+        return file_type.input(seed, number, file_type.originals(Path(folder)))[1]
 
 
 def _print(results: dict[str, list[Result]], seed: int) -> None:

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.files import digest
 from ommatid.scenes import camera, model_file, scene, stack
 from ommatid.scenes.formats import curve, lens_file, picture
 from ommatid.scenes.hardware import frames, source_positions
 from ommatid.scenes.zemax.agf import read_catalogue
 
 from ..conftest import TINY
-from ..examples import GALLERY
 from . import mutations
 from .damage import damaged, damaged_near
+from .file_type import BASE, SCENE, FileType, Originals, fingerprint, from_folder, gallery_files
 from .formats import encoded, exr_damaged, model_resealed, npy_damaged, npz_damaged, stack_resealed
 
 EVERYTHING = (
@@ -53,49 +49,9 @@ size = 12
 overlap = 3
 """
 )
-SCENE = "tiny.toml"  # an undamaged scene in the folder
-BASE = "base.toml"  # the scene to which --set options apply
 PNG_MARKS = (b"IHDR", b"IDAT", b"IEND", b"\x89PNG\r\n\x1a\n")
 TIFF_MARKS = (b"II*\0", b"\0\1\3\0", b"\1\1\3\0", b"\2\1\3\0", b"\3\1\3\0", b"\x11\1\4\0", b"\x16\1", b"\x17\1")
 DOUBLET = b"# a doublet\n50.0\n29.475 3.76 1.67 25.2\n84.83 0.12 1 25.2\n0 4.2 0 17.1  # stop\n-25.87 2 1.603 14\n"
-Originals = Callable[[Path], list[bytes]]
-
-
-@dataclass(frozen=True)
-class FileType:
-    """A type of file.
-
-    file : its name in the folder;  originals : valid contents, from the files of that folder
-    damaged : returns damaged contents;  read : returns a value that is equal for equal contents
-    command : the command line that reads the file, if any
-    sealed : True if a checksum reveals every change
-    """
-
-    name: str
-    file: str
-    originals: Originals
-    damaged: Callable[[Random, bytes], bytes]
-    read: Callable[[Path], object]
-    command: tuple[str, ...]
-    sealed: bool = False
-
-
-def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and other values."""
-    total = hashlib.sha256()
-    for part in parts:
-        total.update((digest(part) if isinstance(part, np.ndarray) else repr(part)).encode())
-    return total.hexdigest()
-
-
-def gallery_files(pattern: str, *more: bytes) -> Originals:
-    """The files of the gallery that match, and further contents."""
-    return lambda _: [*more, *(path.read_bytes() for path in sorted(GALLERY.glob(pattern)))]
-
-
-def from_folder(name: str) -> Originals:
-    """A file of the folder, made by a finished run."""
-    return lambda folder: [(folder / name).read_bytes()]
 
 
 def marked(*marks: bytes) -> Callable[[Random, bytes], bytes]:
@@ -134,9 +90,18 @@ def rows_damaged(rng: Random, original: bytes) -> bytes:
     if rng.random() < 0.4:
         return damaged(rng, original)
     words = original.decode().split(" ")
-    extreme = (*mutations.NUMBERS, "x", "#", "\n", "1,5", "١", "1e9", "\x00", "\x85")
+    extreme = (*mutations.NUMBERS, "x", "#", "\n", "1,5", "١", "1e9", "\x00", "\x85", "\x1b[31m", "1\n" * 20000)
     words[rng.randrange(len(words))] = rng.choice(extreme)
     return " ".join(words).encode()
+
+
+def fields_damaged(rng: Random, original: bytes) -> bytes:
+    """Return a table of comma-separated fields with extreme ones."""
+    fields = original.decode("utf-8-sig").split(",")
+    extreme = (*mutations.NUMBERS, "", '"', '"x\ny"', "\x1b[31m", "x" * 200000, "-1", "1.5", "\x00", "\u202e")
+    for _ in range(rng.choice((1, 1, 2))):
+        fields[rng.randrange(len(fields))] = rng.choice(extreme)
+    return ",".join(fields).encode()
 
 
 def read_lens(path: Path) -> str:
@@ -290,6 +255,7 @@ FILE_TYPES = {
         FileType("lens, ZMX", "lens.zmx", lambda _: [ZMX], rows_damaged, read_lens, LENS),
         FileType("glasses, AGF", "glass.agf", lambda _: [AGF], rows_damaged, read_glasses, ()),
         FileType("curve, CSV", "curve.csv", gallery_files("spectra/*5.csv"), damaged, read_curve, LIGHT),
+        FileType("curve, rows", "curve.csv", gallery_files("spectra/*5.csv"), rows_damaged, read_curve, LIGHT),
         FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
         FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
         FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),
@@ -301,6 +267,7 @@ FILE_TYPES = {
         FileType("frames, NPY", "f.npy", mosaics(".npy"), npy_damaged, read_mosaics, IMPORT),
         FileType("frames, TIFF", "f.tif", mosaics(".tif"), TIFF, read_mosaics, IMPORT),
         FileType("places, CSV", "places.csv", positions_csv, damaged, read_positions, ()),
+        FileType("places, rows", "places.csv", positions_csv, fields_damaged, read_positions, ()),
         FileType("world, XML", "world.xml", gallery_files("worlds/*.xml"), damaged, read_world, ()),
     )
 }

@@ -40,6 +40,7 @@ RATIOS = (
 TEXTS = _quoted(
     "| |fit|auto|\\u0000|a\\u0000b.png|😀|\\u202e|[red]|\\n\\n|photo:|photo:../x|photo:camera|.|/|/dev/null|../.."
     "|scene.toml|frame|svd|ideal|transport|exponential|power",
+    *("\\u001b[31mred", "\\u001b]0;title\\u0007", "\\u009b2J", "\\u2028", "$\\\\frac$", "/dev/zero", "mosaic.npy"),
     *("x" * 300, "x" * 100000),
 )
 ARRAYS = _texts(
@@ -53,7 +54,7 @@ ARRAYS = _texts(
 VALUES = (*NUMBERS, *LENGTHS, *RATIOS, *TEXTS, *ARRAYS)
 JSON_VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 3, 1.5, -1e300, 1e300, 10**30, float("nan"), float("inf"), [], {}, [1], [1, 1]),
-    *("", "x", "x" * 5000, "1 mm", "9**9**9 m", "1/3", "points", "ideal"),
+    *("", "x", "x" * 5000, "1 mm", "9**9**9 m", "1/3", "points", "ideal", "\x1b[31m", "\u202e", "/dev/zero", "../x"),
     *([10**6, 10**6], [[[[[[[[1]]]]]]]], {"a": {"b": 1}}, ["I"]),
 )
 HEADERS = ("[target]", "[camera]", "[[camera.lens]]", "[noise]", "[render]", "[a.b.c]", "[[target]]", "[camera.lens.I]")
@@ -82,6 +83,17 @@ def record(rng: Random, original: Any) -> Any:
     data = copy.deepcopy(original)
     for _ in range(rng.choice((1, 1, 2))):
         _change(rng, data, lambda _: copy.deepcopy(rng.choice(JSON_VALUES)))
+    return data
+
+
+def replaced(rng: Random, original: Any, value: Any) -> Any:
+    """Return a JSON document with one value exchanged for `value`."""
+    data = copy.deepcopy(original)
+    paths = _paths(data)
+    if not paths:
+        return value
+    path = rng.choice(paths)
+    _at(data, path[:-1])[path[-1]] = value
     return data
 
 

@@ -1,0 +1,33 @@
+"""Families of hostile inputs: contents of files, options, names, texts, and files of other kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import ceil
+
+from ..command_family import CommandFamily
+from ..file_type import FileType
+from ..file_types import FILE_TYPES
+from .archives import ARCHIVES
+from .documents import DOCUMENTS
+from .names import NAMES
+from .options import OPTIONS
+from .pictures import PICTURES
+from .special_files import SPECIAL_FILES
+from .texts import TEXTS
+from .worlds import RENDERED, WORLDS
+
+FAMILIES: dict[str, FileType | CommandFamily] = {
+    family.name: family
+    for family in (
+        *FILE_TYPES.values(),
+        *(*PICTURES, *ARCHIVES, *WORLDS),
+        *(*RENDERED, *DOCUMENTS, *TEXTS, *OPTIONS, *NAMES, *SPECIAL_FILES),
+    )
+}
+
+
+def inputs_of(names: Iterable[str], total: int) -> dict[str, range]:
+    """Return the numbers of the inputs of some families, of `total` of all families together."""
+    shares = sum(family.share for family in FAMILIES.values())
+    return {name: range(ceil(total * FAMILIES[name].share / shares)) for name in names}

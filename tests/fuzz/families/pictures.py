@@ -1,0 +1,312 @@
+"""Pictures that decoders disagree on: depths, palettes, transparency, frames, pages and orientations.
+
+The pixels that were encoded are known, so that what is read can be compared with them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import struct
+import warnings
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from ommatid.scenes import camera, scene
+from ommatid.scenes.formats import picture
+from ommatid.scenes.hardware import frames
+
+from ..damage import damaged, damaged_near
+from ..file_type import SCENE, FileType
+
+LUMINANCE = np.array((0.2125, 0.7154, 0.0721))  # docs/pictures.md
+CLOSE = 2e-3  # of 255: half a step of 16 bits
+GREY, RGB, PALETTE, GREY_ALPHA, RGBA = 0, 2, 3, 4, 6  # types of colour of PNG
+CHANNELS = {GREY: 1, RGB: 3, PALETTE: 1, GREY_ALPHA: 2, RGBA: 4}
+DEPTHS = {GREY: (1, 2, 4, 8, 16), RGB: (8, 16), PALETTE: (1, 2, 4, 8), GREY_ALPHA: (8, 16), RGBA: (8, 16)}
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_MARKS = (b"IHDR", b"PLTE", b"tRNS", b"acTL", b"fcTL", b"eXIf", b"IDAT")
+ROWS, COLUMNS = 20, 24
+BOMB = 6000  # pixels along a side of a picture that is a few kilobytes large
+_expected: dict[bytes, Pixels] = {}  # by the digest of a content
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Values of a picture, equal to others within the rounding of 16 bits; without values equal to none."""
+
+    values: Any
+
+    def __eq__(self, other: object) -> bool:
+        """Compare shapes and values."""
+        if not isinstance(other, Pixels) or self.values is None or other.values is None:
+            return False
+        return self.values.shape == other.values.shape and bool(np.abs(self.values - other.values).max() <= CLOSE)
+
+
+NEVER = Pixels(None)  # of contents that must be refused
+
+
+def expected(content: bytes) -> Pixels | None:
+    """Return what must be read from a content, None if that is not known."""
+    return _expected.get(hashlib.sha256(content).digest())
+
+
+def _remembered(content: bytes, pixels: Pixels) -> bytes:
+    _expected[hashlib.sha256(content).digest()] = pixels
+    return content
+
+
+def _luminance(values: Any, largest: int) -> Pixels:
+    """Return the brightness, 0 to 255, of (rows, columns, channels) numbers."""
+    colour = values[..., :3] @ LUMINANCE if values.shape[2] >= 3 else values[..., 0].astype(float)
+    return Pixels(colour * (255 / largest))
+
+
+def oriented(values: Any, orientation: int) -> Any:
+    """Return a picture as EXIF's orientation asks: (rows, columns, channels)."""
+    turns: dict[int, Callable[[Any], Any]] = {
+        2: lambda image: image[:, ::-1],
+        3: lambda image: image[::-1, ::-1],
+        4: lambda image: image[::-1],
+        5: lambda image: image.transpose(1, 0, 2),
+        6: lambda image: image.transpose(1, 0, 2)[:, ::-1],
+        7: lambda image: image[::-1, ::-1].transpose(1, 0, 2),
+        8: lambda image: image.transpose(1, 0, 2)[::-1],
+    }
+    return turns.get(orientation, lambda image: image)(values)
+
+
+def exif(orientation: int, order: str = "<") -> bytes:
+    """Return a TIFF header with the tag of orientation alone."""
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    return mark + struct.pack(f"{order}IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    """Return a chunk of PNG."""
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def _rows_of_png(rng: Random, values: Any, depth: int) -> bytes:
+    """Return the filtered rows of (rows, columns, channels) numbers."""
+    if depth == 16:
+        packed = values.astype(">u2").reshape(values.shape[0], -1).view(np.uint8)
+    elif depth == 8:
+        packed = values.astype(np.uint8).reshape(values.shape[0], -1)
+    else:
+        bits = np.unpackbits(values.astype(np.uint8).reshape(values.shape[0], -1, 1), axis=2)[..., 8 - depth :]
+        packed = np.packbits(bits.reshape(values.shape[0], -1), axis=1)
+    rows: list[bytes] = []
+    before = np.zeros_like(packed[0])
+    for row in packed:
+        up = rng.random() < 0.5
+        rows.append(bytes([2]) + (row - before).tobytes() if up else bytes([0]) + row.tobytes())
+        before = row
+    return b"".join(rows)
+
+
+def png(rng: Random, _: bytes) -> bytes:
+    """Return a PNG file of a random kind."""
+    if rng.random() < 0.03:
+        return _png_bomb(rng)
+    colour = rng.choice(sorted(CHANNELS))
+    depth = rng.choice(DEPTHS[colour])
+    numbers = np.random.default_rng(rng.randrange(1 << 32))
+    values = numbers.integers(0, 1 << depth, (ROWS, COLUMNS, CHANNELS[colour]))
+    pixels, chunks = _luminance(values, (1 << depth) - 1), b""
+    if colour in (GREY_ALPHA, RGBA):
+        if rng.random() < 0.5:
+            values[..., -1] = (1 << depth) - 1
+            pixels = _luminance(values[..., :-1], (1 << depth) - 1)
+        else:
+            pixels = NEVER
+    if colour == PALETTE:
+        table = numbers.integers(0, 256, (1 << depth, 3), dtype=np.uint8)
+        chunks += chunk(b"PLTE", table.tobytes())
+        pixels = _luminance(table[values[..., 0]].astype(float), 255)
+    if colour in (GREY, RGB, PALETTE) and rng.random() < 0.15:
+        transparent = values[0, 0]
+        chunks += chunk(
+            b"tRNS", bytes([0, 255]) * (1 << depth - 1) if colour == PALETTE else transparent.astype(">u2").tobytes()
+        )
+        pixels = NEVER
+    turned = rng.choice((0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9))
+    if turned:
+        chunks += chunk(b"eXIf", exif(turned, rng.choice("<>")))
+        grey = pixels.values
+        pixels = NEVER if grey is None else Pixels(oriented(grey[..., np.newaxis], turned)[..., 0])
+    frame_count = rng.choice((0, 0, 0, 0, 1, 2, 1000))
+    data = zlib.compress(_rows_of_png(rng, values, depth))
+    if frame_count:
+        control = struct.pack(">IIIIIHHBB", 0, COLUMNS, ROWS, 0, 0, 1, 10, 0, 0)
+        chunks += chunk(b"acTL", struct.pack(">II", frame_count, 0)) + chunk(b"fcTL", control)
+        pixels = pixels if frame_count == 1 else NEVER
+    more = b""
+    if frame_count > 1:
+        control = struct.pack(">IIIIIHHBB", 1, COLUMNS, ROWS, 0, 0, 1, 10, 0, 0)
+        more = chunk(b"fcTL", control) + chunk(b"fdAT", struct.pack(">I", 2) + data)
+    content = (
+        SIGNATURE + _header(COLUMNS, ROWS, depth, colour) + chunks + chunk(b"IDAT", data) + more + chunk(b"IEND", b"")
+    )
+    return _perhaps_damaged(rng, content, pixels, PNG_MARKS)
+
+
+def _header(columns: int, rows: int, depth: int, colour: int) -> bytes:
+    return chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, depth, colour, 0, 0, 0))
+
+
+def _png_bomb(rng: Random) -> bytes:
+    """Return a small file of many pixels, or of a long text."""
+    zeros = zlib.compress(bytes(BOMB * (BOMB + 1)), 9)
+    if rng.random() < 0.5:
+        side = rng.choice((BOMB, 100000, 2**31 - 1))
+        return SIGNATURE + _header(side, side, 8, GREY) + chunk(b"IDAT", zeros) + chunk(b"IEND", b"")
+    text = rng.choice((b"zTXt", b"iTXt", b"iCCP"))
+    header = {b"zTXt": b"k\0\0", b"iTXt": b"k\0\1\0\0\0", b"iCCP": b"k\0\0"}[text]
+    rows = zlib.compress(bytes(ROWS * (COLUMNS + 1)))
+    return (
+        SIGNATURE
+        + _header(COLUMNS, ROWS, 8, GREY)
+        + chunk(text, header + zeros)
+        + chunk(b"IDAT", rows)
+        + chunk(b"IEND", b"")
+    )
+
+
+def _perhaps_damaged(rng: Random, content: bytes, pixels: Pixels, marks: tuple[bytes, ...]) -> bytes:
+    """Remember what must be read of a content, or damage it."""
+    choice = rng.random()
+    if choice < 0.7:
+        return _remembered(content, pixels)
+    return damaged_near(rng, content, marks) if choice < 0.9 else damaged(rng, content)
+
+
+def jpeg(rng: Random, _: bytes) -> bytes:
+    """Return a JPEG file with or without an orientation, in grey, colour or inks, of one picture or several."""
+    from PIL import Image
+
+    mode = rng.choice(("L", "RGB", "RGB", "CMYK"))
+    row, column = np.indices((ROWS, COLUMNS))
+    channels = [(row * a + column * b) % 251 for a, b in ((9, 3), (2, 5), (1, 7), (4, 4))]
+    image = Image.fromarray(np.stack(channels, axis=-1).astype(np.uint8), "RGBA")
+    image = Image.merge("CMYK", image.split()) if mode == "CMYK" else image.convert("RGB").convert(mode)
+    turned = rng.choice((0, 1, 2, 3, 4, 5, 6, 7, 8, 9))
+    stream = io.BytesIO()
+    options: dict[str, Any] = {
+        "quality": rng.choice((30, 90)),
+        "exif": b"Exif\0\0" + exif(turned, rng.choice("<>")) if turned else b"",
+    }
+    several = rng.random() < 0.15
+    if several:
+        image.save(stream, "MPO", save_all=True, append_images=[image], **options)
+    else:
+        image.save(stream, "JPEG", progressive=rng.random() < 0.3, **options)
+    content = stream.getvalue()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of files of several pictures
+        with Image.open(io.BytesIO(content), formats=("JPEG",)) as opened:
+            values = np.atleast_3d(np.asarray(opened))
+    pixels = NEVER if several or mode == "CMYK" else _luminance(oriented(values, turned), 255)
+    return _perhaps_damaged(rng, content, pixels, (b"\xff\xd8", b"\xff\xe1", b"\xff\xc0", b"Exif\0\0"))
+
+
+def tiff(rng: Random, _: bytes) -> bytes:
+    """Return a TIFF file of a number type, an orientation and a number of pages."""
+    import tifffile
+
+    numbers = np.random.default_rng(rng.randrange(1 << 32))
+    kind = rng.choice(("u1", "u2", "f4", "u1", "u2"))
+    channels, pages = rng.choice((1, 1, 3)), rng.choice((1, 1, 1, 2, 50))
+    values = numbers.integers(0, 256 if kind != "u2" else 65536, (ROWS, COLUMNS, channels)).astype(kind)
+    inverted = channels == 1 and kind != "f4" and rng.random() < 0.2
+    turned = rng.choice((0, 0, 1, 2, 3, 4, 5, 6, 7, 8))
+    photometric = "rgb" if channels == 3 else "miniswhite" if inverted else "minisblack"
+    stored = values if channels == 3 else values[..., 0]
+    stream = io.BytesIO()
+    with tifffile.TiffWriter(
+        stream, bigtiff=rng.random() < 0.2, byteorder="<" if rng.random() < 0.5 else ">"
+    ) as writer:
+        for _page in range(pages):
+            extra = [(274, "H", 1, turned, True)] if turned else []
+            writer.write(stored, photometric=photometric, extratags=extra, contiguous=False, metadata=None)
+    largest = 65535 if kind == "u2" else 255
+    seen = largest - values if inverted else values
+    pixels = NEVER if pages > 1 else _luminance(oriented(seen, turned), largest)
+    return _perhaps_damaged(rng, stream.getvalue(), pixels, (b"II*\0", b"MM\0*", b"\x12\1", b"\1\x12"))
+
+
+def read_picture(path: Path) -> Pixels:
+    """Read a target picture."""
+    described = scene.read(path.with_name(SCENE), [f"target.image={path.name}", "target.origin=", "target.shape="])
+    return Pixels(picture.load(described))
+
+
+def frame_png(rng: Random, _: bytes) -> bytes:
+    """Return a frame of counts of 1 to 16 bits as PNG; as many as the pixel can hold are taken as they are."""
+    colour = rng.choice((GREY, GREY, RGB))
+    depth = rng.choice(DEPTHS[colour])
+    numbers = np.random.default_rng(rng.randrange(1 << 32))
+    values = numbers.integers(0, 1 << depth, (400, 400, CHANNELS[colour]))
+    data = zlib.compress(_rows_of_png(rng, values, depth), 1)
+    content = SIGNATURE + _header(400, 400, depth, colour) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    counts = values[..., 0].astype(float) if colour == GREY else values @ LUMINANCE
+    return _perhaps_damaged(rng, content, Pixels(counts), PNG_MARKS)
+
+
+def frame_expected(content: bytes) -> Pixels | None:
+    """Return the counts that must be cut from a frame."""
+    whole = expected(content)
+    return None if whole is None else Pixels(_cut(whole.values))
+
+
+def _cut(counts: Any) -> Any:
+    derived = camera.derive(scene.read(Path(SCENE)))
+    settings = frames.AcquisitionSettings(origin=(0, 0))
+    np.save("counts.npy", counts)
+    try:
+        return frames.read_frames(derived, [Path("counts.npy")], settings, mosaics=True).numbers
+    finally:
+        Path("counts.npy").unlink()
+
+
+def read_frame(path: Path) -> Pixels:
+    """Read a frame of the tiny camera's sensor."""
+    derived = camera.derive(scene.read(path.with_name(SCENE)))
+    settings = frames.AcquisitionSettings(origin=(0, 0))
+    return Pixels(frames.read_frames(derived, [path], settings, mosaics=True).numbers)
+
+
+def _one(make: Callable[[Random, bytes], bytes]) -> Callable[[Path], list[bytes]]:
+    """Return an original: the first harmless content that is made."""
+
+    def originals(_: Path) -> list[bytes]:
+        contents = (make(Random(seed), b"") for seed in range(1000))
+        return [next(content for content in contents if expected(content) not in (None, NEVER))]
+
+    return originals
+
+
+SHOW = ("show", SCENE, "--json", "--set", "target.image={file}", "--set", "target.origin=", "--set", "target.shape=")
+IMPORT = ("import", SCENE, "{file}", "-o", "new.exr", "--origin", "0,0", "--json")
+PICTURES = (
+    FileType("picture, kinds of PNG", "k.png", _one(png), png, read_picture, SHOW, expected=expected),
+    FileType("picture, kinds of JPEG", "k.jpg", _one(jpeg), jpeg, read_picture, SHOW, expected=expected),
+    FileType("picture, kinds of TIFF", "k.tif", _one(tiff), tiff, read_picture, SHOW, expected=expected),
+    FileType(
+        "frames, kinds of PNG",
+        "k.png",
+        _one(frame_png),
+        frame_png,
+        read_frame,
+        IMPORT,
+        expected=frame_expected,
+        share=0.5,
+    ),
+)

@@ -1,0 +1,97 @@
+"""Commands in a folder of traps execute nothing of it; `python -m tests.traps` runs each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ..fuzz.families.options import commands
+from ..modules import ROOT
+from .commands import COMMANDS, SLOW, ended, trapped_folder
+from .traps import LIBRARIES, make_traps
+
+ALL = [(name, *words) for name, many in COMMANDS.items() for words in many]
+IN_ONE_PROCESS = """
+import json, os, sys
+from tests.fuzz.verdicts import run_command
+for words in json.loads(sys.argv[1]):
+    done = run_command(words)
+    print(json.dumps([words, done.code, done.err, os.listdir(sys.argv[2])]), flush=True)
+"""
+TIME_LIMIT = 300  # seconds, on a busy machine
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder, marks, count = trapped_folder(tmp_path_factory.mktemp("traps"))
+    assert count >= 50
+    return folder, marks
+
+
+@pytest.fixture
+def trapped(made: tuple[Path, Path]) -> tuple[Path, Path]:
+    for mark in made[1].iterdir():
+        mark.unlink()
+    return made
+
+
+def test_every_command_is_tried() -> None:
+    assert {*commands()} == {*COMMANDS, *SLOW}
+
+
+def test_no_command_executes_anything_of_the_current_folder(trapped: tuple[Path, Path]) -> None:
+    """All commands in one process, which the imports of a start are too long for otherwise."""
+    folder, marks = trapped
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    process = subprocess.run(
+        [sys.executable, "-P", "-c", IN_ONE_PROCESS, json.dumps(ALL), str(marks)],
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        timeout=TIME_LIMIT,
+        check=True,
+    )
+    results = [json.loads(line) for line in process.stdout.splitlines()]
+    assert [tuple(words) for words, *_ in results] == ALL
+    assert [result for result in results if result[1] or result[3]] == []
+    assert not [result for result in results if "numba" in result[2] or "matplotlib" in result[2]]
+
+
+def test_the_console_script_starts_without_the_current_folder(trapped: tuple[Path, Path]) -> None:
+    folder, marks = trapped
+    code, messages, _ = ended(("show", "tiny.toml"), folder)
+    assert (code, messages, os.listdir(marks)) == (0, "", [])  # noqa: PTH208
+
+
+def test_results_into_the_folder_itself_neither_hang_nor_replace_its_traps(trapped: tuple[Path, Path]) -> None:
+    folder, marks = trapped
+    code, messages, _ = ended(("render", "tiny.toml", "-o", "."), folder)
+    assert (code in (0, 2), os.listdir(marks)) == (True, []), messages  # noqa: PTH208
+    assert (folder / "stack.exr").is_fifo()
+
+
+def test_the_traps_work(tmp_path: Path) -> None:
+    """A trap that is executed leaves its mark: a module, a package, a library and a script."""
+    (tmp_path / "traps").mkdir()
+    (tmp_path / "marks").mkdir()
+    folder, marks = tmp_path / "traps", tmp_path / "marks"
+    make_traps(folder, marks)
+    imported = (
+        "import sys; here = sys.path.pop(0); import ctypes, glob; sys.path.insert(0, here)\n"
+        "import simulate, sitecustomize\n"
+        "for file in glob.glob('plugins/*.so'): ctypes.CDLL('./' + file)"
+    )
+    subprocess.run([sys.executable, "-c", imported], cwd=folder, check=True)
+    subprocess.run(["./git"], cwd=folder, check=True)
+    found = {path.name for path in marks.iterdir()}
+    compiled = (
+        {Path(name).name for name in LIBRARIES if name.startswith("plugins/")} if shutil.which("cc") else set[str]()
+    )
+    assert found >= {"simulate", "sitecustomize", "git", *compiled}

@@ -13,8 +13,10 @@ from typing import Annotated
 
 import typer
 
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.library_warnings import library_warnings
 from ommatid.runtime.library_caches import library_caches
+from ommatid.runtime.printable import printable
 from ommatid.runtime.versions import command_line
 
 from . import calibrate, output, predict, reconstruct, run, show, studies
@@ -62,5 +64,13 @@ def main() -> None:
     prepare_streams()
     use_utf8_names()
     with command_line(["ommatid", *sys.argv[1:]]), library_caches(), library_warnings(output.warn):
-        code = exit_code_of(partial(app, prog_name="ommatid", standalone_mode=False))
+        code = exit_code_of(_run)
     sys.exit(code)
+
+
+def _run() -> object:
+    """Run the command line. Raises InputError for an argument that is not UTF-8: JSON and pages cannot name it."""
+    for argument in sys.argv[1:]:
+        if any(0xD800 <= ord(character) < 0xE000 for character in argument):
+            raise InputError(f"expected names and values in UTF-8, got {printable(argument, 80)}; rename the file")
+    return app(prog_name="ommatid", standalone_mode=False)

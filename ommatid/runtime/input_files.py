@@ -9,8 +9,8 @@ import os
 import stat
 from collections.abc import Generator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from .errors import InputError
 
@@ -26,7 +26,7 @@ _KINDS = {
 
 
 @contextmanager
-def open_input(path: Path) -> Generator[BinaryIO]:
+def open_input(path: Path) -> Generator[BufferedReader]:
     """Open a regular file for reading. Raises InputError for anything else, OSError if it cannot be opened."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     with os.fdopen(descriptor, "rb") as stream:

@@ -63,7 +63,7 @@ def csr_matrix(arrays: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> sp
     data, indices, indptr = arrays["data"].astype(np.float64, copy=False), arrays["indices"], arrays["indptr"]
     if min(shape) < 0 or len(indptr) != shape[0] + 1 or indptr[0] != 0 or indptr[-1] != len(indices):
         raise ValueError(f"its rows end at other entries than those of a matrix of shape {shape}")
-    matrix = sparse.csr_array((data, indices, indptr), shape=shape)
+    matrix = sparse.csr_array((data, indices, indptr), shape=(shape[0], shape[1]))
     matrix.check_format(full_check=True)
     if not matrix.has_canonical_format:
         raise ValueError("expected the entries of a row by ascending column, each once")

@@ -252,7 +252,14 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
         update["target"] = scene.target.model_copy(update={"image": str(real_path(source.parent / image))})
     if world is not None:
         update["world"] = world.model_copy(update={"file": str(real_path(source.parent / world.file))})
+    names = [named for named in (update.get("target", scene.target).image, world and update["world"].file) if named]
+    if not all(map(_is_utf8, names)):  # scene.toml of a run names it
+        raise InputError(f"{source}: expected files in folders whose names are UTF-8, got others; rename them")
     return with_tables(scene, **update)
+
+
+def _is_utf8(text: str) -> bool:
+    return text == text.encode("utf-8", "replace").decode("utf-8")
 
 
 def _with_curves(scene: Scene) -> dict[str, Any]:

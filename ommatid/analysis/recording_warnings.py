@@ -47,4 +47,9 @@ def calibration_warnings(calibrated: RecordedCalibration) -> list[str]:
 
 def _dead_pixels(frames: RecordedFrames) -> list[str]:
     count = int(np.sum(~np.isfinite(frames.scale)))
-    return [f"{count} sensor pixels are dead: their flat frame is not above the dark one"] if count else []
+    warnings = [f"{count} sensor pixels are dead: their flat frame is not above the dark one"] if count else []
+    if frames.not_numbers:
+        warnings.append(
+            f"{frames.not_numbers} sensor pixels have NaN, infinite or too large numbers: they count as dead"
+        )
+    return warnings

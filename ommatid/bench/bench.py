@@ -36,7 +36,7 @@ from .slopes import recommend, slope
 from .table import AUTO, JSON, STAGES, BenchTable, Cell, ConvergenceCurve, SkippedJob, Stage
 
 PARTIAL = ".bench.partial.jsonl"
-LOCK = ".bench.lock"  # runs into folders of this folder do not wait for it
+LOCK = ".ommatid-bench.lock"  # runs into folders of this folder do not wait for it
 ROUNDING: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below these are float32 rounding
 FLOOR_SHARE = 0.1  # of the time limit, for the noise floor
 SETUP_SHARE = 0.02  # of the progress, for the reference and the noise floor

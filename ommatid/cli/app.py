@@ -19,7 +19,7 @@ from ommatid.runtime.versions import command_line
 
 from . import calibrate, output, predict, reconstruct, run, show, studies
 from .failures import exit_code_of
-from .streams import prepare_streams
+from .streams import prepare_streams, use_utf8_names
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -60,6 +60,7 @@ def start(version: Version = False) -> None:
 def main() -> None:
     """Run the command line and exit."""
     prepare_streams()
+    use_utf8_names()
     with command_line(["ommatid", *sys.argv[1:]]), library_caches(), library_warnings(output.warn):
         code = exit_code_of(partial(app, prog_name="ommatid", standalone_mode=False))
     sys.exit(code)

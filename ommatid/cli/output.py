@@ -27,6 +27,7 @@ Detail = Literal["table", "summary", "verdict"]
 
 LONGEST_LINE = 1000  # characters of a line on stdout, or of a cell of a table
 MOST_WARNINGS = 20  # which are printed of one list
+LEAST_WIDTH = 40  # columns of a table; in narrower ones, numbers would be cut off
 
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
 
@@ -84,7 +85,9 @@ def print_tables(sections: Iterable[Section]) -> None:
                 printable(value, LONGEST_LINE),
                 style="bold red" if (name, value[:3]) == ("verdict", "not") else None,
             )
-        Console(markup=False, emoji=False).print(table)
+        console = Console(markup=False, emoji=False)
+        console.width = max(console.width, LEAST_WIDTH)
+        console.print(table)
 
 
 @contextmanager

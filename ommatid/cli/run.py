@@ -80,11 +80,8 @@ def run(
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
-    figures = figure_files(figure_formats, figure_resolution)
-    asked, words = (
-        (changes(sets, complete, allow_outside), lens_names(lens)),
-        _job_words(within, formats, figure_formats),
-    )
+    figures, words = figure_files(figure_formats, figure_resolution), _job_words(within, formats, figure_formats)
+    asked = changes(sets, complete, allow_outside), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
     share = share_of_job("" if dry_run else job, members, folder, words, *asked, scheduler)
     members = members if share is None else share.members

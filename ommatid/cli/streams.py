@@ -1,4 +1,4 @@
-"""Streams of the command line: open, and of an encoding that prints every character in some way."""
+"""Standard streams that are open and print every character in some way, and names of files in UTF-8, on any machine."""
 
 from __future__ import annotations
 
@@ -41,3 +41,15 @@ def _alternative(error: UnicodeError) -> tuple[str, int]:
     missing = error.object[error.start : error.end]
     words = (ALTERNATIVES.get(character) or character.encode("unicode_escape").decode("ascii") for character in missing)
     return "".join(words), error.end
+
+
+def use_utf8_names() -> None:
+    """Start this program again with names of files in UTF-8, where the locale has another encoding.
+
+    OpenEXR and Mitsuba take UTF-8 in every locale, so that they would open another file. Output keeps the encoding of
+    the locale.
+    """
+    if sys.getfilesystemencoding().lower() in ("utf-8", "utf8") or sys.flags.utf8_mode:
+        return
+    os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")
+    os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])

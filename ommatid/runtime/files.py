@@ -30,6 +30,7 @@ Made = TypeVar("Made")
 LONGEST_FIELD = 1000  # characters of a text in a CSV file
 _SIGNED = re.compile(r"[-+](?:[\d.]+(?:[eE][-+]?\d+)?\s*[^\W\d_]*|inf|nan)")  # a number, also with a unit
 PART = ".part."  # in the name of a file that is still being written
+written: set[Path] = set()  # absolute paths of the files that this process wrote
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
@@ -45,6 +46,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
             with temporary.open("rb+") as stream:
                 os.fsync(stream.fileno())
             temporary.replace(path)
+            written.add(path.absolute())
     except OSError as error:
         reason = error.strerror or str(error)
         raise MachineError(
@@ -81,7 +83,7 @@ def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
 
     def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # of names that are not UTF-8
 
     write_whole(path, write)
 

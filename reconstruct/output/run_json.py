@@ -18,7 +18,7 @@ from ommatid.runtime.input_files import read_bytes
 from ommatid.scenes.formats.provenance import FitRecord
 
 from .held_out_report import HeldOutReport
-from .record import Record
+from .record import Amount, Record
 from .solver_report import SolverReport
 
 RUN = "run.json"
@@ -28,7 +28,7 @@ class StageReport(Record):
     """Method and settings of a stage, and its duration when it ran."""
 
     method: str | None = None
-    seconds: float = 0.0
+    seconds: Amount = 0.0
     samples: int | None = None
     fewest_samples: int | None = None
     passes: int | None = None
@@ -43,16 +43,16 @@ class StageReport(Record):
 class IntervalReport(Record):
     """Expected mean squared error of this image, and the interval that holds it in 99 of 100 cases."""
 
-    mse: float
+    mse: Amount
     low: float
-    high: float
+    high: Amount
 
 
 class BaselineReport(Record):
     """The best single sub-image, enlarged to f's grid, and its error against the truth."""
 
     sub_imager: str
-    mse: float
+    mse: Amount
     psnr: float | None
     ssim: float | None
 
@@ -63,14 +63,14 @@ class ErrorReport(Record):
     gain : dB of `psnr` over that of the baseline, None if one of them is exact
     """
 
-    mse: float | None = None
-    trimmed_mse: float | None = None
+    mse: Amount | None = None
+    trimmed_mse: Amount | None = None
     psnr: float | None = None
     ssim: float | None = None
     baseline: BaselineReport | None = None
     gain: float | None = None
-    predicted_mse: float
-    predicted_trimmed_mse: float | None = None
+    predicted_mse: Amount
+    predicted_trimmed_mse: Amount | None = None
     budget: dict[str, float]
     expected_given_truth: IntervalReport | None = None
 
@@ -79,8 +79,8 @@ class ResidualReport(Record):
     """Chi-squared of the residual, its expectation and its standard deviation."""
 
     chi_squared: float
-    expected: float
-    deviation: float
+    expected: Amount
+    deviation: Amount
 
 
 class ResidualPartReport(Record):
@@ -94,8 +94,8 @@ class ResidualPartReport(Record):
     measurements: int
     chi_squared: float
     prior: float
-    expected: float
-    deviation: float
+    expected: Amount
+    deviation: Amount
     p_value: float
 
 
@@ -162,14 +162,14 @@ class MoreTime(Record):
     """Seconds and expected error of `times` as many samples."""
 
     times: int
-    seconds: float
-    predicted_mse: float
+    seconds: Amount
+    predicted_mse: Amount
 
 
 class RequestedTime(Record):
     """Seconds that a number of scenes were given together."""
 
-    seconds: float
+    seconds: Amount
     scenes: int
 
 
@@ -179,8 +179,8 @@ class TimeReport(Record):
     start_up : seconds from the start of the process to the first stage, where the process ran this scene alone
     """
 
-    seconds: float
-    stages: dict[str, float]
+    seconds: Amount
+    stages: dict[str, Amount]
     noise_alone: float
     start_up: float | None = None
     more: tuple[MoreTime, ...] = ()
@@ -203,7 +203,7 @@ class RegionReport(Record):
     corner: tuple[int, int]
     size: tuple[int, int]
     mean: float
-    deviation: float
+    deviation: Amount
 
 
 class DepthBin(Record):
@@ -226,12 +226,12 @@ class StudyCase(Record):
     """
 
     model: str
-    mse: float | None
-    predicted: float
-    expected: float | None
+    mse: Amount | None
+    predicted: Amount
+    expected: Amount | None
     low: float | None
-    high: float | None
-    seconds: float
+    high: Amount | None
+    seconds: Amount
 
 
 class RunReport(Record):

@@ -153,7 +153,7 @@ def grey(pixels: NDArray[Any], where: str) -> FloatArray:
         raise InputError(f"{where}: expected a picture of rows x columns, grey or colour, got shape {pixels.shape}")
     if pixels.dtype.kind not in "buif":
         raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
-    with np.errstate(over="ignore"):  # of long doubles; infinite values are refused or count as dead
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite values and NaN are refused or count as dead
         values = pixels.astype(np.float64)
     if values.ndim == 2:
         return values

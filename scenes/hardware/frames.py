@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import open_input
 
@@ -130,7 +130,8 @@ class RecordedFrames:
         """Units of f per digital number, (M,); NaN for dead pixels."""
         if self.flat is None:
             return np.ones(self.layout.camera.measurements)
-        signal: FloatArray = self.flat if self.dark is None else self.flat - self.dark
+        with np.errstate(over="ignore", invalid="ignore"):
+            signal: FloatArray = self.flat if self.dark is None else self.flat - self.dark
         alive = np.isfinite(signal) & (signal > 0)
         scale: FloatArray = np.full(signal.shape, np.nan)
         scale[alive] = self.settings.flat_value / signal[alive]
@@ -138,7 +139,17 @@ class RecordedFrames:
 
     def values(self) -> FloatArray:
         """(image - dark) / (flat - dark) flat_value, NaN for dead pixels: (exposures, M)."""
-        return (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
+
+    @property
+    def not_numbers(self) -> int:
+        """Count of sensor pixels whose image or dark frame is NaN, infinite or beyond single precision somewhere."""
+        largest = np.finfo(np.float32).max
+        usable: BoolArray = np.abs(self.numbers) <= largest
+        if self.dark is not None:
+            usable &= np.abs(self.dark) <= largest
+        return int(np.sum(~np.min(usable, axis=0)))
 
 
 def read_frames(
@@ -229,7 +240,8 @@ def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSetting
 
 
 def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:
-    return np.mean([numbers for _, numbers in exposures], axis=0) if exposures else None
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.mean([numbers for _, numbers in exposures], axis=0) if exposures else None
 
 
 def _sha256(path: Path) -> str:

@@ -9,7 +9,8 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from ommatid.runtime.errors import shortened, shortened_repr
+from ommatid.runtime.errors import shortened_repr
+from ommatid.runtime.printable import printable
 
 LONGEST = 100  # characters of a key that is compared with the known ones
 _SHOULD_HAVE = re.compile(r"^\w+ should have")  # of pydantic
@@ -51,7 +52,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel]) -> str:
     error_type = problem["type"]
     location = problem["loc"] if error_type == "extra_forbidden" else _keys_only(problem["loc"])
-    key = shortened(_dotted(location, data))
+    key = printable(_dotted(location, data), LONGEST)
     if error_type == "extra_forbidden":
         keys = known_keys(model)
         bare = ".".join(part for part in location if isinstance(part, str))[-LONGEST:]

@@ -14,11 +14,15 @@ class CommandCase:
 
     refused : True if it must be refused, False if it must work, None if either is right
     outputs : beginnings of the names of files that it may write if it is not refused
+    finished : beginnings of the names of files that may have changed before it is refused: what is finished stays
+    kept : name of a file that is not to be replaced by a command that is refused
     """
 
     words: tuple[str, ...]
     refused: bool | None = None
     outputs: tuple[str, ...] = ("new",)
+    finished: tuple[str, ...] = ()
+    kept: str = ""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ them. Everything else has to be equal bit for bit, and a finished stage keeps th
 from __future__ import annotations
 
 import csv
+import json
 import os
 import random
 import select
@@ -22,6 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ommatid.page.cached import read_stamp
 from ommatid.reconstruct.output import run_json
 from ommatid.scenes import model_file, stack
@@ -29,13 +32,14 @@ from ommatid.scenes.formats import exr
 
 from ..batch.attempts import STARTER
 from ..conftest import TINY
-from ..runs import content
+from ..runs import numbers, without_times
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 NOT_BEGUN = 99  # exit code of a process that is interrupted before its command
 MOST_KILLS = 6  # of one folder, before its commands may run to their end
 SCENES = ("a.toml", "b.toml", "c.toml")
 OUT, INPUTS = "out", "inputs"
+TIMED = "fingerprint", "sha256", "seal", "report"  # of records in EXR files
 STACK, MODEL = "stack.exr", "model.npz"
 BATCH = ("run", *SCENES, "-o", OUT)
 SWEEP = ("run", SCENES[0], "-o", OUT, "--sweep", "noise.variance=1e-3,1e-2", "--sweep", "render.seed=1,2")
@@ -68,6 +72,13 @@ class Tally:
         return sum(self.killed.values())
 
 
+def _heed_signals() -> None:
+    """Undo what shells do to background jobs: they ignore some signals."""
+    for number in SIGNALS:
+        if number != signal.SIGKILL:
+            signal.signal(number, signal.SIG_DFL)
+
+
 @contextmanager
 def prepared(here: Path) -> Generator[subprocess.Popen[str]]:
     """Write the scenes and the recorded frames into a folder, and yield a process that starts commands there."""
@@ -75,7 +86,11 @@ def prepared(here: Path) -> Generator[subprocess.Popen[str]]:
         text = TINY.replace("[render]", f"[render]\nseed = {number}")
         (here / name).write_text(text, encoding="utf-8")
     with subprocess.Popen(
-        [sys.executable, "-c", STARTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", STARTER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=_heed_signals,
     ) as starter:
         try:
             run(starter, here, (*BATCH, "--workers", "1"))
@@ -185,7 +200,7 @@ def finished_times(out: Path) -> dict[str, float]:
         times[str(path)] = model_file.read(path).record["seconds"]
     for path in out.glob("*/run.json"):
         times[str(path)] = run_json.read(path.parent).stages["reconstruct"].seconds
-    for path in out.glob("*.exr"):
+    for path in out.glob("[!.]*.exr"):
         times[str(path)] = exr.read(path)[0].record["report"]["stages"]["reconstruct"]["seconds"]
     return times
 
@@ -193,18 +208,24 @@ def finished_times(out: Path) -> dict[str, float]:
 def results(out: Path) -> dict[str, Any]:
     """Everything in an output folder that does not depend on the time it took."""
     found: dict[str, Any] = {"names": sorted(str(path.relative_to(out)) for path in out.rglob("*"))}
-    for path in out.rglob("*"):
+    for path in out.rglob("[!.]*"):
         name = str(path.relative_to(out))
-        if path.name == "run.json":
-            found |= {f"{path.parent.name}/{part}": value for part, value in content(path.parent).items()}
-        elif path.parent == out and path.suffix == ".exr":
-            found |= {f"{name}/{channel}": pixels.tobytes() for channel, pixels in exr.read(path)[0].channels.items()}
-        elif path.suffix == ".png":
+        if path.suffix in (".png", ".toml"):
             found[name] = path.read_bytes()
-        elif path.name == "report.html":
-            found[name] = read_stamp(path)[1] is not None
-        elif path.name == "index.html":
-            found[name] = read_stamp(path)[1] is not None, path.read_text(encoding="utf-8").count("report.html")
+        elif path.suffix == ".exr":
+            for part in exr.read(path):
+                kept = {key: value for key, value in part.record.items() if key not in TIMED}
+                kept["record"] = without_times(kept.get("record", {}))
+                found[f"{name}/{part.name}"] = kept, {key: value.tobytes() for key, value in part.channels.items()}
+        elif path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                found[name] = [(key, file[key].tobytes()) for key in file.files if key != "ommatid"]
+            found[f"{name}/record"] = without_times(model_file.read(path).record)
+        elif path.name == "run.json":
+            found[name] = numbers(json.loads(path.read_text(encoding="utf-8")))
+        elif path.name in ("report.html", "index.html"):
+            text = path.read_text(encoding="utf-8")
+            found[name] = read_stamp(path)[1] is not None, text.count("report.html"), text.count("<img")
         elif path.name == "sweep.csv":
             with path.open(encoding="utf-8", newline="") as stream:
                 found[name] = [{key: row[key] for key in row if "seconds" not in key} for row in csv.DictReader(stream)]

@@ -160,6 +160,18 @@ def test_a_refusal_leaves_what_was_there(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"a", "a/mine.txt", "a/b", "a/b/c", "a/b/c/scene.toml"}
 
 
+def test_a_refusal_leaves_what_others_saved_meanwhile(tmp_path: Path) -> None:
+    def work() -> None:
+        with occupied(tmp_path):
+            write_text(tmp_path / "run.json", "")
+            (tmp_path / "notes.txt").write_text("of the user, saved meanwhile", encoding="utf-8")
+            raise InputError("wrong")
+
+    with pytest.raises(InputError, match="wrong"):
+        work()
+    assert tree(tmp_path) == {"notes.txt"}
+
+
 @pytest.mark.parametrize("error", [MachineError("full"), KeyboardInterrupt()])
 def test_interrupted_work_stays(error: BaseException, tmp_path: Path) -> None:
     folder = tmp_path / "a"
@@ -212,7 +224,11 @@ def test_a_killed_process_frees_its_folder(tmp_path: Path) -> None:
     assert tree(folder) == {"half"}
 
 
-@pytest.mark.parametrize("make", [make_fifo, link_to("/dev/null"), link_to("mine.txt"), Path.mkdir])
+def make_text(path: Path) -> None:
+    path.write_text("mine", encoding="utf-8")
+
+
+@pytest.mark.parametrize("make", [make_fifo, make_text, link_to("/dev/null"), link_to("mine.txt"), Path.mkdir])
 def test_a_lock_file_of_another_kind_is_refused(make: Callable[[Path], None], tmp_path: Path) -> None:
     make(tmp_path / LOCK)
     with pytest.raises(InputError, match="expected a lock file"), occupied(tmp_path):

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 import tifffile
 
+from ommatid.pipeline.imports import import_file
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats.picture import LUMINANCE, grey
 from ommatid.scenes.hardware.frame_files import FrameNotes, files_in, pictures_of, stored_pictures
+from ommatid.scenes.hardware.frames import AcquisitionSettings
 
 from . import picture_bytes as made
+from .mosaics import SCENE, SHAPE
 
 RNG = np.random.default_rng(19)
 
@@ -78,3 +81,22 @@ def test_a_folder_of_frames_may_hold_no_fifo(tmp_path: Path) -> None:
     (path,) = files_in(tmp_path)
     with pytest.raises(InputError, match=r"0\.png: expected a regular file, got a FIFO"):
         pictures_of(path, "images")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e308, np.longdouble("1e4000")])
+@pytest.mark.parametrize("kind", ["image", "dark"])
+def test_numbers_that_are_none_are_dead_and_are_said(kind: str, value: float, tmp_path: Path) -> None:
+    scene = tmp_path / "s.toml"
+    scene.write_text(SCENE, encoding="utf-8")
+    for name, level in {"image": 100, "dark": 50, "flat": 200}.items():
+        frame = np.full(SHAPE, level, np.longdouble)
+        if name == kind:
+            frame[18:24, 27:33] = value
+        np.save(tmp_path / f"{name}.npy", frame)
+    settings = AcquisitionSettings(dark=(tmp_path / "dark.npy",), flat=(tmp_path / "flat.npy",))
+    result = import_file(scene, [tmp_path / "image.npy"], tmp_path / "stack.exr", settings, (), ())
+    numbers = np.concatenate([np.ravel(image) for image in result.stack.images()])
+    dead = int(np.sum(~np.isfinite(numbers)))
+    assert dead
+    np.testing.assert_allclose(numbers[np.isfinite(numbers)], 255 * 50 / 150, rtol=1e-6)
+    assert f"{dead} sensor pixels have NaN, infinite or too large numbers" in "\n".join(result.warnings)

@@ -14,7 +14,7 @@ import pytest
 from ..fuzz.families.options import commands
 from ..modules import ROOT
 from .commands import COMMANDS, SLOW, ended, trapped_folder
-from .traps import LIBRARIES, MODULES, make_traps
+from .traps import LIBRARIES, make_traps
 
 ALL = [(name, *words) for name, many in COMMANDS.items() for words in many]
 IN_ONE_PROCESS = """
@@ -85,7 +85,7 @@ def test_the_traps_work(tmp_path: Path) -> None:
     make_traps(folder, marks)
     imported = (
         "import sys; here = sys.path.pop(0); import ctypes, glob; sys.path.insert(0, here)\n"
-        "import simulate, evil, sitecustomize\n"
+        "import simulate, sitecustomize\n"
         "for file in glob.glob('plugins/*.so'): ctypes.CDLL('./' + file)"
     )
     subprocess.run([sys.executable, "-c", imported], cwd=folder, check=True)
@@ -94,5 +94,4 @@ def test_the_traps_work(tmp_path: Path) -> None:
     compiled = (
         {Path(name).name for name in LIBRARIES if name.startswith("plugins/")} if shutil.which("cc") else set[str]()
     )
-    assert found >= {"simulate", "evil", "sitecustomize", "git", *compiled}
-    assert {"simulate", "evil"} <= {*MODULES}
+    assert found >= {"simulate", "sitecustomize", "git", *compiled}

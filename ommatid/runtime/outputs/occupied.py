@@ -12,10 +12,10 @@ from pathlib import Path
 from stat import S_ISREG
 
 from ..errors import InputError
-from ..files import make_folder
+from ..files import make_folder, written
 from ..printable import printable, printable_sentence
 
-LOCK = ".lock"
+LOCK = ".ommatid.lock"
 
 
 def _say(sentence: str) -> None:
@@ -28,7 +28,7 @@ def occupied(
 ) -> Generator[None]:
     """Make a folder and keep other processes out of it, until they have ended a process waits here for them.
 
-    An InputError raised inside leaves no file and no folder that was not there before.
+    After an InputError raised inside, no file that this process wrote anew is left, and no folder that it made.
 
     finished : file that the first stage makes; once it is made, a later InputError leaves everything
     lock : name of the lock file inside, which is removed at the end; a killed process frees it
@@ -95,7 +95,8 @@ def _locked(folder: Path, name: str, say: Callable[[str], None], created: list[P
             yield  # nothing can be written here, so nothing needs a lock
             return
         with os.fdopen(descriptor, "rb+", buffering=0):
-            if not S_ISREG(os.fstat(descriptor).st_mode):
+            status = os.fstat(descriptor)
+            if not S_ISREG(status.st_mode) or status.st_size:  # it would be removed at the end
                 raise _in_the_way(path)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -133,6 +134,8 @@ def _of(status: os.stat_result) -> tuple[int, int]:
 
 
 def _remove_files(folder: Path, kept: set[Path]) -> None:
+    """Remove what this process wrote, except `kept`; other programs may have saved files there meanwhile."""
     for path in set(folder.iterdir()) - kept:
-        with suppress(OSError):
-            path.unlink()
+        if path.absolute() in written:
+            with suppress(OSError):
+                path.unlink()

@@ -15,14 +15,14 @@ from .options import OPTIONS
 from .pictures import PICTURES
 from .special_files import SPECIAL_FILES
 from .texts import TEXTS
-from .worlds import WORLDS
+from .worlds import RENDERED, WORLDS
 
 FAMILIES: dict[str, FileType | CommandFamily] = {
     family.name: family
     for family in (
         *FILE_TYPES.values(),
         *(*PICTURES, *ARCHIVES, *WORLDS),
-        *(*DOCUMENTS, *TEXTS, *OPTIONS, *NAMES, *SPECIAL_FILES),
+        *(*RENDERED, *DOCUMENTS, *TEXTS, *OPTIONS, *NAMES, *SPECIAL_FILES),
     )
 }
 

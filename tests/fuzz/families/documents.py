@@ -123,7 +123,7 @@ def beside(
         original = path.read_bytes() if path.exists() else b""
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(damage(rng, original))
-        return CommandCase(rng.choice(commands), outputs=("out", "new"))
+        return CommandCase(rng.choice(commands), outputs=("out", "new"), finished=("out",))
 
     return CommandFamily(f"results, {name}", case, commands, share)
 

@@ -64,7 +64,7 @@ def _remembered(content: bytes, pixels: Pixels) -> bytes:
 
 
 def _luminance(values: Any, largest: int) -> Pixels:
-    """Return the grey values from 0 to 255 of (rows, columns, channels) numbers."""
+    """Return the brightness, 0 to 255, of (rows, columns, channels) numbers."""
     colour = values[..., :3] @ LUMINANCE if values.shape[2] >= 3 else values[..., 0].astype(float)
     return Pixels(colour * (255 / largest))
 
@@ -134,7 +134,7 @@ def png(rng: Random, _: bytes) -> bytes:
     if colour in (GREY, RGB, PALETTE) and rng.random() < 0.15:
         transparent = values[0, 0]
         chunks += chunk(
-            b"tRNS", bytes([0]) * (1 << depth) if colour == PALETTE else transparent.astype(">u2").tobytes()
+            b"tRNS", bytes([0, 255]) * (1 << depth - 1) if colour == PALETTE else transparent.astype(">u2").tobytes()
         )
         pixels = NEVER
     turned = rng.choice((0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9))

@@ -183,9 +183,8 @@ def input_case(rng: Random, folder: Path) -> CommandCase:
 
 def found_case(rng: Random, folder: Path) -> CommandCase:
     """Return a command with such a file in the place of something in its folder of results."""
-    name, make, words = _case(rng, folder, FOUND, (*NOT_FILES, large, empty))
-    del name, make
-    return CommandCase(words, outputs=("out",))
+    name, _, words = _case(rng, folder, FOUND, (*NOT_FILES, large, empty))
+    return CommandCase(words, outputs=("out",), finished=("out",), kept=name)
 
 
 def output_case(rng: Random, folder: Path) -> CommandCase:

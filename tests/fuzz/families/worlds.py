@@ -9,6 +9,7 @@ from random import Random
 
 import numpy as np
 
+from ..command_family import CommandCase, CommandFamily
 from ..damage import damaged
 from ..file_type import SCENE, FileType, fingerprint
 
@@ -307,17 +308,19 @@ def read_mesh(path: Path) -> str:
 
 
 WORLDS = (
-    FileType(
-        "world, elements",
-        "w.xml",
-        lambda _: [PLAIN.encode()],
-        elements,
-        read_world,
-        ("predict", SCENE, "--set", "world.file={file}"),
-    ),
+    FileType("world, elements", "w.xml", lambda _: [PLAIN.encode()], elements, read_world, ()),
     FileType("world, PLY", "mesh.ply", lambda _: [PLY], ply, read_mesh, ()),
     FileType(
         "world, serialized", "mesh.serialized", lambda _: [serialized_mesh()], serialized, read_mesh, (), share=0.5
     ),
     FileType("world, OBJ", "mesh.obj", lambda _: [OBJ], obj, read_mesh, (), share=0.5),
 )
+
+
+def rendered(rng: Random, folder: Path) -> CommandCase:
+    """Return the rendering of a world with one hostile element."""
+    (folder / "w.xml").write_bytes(elements(rng, PLAIN.encode()))
+    return CommandCase(("render", SCENE, "-o", "new", "--set", "world.file=w.xml", "--set", "world.white=1"))
+
+
+RENDERED = (CommandFamily("world, rendered", rendered, share=0.2),)

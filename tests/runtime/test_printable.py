@@ -111,7 +111,7 @@ def test_warnings_of_libraries_are_said_once(monkeypatch: pytest.MonkeyPatch) ->
             warnings.warn_explicit(f"number {number}", UserWarning, "/x/a.py", 1)
     assert [sentence.partition(";")[0] for sentence in said[:3]] == [
         "numpy: first line\\x1b[31m",
-        "UserWarning: second",
+        "ommatid: second",
         "a: third",
     ]
     assert len(said) == 20

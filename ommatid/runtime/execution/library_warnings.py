@@ -54,7 +54,7 @@ def library_warnings(warn: Callable[[str], None]) -> Generator[None]:
         line: str | None = None,
     ) -> None:
         del lineno, file, line
-        say(_library(filename) or category.__name__, message)
+        say(_library(filename) or ("numpy" if issubclass(category, RuntimeWarning) else "ommatid"), message)
 
     before = warnings.showwarning, logging.lastResort
     warnings.showwarning, logging.lastResort = show, LastHandler(logging.WARNING)
@@ -65,6 +65,6 @@ def library_warnings(warn: Callable[[str], None]) -> Generator[None]:
 
 
 def _library(filename: str) -> str:
-    """Return the package that a warning comes from; an empty text for this program and for Python itself."""
+    """Return the package that a warning names; an empty text for this program, in which NumPy's overflows occur."""
     parts = Path(filename).parts
     return parts[parts.index("site-packages") + 1] if "site-packages" in parts[:-1] else ""

@@ -5,7 +5,7 @@ BIN := .venv/bin
 READY := .venv/ready
 DOCS_READY := .venv/docs-ready
 
-.PHONY: demo test figures docs check bench setup llvm browser clean
+.PHONY: demo test matrix figures docs check bench setup llvm browser clean
 
 demo: setup
 	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
@@ -14,6 +14,10 @@ demo: setup
 # One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
 test: setup browser
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
+# Every version of Python that is installed here, each in an environment of its own; others are skipped.
+matrix: setup
+	$(BIN)/nox
 
 # Figures of the pages that take minutes to compute anew; `make test` checks all others.
 figures: setup

@@ -10,13 +10,14 @@ The functions of this module do what the commands of the same names do, and retu
 Nothing heavy is loaded before the first of them is used.
 """
 
-from __future__ import annotations
-
+# Neither `typing` nor `__future__` is imported: `python -m ommatid` first takes the current folder off the path.
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from .interface import (
         InputError,
         MachineError,
@@ -65,7 +66,7 @@ __all__ = [
 class _CallablePackage(ModuleType):
     """The package ommatid.reconstruct, which is also the function of that name."""
 
-    def __call__(self, stack: Stack, model: Model, truth: Any = None) -> Result:
+    def __call__(self, stack: "Stack", model: "Model", truth: "Any" = None) -> "Result":
         """Reconstruct a stack with a model; see ommatid.interface.reconstruct."""
         return import_module(".interface", __name__).reconstruct(stack, model, truth)
 
@@ -73,7 +74,7 @@ class _CallablePackage(ModuleType):
 import_module(".reconstruct", __name__).__class__ = _CallablePackage  # a docstring: this loads nothing else
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name not in __all__:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     return getattr(import_module(".interface", __name__), name)

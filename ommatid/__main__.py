@@ -1,8 +1,15 @@
 """The console script: `ommatid`, or `python -m ommatid`."""
 
-from __future__ import annotations
+from ommatid.runtime.execution.interpreter import leave_current_folder
 
-from ommatid.cli.app import main
+
+def main() -> None:
+    """Run the command line and exit."""
+    leave_current_folder()  # before anything else is imported
+    from ommatid.cli.app import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()

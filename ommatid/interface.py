@@ -22,6 +22,7 @@ from ommatid.reconstruct.output.held_out_report import HeldOutReport
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError, MachineError, naming_source
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file
 from ommatid.scenes import scene as scene_file
@@ -38,14 +39,18 @@ from .result import Result, check_type, flat_truth, result_of
 __all__ = ["InputError", "MachineError", "Model", "Reconstructor", "Result", "Scene", "Stack"]
 
 
-def read_scene(path: str | Path, set: str | Sequence[str] = (), lens: str | Sequence[str] = ()) -> Scene:
+def read_scene(
+    path: str | Path, set: str | Sequence[str] = (), lens: str | Sequence[str] = (), allow_outside: bool = False
+) -> Scene:
     """Read a scene file, or a scene of the gallery by its name.
 
     set : changes of keys, such as "noise.variance=1e-2";  lens : names of the lens types to keep, absent: all
+    allow_outside : True if the files of its world may be outside the folder of the world's file
     Raises InputError that names the file and the key.
     """
     names = lens.split(",") if isinstance(lens, str) and lens else lens
-    return scene_file.read(Path(path), [set] if isinstance(set, str) else set, [name.strip() for name in names])
+    changes = [*([set] if isinstance(set, str) else set), *([scene_file.ALLOW_OUTSIDE] if allow_outside else ())]
+    return scene_file.read(Path(path), changes, [name.strip() for name in names])
 
 
 def read_stack(path: str | Path) -> Stack:
@@ -186,7 +191,9 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
 
     Raises InputError for a wrong scene, MachineError for a full disk.
     """
-    stages.run(_setup(scene), Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
+    setup = _setup(scene)
+    with occupied(Path(folder), "stack.exr"):
+        stages.run(setup, Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
     return read_result(folder)
 
 

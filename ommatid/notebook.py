@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.output.verdict_words import error_words, grounds, heading
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -107,8 +108,12 @@ def _html(title: str, pictures: Sequence[Picture], rows: Rows) -> str:
         f"{'' if limits else f', {np.nanmin(image):.3g} to {np.nanmax(image):.3g}'}</figcaption></figure>"
         for caption, image, limits in pictures
     )
-    table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
-    return f"<div><strong>{escape(title)}</strong><div>{figures}</div><table>{table}</table></div>"
+    table = "".join(f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows)
+    return f"<div><strong>{_text(title)}</strong><div>{figures}</div><table>{table}</table></div>"
+
+
+def _text(text: str) -> str:
+    return escape(printable(text))
 
 
 def _record_rows(record: dict[str, Any]) -> list[tuple[str, str]]:

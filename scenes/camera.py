@@ -23,7 +23,7 @@ from ommatid.runtime.memory import check_memory
 from .formats.picture import target_shape
 from .layout.sensor_extent import check_sensor
 from .layout.windows import check_overlap, whole_pixels, with_steering
-from .lens_type import LensOptics, LensType, SubImager, adjacent_slices
+from .lens_type import LensOptics, LensType, SubImager, adjacent_slices, check_counts
 from .optics.spectrum import wavelengths_of
 from .scene import Scene
 from .tables.camera import LensTable, ToleranceTable
@@ -263,8 +263,7 @@ def derive(scene: Scene) -> Camera:
         bands=bands,
         walls=scene.camera.walls,
     )
-    for lens_type in types:
-        lens_type.check_count(scene.source)
+    check_counts(types, scene.source)
     needed = PLANES * 8 * (camera.world.unknowns + camera.measurements)
     check_memory(needed, f"{scene.source}: a target of {rows} x {columns} pixels", "make target.shape smaller")
     if camera.measurements > MOST_MEASUREMENTS:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cached_property
 from itertools import accumulate, pairwise, product
 from math import ceil
 from pathlib import Path
@@ -17,7 +18,7 @@ from ommatid.runtime.errors import InputError
 
 from .tables.camera import Surface
 
-MOST_SUB_IMAGERS = 2**14
+MOST_SUB_IMAGERS, MOST_OF_ALL_TYPES = 2**14, 2**16
 
 
 @dataclass(frozen=True)
@@ -113,14 +114,6 @@ class LensType:
         """Number of sensor pixels of all sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
 
-    def check_count(self, source: Path) -> None:
-        """Raise InputError, which names the scene file, for too many sub-imagers."""
-        if self.count > MOST_SUB_IMAGERS:
-            raise InputError(
-                f"{source}: camera.lens.{self.name}.array has {self.count} sub-imagers, expected at most"
-                f" {MOST_SUB_IMAGERS} per lens type; use fewer"
-            )
-
     def finer(self, detail: int) -> LensType:
         """The same lens type on a grid of the target that is `detail` times finer along both axes."""
         origin = self.origin[0] * detail, self.origin[1] * detail
@@ -132,10 +125,14 @@ class LensType:
 
     def view(self, k: int, l: int) -> Steering:  # noqa: E741
         """Window and rotation of sub-imager (k, l)."""
-        for each in self.steered:
-            if (each.k, each.l) == (k, l):
-                return each
+        steered = self._steered_by_place.get((k, l))
+        if steered is not None:
+            return steered
         return Steering(k, l, (self.origin[0] + k * self.step[0], self.origin[1] + l * self.step[1]), self.rotation)
+
+    @cached_property
+    def _steered_by_place(self) -> dict[tuple[int, int], Steering]:
+        return {(each.k, each.l): each for each in self.steered}
 
     @property
     def is_rotated(self) -> bool:
@@ -252,3 +249,16 @@ class SubImager:
                 f"{source}: camera.lens_pitch: the sub-images {self.name} and {other.name} overlap on the sensor"
                 f" (their centres are {distance:.4g} mm apart, they need {needed:.4g} mm); widen the pitch"
             )
+
+
+def check_counts(types: Iterable[LensType], source: Path) -> None:
+    """Raise InputError, which names the scene file, for too many sub-imagers."""
+    counts = {lens_type.name: lens_type.count for lens_type in types}
+    for name, count in counts.items():
+        if count > MOST_SUB_IMAGERS:
+            raise InputError(
+                f"{source}: camera.lens.{name}.array has {count} sub-imagers, expected at most"
+                f" {MOST_SUB_IMAGERS} per lens type; use fewer"
+            )
+    if sum(counts.values()) > MOST_OF_ALL_TYPES:
+        raise InputError(f"{source}: camera.lens: expected at most {MOST_OF_ALL_TYPES} sub-imagers in all; use fewer")

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import digest, write_whole
@@ -25,13 +24,12 @@ from .fitted.fitted_matrix import FittedMatrix, Views
 from .fitted.fitted_model import MeasuredRows, fitted_model, measured_rows
 from .fitted.kernels import KernelFootprints, read_kernels
 from .formats import npz
+from .formats.model_arrays import ENTRIES, check_headers, check_range, csr_matrix
 from .formats.provenance import checked
 from .model import Model
-from .scene import parse
+from .scene import parse_stored
 from .setup import Setup
-from .tables.table import LARGEST
 
-ENTRIES = ("indices", "indptr", "data")
 CSR, BOXES, VIEWS = b"csr", b"boxes", b"views 1"
 PREFIX, KERNELS, DESCRIPTION = "views.", "kernels.", "description"
 
@@ -72,13 +70,13 @@ def read(path: Path) -> Model:
     arrays, description = _arrays(path)
     try:
         content = json.loads(description)
-        scene = parse(content["scene"], path)
+        scene = parse_stored(content["scene"], path)
         record = checked(content["record"])
         method = record["method"]
         camera = derive(scene).with_grid_of_matrix
         matrix, shape = None, tuple(arrays["shape"].tolist())
         if "data" in arrays:
-            matrix = _matrix(arrays, shape)
+            matrix = csr_matrix(arrays, shape)
         fitted = _fitted(arrays, Setup(scene, camera).simulated)
         if matrix is None and fitted is None and not (method == "ideal" and camera.has_box_footprints):
             raise ValueError("it has no entries")
@@ -116,23 +114,9 @@ def _kernels(arrays: dict[str, NDArray[Any]], camera: Camera, prefix: str) -> Ke
     if not own:
         return None
     description = json.loads(str(own.pop(DESCRIPTION)[()]))
-    if not all(each.dtype.kind == "f" and np.isfinite(each).all() for each in own.values()):
-        raise ValueError(f"{prefix} has numbers that are not finite")
+    for name, values in own.items():
+        check_range(f"{prefix}{name}", values)
     return read_kernels(camera, description, own)
-
-
-def _matrix(arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:
-    """H from its arrays. Raises ValueError if they do not form a CSR matrix, or hold values out of range."""
-    for name, kinds in (("data", "f"), ("variance", "f"), ("batches", "f"), ("indices", "i"), ("indptr", "i")):
-        if arrays[name].dtype.kind not in kinds or not (np.abs(arrays[name]) <= LARGEST**2).all():
-            raise ValueError(f"{name} of {arrays[name].dtype} has values of another type or out of range")
-    if (arrays["variance"] < 0).any():
-        raise ValueError("a variance is below 0")
-    if len(shape) != 2:
-        raise ValueError(f"its shape is {shape}")
-    matrix = sparse.csr_array((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
-    matrix.check_format(full_check=True)
-    return matrix
 
 
 def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
@@ -140,7 +124,7 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        content = npz.read(path)
+        content = npz.read(path, check_headers)
         layout = content["format"][()]
         if layout not in (CSR, BOXES, VIEWS):
             raise ValueError(f"its format is {layout!r}")

@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_vali
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
+from ommatid.runtime.input_files import read_text, real_path
 
 from .geometry.solution import complete
 from .tables import toml
@@ -29,6 +30,7 @@ from .tables.table import Table, allow_absent
 from .tables.units import Corner, FileName, Length, Pair
 from .tables.world import WorldTable
 
+ALLOW_OUTSIDE = "--allow-outside"  # stands among the changes of a scene, so that it goes where they go
 TRUTH = "truth.exr"
 WORLD_PICTURE = "target.exr"  # beside it, where the world is finer than f
 
@@ -81,6 +83,7 @@ class Scene(Table):
 
     _source: Path = PrivateAttr(default=Path("scene"))
     _world_copy: Path | None = PrivateAttr(default=None)
+    _allow_outside: bool = PrivateAttr(default=False)
 
     @model_validator(mode="before")
     @classmethod
@@ -124,6 +127,11 @@ class Scene(Table):
     def world_copy(self) -> Path | None:
         """The file to read in place of `world.file`, if this is another machine."""
         return self._world_copy
+
+    @property
+    def allows_outside(self) -> bool:
+        """True if the world may name files outside its folder; a copy on another machine was checked before."""
+        return self._allow_outside or self._world_copy is not None
 
     @property
     def assumed_prior(self) -> PriorTable:
@@ -176,6 +184,25 @@ def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) ->
     return _with_source(scene, source)
 
 
+def parse_stored(data: dict[str, Any], source: Path) -> Scene:
+    """Validate the scene that a stack or a model stores, which needs no other file.
+
+    Raises InputError as `parse` does, and for a scene that names files of lenses, glasses or curves, which a scene has
+    only until they are read: a file that was received is not to open others.
+    """
+    scene = parse(data, source)
+    named = [f"camera.lens.{lens.name}.surfaces" for lens in scene.camera.lens if isinstance(lens.surfaces, str)]
+    named += [] if scene.camera.glass_catalogue is None else ["camera.glass_catalogue"]
+    named += [] if scene.light is None or scene.light.file is None else ["light.spectrum"]
+    efficiency = None if scene.sensor is None else scene.sensor.quantum_efficiency
+    named += ["sensor.quantum_efficiency"] if isinstance(efficiency, str) else []
+    if named:
+        raise InputError(f"{source}: expected a scene without other files, got a file as {named[0]}; make it again")
+    if scene.target.shape is None:
+        raise InputError(f"{source}: expected a scene with target.shape, got none; make it again")
+    return scene
+
+
 def _with_source(scene: Scene, source: Path) -> Scene:
     scene._source = source  # pyright: ignore[reportPrivateUsage]
     return scene
@@ -190,11 +217,13 @@ def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) 
     """
     path = find_scene(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, toml.LARGEST)
     except FileNotFoundError as error:
         raise InputError(missing_scene(path)) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: could not be read as a scene file ({error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a scene file in UTF-8, got other bytes at {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{path}: could not be read as a scene file ({error.strerror})") from error
     try:
         data = toml.loads(text)
     except ValueError as error:
@@ -204,11 +233,14 @@ def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) 
 
 def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], lenses: Iterable[str]) -> Scene:
     """The scene in `data` after `--set` overrides and `--lens`, with absolute paths. Raises InputError."""
+    overrides = list(overrides)
+    keys = [override for override in overrides if override != ALLOW_OUTSIDE]
     try:
-        data = keep_lenses(apply_overrides(data, overrides), lenses)
+        data = keep_lenses(apply_overrides(data, keys), lenses)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
     scene = parse(data, source)
+    scene._allow_outside = len(keys) < len(overrides)  # pyright: ignore[reportPrivateUsage]
     update: dict[str, Any] = {}
     if any(lens.surfaces is not None for lens in scene.camera.lens):
         from .formats.lens_file import with_surfaces
@@ -217,10 +249,17 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], l
     update |= _with_curves(scene)
     image, world = scene.target.image, scene.world
     if image is not None and not image.startswith("photo:"):
-        update["target"] = scene.target.model_copy(update={"image": str((source.parent / image).resolve())})
+        update["target"] = scene.target.model_copy(update={"image": str(real_path(source.parent / image))})
     if world is not None:
-        update["world"] = world.model_copy(update={"file": str((source.parent / world.file).resolve())})
+        update["world"] = world.model_copy(update={"file": str(real_path(source.parent / world.file))})
+    names = [named for named in (update.get("target", scene.target).image, world and update["world"].file) if named]
+    if not all(map(_is_utf8, names)):  # scene.toml of a run names it
+        raise InputError(f"{source}: expected files in folders whose names are UTF-8, got others; rename them")
     return with_tables(scene, **update)
+
+
+def _is_utf8(text: str) -> bool:
+    return text == text.encode("utf-8", "replace").decode("utf-8")
 
 
 def _with_curves(scene: Scene) -> dict[str, Any]:
@@ -229,17 +268,15 @@ def _with_curves(scene: Scene) -> dict[str, Any]:
 
     update: dict[str, Any] = {}
     if scene.light is not None and scene.light.file is not None:
-        points = read_curve((scene.source.parent / scene.light.file).resolve())
+        points = read_curve(real_path(scene.source.parent / scene.light.file))
         update["light"] = scene.light.model_copy(update={"spectrum": points})
     if scene.sensor is not None and isinstance(scene.sensor.quantum_efficiency, str):
-        points = read_curve((scene.source.parent / scene.sensor.quantum_efficiency).resolve(), 1.0)
+        points = read_curve(real_path(scene.source.parent / scene.sensor.quantum_efficiency), 1.0)
         update["sensor"] = scene.sensor.model_copy(update={"quantum_efficiency": points})
     return update
 
 
 def write(path: Path, scene: Scene) -> None:
     """Write a scene as TOML, defaults included. Raises InputError or MachineError."""
-    import tomli_w
-
     pair = re.compile(r"\[\s+([-+.\de]+),\s+([-+.\de]+),\s+\]")  # tomli_w spreads pairs over four lines
-    write_text(path, pair.sub(r"[\1, \2]", tomli_w.dumps(scene.plain())))
+    write_text(path, pair.sub(r"[\1, \2]", toml.dumps(scene.plain())))

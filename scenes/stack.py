@@ -22,7 +22,8 @@ from .formats import exr
 from .formats.provenance import checked
 from .lens_type import adjacent_slices
 from .recording import Recording
-from .scene import Scene, parse
+from .scene import Scene, parse_stored
+from .tables.table import LARGEST
 
 CHANNELS = ("Y", "variance")
 SENSOR_CHANNELS = ("dark", "flat")
@@ -114,12 +115,15 @@ def read(path: Path) -> Stack:
                 f" {sub.type.pixels}, got {shapes}"
             )
     variance = _joined(parts, "variance")
-    if (variance < 0).any():
-        raise InputError(f"{path}: holds variances below 0; make it again")
+    if not (variance >= 0).all():
+        raise InputError(f"{path}: expected variances of 0 or more, got others; make it again")
     if scene.sensor is None:
-        return Stack(scene, camera, _joined(parts, "Y"), variance, record)
+        values = _joined(parts, "Y")
+        _check_range(path, variance=variance, Y=values[~np.isnan(values)])  # of dead pixels
+        return Stack(scene, camera, values, variance, record)
     sizes = [sub.type.pixels[0] * sub.type.pixels[1] for sub in camera.sub_imagers]
     digital, dark, flat = (_joined(parts, name) for name in ("Y", *SENSOR_CHANNELS))
+    _check_range(path, variance=variance, Y=digital, dark=dark, flat=flat)
     recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts, sizes))
     return stack_from_recording(scene, camera, recording, variance, record)
 
@@ -137,8 +141,17 @@ def _described(path: Path, first: dict[str, Any]) -> tuple[Scene, Camera, dict[s
         record = checked(first["record"])
     except ValueError as error:
         raise InputError(f"{path}: {error}; make it again") from error
-    scene = parse(first["scene"], path)
+    scene = parse_stored(first["scene"], path)
     return scene, derive(scene), record
+
+
+def _check_range(path: Path, **channels: FloatArray) -> None:
+    """Raise InputError for values that are not finite, or too large for their squares."""
+    for name, values in channels.items():
+        if values.size and not (values.min() >= -(LARGEST**2) and values.max() <= LARGEST**2):
+            raise InputError(
+                f"{path}: expected finite numbers up to {LARGEST**2:g} as {name}, got others; make it again"
+            )
 
 
 def _joined(parts: list[exr.Part], channel: str) -> FloatArray:

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.reconstruct.output.run_json import DepthBin
 from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.printable import printable_label
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.scene import TRUTH
@@ -111,6 +112,7 @@ def _distance(depth_bin: DepthBin) -> str:
     return f"{near} mm" if near == far else f"{near} to {far} mm"
 
 
+@own_style()
 def draw(
     path: Path,
     camera: Camera,
@@ -125,7 +127,7 @@ def draw(
 
     figure: Any = Figure(figsize=(6.4, 6.4), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, parse_math=False)
+    figure.suptitle(printable_label(title))
     above, below = figure.subplots(2, 1, sharex=True)
     below.set_xscale("log")
     known = [(row.nearest, row.farthest, row) for row in bins if row.nearest is not None and row.farthest is not None]

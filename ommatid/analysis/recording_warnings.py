@@ -13,7 +13,7 @@ ROW_SUM_ERROR = 0.2  # by which the median row sum of a calibrated H may differ 
 
 def import_warnings(frames: RecordedFrames) -> list[str]:
     """Warnings about frames that are imported as a stack."""
-    warnings: list[str] = []
+    warnings = list(frames.notes)
     if frames.layout.beside > WORST_OFFSET:
         warnings.append(
             f"the sub-images lie up to {frames.layout.beside:.2f} sensor pixels beside whole pixels of the mosaic, so"
@@ -24,7 +24,7 @@ def import_warnings(frames: RecordedFrames) -> list[str]:
 
 def calibration_warnings(calibrated: RecordedCalibration) -> list[str]:
     """Warnings about an H that was calibrated from recorded point sources."""
-    warnings = _dead_pixels(calibrated.frames)
+    warnings = [*calibrated.frames.notes, *_dead_pixels(calibrated.frames)]
     sums = np.asarray(calibrated.model.matrix.sum(axis=1)).ravel()
     typical = float(np.median(sums[sums > 0])) if (sums > 0).any() else 0.0
     if abs(typical - 1) > ROW_SUM_ERROR:
@@ -47,4 +47,9 @@ def calibration_warnings(calibrated: RecordedCalibration) -> list[str]:
 
 def _dead_pixels(frames: RecordedFrames) -> list[str]:
     count = int(np.sum(~np.isfinite(frames.scale)))
-    return [f"{count} sensor pixels are dead: their flat frame is not above the dark one"] if count else []
+    warnings = [f"{count} sensor pixels are dead: their flat frame is not above the dark one"] if count else []
+    if frames.not_numbers:
+        warnings.append(
+            f"{frames.not_numbers} sensor pixels have NaN, infinite or too large numbers: they count as dead"
+        )
+    return warnings

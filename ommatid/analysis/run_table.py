@@ -109,7 +109,7 @@ def _error_rows(error: ErrorReport) -> list[Row]:
     return lines + [
         (f"    from {name.replace('_', ' ')}", f"{part:.3g} ({100 * part / total:.1f} %)")
         for name, part in error.budget.items()
-        if part > 0
+        if part > 0 and total > 0
     ]
 
 
@@ -130,11 +130,11 @@ def _image_quality_rows(error: ErrorReport) -> list[Row]:
 def _solver_rows(solver: SolverReport) -> list[Row]:
     if solver.way == "frame":
         lines = [
-            ("computation, error", f"below {solver.bound:.1g} posterior standard deviations in every pixel"),
+            ("computation, error", f"below {solver.bound or 0.0:.1g} posterior standard deviations in every pixel"),
             ("  of variances", f"{solver.variance_bound:.1g}, relative, by exact solutions for some pixels"),
         ]
     else:
-        bounds = f"error below {solver.bound:.0e}, of variances {solver.variance_bound:.0e} (relative)"
+        bounds = f"error below {solver.bound or 0.0:.0e}, of variances {solver.variance_bound:.0e} (relative)"
         lines = [("right digits", f"{solver.digits:.1f}: {bounds}")]
     if solver.way == "tiles":
         lines.append(("  in tiles", solver.why))
@@ -167,7 +167,7 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
 
 def _model_rows(model: ModelReport) -> list[Row]:
     lines: list[Row] = []
-    if model.max_z is not None:
+    if None not in (model.max_z, model.rms_difference_from_ideal, model.p_value):
         difference = f"{model.rms_difference_from_ideal:.2g} rms, largest z {model.max_z:.1f}, p {model.p_value:.2g}"
         lines.append(("H against the ideal one", difference))
     if model.fit is not None:

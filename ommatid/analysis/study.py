@@ -14,6 +14,7 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_csv, write_text
+from ommatid.runtime.input_files import read_bytes
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -107,7 +108,7 @@ def remove_study(folder: Path) -> None:
 
 def _read_study(folder: Path) -> tuple[tuple[StudyCase, ...], str | None]:
     """Return the cases in study.json, and its fingerprint if study.csv is there too."""
-    study = StudyFile.model_validate_json((folder / NUMBERS).read_bytes())
+    study = StudyFile.model_validate_json(read_bytes(folder / NUMBERS))
     return study.cases, study.fingerprint if (folder / TABLE).is_file() else None
 
 

@@ -11,10 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ommatid.runtime.errors import MachineError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError
+from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
-from ommatid.runtime.execution.workers import Completed
-from ommatid.runtime.files import check_output, clear_abandoned, make_folder
+from ommatid.runtime.execution.workers import LOST, Completed
+from ommatid.runtime.files import clear_abandoned, make_folder
+from ommatid.runtime.outputs.kinds import check_folder, check_output
+from ommatid.runtime.outputs.occupied import new_folder, occupied
 from ommatid.runtime.processors import processors
 from ommatid.scenes.formats.picture import write_truth
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, write
@@ -29,6 +32,7 @@ PICTURES = (
     *("stack.exr", "estimate.exr", "estimate.png", "estimate.npy", "estimate.tiff", "overview.png", "depth.png"),
     *("scene.toml", TRUTH),
 )
+OTHERS = "model.npz", "run.json", "report.html"
 
 
 @dataclass(frozen=True)
@@ -68,15 +72,15 @@ class Batch:
     versions: Callable[[bool], dict[str, str]]
     count: Callable[[Sequence[Member]], int]
 
-    def run(self, members: Sequence[Member], scheduler: str = "", count: int | None = None) -> Runs:
+    def run(self, members: Sequence[Member], cluster: Cluster | None = None, count: int | None = None) -> Runs:
         """Yield every scene with a function that returns its description or raises its error.
 
-        Scenes run in `count` processes or on the cluster at `scheduler`; without either, in as many processes as
+        Scenes run in `count` processes or on `cluster`; without either, in as many processes as
         finish soonest, given the scenes, processors and memory. A single process is this one, which shows progress.
         """
-        check_options(scheduler, count)
-        if scheduler:
-            return self._on_cluster(members, scheduler)
+        check_options(cluster, count)
+        if cluster is not None:
+            return self._on_cluster(members, cluster)
         count = min(self._best_count(members) if count is None else count, len(members))
         return self._in_processes(members, count) if count > 1 else self._in_this_process(members)
 
@@ -99,47 +103,66 @@ class Batch:
                 member = members[ended.index]
                 yield member, partial(self._collect, member, ended)
 
-    def _on_cluster(self, members: Sequence[Member], scheduler: str) -> Runs:
+    def _on_cluster(self, members: Sequence[Member], cluster: Cluster) -> Runs:
         """Yield scenes with errors that show already here, then the others as they end."""
         waiting: list[Member] = []
         auto_variant = False
         for member in members:
             try:
                 setup = self.open(member)
-                prepare(setup, member.folder)
+                check_files(setup, member.folder)
+                with new_folder(member.folder):  # fails before any work if there can be none
+                    waiting.append(member)
             except Exception as error:
                 yield member, partial(_raise, error)
                 continue
-            waiting.append(member)
             auto_variant |= setup.scene.render.variant == "auto"
         if not waiting:
             return
-        with worker_pool(scheduler) as pool:
+        with worker_pool(cluster) as pool:
             pool.check_versions(partial(self.versions, auto_variant))
             packages = _ScenePackages(self.open, tuple(waiting))
             try:
                 for ended in pool.each(partial(carry_out, self.stages), packages):
+                    if ended.is_lost:
+                        raise MachineError(LOST)
                     member = packages.sent[ended.index]
                     waiting.remove(member)
                     yield member, partial(self._collect, member, ended)
             except MachineError as error:
-                packages.failed |= {member: MachineError(f"{member.scene}: {error}") for member in waiting}
+                left = [member for member in waiting if member not in packages.failed]
+                packages.failed |= _unfinished(left, error)
         for member in waiting:
             yield member, partial(_raise, packages.failed[member])
 
     def _collect(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
-        """Write the files that a worker returned, and report its stages. Raises the worker's error."""
+        """Write the files that a worker returned, and report its stages. Raises the worker's error.
+
+        A scene that was refused leaves no files.
+        """
         try:
             outcome = ended.result()
         except MachineError as error:
             raise MachineError(f"{member.scene}: {error}") from error
-        unpack(outcome, member.folder)
+        if outcome.done or not isinstance(outcome.error, InputError):
+            with occupied(member.folder):
+                unpack(outcome, member.folder)
         observer = self.observe(member.folder)
         for stage, executed in outcome.done.items():
             observer.done(stage, executed)
         if outcome.error is not None:
             raise outcome.error
         return self.report(member, outcome.description)
+
+
+def _unfinished(members: Sequence[Member], error: MachineError) -> dict[Member, Exception]:
+    """Return an error for each scene that is left when a cluster fails. The first one counts the others."""
+    if not members:
+        return {}
+    first, *others = members
+    count = f" and {len(others)} more" if others else ""
+    failures: dict[Member, Exception] = {first: MachineError(f"{first.scene}{count}: {error}")}
+    return failures | {member: NotStartedError(f"{member.scene}: {error}") for member in others}
 
 
 def _run_in_process(open_member: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:
@@ -170,9 +193,10 @@ class _ScenePackages:
 def check_files(setup: Setup, folder: Path) -> None:
     """Raise InputError if a scene has no picture, or if its results would replace a file that it is read from."""
     scene, _ = setup.scene, setup.picture
+    check_folder(folder)
     if folder.is_dir():
         read = scene.source, *([Path(scene.target.image)] if scene.target.image else [])
-        for name in (*PICTURES, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
+        for name in (*PICTURES, *OTHERS, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):
             check_output(folder / name, *read)
 
 

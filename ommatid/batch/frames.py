@@ -25,7 +25,11 @@ from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution.pool import worker_pool
-from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, make_folder
+from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint
+from ommatid.runtime.input_files import real_path
+from ommatid.runtime.outputs.kinds import check_folder
+from ommatid.runtime.outputs.names import check_name
+from ommatid.runtime.outputs.occupied import new_folder
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import origin
 from ommatid.scenes import model_file
@@ -99,12 +103,11 @@ def reconstruct_frames(
         _check(stack, model, options)
     for output in outputs:
         check_formats(output, options.formats)
-    make_folder(folder)
-    clear_abandoned(folder)
+    check_folder(folder)
     common = [file_digest(options.model), options.changes, options.lenses, options.regions]
     pairs = zip(stacks, outputs, strict=True)
     frames = [Frame(stack, output, _made_from(stack, common)) for stack, output in pairs]
-    return _reports(frames, Prepared(model), options, workers, progress)
+    return _reports(folder, frames, Prepared(model), options, workers, progress)
 
 
 def _outputs(stacks: Sequence[Path], folder: Path, model: Path) -> list[Path]:
@@ -116,6 +119,7 @@ def _outputs(stacks: Sequence[Path], folder: Path, model: Path) -> list[Path]:
         raise InputError(f"{folder}: expected a folder for the estimates of {len(stacks)} stacks, got a file")
     first: dict[str, Path] = {}
     for stack in stacks:
+        check_name(stack.stem, stack)
         if stack.stem in first:
             raise InputError(
                 f"{first[stack.stem]} and {stack}: expected stacks of different names, got two '{stack.stem}', whose"
@@ -123,9 +127,9 @@ def _outputs(stacks: Sequence[Path], folder: Path, model: Path) -> list[Path]:
             )
         first[stack.stem] = stack
     outputs = [folder / f"{stack.stem}.exr" for stack in stacks]
-    read = {path.resolve() for stack in stacks for path in (stack, stack.parent / TRUTH)} | {model.resolve()}
+    read = {real_path(path) for stack in stacks for path in (stack, stack.parent / TRUTH)} | {real_path(model)}
     for output in outputs:
-        if output.resolve() in read:
+        if real_path(output) in read:
             raise InputError(f"{output}: would replace a file that is read; choose another folder with -o")
     return outputs
 
@@ -148,9 +152,22 @@ def _made_from(stack: Path, common: list[Any]) -> str:
 
 
 def _reports(
-    frames: Sequence[Frame], prepared: Prepared, options: FrameOptions, workers: int | None, progress: Progress
+    folder: Path,
+    frames: Sequence[Frame],
+    prepared: Prepared,
+    options: FrameOptions,
+    workers: int | None,
+    progress: Progress,
 ) -> Reports:
     """Yield the frames that are up to date, then the others as they end."""
+    with new_folder(folder):
+        clear_abandoned(folder)
+        yield from _all_frames(frames, prepared, options, workers, progress)
+
+
+def _all_frames(
+    frames: Sequence[Frame], prepared: Prepared, options: FrameOptions, workers: int | None, progress: Progress
+) -> Reports:
     missing: list[Frame] = []
     for frame in frames:
         report = None if options.force else frame.finished()

@@ -24,7 +24,7 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
 
-from .world_package import WorldPackage, packed_world, unpacked_world
+from .world_package import WorldPackage, packed_world, path_inside, unpacked_world
 
 WORLD = "world"  # folder inside that of the scene, on a worker
 LAST = "run.json"  # is written last, since it vouches for the other files
@@ -88,8 +88,8 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
     """Execute `stages` in a temporary folder; a failure keeps the files made before it."""
     with TemporaryDirectory(prefix="ommatid-", dir=scratch_folder()) as temporary:
         folder = Path(temporary)
-        for name, content in package.files.items():
-            (folder / name).write_bytes(content)
+        for path, content in [(path_inside(folder, name), content) for name, content in package.files.items()]:
+            path.write_bytes(content)
 
         def work(observer: RunObserver) -> dict[str, Any]:
             world = None if package.world is None else unpacked_world(package.world, folder / WORLD)
@@ -100,7 +100,7 @@ def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
             outcome = outcome_of(work)
         error = outcome.error
         if isinstance(error, InputError | MachineError):
-            message = str(error)
+            message = "".join(map(str, error.args[:1]))  # as raised: names of folders are replaced in whole
             if package.world is not None:
                 message = message.replace(str(folder / WORLD), package.world.root)
             error = type(error)(message.replace(temporary, package.folder))
@@ -119,11 +119,15 @@ def outcome_of(work: Callable[[RunObserver], dict[str, Any]]) -> SceneOutcome:
 
 
 def unpack(outcome: SceneOutcome, folder: Path) -> None:
-    """Remove the removed files and write the returned ones, run.json last. Raises InputError or MachineError."""
+    """Remove the removed files and write the returned ones, run.json last. Raises InputError or MachineError.
+
+    A name that leads out of the folder is refused before anything is written.
+    """
+    paths = {name: path_inside(folder, name) for name in (*outcome.removed, *outcome.files)}
     for name in outcome.removed:
-        (folder / name).unlink(missing_ok=True)
+        paths[name].unlink(missing_ok=True)
     for name in sorted(outcome.files, key=LAST.__eq__):
-        write_whole(folder / name, partial(_write_bytes, outcome.files[name]))
+        write_whole(paths[name], partial(_write_bytes, outcome.files[name]))
 
 
 def _write_bytes(content: bytes, path: Path) -> None:
@@ -131,6 +135,11 @@ def _write_bytes(content: bytes, path: Path) -> None:
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
-    """Read the files of a folder by name, in the order in which they were written, without hidden ones."""
+    """Read the files of a folder by name, in the order in which they were written, without hidden ones.
+
+    A folder that does not exist has none.
+    """
+    if not folder.is_dir():
+        return {}
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     return {path.name: path.read_bytes() for path in sorted(files, key=lambda path: path.stat().st_mtime_ns)}

@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import prod
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.outputs.names import check_name, shortened_name
 from ommatid.scenes.scene import read
 
 from .batch import Member
 
 EXAMPLE = "such as --sweep noise.variance=1e-6,1e-4"
+MOST_SCENES = 100_000
 LONGEST = 40  # characters of a value in a folder's name
 _PAIRS = {"]": "[", "}": "{", ")": "("}
 
@@ -40,12 +44,15 @@ def sweep_axes(options: Iterable[str]) -> tuple[SweepAxis, ...]:
         key, equals, text = (part.strip() for part in option.partition("="))
         values = tuple(_split(text))
         if not key or not equals or not all(values):
-            raise InputError(f"--sweep {option}: expected KEY=VALUE,VALUE,... without an empty value, {EXAMPLE}")
-        repeated = [value for value in values if values.count(value) > 1]
+            raise InputError(
+                f"--sweep {shortened(option)}: expected KEY=VALUE,VALUE,... without an empty value, {EXAMPLE}"
+            )
+        option = shortened(option)
+        repeated = [value for value, count in Counter(values).items() if count > 1]
         if repeated:
-            raise InputError(f"--sweep {option}: expected every value once, got '{repeated[0]}' twice")
+            raise InputError(f"--sweep {option}: expected every value once, got '{shortened(repeated[0])}' twice")
         if key in {axis.key for axis in axes}:
-            raise InputError(f"--sweep {option}: expected every key once, got '{key}' twice; join its values by commas")
+            raise InputError(f"--sweep {option}: expected every key once, got it twice; join its values by commas")
         axes.append(SweepAxis(key, values))
     return tuple(axes)
 
@@ -53,13 +60,19 @@ def sweep_axes(options: Iterable[str]) -> tuple[SweepAxis, ...]:
 def members(scenes: Sequence[Path], axes: Sequence[SweepAxis], output: Path) -> list[Member]:
     """List every scene with every combination of values, in folders of `output` that are named after them.
 
-    Raises InputError if two of them would share a folder.
+    Raises InputError if two of them would share a folder, for a scene with a name that no folder can have, and for more
+    than MOST_SCENES of them.
     """
+    count = len(scenes) * prod(len(axis.values) for axis in axes)
+    if count > MOST_SCENES:
+        raise InputError(f"--sweep: expected at most {MOST_SCENES} combinations of values, got {count}; sweep fewer")
     names = [_folder_names(axis) for axis in axes]
     by_folder: dict[Path, Member] = {}
+    for scene in scenes:
+        check_name(scene.stem, scene)
     for scene, values in product(scenes, product(*(axis.values for axis in axes))):
         parts = [f"{_safe(axis.key)}={name[value]}" for axis, name, value in zip(axes, names, values, strict=True)]
-        folder = output / "+".join([scene.stem, *parts])
+        folder = output / shortened_name("+".join([scene.stem, *parts]))
         if folder in by_folder:
             raise InputError(f"{folder}: two scenes of the batch are called '{scene.stem}'; rename one of them")
         changes = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
@@ -77,7 +90,7 @@ def check_keys(scene: Path, axes: Sequence[SweepAxis], changes: Sequence[str], l
     for axis in axes:
         error = _key_error(scene, (*changes, f"{axis.key}={axis.values[0]}"), lenses, axis.key)
         if error:
-            raise InputError(f"--sweep {axis.key}: {error}")
+            raise InputError(f"--sweep {shortened(axis.key)}: {error}")
 
 
 def _key_error(scene: Path, changes: Sequence[str], lenses: Sequence[str], key: str | None) -> InputError | None:
@@ -116,10 +129,10 @@ def _split(text: str) -> list[str]:
 def _folder_names(axis: SweepAxis) -> dict[str, str]:
     """Map values to parts of folder names; values that would share a name, or have a long one, get a hash."""
     plain = {value: _safe(value) for value in axis.values}
-    texts = list(plain.values())
+    texts = Counter(plain.values())
     return {
         value: text
-        if texts.count(text) == 1 and 0 < len(text) <= LONGEST
+        if texts[text] == 1 and 0 < len(text) <= LONGEST
         else f"{text[:LONGEST]}~{hashlib.sha256(value.encode()).hexdigest()[:6]}"
         for value, text in plain.items()
     }

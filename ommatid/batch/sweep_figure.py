@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.figures.quantity_axis import GREY_LEVELS, QuantityAxis, quantity_axis, spans_decade
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.runtime.printable import printable_label
 
 from .sweep_row import SweepRow
 
@@ -55,6 +56,7 @@ class Crossing:
     error: float
 
 
+@own_style()
 def write_figure(path: Path, rows: Sequence[SweepRow], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the errors of a sweep. Raises MachineError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -177,7 +179,7 @@ def _label_axes(panel: Any, rows: Sequence[SweepRow], axis: QuantityAxis) -> Non
     failed = sum(row.failed is not None for row in rows)
     scenes = ", ".join(dict.fromkeys(Path(row.scene).stem for row in rows))
     note = f"; {failed} of {len(rows)} failed, see sweep.csv" if failed else ""
-    panel.set_title(f"Sweep of {scenes}{note}", fontsize=11)
+    panel.set_title(f"Sweep of {printable_label(scenes)}{note}", fontsize=11)
     panel.set_ylabel(f"mean squared error ({GREY_LEVELS} squared)")
     axis.draw(panel.xaxis)
     numbers = [number for row in rows for number in (row.mse, _predicted(row), *_interval(row))]
@@ -268,6 +270,6 @@ def _legend(
 
 def _label(key: str, value: str) -> str:
     if key == SCENE:
-        return Path(value).stem
+        return printable_label(Path(value).stem)
     words = WORDS.get((key, value.strip("\"'")))
-    return f"{key} = {value}" + (f" ({words})" if words else "")
+    return printable_label(f"{key} = {value}") + (f" ({words})" if words else "")

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
+from ommatid.runtime.input_files import read_bytes
 from ommatid.scenes.tables.overrides import value_of
 
 NUMBERS = "sweep.json"
@@ -120,7 +121,7 @@ def write_rows(path: Path, rows: Sequence[SweepRow]) -> None:
 def read_rows(path: Path) -> list[SweepRow]:
     """Read sweep.json. Raises InputError if it is missing, damaged or another file."""
     try:
-        return TypeAdapter(list[SweepRow]).validate_json(path.read_bytes())
+        return TypeAdapter(list[SweepRow]).validate_json(read_bytes(path))
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror}); `ommatid run --sweep` writes it") from error
     except ValidationError as error:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 
 
@@ -41,9 +42,24 @@ def packed_world(scene: Scene) -> WorldPackage:
 
 
 def unpacked_world(package: WorldPackage, folder: Path) -> Path:
-    """Write the files of a world into a folder, and return the path of the world's own."""
+    """Write the files of a world into a folder, and return the path of the world's own.
+
+    Raises InputError before anything is written if a name leads out of the folder.
+    """
+    world, paths = path_inside(folder, package.file), {name: path_inside(folder, name) for name in package.contents}
     for name, content in package.contents.items():
-        path = folder / name
+        path = paths[name]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
-    return folder / package.file
+    return world
+
+
+def path_inside(folder: Path, name: str) -> Path:
+    """Return the path of a file that another machine names, inside a folder. Raises InputError if it leads out."""
+    parts = PurePath(name).parts
+    if not parts or ".." in parts or PurePath(name).is_absolute():
+        raise InputError(
+            f"{folder}: another machine sent a file '{printable(name)}', expected one inside this folder; nothing was"
+            " written, check the cluster"
+        )
+    return folder / name

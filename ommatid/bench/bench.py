@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
@@ -14,7 +13,9 @@ from typing import cast
 import numpy as np
 
 from ommatid.runtime.errors import InputError, naming_source
-from ommatid.runtime.files import digest, fingerprint, make_folder
+from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.outputs.kinds import check_folder
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
@@ -35,6 +36,7 @@ from .slopes import recommend, slope
 from .table import AUTO, JSON, STAGES, BenchTable, Cell, ConvergenceCurve, SkippedJob, Stage
 
 PARTIAL = ".bench.partial.jsonl"
+LOCK = ".ommatid-bench.lock"  # runs into folders of this folder do not wait for it
 ROUNDING: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below these are float32 rounding
 FLOOR_SHARE = 0.1  # of the time limit, for the noise floor
 SETUP_SHARE = 0.02  # of the progress, for the reference and the noise floor
@@ -46,8 +48,14 @@ def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tup
     Cells that are already in `folder` are not measured again; those that do not fit into `seconds` are left out.
     Raises InputError for a scene that cannot be measured, and if `folder` holds the table of another scene.
     """
-    start = perf_counter()
     _check_flat(setup.scene)
+    check_folder(folder)
+    with occupied(folder, JSON, lock=LOCK):
+        return _bench(setup, folder, seconds, progress)
+
+
+def _bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
+    start = perf_counter()
     setup = replace(setup, scene=_with_exact_assumptions(setup.scene), given_image=setup.image)
     scene, camera = setup.scene, setup.camera
     check_scene(setup, calibrates=False)
@@ -71,12 +79,13 @@ def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tup
     late = measure(listed, seconds, journal, measured, perf_counter() - start)
     left_out += [SkippedJob(what=name, why=why) for name, why in journal.refused.items()]
     cells = tuple(journal.cells[job.name] for job in listed if job.name in journal.cells)
+    system = os.uname().sysname, os.uname().release, os.uname().machine  # `platform` runs the command uname
     table = BenchTable(
         title=scene.title or scene.source.stem,
         scene=subject_print,
         fingerprint=made_from,
         camera=camera.describe(),
-        machine={"cores": os.cpu_count(), "system": platform.platform(), "load": os.getloadavg()[0]},
+        machine={"cores": os.cpu_count(), "system": " ".join(system), "load": os.getloadavg()[0]},
         versions=versions("mitsuba", "drjit", "scipy"),
         against=right.description,
         noise_deviation=_noise_deviation(subject),
@@ -105,7 +114,6 @@ def _check_flat(scene: Scene) -> None:
 
 def _open_journal(folder: Path, made_from: str, previous: BenchTable | None) -> Journal:
     """Open the journal of an interrupted bench, or begin one with the cells of a table that needs more time."""
-    make_folder(folder)
     journal = Journal(folder / PARTIAL, made_from)
     if previous is not None:
         for cell in previous.cells:

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.analysis.pareto import pareto_front
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.runtime.printable import printable_label
 
 from .labels import Label, label_points
 from .slopes import TOLERANCE, median_error, median_seconds
@@ -50,6 +51,7 @@ Abscissa = Callable[[Cell], float | None]
 Ordinate = Callable[[Cell], Quantiles | None]
 
 
+@own_style()
 def write_figures(folder: Path, table: BenchTable, files: FigureFiles = SCREEN_PNG) -> None:
     """Write a PNG for each stage that has cells: render.png, calibrate.png, reconstruct.png."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -71,7 +73,7 @@ def _draw_sampling(figure: Any, table: BenchTable, stage: Stage) -> None:
     """Draw error against samples with slopes, error against seconds, and the image's error against seconds."""
     unit = "RMS over sensor pixels (grey levels)" if stage == "render" else "RMS over entries of H"
     name = "Rendering" if stage == "render" else "Calibration"
-    figure.suptitle(f"{name}: {table.title}", parse_math=False)
+    figure.suptitle(f"{name}: {printable_label(table.title)}")
     panels = figure.subplots(1, 3, width_ratios=(1.35, 1, 1))
     cells = table.of(stage)
     groups, styles = _groups([cell for cell in cells if cell.counted]), _styles(cells)
@@ -102,7 +104,7 @@ def _draw_sampling(figure: Any, table: BenchTable, stage: Stage) -> None:
 
 def _draw_reconstruction(figure: Any, table: BenchTable) -> None:
     """Draw numerical error, and the image's error, against seconds: one labelled mark per setting."""
-    figure.suptitle(f"Reconstruction: {table.title}", parse_math=False)
+    figure.suptitle(f"Reconstruction: {printable_label(table.title)}")
     panels = figure.subplots(1, 2, width_ratios=(1.5, 1))
     cells = table.of("reconstruct")
     groups: dict[Key, list[Cell]] = {(cell.way, cell.setting): [cell] for cell in cells}

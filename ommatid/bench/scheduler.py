@@ -17,6 +17,7 @@ from time import perf_counter
 import numpy as np
 
 from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.input_files import read_text
 from ommatid.runtime.progress import Progress
 
 from .resources import Cost
@@ -81,8 +82,8 @@ class Journal:
         self.refused: dict[str, str] = {}
         self.seconds = 0.0
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError):
+            lines = read_text(path).splitlines()
+        except (OSError, ValueError):
             lines = []
         for line in lines:
             self._load(line)
@@ -97,7 +98,7 @@ class Journal:
             else:
                 self.refused[str(entry["name"])] = str(entry["why"])
             self.seconds += float(entry["seconds"])
-        except (ValueError, KeyError, TypeError):  # truncated when the program was killed
+        except (ValueError, KeyError, TypeError, RecursionError):  # truncated when the program was killed
             return
 
     def add(self, name: str, cell: Cell | str, seconds: float) -> None:

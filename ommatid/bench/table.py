@@ -15,8 +15,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import write_csv, write_text
+from ommatid.runtime.input_files import read_bytes, real_path
 
 JSON, CSV = "bench.json", "bench.csv"
 ALONE = "alone"  # the setting of a dense form without refinement, which a scene cannot ask for
@@ -194,13 +195,14 @@ def write(folder: Path, table: BenchTable) -> None:
 def read(path: Path) -> BenchTable:
     """Read bench.json. Raises InputError if the file is missing, truncated or not written by `ommatid bench`."""
     try:
-        return BenchTable.model_validate_json(path.read_bytes(), strict=True)
+        return BenchTable.model_validate_json(read_bytes(path), strict=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); run `ommatid bench` to create it") from error
     except ValidationError as error:
-        field = ".".join(map(str, error.errors()[0]["loc"])) or "the file"
+        first = error.errors()[0]
+        field, reason = shortened(".".join(map(str, first["loc"]))) or "the file", shortened(first["msg"])
         raise InputError(
-            f"{path}: expected the output of `ommatid bench`, but {field} is not valid ({error.errors()[0]['msg']});"
+            f"{path}: expected the output of `ommatid bench`, but {field} is not valid ({reason});"
             " run `ommatid bench` again"
         ) from error
 
@@ -211,7 +213,7 @@ def bench_tables(folder: Path, camera: Mapping[str, Any]) -> Iterator[BenchTable
     camera : description of the camera, as `Camera.describe` returns it
     """
     same_camera = json.loads(json.dumps(camera))
-    for path in (folder / JSON, folder.resolve().parent / JSON):
+    for path in (folder / JSON, real_path(folder).parent / JSON):
         try:
             table = read(path)
         except InputError:

@@ -13,10 +13,13 @@ from typing import Annotated
 
 import typer
 
+from ommatid.runtime.execution.library_warnings import library_warnings
+from ommatid.runtime.library_caches import library_caches
 from ommatid.runtime.versions import command_line
 
-from . import calibrate, predict, reconstruct, run, show, studies
+from . import calibrate, output, predict, reconstruct, run, show, studies
 from .failures import exit_code_of
+from .streams import prepare_streams, use_utf8_names
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -56,6 +59,8 @@ def start(version: Version = False) -> None:
 
 def main() -> None:
     """Run the command line and exit."""
-    with command_line(["ommatid", *sys.argv[1:]]):
+    prepare_streams()
+    use_utf8_names()
+    with command_line(["ommatid", *sys.argv[1:]]), library_caches(), library_warnings(output.warn):
         code = exit_code_of(partial(app, prog_name="ommatid", standalone_mode=False))
     sys.exit(code)

@@ -9,6 +9,7 @@ import typer
 
 from . import options, output
 from .options import (
+    AllowOutside,
     Complete,
     Dark,
     Flat,
@@ -50,6 +51,7 @@ def calibrate(
     sets: Sets = None,
     lens: Lenses = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     as_json: Json = False,
 ) -> None:
     """Find the observation matrix H alone.
@@ -61,7 +63,7 @@ def calibrate(
     settings = options.acquisition(dark, flat, flat_value, origin, upright)
     value = options.positive("--point-value", point_value)
     recording = point_recording(points or (), more or (), places, value, settings)
-    asked = options.changes(sets, complete), options.lens_names(lens)
+    asked = options.changes(sets, complete, allow_outside), options.lens_names(lens)
     with output.progress_bar("calibrate") as progress:
         outcome = calibrate_file(scene, file, *asked, recording, progress)
     output.warn_all(outcome.warnings)

@@ -7,10 +7,15 @@ results that are not to be trusted.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
-from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError
+from ommatid.runtime.execution.library_warnings import TRACEBACK
+from ommatid.runtime.outputs.kinds import input_error
+from ommatid.runtime.printable import printable
 
 from .output import say
 
@@ -43,24 +48,31 @@ def exit_code_of(command: Callable[[], object]) -> int:
 
 def report(error: Exception) -> int:
     """Say in one sentence what went wrong, and return the exit code."""
+    if isinstance(error, OSError) and isinstance(error.filename, str):
+        error = input_error(Path(error.filename), error) or error
     if isinstance(error, BatchError):
         return error.exit_code
+    if isinstance(error, NotStartedError):
+        return 1
     if hasattr(error, "format_message"):  # raised by the parser of the command line
         message = cast(Any, error).format_message()
-        say(message if type(error).__name__ == "NoArgsIsHelpError" else f"ommatid: {message}")
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print(message, file=sys.stderr)
+        else:
+            say(f"ommatid: {message}")
         return 2
     if isinstance(error, InputError | MachineError):
-        say("ommatid: " + " ".join(str(error).splitlines()))
+        say(f"ommatid: {error}")
         return 2 if isinstance(error, InputError) else 1
-    if os.environ.get("OMMATID_TRACEBACK"):
+    if os.environ.get(TRACEBACK):
         raise error
     if isinstance(error, MemoryError):
         say("ommatid: not enough memory; crop the target or close other programs")
     elif isinstance(error, OSError):
         say(f"ommatid: {error.filename or 'the machine'}: {error.strerror or error}")
     else:
-        what = " ".join(f"{type(error).__name__}: {error}".split())
-        say(f"ommatid: unexpected {what}; set OMMATID_TRACEBACK=1 to see where, and report it")
+        what = printable(f"{type(error).__name__}: {error}")
+        say(f"ommatid: unexpected {what}; set {TRACEBACK}=1 to see where, and report it")
     return 1
 
 

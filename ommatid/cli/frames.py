@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable_sentence
 
 from . import failures, output
 
@@ -98,9 +99,9 @@ def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict:
     try:
         report, made = work()
     except Exception as error:
-        code = failures.report(error)
-        document = {**heading, "error": str(error), "exit_code": code}
-        return DescribedFrame(document, (name, f"failed: {error}"), code, None)
+        code, reason = failures.report(error), printable_sentence(error)
+        document = {**heading, "error": reason, "exit_code": code}
+        return DescribedFrame(document, (name, f"failed: {reason}"), code, None)
     if not quiet:
         output.say_done("reconstruct", made, frame.output)
     code = failures.NOT_TRUSTED if strict and not is_trusted(report) else 0

@@ -7,13 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.scenes.tables.gallery import gallery_names
 
 if TYPE_CHECKING:
     from ommatid.figures.saving import FigureFiles
+    from ommatid.runtime.execution.cluster import Cluster
     from ommatid.scenes.hardware.frames import AcquisitionSettings
 
+MOST_WORKERS = 4096
+LARGEST_PIXEL = 2**31  # number of a row or a column
+LARGEST_VALUE = 1e12  # of a pixel, as in a scene file
 _SCENE = f"A scene file, or a scene of the gallery by name: {', '.join(gallery_names())}."
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help=_SCENE, autocompletion=gallery_names)]
@@ -43,6 +47,9 @@ Lenses = Annotated[
 Complete = Annotated[
     bool, typer.Option("--complete", help="Simulate every effect, however small: render.complete=true.")
 ]
+AllowOutside = Annotated[
+    bool, typer.Option("--allow-outside", help="Let a world name files outside the folder of its own file.")
+]
 Sweeps = Annotated[
     list[str] | None,
     typer.Option(
@@ -54,9 +61,17 @@ Sweeps = Annotated[
 Scheduler = Annotated[
     str, typer.Option("--scheduler", metavar="ADDRESS", help="Send the scenes to this Dask cluster: tcp://host:port.")
 ]
+TlsCa = Annotated[
+    Path | None,
+    typer.Option("--tls-ca", metavar="FILE", help="Certificate of the authority of a cluster at tls://host:port."),
+]
+TlsCert = Annotated[Path | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate signed by --tls-ca.")]
+TlsKey = Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="Private key of --tls-cert.")]
 Workers = Annotated[
     int | None,
-    typer.Option("--workers", metavar="N", min=1, help="Number of processes (default: chosen automatically)."),
+    typer.Option(
+        "--workers", metavar="N", min=1, max=MOST_WORKERS, help="Number of processes (default: chosen automatically)."
+    ),
 ]
 Job = Annotated[
     str,
@@ -142,9 +157,19 @@ def lens_names(lens: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in lens.split(",")) if lens else ()
 
 
-def changes(sets: list[str] | None, complete: bool = False) -> tuple[str, ...]:
-    """Collect the changes of `--set` and `--complete`, in the order in which they apply."""
-    return (*(sets or ()), *(("render.complete=true",) if complete else ()))
+def changes(sets: list[str] | None, complete: bool = False, allow_outside: bool = False) -> tuple[str, ...]:
+    """Collect the changes of `--set`, `--complete` and `--allow-outside`, in the order in which they apply."""
+    outside = ("--allow-outside",) if allow_outside else ()
+    return (*(sets or ()), *(("render.complete=true",) if complete else ()), *outside)
+
+
+def cluster(scheduler: str, authority: Path | None, certificate: Path | None, key: Path | None) -> Cluster | None:
+    """Collect the options of a cluster; None without one. Raises InputError for --tls-ca and its kin without one."""
+    from ommatid.runtime.execution.cluster import Cluster
+
+    if not scheduler and (authority or certificate or key):
+        raise InputError("--tls-ca, --tls-cert, --tls-key: expected --scheduler tls://HOST:PORT with them, got none")
+    return Cluster(scheduler, authority, certificate, key) if scheduler else None
 
 
 def figure_files(formats: str, resolution: int, always: str = "png") -> FigureFiles:
@@ -179,17 +204,19 @@ def acquisition(
 
 
 def positive(option: str, value: float) -> float:
-    """Return the value of an option if it is finite and above 0. Raises InputError otherwise."""
-    if not 0 < value < float("inf"):
-        raise InputError(f"{option}: expected a value above 0, such as 255, got {value:g}")
+    """Return the value of an option if it is above 0 and no larger than a pixel can be. Raises InputError otherwise."""
+    if not 0 < value <= LARGEST_VALUE:
+        raise InputError(
+            f"{option}: expected a value above 0 and at most {LARGEST_VALUE:g}, such as 255, got {value:g}"
+        )
     return value
 
 
 def _integers(option: str, text: str, expected: str, example: str) -> list[int]:
     try:
         numbers = [int(number) for number in text.split(",")]
-        if len(numbers) != len(expected.split(",")):
+        if len(numbers) != len(expected.split(",")) or max(map(abs, numbers)) > LARGEST_PIXEL:
             raise ValueError(text)
     except ValueError as error:
-        raise InputError(f"{option}: expected {expected}, such as {example}, got '{text}'") from error
+        raise InputError(f"{option}: expected {expected}, such as {example}, got '{shortened(text)}'") from error
     return numbers

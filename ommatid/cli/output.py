@@ -1,17 +1,21 @@
-"""Print tables and JSON documents on stdout, and messages and progress bars on stderr."""
+"""Print tables and JSON documents on stdout, and messages and progress bars on stderr.
+
+All other modules print by these functions, which escape and shorten what came from outside.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Generator, Iterable
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import LONGEST_MESSAGE, printable, printable_sentence
 
 if TYPE_CHECKING:
     from ommatid.batch.remote import RunObserver
@@ -21,12 +25,17 @@ if TYPE_CHECKING:
 
 Detail = Literal["table", "summary", "verdict"]
 
+LONGEST_LINE = 1000  # characters of a line on stdout, or of a cell of a table
+MOST_WARNINGS = 20  # which are printed of one list
+LEAST_WIDTH = 40  # columns of a table; in narrower ones, numbers would be cut off
+
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
 
 
 def say(text: str) -> None:
-    """Print a sentence on stderr."""
-    print(text, file=sys.stderr)
+    """Print a sentence on stderr, unless its reader has gone."""
+    with suppress(OSError, ValueError):
+        print(printable_sentence(text, LONGEST_MESSAGE), file=sys.stderr)
 
 
 def warn(sentence: str) -> None:
@@ -35,9 +44,12 @@ def warn(sentence: str) -> None:
 
 
 def warn_all(sentences: Iterable[str]) -> None:
-    """Print warnings on stderr, a line each."""
-    for sentence in sentences:
+    """Print warnings on stderr, a line each: the first of very many."""
+    sentences = list(sentences)
+    for sentence in sentences[:MOST_WARNINGS]:
         warn(sentence)
+    if len(sentences) > MOST_WARNINGS:
+        warn(f"there are {len(sentences) - MOST_WARNINGS} more of these")
 
 
 def say_done(command: str, made: bool, file: Path | None = None) -> None:
@@ -57,7 +69,7 @@ def print_result(document: object, sections: Iterable[Section], as_json: bool, f
         return
     print_tables(sections)
     if footer:
-        print(footer)
+        print_lines([footer])
 
 
 def print_tables(sections: Iterable[Section]) -> None:
@@ -66,10 +78,16 @@ def print_tables(sections: Iterable[Section]) -> None:
     from rich.table import Table
 
     for title, lines in sections:
-        table = Table("", "", title=title, title_justify="left", show_header=False)
+        table = Table("", "", title=printable_sentence(title, LONGEST_MESSAGE), title_justify="left", show_header=False)
         for name, value in lines:
-            table.add_row(name, value, style="bold red" if (name, value[:3]) == ("verdict", "not") else None)
-        Console(markup=False, emoji=False).print(table)
+            table.add_row(
+                printable(name),
+                printable(value, LONGEST_LINE),
+                style="bold red" if (name, value[:3]) == ("verdict", "not") else None,
+            )
+        console = Console(markup=False, emoji=False)
+        console.width = max(console.width, LEAST_WIDTH)
+        console.print(table)
 
 
 @contextmanager
@@ -88,7 +106,9 @@ def progress_bar(stage: str) -> Generator[Progress]:
 def print_lines(lines: Iterable[str], *, alarm: bool = False) -> None:
     """Print lines on stdout; with `alarm` the first in red where stdout is a terminal."""
     for number, line in enumerate(lines):
-        typer.secho(line, fg="red" if alarm and number == 0 else None, bold=alarm and number == 0)
+        typer.secho(
+            printable(line, LONGEST_LINE), fg="red" if alarm and number == 0 else None, bold=alarm and number == 0
+        )
 
 
 def detail(verbose: bool, quiet: bool) -> Detail:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from . import failures, frames, options, output
-from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, Verbose
+from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, TlsCa, TlsCert, TlsKey, Verbose
 
 if TYPE_CHECKING:
     from ommatid.pipeline.reconstruction import ReconstructionRequest
     from ommatid.reconstruct.output.estimate_formats import Format
+    from ommatid.runtime.execution.cluster import Cluster
 
 StackAndModel = Annotated[
     list[Path],
@@ -56,7 +57,11 @@ TileScheduler = Annotated[
 TileWorkers = Annotated[
     int | None,
     typer.Option(
-        "--workers", metavar="N", min=1, help="Distribute several stacks, or the tiles of one, over N processes."
+        "--workers",
+        metavar="N",
+        min=1,
+        max=options.MOST_WORKERS,
+        help="Distribute several stacks, or the tiles of one, over N processes.",
     ),
 ]
 ScenePrior = Annotated[
@@ -75,6 +80,9 @@ def reconstruct(
     lens: Lenses = "",
     region: Regions = None,
     scheduler: TileScheduler = "",
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     workers: TileWorkers = None,
     formats: Formats = "",
     force: Force = False,
@@ -95,13 +103,14 @@ def reconstruct(
         frames.reconstruct(request, file, scheduler, workers, strict, None if as_json else detail)
         return
     request = reconstruction.ReconstructionRequest(stacks[0], model, *asked, force)
-    _reconstruct_one(request, file, (scheduler, workers), others, None if as_json else detail, strict)
+    pool = options.cluster(scheduler, tls_ca, tls_cert, tls_key), workers
+    _reconstruct_one(request, file, pool, others, None if as_json else detail, strict)
 
 
 def _reconstruct_one(
     request: ReconstructionRequest,
     file: Path,
-    pool: tuple[str, int | None],
+    pool: tuple[Cluster | None, int | None],
     formats: tuple[Format, ...],
     detail: output.Detail | None,
     strict: bool,

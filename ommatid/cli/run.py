@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from . import failures, output
 from .options import (
     SCREEN,
+    AllowOutside,
     Complete,
     DryRun,
     FigureFormats,
@@ -27,10 +28,14 @@ from .options import (
     Sets,
     Strict,
     Sweeps,
+    TlsCa,
+    TlsCert,
+    TlsKey,
     Verbose,
     Within,
     Workers,
     changes,
+    cluster,
     figure_files,
     lens_names,
 )
@@ -49,9 +54,13 @@ def run(
     lens: Lenses = "",
     sweep: Sweeps = None,
     scheduler: Scheduler = "",
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     within: Within = "",
     figure_formats: FigureFormats = "",
     figure_resolution: FigureResolution = SCREEN,
@@ -71,23 +80,23 @@ def run(
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
-    figures = figure_files(figure_formats, figure_resolution)
-    asked = changes(sets, complete), lens_names(lens)
+    figures, words = figure_files(figure_formats, figure_resolution), _job_words(within, formats, figure_formats)
+    asked = changes(sets, complete, allow_outside), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
-    job = "" if dry_run else job
-    share = share_of_job(job, members, folder, _job_words(within, formats, figure_formats), *asked, scheduler)
+    share = share_of_job("" if dry_run else job, members, folder, words, *asked, scheduler)
     members = members if share is None else share.members
     output.warn_all(batch_warnings(members, *asked))
     if dry_run:
         _print_plans(members, *asked, force, as_json)
         return
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
+    pool = cluster(scheduler, tls_ca, tls_cert, tls_key), workers
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
     report = partial(_print_run, None if as_json else detail)
     check = (check_within if within else check_run) if force else None
     batch = scene_batch(*asked, with_options(with_figures(stages, figures), check, others), observer, report)
     files: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures, "share": share}
-    finish_batch(run_batch(batch, members, failures.report, scheduler, workers, **files), as_json, strict)
+    finish_batch(run_batch(batch, members, failures.report, *pool, **files), as_json, strict)
 
 
 def _print_run(detail: output.Detail | None, member: Member, description: dict[str, Any]) -> dict[str, Any]:
@@ -134,9 +143,13 @@ def render(
     lens: Lenses = "",
     sweep: Sweeps = None,
     scheduler: Scheduler = "",
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -148,14 +161,15 @@ def render(
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         return {"file": str(member.folder / "stack.exr"), **description}
 
-    asked = changes(sets, complete), lens_names(lens)
+    asked = changes(sets, complete, allow_outside), lens_names(lens)
     members = batch_members(scenes, folder, sweep, *asked)
     share = share_of_job(job, members, folder, ("render",), *asked, scheduler)
     members = members if share is None else share.members
     output.warn_all(batch_warnings(members, *asked))
     check = stages.check_render if force else None
     batch = scene_batch(*asked, with_options(stages.render, check, ()), output.observer, report)
-    outcome = run_batch(batch, members, failures.report, scheduler, workers, sweep_folder=folder, share=share)
+    pool = cluster(scheduler, tls_ca, tls_cert, tls_key), workers
+    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, share=share)
     finish_batch(outcome, as_json)
 
 

@@ -11,7 +11,18 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables.gallery import gallery_names
 
 from . import options, output
-from .options import SCREEN, Complete, FigureFormats, FigureResolution, Json, Lenses, Output, SceneFile, Sets
+from .options import (
+    SCREEN,
+    AllowOutside,
+    Complete,
+    FigureFormats,
+    FigureResolution,
+    Json,
+    Lenses,
+    Output,
+    SceneFile,
+    Sets,
+)
 
 FigureFile = Annotated[
     Path | None, typer.Option("--figure", metavar="FILE", help="Write a drawing of the camera: .png, .svg or .pdf.")
@@ -31,6 +42,7 @@ def show(
     sets: Sets = None,
     lens: Lenses = "",
     complete: Complete = False,
+    allow_outside: AllowOutside = False,
     figure: FigureFile = None,
     figure_formats: FigureFormats = "",
     figure_resolution: FigureResolution = SCREEN,
@@ -42,7 +54,7 @@ def show(
     from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
 
-    described = read(scene, options.changes(sets, complete), options.lens_names(lens))
+    described = read(scene, options.changes(sets, complete, allow_outside), options.lens_names(lens))
     output.warn_all(conversions(described))
     description = describe_scene(described)
     if figure is not None:

@@ -10,11 +10,19 @@ import typer
 from . import options, output
 from .options import SCREEN, FigureFormats, FigureResolution, Folder, Json, Lenses, SceneFile, Sets
 
+LONGEST = 1e7  # seconds of a bench
+
 Photograph = Annotated[str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the noise in Figure 7.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the noise in Figure 7.")]
 Seconds = Annotated[
     float,
-    typer.Option("--seconds", metavar="N", min=1, help="Time for all measurements; those that do not fit are skipped."),
+    typer.Option(
+        "--seconds",
+        metavar="N",
+        min=1,
+        max=LONGEST,
+        help="Time for all measurements; those that do not fit are skipped.",
+    ),
 ]
 
 

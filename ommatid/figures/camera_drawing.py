@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable_label
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.lens_type import LensType, SubImager
@@ -18,7 +19,7 @@ from ommatid.scenes.scene import Scene
 
 from .camera_key import write_key
 from .lengths import length_words
-from .saving import FORMATS, SCREEN_PNG, FigureFiles
+from .saving import FORMATS, SCREEN_PNG, FigureFiles, own_style
 from .sensor_drawing import draw_sensor, draw_sub_images, sensor_aspect, write_beside
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
@@ -42,6 +43,7 @@ ARROW: dict[str, Any] = {
 Ray = tuple[tuple[float, float], ...]  # points (z, x)
 
 
+@own_style()
 def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True) -> Any:
     """Draw a camera to scale, with its lengths, as a Matplotlib figure.
 
@@ -69,8 +71,8 @@ def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True) -> A
     if not described:
         return figure
     write_key(figure, camera, terms, colours, key - 1.5 * LINE, LINE)
-    name = scene.title or scene.source.stem
-    figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center", parse_math=False)
+    name = printable_label(scene.title or scene.source.stem)
+    figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center")
     return figure
 
 

@@ -13,6 +13,7 @@ from fractions import Fraction
 from math import ceil, exp, floor, isfinite, log, log10
 from typing import Any
 
+from ommatid.runtime.printable import printable_label
 from ommatid.scenes.tables.units import in_unit
 
 DECADE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
@@ -90,7 +91,7 @@ class QuantityAxis:
         from matplotlib.ticker import LogLocator, NullFormatter
 
         panel = axis.axes
-        panel.set_xlabel(self.title)
+        panel.set_xlabel(printable_label(self.title))
         if self.logarithmic:
             panel.set_xscale("log")
             axis.set_major_formatter("{x:g}")
@@ -98,7 +99,8 @@ class QuantityAxis:
             axis.set_minor_locator(locator)
             axis.set_minor_formatter(NullFormatter())
         if self.categories or len(self.positions) <= MOST_TICKS:
-            panel.set_xticks(list(self.positions.values()), [self.labels[value] for value in self.positions])
+            labels = [printable_label(self.labels[value]) for value in self.positions]
+            panel.set_xticks(list(self.positions.values()), labels)
         if self.categories and sum(map(len, self.labels.values())) > 8 * MOST_TICKS:
             panel.tick_params(axis="x", labelrotation=30)
 

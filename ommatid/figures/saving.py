@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,12 +60,27 @@ def figure_formats(text: str) -> tuple[str, ...]:
     return names
 
 
+@contextmanager
+def own_style() -> Generator[None]:
+    """Draw with Matplotlib's defaults, whatever a matplotlibrc or a notebook has set. Also usable as a decorator.
+
+    A character that the font lacks is drawn as a box, without a warning.
+    """
+    import matplotlib
+
+    module: Any = matplotlib
+    defaults = {key: value for key, value in module.rcParamsDefault.items() if key != "backend"}
+    with module.rc_context({**defaults, **SETTINGS}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font", UserWarning)
+        yield
+
+
 def save_figure(figure: Any, path: Path, formats: Sequence[str] = ("png",), resolution: int = SCREEN) -> None:
     """Write a figure beside `path` in each format; the suffix of `path` is replaced. Raises InputError or MachineError.
 
     resolution : of PNG files, and of pictures inside the others, in dots per inch
     """
-    with _settings():
+    with own_style():
         for name in formats:
             options: dict[str, Any] = {"format": name, "dpi": resolution, "metadata": DATE[name]}
             write_whole(path.with_suffix(f".{name}"), lambda file, options=options: figure.savefig(file, **options))
@@ -76,17 +92,10 @@ def svg_text(figure: Any) -> str:
     Its width is that of the element around it.
     """
     file = io.StringIO()
-    with _settings():
+    with own_style():
         figure.savefig(file, format="svg", transparent=True, metadata=DATE["svg"])
     text = re.sub(r"\A.*?(?=<svg)|<metadata>.*?</metadata>|<!--.*?-->", "", file.getvalue(), flags=re.DOTALL)
     text = re.sub(r' id="[a-z]+[0-9.]*_[0-9]+"', "", text)  # of groups; several figures of a page share these names
     head, rest = text.split(">", 1)
     head = re.sub(r' (width|height)="[^"]*"', "", head)
     return f'{head} role="img" fill="currentColor">{rest.replace(INK, "currentColor")}'
-
-
-def _settings() -> AbstractContextManager[None]:
-    import matplotlib
-
-    context: Any = matplotlib.rc_context  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    return context(SETTINGS)

@@ -5,6 +5,7 @@ A sweep is a batch with `sweep.json`, which lists its folders with the `values` 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -22,6 +23,9 @@ from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
+from ommatid.runtime.input_files import real_path
+from ommatid.runtime.outputs.kinds import check_folder
+from ommatid.runtime.printable import printable
 from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.scene import read as read_scene
@@ -50,7 +54,7 @@ class BatchEntry:
     @property
     def title(self) -> str:
         """Title of the scene, or the name of its folder."""
-        return (self.report.title if self.report else "") or self.name
+        return printable((self.report.title if self.report else "") or self.name)
 
     @property
     def agreement(self) -> str:
@@ -74,7 +78,7 @@ class BatchEntry:
 
     def url(self, file: str) -> str:
         """Return the address of a file of the run, relative to the index."""
-        return quote(f"{self.name}/{file}")
+        return quote(os.fsencode(f"{self.name}/{file}"))
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,7 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     ]
     content = [described, None if sweep is None else asdict(sweep)]
     stamp = fingerprint([content, sources_digest()])
-    name = output.resolve().name
+    name = real_path(output).name
     return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
 
 
@@ -112,6 +116,7 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
         return BatchEntry(folder.name, failure=failure)
     try:
+        check_folder(folder)
         return BatchEntry(folder.name, run_json.read(folder), sensor_area=_sensor_area(folder / "scene.toml"))
     except InputError as error:
         return BatchEntry(folder.name, failure=str(error))
@@ -134,7 +139,9 @@ def read_sweep(path: Path) -> SweepTable | None:
     keys = tuple(dict.fromkeys(key for scene in scenes for key in scene.values))
     rows = [
         (
-            "" if scene.failed is not None or scene.folder is None else quote(f"{Path(scene.folder).name}/{REPORT}"),
+            ""
+            if scene.failed is not None or scene.folder is None
+            else quote(os.fsencode(f"{Path(scene.folder).name}/{REPORT}")),
             tuple(str(scene.values.get(key, "")) for key in keys),
             scene.mse,
             scene.predicted_mse,

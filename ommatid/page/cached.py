@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.time_spent import PAGE, before_page, with_stage, without_page
 from ommatid.runtime.files import cached, fingerprint, write_text
+from ommatid.runtime.input_files import open_input
 from ommatid.scenes import stack
 
 from .data import read_run
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 REPORT = "report.html"
 HERE = Path(__file__).parent
 DRAWN = HERE.parent / "analysis" / "quality", HERE.parent / "figures"  # folders of what the pages draw
-HEAD = 4096  # characters at the beginning of a page that contain its stamp
+HEAD, TAIL = 4096, 64  # bytes at the beginning of a page that contain its stamp, and at its end
 
 
 def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
@@ -57,9 +59,12 @@ def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
 
 def read_stamp(path: Path) -> tuple[None, str | None]:
     """Return the fingerprint of a page on disk; None for a foreign or truncated file."""
-    text = path.read_text(encoding="utf-8")
-    match = re.search(r'<meta name="ommatid" content="([0-9a-f]+)">', text[:HEAD])
-    return None, match[1] if match and text.rstrip().endswith("</html>") else None
+    with open_input(path) as stream:
+        head = stream.read(HEAD)
+        stream.seek(-min(TAIL, stream.seek(0, os.SEEK_END)), os.SEEK_END)
+        end = stream.read(TAIL)
+    match = re.search(rb'<meta name="ommatid" content="([0-9a-f]+)">', head)
+    return None, match[1].decode() if match and end.rstrip().endswith(b"</html>") else None
 
 
 def sources_digest() -> str:

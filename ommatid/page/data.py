@@ -18,6 +18,8 @@ from ommatid.reconstruct.output.result_files import ESTIMATE
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import real_path
+from ommatid.runtime.printable import printable
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 from ommatid.scenes.model import Model
@@ -41,7 +43,7 @@ class Run:
     @property
     def title(self) -> str:
         """Title of the scene, or the name of the folder if it has none."""
-        return self.stack.scene.title or self.folder.resolve().name
+        return printable(self.stack.scene.title or real_path(self.folder).name)
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class Contents:
     def title(self) -> str:
         """Title of the scene, or the name of the folder if it has none."""
         described = self.stack or self.model
-        return (described.scene.title if described is not None else "") or self.folder.resolve().name
+        return printable((described.scene.title if described is not None else "") or real_path(self.folder).name)
 
 
 def read_contents(folder: Path) -> Contents:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from ommatid.bench.table import BenchTable
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable_lines
 
 from . import sections
 from .data import Run, read_contents
@@ -58,10 +59,14 @@ def page_of(folder: Path) -> str:
 
 
 def fill(template: str, content: Mapping[str, Any]) -> str:
-    """Return a template with its content, style and program; all text of the content is escaped."""
+    """Return a template with its content, style and program.
+
+    All text of the content is escaped, for HTML and for readers: control characters and those that reorder text are
+    written as escapes.
+    """
     files = {"css": "page.css", "print_css": "print.css", "js": "page.js"}
     trusted = {name: Markup((TEMPLATES / file).read_text(encoding="utf-8")) for name, file in files.items()}
-    return _environment().get_template(template).render({**content, **trusted})
+    return printable_lines(_environment().get_template(template).render({**content, **trusted}))
 
 
 @cache

@@ -14,6 +14,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables import toml
 
 from .data import Run
 
@@ -192,6 +193,4 @@ def made(report: RunReport) -> list[tuple[str, str]]:
 
 def scene_text(scene: Scene) -> str:
     """Return a scene as the text of a scene file, defaults included."""
-    import tomli_w
-
-    return tomli_w.dumps(scene.plain())
+    return toml.dumps(scene.plain())

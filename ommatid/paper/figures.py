@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.printable import printable_label
 from ommatid.scenes.constants import WHITE
 
 from .photographs import Photograph, TileCrops, Trials
@@ -29,6 +30,7 @@ NOISE = "actual noise variance (grey levels squared)"
 EXPECTED_NOISE = "noise variance that\nthe estimator expects"
 
 
+@own_style()
 def draw_sweeps(path: Path, shown: list[PaperTile], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 2 or 4: mean error against actual noise, whole and trimmed, one line per estimator and combination."""
     figure = _figure(12.0, 6.0)
@@ -52,6 +54,7 @@ def draw_sweeps(path: Path, shown: list[PaperTile], files: FigureFiles = SCREEN_
     files.replace(figure, path)
 
 
+@own_style()
 def draw_maps(path: Path, shown: list[PaperTile], noise: float, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 3: the error within the tile for each combination of lens types, and below it without the border.
 
@@ -85,6 +88,7 @@ def _error_map(figure: Any, axes: Any, tile: PaperTile, noise: float, trim: int)
     bar.set_label("expected squared error (grey levels squared)")
 
 
+@own_style()
 def draw_sides(path: Path, shown: list[PaperTile], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 5: tiles of several sizes with three lens types, on the same axes."""
     figure = _figure(15.0, 5.8)
@@ -113,6 +117,7 @@ def _error_of_one(axes: Any, best: FloatArray) -> None:
     )
 
 
+@own_style()
 def draw_distortion(path: Path, shown: list[PaperTile], noise: float, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw error against noise of one lens type with and without distortion and of three types, and maps of it."""
     figure = _figure(14.5, 5.2)
@@ -136,6 +141,7 @@ def draw_distortion(path: Path, shown: list[PaperTile], noise: float, files: Fig
     files.replace(figure, path)
 
 
+@own_style()
 def draw_photograph(path: Path, photograph: Photograph, side: int, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 7: measured and predicted errors of six tiles against noise and bits, the tiles above."""
     figure = _figure(13.0, 10.2)
@@ -143,7 +149,7 @@ def draw_photograph(path: Path, photograph: Photograph, side: int, files: Figure
     name = (
         f"Six tiles of {Path(photograph.name).name}, {side} x {side} pixels each, reconstructed from three lens types"
     )
-    above.suptitle(name, parse_math=False)
+    above.suptitle(printable_label(name))
     _thumbnails(above, photograph.crops, side)
     panels = below.subplots(2, 2, sharex="col", sharey="row", height_ratios=(2.4, 1.0))
     experiments = (

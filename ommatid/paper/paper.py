@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
-from ommatid.runtime.files import check_output, make_folder, write_csv
+from ommatid.runtime.files import write_csv
+from ommatid.runtime.outputs.kinds import check_output
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
 
 from . import figures
 from .claims import PAPER, Claim, error_claims, rank_claims
 from .photograph_claims import photograph_claims
-from .photographs import PHOTOGRAPH, Photograph, Trials, crop_tiles, load, seeds, simulate_trials
+from .photographs import PHOTOGRAPH, Photograph, TileCrops, Trials, crop_tiles, load, seeds, simulate_trials
 from .tile_claims import tile_claims
 from .tile_errors import ACTUAL, COMBINATIONS, SIDES, THREE, PaperTile, Tiles, distortion, sweep, tiles
 
@@ -46,9 +48,15 @@ def write_paper(
     """
     started = perf_counter()
     crops = crop_tiles(load(image), SIDE, image, np.random.default_rng(seeds(seed, FRACTIONS)(0, 0)))
-    make_folder(folder)
-    for name in FILES:
-        check_output(folder / name, Path(image))
+    with occupied(folder):
+        for name in FILES:
+            check_output(folder / name, Path(image))
+        return _write_all(folder, image, seed, progress, files, crops, started)
+
+
+def _write_all(
+    folder: Path, image: str, seed: int, progress: Progress, files: FigureFiles, crops: TileCrops, started: float
+) -> dict[str, Any]:
     computed = tiles()
     progress(0.4)
     photograph = simulate_trials(computed[SIDE, THREE], image, crops, seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,8 +21,12 @@ from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.cluster import Cluster
+from ommatid.runtime.outputs.kinds import check_folder
+from ommatid.runtime.outputs.occupied import occupied
+from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
-from ommatid.scenes.scene import read
+from ommatid.scenes.scene import ALLOW_OUTSIDE, read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
@@ -46,12 +50,14 @@ def batch_members(
 ) -> list[Member]:
     """List every scene with every combination of swept values, each with its own folder inside `folder`.
 
-    Raises InputError for a sweep that cannot be read, a key that no scene has, and two scenes of one name.
+    Raises InputError for a sweep that cannot be read, a key that no scene has, two scenes of one name, and a name
+    that no folder can have.
     """
     axes = sweep.sweep_axes(sweeps or ())
+    members = sweep.members(scenes, axes, folder)
     for scene in scenes:
         sweep.check_keys(scene, axes, changes, lenses)
-    return sweep.members(scenes, axes, folder)
+    return members
 
 
 def batch_warnings(members: Sequence[Member], changes: Sequence[str], lenses: Sequence[str]) -> list[str]:
@@ -99,7 +105,8 @@ def share_of_job(
         return None
     if scheduler:
         raise InputError("--job and --scheduler: expected one of them; both distribute the scenes over machines")
-    command = (*words, *(f"--set {change}" for change in changes), *([f"--lens {','.join(lenses)}"] if lenses else []))
+    changed = (change if change == ALLOW_OUTSIDE else f"--set {change}" for change in changes)
+    command = (*words, *changed, *([f"--lens {','.join(lenses)}"] if lenses else []))
 
     def seconds(member: Member) -> float:
         return estimate_cost(member, changes, lenses).seconds
@@ -122,7 +129,7 @@ def run_batch(
     batch: Batch,
     members: Sequence[Member],
     report_failure: Callable[[Exception], int],
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
     *,
     sweep_folder: Path | None = None,
@@ -137,18 +144,23 @@ def run_batch(
     figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     share : of a job, whose scenes `members` are; the last job writes table and page
+    Where all scenes fail, neither table nor page is written.
     """
+    for folder in (index_folder, sweep_folder):
+        if folder is not None:
+            check_folder(folder)  # before any work
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]
-    for member, work in batch.run(members, scheduler, workers):
+    for member, work in batch.run(members, cluster, workers):
         document = _heading(member, with_folders)
         try:
             results[member] = {**document, **work()}
         except Exception as error:
             codes.append(report_failure(error))
-            failures[member] = str(error) or type(error).__name__
-            results[member] = {**document, "error": str(error), "exit_code": codes[-1]}
+            reason = printable_sentence(error)
+            failures[member] = reason or type(error).__name__
+            results[member] = {**document, "error": reason, "exit_code": codes[-1]}
     documents = [results[member] for member in members]
     ended = [
         EndedScene(
@@ -160,6 +172,8 @@ def run_batch(
     ]
     describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
     if share is None:
+        if len(failures) == len(members):  # leaves nothing behind
+            describe = partial(_describe, None, None, figures, report_failure)
         sections, code = describe(ended)
         return BatchOutcome(documents, sections, max(*codes, code))
     described, jobs = share.end(ended, describe)
@@ -176,13 +190,15 @@ def _describe(
 ) -> tuple[list[Section], int]:
     """Write the table of a sweep and the page of a batch; return the printed table, and an exit code."""
     rows = [scene.row for scene in ended if scene.row is not None]
-    sections = _sweep_sections(rows, sweep_folder, figures) if rows else []
-    if index_folder is not None:
-        try:
-            cached_index(index_folder, {index_folder / scene.folder: scene.failure for scene in ended})
-        except Exception as error:
-            return sections, report_failure(error)
-    return sections, 0
+    folder = sweep_folder if rows else index_folder
+    with nullcontext() if folder is None or not (rows or folder.is_dir()) else occupied(folder):
+        sections = _sweep_sections(rows, sweep_folder, figures) if rows else []
+        if index_folder is not None:
+            try:
+                cached_index(index_folder, {index_folder / scene.folder: scene.failure for scene in ended})
+            except Exception as error:
+                return sections, report_failure(error)
+        return sections, 0
 
 
 def _heading(member: Member, with_folder: bool) -> dict[str, Any]:

@@ -9,10 +9,12 @@ from typing import Any
 
 from ommatid.analysis.recording_warnings import calibration_warnings
 from ommatid.runtime.errors import InputError, naming_source
-from ommatid.runtime.files import check_output, write_whole
+from ommatid.runtime.files import write_whole
+from ommatid.runtime.outputs.kinds import check_output
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file
-from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
+from ommatid.scenes.hardware.frame_files import files_in
+from ommatid.scenes.hardware.frames import AcquisitionSettings
 from ommatid.scenes.hardware.point_sources import from_recorded_points
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read

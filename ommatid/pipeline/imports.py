@@ -9,10 +9,10 @@ from typing import Any
 
 from ommatid.analysis.recording_warnings import import_warnings
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import check_output
+from ommatid.runtime.outputs.kinds import check_output
 from ommatid.scenes import stack
-from ommatid.scenes.formats.picture import colour_lost
-from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
+from ommatid.scenes.hardware.frame_files import files_in
+from ommatid.scenes.hardware.frames import AcquisitionSettings
 from ommatid.scenes.hardware.stack_import import import_stack
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
@@ -56,6 +56,4 @@ def import_file(
     whole, recorded = import_stack(setup, images, settings)
     kept = whole.restrict(tuple(lenses)) if lenses else whole
     stack.write(output, kept)
-    first = next(iter(files_in(images[0])))
-    lost = [] if first.suffix.lower() == ".npy" else colour_lost(first, str(first), str(path))
-    return ImportOutcome(kept, recorded.layout.beside, [*lost, *import_warnings(recorded)])
+    return ImportOutcome(kept, recorded.layout.beside, import_warnings(recorded))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tomllib
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -20,9 +19,14 @@ from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Workers
-from ommatid.runtime.files import check_output, file_digest, make_folder, write_text, write_whole
+from ommatid.runtime.files import file_digest, write_text, write_whole
+from ommatid.runtime.input_files import read_text, real_path
+from ommatid.runtime.outputs.kinds import check_folder, check_output
+from ommatid.runtime.outputs.names import check_name
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes import model_file
@@ -31,6 +35,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, CalibrationTable, Scene, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables import toml
 
 STACK, MODEL = "stack.exr", "model.npz"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
@@ -63,6 +68,7 @@ class ReconstructionRequest:
 def is_folder(output: Path) -> bool:
     """Return True if `-o` names a folder, not an OpenEXR file. Raises InputError for the name of another file."""
     if output.is_dir():
+        check_folder(output)
         return True
     if output.suffix.lower() in PICTURES:
         advice = output.with_suffix(".exr")
@@ -74,7 +80,7 @@ def reconstruct_files(
     request: ReconstructionRequest,
     output: Path,
     progress: Progress,
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
     formats: Sequence[Format] = (),
 ) -> RunReport:
@@ -84,15 +90,16 @@ def reconstruct_files(
     Returns the content of run.json, with the means of the regions.
     Raises InputError for wrong files and options, and for other files in the way, MachineError for a full disk.
     """
-    check_options(scheduler, workers)
+    check_options(cluster, workers)
     check_output(
         output, request.stack, request.model, *(request.stack.parent / name for name in (TRUTH, WORLD_PICTURE))
     )
+    check_output(output.with_suffix(".png"))
     check_picture(output)
     check_formats(output, formats)
     recorded, calibrated = request.read()
     truth, names = result_files.truth_beside(request.stack, recorded), (request.stack, request.model)
-    with _tile_workers(scheduler, workers) as pool:
+    with _tile_workers(cluster, workers) as pool:
         result, report = result_files.reconstruct(recorded, calibrated, truth, names, pool, progress)
     report = report.with_changes(**region_reports(result, request.regions))
     clear_formats(output)
@@ -105,7 +112,7 @@ def reconstruct_folder(
     request: ReconstructionRequest,
     folder: Path,
     progress: Progress,
-    scheduler: str = "",
+    cluster: Cluster | None = None,
     workers: int | None = None,
 ) -> tuple[RunReport, bool]:
     """Reconstruct into a folder that then holds what a run writes, with copies of the stack, the model and the truth.
@@ -113,28 +120,28 @@ def reconstruct_folder(
     Returns the content of run.json, and False if it was up to date. Raises InputError for wrong files and options, also
     for a folder that holds the stack or the model, and MachineError for a full disk.
     """
-    check_options(scheduler, workers)
+    check_options(cluster, workers)
     recorded, calibrated = request.read()
     check_match(recorded, calibrated, (request.stack, request.model))
-    sources = {path.resolve() for path in (request.stack, request.model, request.stack.parent / TRUTH)}
+    sources = {real_path(path) for path in (request.stack, request.model, request.stack.parent / TRUTH)}
     for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
-        if (folder / name).resolve() in sources:
+        if real_path(folder / name) in sources:
             raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
-    make_folder(folder)
-    _remove_other_scene(folder, recorded)
-    if result_files.truth_beside(request.stack, recorded) is not None:
-        for name in (TRUTH, WORLD_PICTURE):
-            _copy(request.stack.parent / name, folder / name)
-    if request.changes or request.lenses:
-        stack_file.write(folder / STACK, recorded)
-    else:
-        _copy(request.stack, folder / STACK)
-    if request.lenses:
-        model_file.write(folder / MODEL, calibrated)
-    else:
-        _copy(request.model, folder / MODEL)
-    with _tile_workers(scheduler, workers) as pool:
-        return finish_folder(folder, progress, request.regions, pool, request.force)
+    with occupied(folder, RUN):
+        _remove_other_scene(folder, recorded)
+        if result_files.truth_beside(request.stack, recorded) is not None:
+            for name in (TRUTH, WORLD_PICTURE):
+                _copy(request.stack.parent / name, folder / name)
+        if request.changes or request.lenses:
+            stack_file.write(folder / STACK, recorded)
+        else:
+            _copy(request.stack, folder / STACK)
+        if request.lenses:
+            model_file.write(folder / MODEL, calibrated)
+        else:
+            _copy(request.model, folder / MODEL)
+        with _tile_workers(cluster, workers) as pool:
+            return finish_folder(folder, progress, request.regions, pool, request.force)
 
 
 def finish_folder(
@@ -204,26 +211,32 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
     """
     if path.is_file():
         in_run = path.name == STACK and output is None
+        if not in_run and output is None:
+            check_name(path.stem, path)
         return _report_stack(path, path.parent if in_run else output or path.with_suffix(""), progress)
     if output is not None:
         raise InputError(f"{path}: -o is the folder of a stack's results; a folder is reported in place, leave out -o")
     if (path / STACK).is_file():
         if (path / RUN).is_file():
-            _write_page(path)
+            with occupied(path):
+                _write_page(path)
             return ReportOutcome((path,), None, _design_warnings(path))
         return _report_stack(path / STACK, path, progress)
     folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
     if not folders and any((path / name).is_file() for name in (MODEL, result_files.ESTIMATE)):
         from ommatid.page.document import page_of
 
-        write_text(path / REPORT, page_of(path))
+        with occupied(path):
+            write_text(path / REPORT, page_of(path))
         return ReportOutcome((path,), None, ())
     if not folders:
         raise InputError(f"{path}: expected a stack, or a folder with stack.exr or with folders of runs, got none")
     for number, folder in enumerate(folders):
-        _write_page(folder)
+        with occupied(folder):
+            _write_page(folder)
         progress((number + 1) / len(folders))
-    cached_index(path, dict.fromkeys(folders, ""))
+    with occupied(path):
+        cached_index(path, dict.fromkeys(folders, ""))
     warnings = tuple(warning for folder in folders for warning in _design_warnings(folder))
     return ReportOutcome(folders, path / INDEX, warnings)
 
@@ -231,9 +244,10 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
 def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcome:
     """Reconstruct a stack with the model beside it, or with H as designed, and write the page."""
     model = stack.with_name(MODEL)
-    if folder.resolve() == stack.parent.resolve():
-        warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
-        finish_folder(folder, progress)
+    if real_path(folder) == real_path(stack.parent):
+        with occupied(folder, RUN):
+            warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
+            finish_folder(folder, progress)
         return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
     with TemporaryDirectory(prefix="ommatid-") as scratch:
         warnings = ()
@@ -257,7 +271,7 @@ def _write_designed_model(stack: Path, model: Path, progress: Progress) -> str:
 def _remove_other_scene(folder: Path, recorded: Stack) -> None:
     """Remove the scene.toml that an earlier run wrote beside its stack, unless `recorded` is of the same scene."""
     with suppress(OSError, ValueError, KeyError, InputError):
-        written = tomllib.loads((folder / "scene.toml").read_text("utf-8"))
+        written = toml.loads(read_text(folder / "scene.toml"))
         earlier, _ = stack_file.read_header(folder / STACK)
         if written == earlier.plain() != recorded.scene.plain():
             (folder / "scene.toml").unlink()
@@ -274,11 +288,11 @@ def _copy(source: Path, target: Path) -> None:
 
 
 @contextmanager
-def _tile_workers(scheduler: str, count: int | None) -> Generator[Workers | None]:
+def _tile_workers(cluster: Cluster | None, count: int | None) -> Generator[Workers | None]:
     """Yield workers for the tiles of a frame; None where threads of this process solve them."""
-    if not scheduler and count is None:
+    if cluster is None and count is None:
         yield None
         return
-    with worker_pool(scheduler, count) as workers:
+    with worker_pool(cluster, count) as workers:
         workers.check_versions(partial(versions, "scipy"))
         yield workers

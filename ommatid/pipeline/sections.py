@@ -12,6 +12,7 @@ from typing import Any
 from ommatid.analysis import depth_error, light_table, prediction_table, run_table, study, summary
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.prediction import Prediction
+from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.simulate import world_view
 from ommatid.simulate.lenses import sharpness
@@ -22,7 +23,7 @@ Section = tuple[str, list[tuple[str, str]]]
 def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
     """Tabulate the description of a finished run in `folder`."""
     report = RunReport.model_validate(description)
-    sections = [(f"{report.title or folder.name}: {folder}", run_table.rows(report))]
+    sections = [(f"{printable(report.title or folder.name)}: {folder}", run_table.rows(report))]
     if report.depth:
         sections.append(("Error against distance", depth_error.rows(report.depth)))
     if report.study:
@@ -49,7 +50,7 @@ def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, A
         and scene.estimator.misalignment == "trust"
     ):
         lines.append(("misalignment", "not included; it is predicted for small targets and sharp lenses only"))
-    return [(scene.title or scene.source.stem, lines), *_light_sections({"light": light} if light else {})]
+    return [(printable(scene.title or scene.source.stem), lines), *_light_sections({"light": light} if light else {})]
 
 
 def backend_sections(description: dict[str, Any]) -> list[Section]:

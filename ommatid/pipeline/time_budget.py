@@ -5,7 +5,6 @@ All of them are ordinary runs in the scene's own folder, so that it holds comple
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,9 +19,11 @@ from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.run_json import ErrorReport, RequestedTime, RunReport, TimeReport
 from ommatid.reconstruct.output.time_spent import STAGES
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import read_text
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables import toml
 from ommatid.scenes.tables.units import duration
 
 from . import stages
@@ -256,7 +257,7 @@ def _earlier_run(folder: Path, setup: Setup, requested: dict[str, Any]) -> TimeR
     try:
         earlier = run_json.read(folder).spent
         scene = _with_samples(setup, *_samples_of(earlier.chosen)).resolved.plain()
-        same_scene = tomllib.loads((folder / "scene.toml").read_text("utf-8")) == scene
+        same_scene = toml.loads(read_text(folder / "scene.toml")) == scene
     except (InputError, OSError, ValueError, KeyError):
         return None
     return earlier if same_scene and earlier.asked == RequestedTime(**requested) else None

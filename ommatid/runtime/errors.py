@@ -3,32 +3,69 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
+
+from .printable import printable, printable_sentence
+
+LONGEST_VALUE = 80  # characters of a text within a message
+MOST_NAMED = 10  # names in a message
 
 
 class InputError(ValueError):
     """Error in a scene, option or file that the user can correct; exit code 2 of the command line."""
 
+    def __str__(self) -> str:
+        """Return the message as it may be printed, whatever names and values it quotes."""
+        return printable_sentence(super().__str__())
+
 
 class MachineError(OSError):
     """Failure of the machine, such as a full disk or a lost worker; exit code 1 of the command line."""
 
+    def __str__(self) -> str:
+        """Return the message as it may be printed, whatever names it quotes."""
+        return printable_sentence(super().__str__())
 
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
-_SHORT.maxlevel = 3
+
+class NotStartedError(MachineError):
+    """Failure of one of many scenes for a reason that was reported with the first; exit code 1, and no message."""
+
+
+class _ShortRepr(reprlib.Repr):
+    """The repr of values, shortened; of numbers that Python does not print, the count of their bits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = self.maxlong = LONGEST_VALUE
+        self.maxlevel = 3
+
+    def repr_int(self, x: int, level: int) -> str:
+        """Return the repr of a number, which Python refuses for one of more than 4300 digits."""
+        if x.bit_length() > 8 * LONGEST_VALUE:
+            return f"a number of {x.bit_length()} bits"
+        return super().repr_int(x, level)
+
+
+_SHORT = _ShortRepr()
 
 
 def shortened_repr(value: object) -> str:
     """Return the repr of a value, shortened to fit into a message."""
-    return _SHORT.repr(value)
+    return printable(_SHORT.repr(value))
 
 
 def shortened(text: str) -> str:
     """Return a text, shortened to fit into a message."""
-    return shortened_repr(text)[1:-1] if len(text) > _SHORT.maxstring else text
+    return printable(text, LONGEST_VALUE)
+
+
+def named(names: Iterable[object]) -> str:
+    """Return the first names of a list, shortened, and the count of the others; "none" for an empty list."""
+    known = [shortened(str(name)) for name in names]
+    more = [f"{len(known) - MOST_NAMED} more"] if len(known) > MOST_NAMED else []
+    return ", ".join([*known[:MOST_NAMED], *more]) or "none"
 
 
 @contextmanager
@@ -37,6 +74,6 @@ def naming_source(source: Path) -> Generator[None]:
     try:
         yield
     except InputError as error:
-        if str(source) in str(error):
+        if error.args and str(source) in str(error.args[0]):
             raise
         raise InputError(f"{source}: {error}") from error

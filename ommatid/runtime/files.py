@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import secrets
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
@@ -19,11 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, MachineError
+from .input_files import open_input
+from .outputs.kinds import check_folder, check_output, input_error
+from .printable import printable
 
 Content = TypeVar("Content")
 Made = TypeVar("Made")
 
+LONGEST_FIELD = 1000  # characters of a text in a CSV file
+_SIGNED = re.compile(r"[-+](?:[\d.]+(?:[eE][-+]?\d+)?\s*[^\W\d_]*|inf|nan)")  # a number, also with a unit
 PART = ".part."  # in the name of a file that is still being written
+written: set[Path] = set()  # absolute paths of the files that this process wrote
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
@@ -39,6 +46,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
             with temporary.open("rb+") as stream:
                 os.fsync(stream.fileno())
             temporary.replace(path)
+            written.add(path.absolute())
     except OSError as error:
         reason = error.strerror or str(error)
         raise MachineError(
@@ -71,43 +79,47 @@ def clear_abandoned(folder: Path, name: str | None = None) -> None:
             temporary.unlink()
 
 
-def check_output(path: Path, *inputs: Path) -> None:
-    """Raise InputError if a result could not be written to `path`, or would replace one of its `inputs`."""
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
-    if path.is_dir():
-        raise InputError(f"{path}: expected the name of a file, got a folder")
-    for source in inputs:
-        if path.resolve() == source.resolve():
-            raise InputError(f"{path}: would replace the file that is read; choose another name with -o")
-
-
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
 
     def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # of names that are not UTF-8
 
     write_whole(path, write)
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
-    """Write a CSV file atomically: a header, then one line per row; None becomes an empty field."""
+    """Write a CSV file atomically: a header, then one line per row; None becomes an empty field.
+
+    Texts are written as they are printed; one that a spreadsheet would execute as a formula begins with an apostrophe.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
+    writer.writerow(map(_field, columns))
+    writer.writerows(map(_field, row) for row in rows)
     write_text(path, text.getvalue())
 
 
+def _field(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    text = printable(value, LONGEST_FIELD)
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) and not _SIGNED.fullmatch(text) else text
+
+
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents. Raises MachineError or InputError."""
+    """Create a folder and its parents. Raises MachineError, or InputError where it cannot be one of results."""
+    check_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"{path}: expected a folder to write to, but a file of that name is in the way") from error
+        raise InputError(
+            f"{printable(path)}: expected a folder to write to, but a file of that name is in the way"
+        ) from error
     except OSError as error:
-        raise MachineError(f"{path}: the folder could not be created ({error.strerror})") from error
+        raise input_error(path, error) or MachineError(
+            f"{printable(path)}: the folder could not be created ({error.strerror})"
+        ) from error
 
 
 def digest(*arrays: NDArray[Any]) -> str:
@@ -122,7 +134,7 @@ def digest(*arrays: NDArray[Any]) -> str:
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's bytes, as hexadecimal text. Raises InputError if it cannot be read."""
     try:
-        with path.open("rb") as stream:
+        with open_input(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error})") from error

@@ -45,8 +45,9 @@ def check_regular(path: Path) -> None:
 def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
     """Read a regular file of at most `largest` bytes. Raises InputError, and OSError if it cannot be opened."""
     with open_input(path) as stream:
-        content = stream.read(largest + 1)
-    if len(content) > largest:
+        declared = os.fstat(stream.fileno()).st_size
+        content = b"" if declared > largest else stream.read(largest + 1)
+    if max(declared, len(content)) > largest:
         raise InputError(f"{path}: expected a file of at most {largest / 1e6:.3g} MB, got a larger one")
     return content
 
@@ -54,6 +55,11 @@ def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
 def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
     """Read a regular UTF-8 file. Raises as `read_bytes` does, and UnicodeDecodeError."""
     return read_bytes(path, largest).decode("utf-8")
+
+
+def real_path(path: Path) -> Path:
+    """Return the absolute path without symbolic links; one with links in a circle as far as it can be followed."""
+    return Path(os.path.realpath(path))
 
 
 def _check_kind(path: Path, mode: int) -> None:

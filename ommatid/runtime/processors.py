@@ -6,9 +6,12 @@ import os
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
+from pathlib import Path
 
 import psutil
 from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
+
+START_TIME = 19  # position in /proc/self/stat after the name of the program: ticks from the start of the machine
 
 
 def processors() -> int:
@@ -19,8 +22,12 @@ def processors() -> int:
 
 
 def seconds_since_start() -> float:
-    """Return the seconds since this process started."""
-    return time.time() - psutil.Process().create_time()
+    """Return the seconds since this process started, by clocks that are never set back where there are such."""
+    try:
+        started = int(Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[START_TIME])
+        return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - started / os.sysconf("SC_CLK_TCK"))
+    except (OSError, ValueError, AttributeError, IndexError):  # not on Linux
+        return max(0.0, time.time() - psutil.Process().create_time())
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 
 from .outcome import SweepOutcome
 
@@ -28,6 +28,7 @@ TITLES = {"three": "three types: H has full rank", "two": "two types: H has a nu
 _TEXT = {"ha": "right", "fontsize": 8, "color": "0.4"}
 
 
+@own_style()
 def write_figure(path: Path, curves: list[SweepOutcome], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the digits lost, with one row of panels per H and one column per quantity."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

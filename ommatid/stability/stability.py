@@ -19,7 +19,8 @@ from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import make_folder, write_csv, write_text
+from ommatid.runtime.files import write_csv, write_text
+from ommatid.runtime.outputs.occupied import occupied
 
 from .cases import Matrices, StabilityCase, extreme_cases, noise_sweep
 from .exact_answer import ExactAnswer, exact_answer
@@ -117,8 +118,13 @@ def write_stability(
     folder: Path, matrices: Matrices, progress: Callable[[float], None], figures: FigureFiles = SCREEN_PNG
 ) -> dict[str, Any]:
     """Write stability.csv, stability.md and stability.png; return a summary. Raises InputError or MachineError."""
-    make_folder(folder)
-    curves, table = run(matrices, progress)
+    with occupied(folder):
+        return _write(folder, *run(matrices, progress), figures)
+
+
+def _write(
+    folder: Path, curves: list[SweepOutcome], table: list[StabilityOutcome], figures: FigureFiles
+) -> dict[str, Any]:
     outcomes = [point.outcome for point in curves] + table
     automatic = [outcome for outcome in outcomes if outcome.asked == AUTO]
     verdicts = [outcome.verdict for outcome in automatic]

@@ -13,7 +13,7 @@ from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.constants import WHITE
-from ommatid.scenes.formats import exr
+from ommatid.scenes.formats import exr, npz
 
 Format = Literal["npy", "tiff16", "tiff32"]
 STEPS = 257  # of a 16-bit value per grey level: 65535 stands for 255, as in pictures that are read
@@ -93,7 +93,7 @@ def shows_estimate(path: Path, estimate: Path) -> bool:
     with suppress(OSError, ValueError, KeyError, IndexError, EOFError, InputError, TiffFileError):
         if path.suffix == ".npy":
             image = exr.read(estimate)[0].channels["estimate"]
-            return np.array_equal(np.load(path, allow_pickle=False), image, equal_nan=True)
+            return np.array_equal(npz.array(path), image, equal_nan=True)
         with TiffFile(path) as file:
             return str(file.pages.first.description).startswith(MARK)
     return False

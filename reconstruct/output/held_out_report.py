@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..held_out.check import HeldOutCheck, HeldOutSubImager
-from .record import Record
+from .record import Index, Record
 
 MOST_LISTED = 5  # sub-imagers in one sentence
 
@@ -42,8 +42,8 @@ class HeldOutEntry(Record):
 
     name: str
     type: str
-    k: int
-    l: int  # noqa: E741  (the paper's letter)
+    k: Index
+    l: Index  # noqa: E741  (the paper's letter)
     pixels: int
     chi_squared: float
     expected: float

@@ -13,8 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.printable import printable_label
 from ommatid.scenes.formats import exr
 from ommatid.scenes.stack import Stack
 
@@ -39,6 +40,7 @@ class OverviewPanel:
     content: Literal["values", "recorded", "error", "deviation"]
 
 
+@own_style()
 def write_overview(folder: Path, stack: Stack, report: RunReport, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the result in a folder, which has estimate.exr. Raises InputError or MachineError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -81,7 +83,7 @@ def headline(report: RunReport) -> str:
 
 def _write_headline(figure: Any, title: str, report: RunReport) -> None:
     height = figure.get_figheight()
-    figure.text(0.5, 1 - 0.28 / height, title, fontsize=13, ha="center", va="center", parse_math=False)
+    figure.text(0.5, 1 - 0.28 / height, printable_label(title), fontsize=13, ha="center", va="center")
     heading = verdict_words.heading(report)
     colour = {"trusted": GOOD, "not to be trusted": BAD}.get(heading, "#000000")
     style: dict[str, Any] = {"fontsize": 12, "va": "center", "color": colour}

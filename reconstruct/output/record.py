@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
+
+Amount = Annotated[float, Field(ge=0, le=1e100)]  # a squared error, or a time in seconds
+Index = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Record(BaseModel):

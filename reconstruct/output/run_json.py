@@ -12,11 +12,13 @@ from typing import Any, Literal
 
 from pydantic import AliasChoices, Field, ValidationError
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import write_text
+from ommatid.runtime.input_files import read_bytes
+from ommatid.scenes.formats.provenance import FitRecord
 
 from .held_out_report import HeldOutReport
-from .record import Record
+from .record import Amount, Record
 from .solver_report import SolverReport
 
 RUN = "run.json"
@@ -26,7 +28,7 @@ class StageReport(Record):
     """Method and settings of a stage, and its duration when it ran."""
 
     method: str | None = None
-    seconds: float = 0.0
+    seconds: Amount = 0.0
     samples: int | None = None
     fewest_samples: int | None = None
     passes: int | None = None
@@ -41,16 +43,16 @@ class StageReport(Record):
 class IntervalReport(Record):
     """Expected mean squared error of this image, and the interval that holds it in 99 of 100 cases."""
 
-    mse: float
+    mse: Amount
     low: float
-    high: float
+    high: Amount
 
 
 class BaselineReport(Record):
     """The best single sub-image, enlarged to f's grid, and its error against the truth."""
 
     sub_imager: str
-    mse: float
+    mse: Amount
     psnr: float | None
     ssim: float | None
 
@@ -61,14 +63,14 @@ class ErrorReport(Record):
     gain : dB of `psnr` over that of the baseline, None if one of them is exact
     """
 
-    mse: float | None = None
-    trimmed_mse: float | None = None
+    mse: Amount | None = None
+    trimmed_mse: Amount | None = None
     psnr: float | None = None
     ssim: float | None = None
     baseline: BaselineReport | None = None
     gain: float | None = None
-    predicted_mse: float
-    predicted_trimmed_mse: float | None = None
+    predicted_mse: Amount
+    predicted_trimmed_mse: Amount | None = None
     budget: dict[str, float]
     expected_given_truth: IntervalReport | None = None
 
@@ -77,8 +79,8 @@ class ResidualReport(Record):
     """Chi-squared of the residual, its expectation and its standard deviation."""
 
     chi_squared: float
-    expected: float
-    deviation: float
+    expected: Amount
+    deviation: Amount
 
 
 class ResidualPartReport(Record):
@@ -92,8 +94,8 @@ class ResidualPartReport(Record):
     measurements: int
     chi_squared: float
     prior: float
-    expected: float
-    deviation: float
+    expected: Amount
+    deviation: Amount
     p_value: float
 
 
@@ -145,7 +147,7 @@ class ModelReport(Record):
     p_value: float | None
     # Files of earlier versions call it feigned_information.
     spurious_information: float = Field(validation_alias=AliasChoices("spurious_information", "feigned_information"))
-    fit: dict[str, Any] | None = None
+    fit: FitRecord | None = None
 
 
 class SkippedReport(Record):
@@ -160,14 +162,14 @@ class MoreTime(Record):
     """Seconds and expected error of `times` as many samples."""
 
     times: int
-    seconds: float
-    predicted_mse: float
+    seconds: Amount
+    predicted_mse: Amount
 
 
 class RequestedTime(Record):
     """Seconds that a number of scenes were given together."""
 
-    seconds: float
+    seconds: Amount
     scenes: int
 
 
@@ -177,8 +179,8 @@ class TimeReport(Record):
     start_up : seconds from the start of the process to the first stage, where the process ran this scene alone
     """
 
-    seconds: float
-    stages: dict[str, float]
+    seconds: Amount
+    stages: dict[str, Amount]
     noise_alone: float
     start_up: float | None = None
     more: tuple[MoreTime, ...] = ()
@@ -201,7 +203,7 @@ class RegionReport(Record):
     corner: tuple[int, int]
     size: tuple[int, int]
     mean: float
-    deviation: float
+    deviation: Amount
 
 
 class DepthBin(Record):
@@ -224,12 +226,12 @@ class StudyCase(Record):
     """
 
     model: str
-    mse: float | None
-    predicted: float
-    expected: float | None
+    mse: Amount | None
+    predicted: Amount
+    expected: Amount | None
     low: float | None
-    high: float | None
-    seconds: float
+    high: Amount | None
+    seconds: Amount
 
 
 class RunReport(Record):
@@ -277,14 +279,16 @@ def read(folder: Path) -> RunReport:
     """Read run.json of a folder. Raises InputError where there is none, or where a key is missing or wrong."""
     path = folder / RUN
     try:
-        report = RunReport.model_validate_json(path.read_bytes())
+        report = RunReport.model_validate_json(read_bytes(path))
     except OSError as error:
-        raise InputError(f"{path}: expected the results of a run, got no file that can be read ({error})") from error
+        raise InputError(
+            f"{path}: expected the results of a run, got no file that can be read ({error.strerror})"
+        ) from error
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(map(str, first["loc"])) or "the file"
+        key = shortened(".".join(map(str, first["loc"]))) or "content"
         raise InputError(
-            f"{path}: expected the results of a run, got a file whose {key} is not: {first['msg'].lower()};"
+            f"{path}: expected the results of a run, got a file whose {key} is wrong: {shortened(first['msg'])};"
             " delete it and run the scene again"
         ) from error
     if not report.fingerprint:

@@ -6,13 +6,14 @@ Work is divided into ranges of rows that do not depend on the number of threads,
 # pyright: basic
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from ommatid.runtime.library_caches import compiled
 
 UNROLLED = 4
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def correlate_line(image, kernels, top, left, length, source, lines):
     """Fill `lines`, (S, length), with sums of kernels * image at row `top` and columns left, left + 1, ... of f.
 
@@ -42,7 +43,7 @@ def correlate_line(image, kernels, top, left, length, source, lines):
                     line[x] += a * source[x + dx]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def spread_line(lines, kernels, top, left, source, first, last, out):
     """Add the adjoint of `correlate_line`, applied to `lines`, to rows first to last of `out`."""
     columns = out.shape[1]
@@ -65,7 +66,7 @@ def spread_line(lines, kernels, top, left, source, first, last, out):
             target[x] += source[x - left]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def correlate(image, kernels, weights, down, across, order, top, left, columns_at, out, first, last):
     """Fill `out`, (K, L, rows, columns), for sensor rows order[first:last].
 
@@ -94,7 +95,7 @@ def correlate(image, kernels, weights, down, across, order, top, left, columns_a
             out[k, column // out.shape[3], i, column % out.shape[3]] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def spread(readings, kernels, weights, down, across, order, top, left, columns_at, out, first, last):
     """Add the adjoint of `correlate`, applied to `readings`, to rows first to last of `out`."""
     count, powers = weights.shape[0], weights.shape[1]
@@ -119,7 +120,7 @@ def spread(readings, kernels, weights, down, across, order, top, left, columns_a
             lines[:] = 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _factors(weights, down, factors):
     """Fill `factors`, (S, P), with the weights of the polynomials across at one sensor row."""
     for s in range(weights.shape[0]):

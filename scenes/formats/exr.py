@@ -23,9 +23,15 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint, write_whole
+from ommatid.runtime.input_files import check_regular
 from ommatid.runtime.memory import check_memory
+from ommatid.runtime.printable import printable
+
+from .stored_picture import StoredPicture, check_single, check_size
 
 ATTRIBUTE = "ommatid"
+BOUNDED = ("NO_COMPRESSION", "RLE_COMPRESSION", "ZIPS_COMPRESSION", "ZIP_COMPRESSION")  # ratio as Deflate's or below
+MOST_DEFLATED, SMALLEST = 1032, 2  # largest ratio of inflated to deflated bytes, bytes of a number
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ def write(path: Path, parts: Sequence[Part]) -> None:
             if len(read(beside)) != len(parts):
                 raise InputError("parts are missing")
         except (RuntimeError, InputError) as error:
-            raise OSError(errno.ENOSPC, f"not all of it could be stored: {error}") from error
+            raise OSError(errno.ENOSPC, "not all of it could be stored") from error
 
     write_whole(path, fill)
 
@@ -100,17 +106,88 @@ def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
     return parts[0][1]
 
 
-def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, NDArray[np.float32]], str | None]]:
-    """Name, channels and JSON attribute of each part. Raises InputError if the file cannot be read."""
+def read_picture(path: Path) -> StoredPicture:
+    """Read Y, or R, G and B, of an OpenEXR picture, and A if it has one.
+
+    Raises InputError for several parts, for deep and subsampled pictures, and for pictures whose display window is not
+    the stored one.
+    """
+    header = _picture_header(path)
+    sampling = {channel.name: (channel.xSampling, channel.ySampling) for channel in header["channels"]}
+    grey, colours = "Y" in sampling, {"R", "G", "B"} <= sampling.keys()
+    if grey == colours:
+        names = printable(", ".join(sampling), longest=100)
+        raise InputError(f"{path} has channels {names}; expected Y, or R, G and B, not both")
+    used = [*("Y" if grey else "RGB"), *("A" if "A" in sampling else "")]
+    for name in used:
+        if sampling[name] != (1, 1):
+            across, down = sampling[name]
+            raise InputError(
+                f"{path}: expected all values of channel {name}, got one for {across} x {down} pixels; save it whole"
+            )
+    channels = _parts(path)[0].channels
+    pixels = [np.asarray(channels[name].pixels) for name in used]
+    rows, columns = _extent(header["dataWindow"])
+    if any(values.shape != (rows, columns) for values in pixels):
+        raise InputError(f"{path}: expected {rows} x {columns} values of every channel, got fewer; make the file again")
+    unused = printable(", ".join(name for name in sampling if name not in used), longest=100)
+    notes = (f"has channels that are not used: {unused}",) if unused else ()
+    return StoredPicture(pixels[0] if len(pixels) == 1 else np.stack(pixels, axis=-1), notes=notes)
+
+
+def _picture_header(path: Path) -> dict[str, Any]:
+    """Return the header of a picture, from which all that is not read is refused before pixels are."""
+    check_regular(path)
+    parts = _parts(path, header_only=True)
+    check_single(path, len(parts), "parts")
+    if not parts or not parts[0].header["channels"]:
+        raise InputError(f"{path}: expected an OpenEXR picture, got a file without complete channels")
+    header: dict[str, Any] = parts[0].header
+    if "deep" in str(header.get("type")):
+        raise InputError(f"{path}: expected one value per pixel and channel, got a deep picture; save it flat")
+    stored, shown = header["dataWindow"], header["displayWindow"]
+    if not np.array_equal(stored, shown):
+        sizes = " and ".join("{} x {}".format(*_extent(window)) for window in (shown, stored))
+        raise InputError(
+            f"{path}: expected a picture that is stored whole, got a display window and a data window ({sizes}) that"
+            " differ; save it with equal windows"
+        )
+    rows, columns = _extent(stored)
+    check_size(path, rows * columns * len(header["channels"]))
+    least = rows * columns * SMALLEST * len(header["channels"])
+    if str(header.get("compression")).rpartition(".")[2] in BOUNDED and least > MOST_DEFLATED * path.stat().st_size:
+        raise InputError(f"{path}: expected {rows} x {columns} pixels, got fewer; the file is cut short")
+    return header
+
+
+def _extent(window: Any) -> tuple[int, int]:
+    """Rows and columns of a window of a header."""
+    (left, top), (right, bottom) = ((int(corner[0]), int(corner[1])) for corner in window)
+    return bottom - top + 1, right - left + 1
+
+
+def _parts(path: Path, header_only: bool = False) -> list[Any]:
+    """Parts of a file as the library reads them. Raises InputError if it cannot."""
     import OpenEXR
 
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
     try:
         with _silenced():
-            if not header_only:
-                check_memory(_declared_size(path), f"{path}: to read it", "take a smaller one, or free some memory")
-            file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+            return list(OpenEXR.File(str(path), separate_channels=True, header_only=header_only).parts)
+    except (RuntimeError, ValueError, TypeError, KeyError, IndexError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path}: expected an OpenEXR file, got one that cannot be read ({printable(error, longest=100)})"
+        ) from error
+
+
+def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, NDArray[np.float32]], str | None]]:
+    """Name, channels and JSON attribute of each part. Raises InputError if the file cannot be read."""
+    try:
+        check_regular(path)
+    except OSError as error:
+        raise InputError(f"{path}: no such file") from error
+    if not header_only:
+        check_memory(_declared_size(path), f"{path}: to read it", "take a smaller one, or free some memory")
+    try:
         return [
             (
                 str(part.header.get("name", "")),
@@ -119,22 +196,19 @@ def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, ND
                 else {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()},
                 part.header.get(ATTRIBUTE),
             )
-            for part in file.parts
+            for part in _parts(path, header_only)
         ]
-    except InputError:
-        raise
-    except (RuntimeError, ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected an OpenEXR file, got one that cannot be read ({error})") from error
+    except (RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            f"{path}: expected an OpenEXR file, got one that cannot be read ({printable(error, longest=100)})"
+        ) from error
 
 
 def _declared_size(path: Path) -> int:
     """Bytes of all channels by the headers, twice: for the library's copy and for the arrays here."""
-    import OpenEXR
-
     total = 0
-    for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts:
-        first, last = part.header["dataWindow"]
-        columns, rows = (int(high) - int(low) + 1 for low, high in zip(first, last, strict=True))
+    for part in _parts(path, header_only=True):
+        rows, columns = _extent(part.header["dataWindow"])
         total += 2 * 4 * rows * columns * len(part.header["channels"])
     return total
 

@@ -16,18 +16,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.input_files import read_text, real_path
 
 from ..tables import glass, toml
-from ..tables.camera import CameraTable, Surface
+from ..tables.camera import MOST_SURFACES, SURFACES, CameraTable, Surface
 from ..tables.messages import explain
 from ..tables.table import Table
-from ..tables.units import pair
 from ..zemax.agf import Catalogue, read_catalogue
 from ..zemax.zmx import read_zmx
 
+LARGEST = 10**6  # bytes
 COLUMNS = "radius, thickness, index of refraction, diameter"
 
 
@@ -35,7 +36,7 @@ class LensFile(Table):
     """The content of a lens file in TOML."""
 
     title: str = ""
-    surfaces: Annotated[tuple[Surface, ...], BeforeValidator(pair), Field(min_length=1)]
+    surfaces: Annotated[tuple[Surface, ...], SURFACES, Field(min_length=1)]
 
 
 def read_lens(path: Path) -> tuple[Surface, ...]:
@@ -46,11 +47,13 @@ def read_lens(path: Path) -> tuple[Surface, ...]:
     if path.suffix.lower() == ".zmx":
         return _with_one_stop(read_zmx(path), path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LARGEST)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such lens file; expected one beside the scene file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: could not be read as a lens file ({error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a lens file in UTF-8, got other bytes at {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{path}: could not be read as a lens file ({error.strerror})") from error
     return _with_one_stop(_from_toml(text, path) if path.suffix == ".toml" else _from_rows(text, path), path)
 
 
@@ -68,14 +71,14 @@ def with_surfaces(camera: CameraTable, source: Path) -> CameraTable:
     comes before the built-in glasses. Raises InputError for a damaged file and for an unknown glass.
     """
     lenses = [
-        lens.model_copy(update={"surfaces": read_lens((source.parent / lens.surfaces).resolve())})
+        lens.model_copy(update={"surfaces": read_lens(real_path(source.parent / lens.surfaces))})
         if isinstance(lens.surfaces, str)
         else lens
         for lens in camera.lens
     ]
     catalogue = None
     if camera.glass_catalogue is not None:
-        catalogue = read_catalogue((source.parent / camera.glass_catalogue).resolve())
+        catalogue = read_catalogue(real_path(source.parent / camera.glass_catalogue))
     for place, lens in enumerate(lenses):
         if lens.surfaces and not isinstance(lens.surfaces, str):
             where = f"{source}: camera.lens.{lens.name}.surfaces"
@@ -123,6 +126,8 @@ def _from_rows(text: str, path: Path) -> tuple[Surface, ...]:
         del rows[0]  # the focal length, which follows from the surfaces
     if not rows:
         raise InputError(f"{path}: expected rows of {COLUMNS}, got none")
+    if len(rows) > MOST_SURFACES:
+        raise InputError(f"{path}: expected at most {MOST_SURFACES} surfaces, got {len(rows)}")
     surfaces: list[Surface] = []
     before = 1.0
     for number, values in rows:

@@ -1,13 +1,11 @@
 """The target's picture in the paper's range of values, 0 to 255; row 0 is its top.
 
-Colour becomes luminance; 8-bit and floating-point values are kept, 16-bit values are divided by 257.
+Colour becomes luminance; 8-bit and floating-point values are kept, others are scaled: 16-bit values by 1 / 257.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -17,12 +15,15 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import check_regular
 from ommatid.runtime.memory import check_memory
+from ommatid.runtime.printable import printable
 
 from ..constants import WHITE
 from ..scene import Scene
-from . import npz, tiff
-from .exr import Part, read_channels, write
+from .exr import Part, write
+from .picture_file import read_picture
+from .stored_picture import BYTES, StoredPicture
 
 COLOURS = 3  # channels, at least, of a colour picture
 STEPS = 257.0  # of a 16-bit value per grey level: 65535 is 255
@@ -47,10 +48,11 @@ def load(scene: Scene) -> FloatArray:
                 " (show, predict, design and calibrate need none)"
             )
         check_memory(
-            prod(target.shape) * target.detail**2 * tiff.BYTES, f"{scene.source}: target.shape", "take a smaller one"
+            prod(target.shape) * target.detail**2 * BYTES, f"{scene.source}: target.shape", "take a smaller one"
         )
         return np.zeros(finer(target.shape, target.detail))
-    picture = luminance(_pixels(target.image, where), where)
+    stored = _stored(target.image, where)
+    picture = luminance(stored.pixels, where) * (1.0 if stored.bits is None else _step(stored.bits))
     if target.origin is None:
         if target.shape is not None and finer(target.shape, target.detail) != picture.shape:
             rows, columns = finer(target.shape, target.detail)
@@ -77,44 +79,31 @@ def conversions(scene: Scene) -> list[str]:
     if image is None:
         return []
     where = f"{scene.source}: target.image"
-    path = _picture_path(image, where)
-    dtype, channels = _stored(path, where)
-    sentences = [_colour_words(image)] if channels >= COLOURS else []
+    stored = _stored(image, where)
+    sentences = notes_of(image, stored)
+    dtype = stored.pixels.dtype
     if dtype.kind == "u" and dtype.itemsize == 2:
-        sentences.append(f"{image} has 16-bit values: they are divided by {STEPS:g}, to the range from 0 to 255")
+        sentences.append(
+            f"{printable(image)} has 16-bit values: they are divided by {STEPS:g}, to the range from 0 to 255"
+        )
+    if stored.bits is not None:
+        sentences.append(
+            f"{printable(image)} has {stored.bits}-bit values: they are multiplied by {_step(stored.bits):g}, to the"
+            " range from 0 to 255"
+        )
     return sentences
 
 
-def colour_lost(path: Path, name: str, where: str) -> list[str]:
-    """Return a sentence about the colours of a picture file of that name; nothing for a grey one.
-
-    Raises InputError that begins with `where` if it cannot be read.
-    """
-    return [_colour_words(name)] if _stored(path, where)[1] >= COLOURS else []
-
-
-def _colour_words(name: str) -> str:
-    weights = " + ".join(f"{weight} {colour}" for weight, colour in zip(LUMINANCE, "RGB", strict=True))
-    return f"{name} is a colour picture: only its luminance is used, {weights}"
+def notes_of(name: str, stored: StoredPicture) -> list[str]:
+    """Return what is lost or changed when a picture is read without scaling, a sentence each."""
+    pixels = stored.pixels
+    is_colour = pixels.ndim == 3 and pixels.shape[2] in (COLOURS, COLOURS + 1)
+    return [f"{printable(name)} {note}" for note in ([_COLOUR_NOTE] if is_colour else []) + list(stored.notes)]
 
 
-def _stored(path: Path, where: str) -> tuple[np.dtype[Any], int]:
-    """Return type and number of channels of a picture file, of PNG and JPEG from the header alone."""
-    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
-        from PIL import Image
-
-        try:
-            with _any_size(), Image.open(path, formats=("PNG", "JPEG")) as opened:
-                wide = opened.mode.startswith("I")
-                colours = COLOURS if opened.mode in ("P", "PA") else len(opened.getbands())
-                opened.verify()
-                return np.dtype(np.uint16 if wide else np.uint8), colours
-        except Exception as error:
-            raise InputError(
-                f"{where}: {path} could not be read as a picture; it is damaged or another kind of file"
-            ) from error
-    pixels = decode(path, where)
-    return pixels.dtype, pixels.shape[2] if pixels.ndim == 3 and pixels.shape[2] <= len("RGBA") else 1
+_COLOUR_NOTE = "is a colour picture: only its luminance is used, " + " + ".join(
+    f"{weight} {colour}" for weight, colour in zip(LUMINANCE, "RGB", strict=True)
+)
 
 
 def target_shape(scene: Scene) -> tuple[int, int]:
@@ -164,7 +153,8 @@ def grey(pixels: NDArray[Any], where: str) -> FloatArray:
         raise InputError(f"{where}: expected a picture of rows x columns, grey or colour, got shape {pixels.shape}")
     if pixels.dtype.kind not in "buif":
         raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
-    values = pixels.astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite values and NaN are refused or count as dead
+        values = pixels.astype(np.float64)
     if values.ndim == 2:
         return values
     channels = values.shape[2]
@@ -189,9 +179,14 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
     return picture[row : row + rows, column : column + columns]
 
 
-def _pixels(image: str, where: str) -> NDArray[Any]:
-    """Read the picture that `target.image` names."""
-    return decode(_picture_path(image, where), where)
+def _stored(image: str, where: str) -> StoredPicture:
+    """Read the picture that `target.image` names, without scaling."""
+    return read_picture(_picture_path(image, where), where)
+
+
+def _step(bits: int) -> float:
+    """Grey levels per value of a PNG file with fewer than 8 bits."""
+    return WHITE / (2**bits - 1)
 
 
 def _picture_path(image: str, where: str) -> Path:
@@ -199,8 +194,14 @@ def _picture_path(image: str, where: str) -> Path:
     if image.startswith("photo:"):
         return _photo_path(image.removeprefix("photo:"), where)
     path = Path(image)
-    if not path.is_file():
-        raise InputError(f"{where}: there is no picture {path}; name a PNG, TIFF, EXR or NPY file, or photo:camera")
+    try:
+        check_regular(path)
+    except InputError as error:
+        raise InputError(f"{where}: {error}; name a PNG, TIFF, EXR or NPY file") from error
+    except (OSError, ValueError) as error:  # ValueError for a name with a null
+        raise InputError(
+            f"{where}: there is no picture {printable(path)}; name a PNG, TIFF, EXR or NPY file, or photo:camera"
+        ) from error
     return path
 
 
@@ -214,63 +215,3 @@ def _photo_path(name: str, where: str) -> Path:
     if name not in known:
         raise InputError(f"{where}: scikit-image ships no picture 'photo:{name}'; it has {', '.join(known)}")
     return known[name]
-
-
-def decode(path: Path, where: str) -> NDArray[Any]:
-    """Read a picture file as stored, without conversion. Raises InputError that begins with `where`."""
-    suffix = path.suffix.lower()
-    if suffix == ".exr":
-        try:
-            channels = read_channels(path)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from error
-        if "Y" in channels:
-            return channels["Y"]
-        if not {"R", "G", "B"} <= channels.keys():
-            raise InputError(f"{where}: {path} has channels {', '.join(channels)}; expected Y, or R, G and B")
-        return np.stack([channels[name] for name in "RGB"], axis=-1)
-    if suffix not in _READERS:
-        raise InputError(f"{where}: expected a PNG, TIFF, EXR or NPY file, got {path}")
-    try:
-        return _READERS[suffix](path)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-    except Exception as error:  # every decoder has exceptions of its own
-        raise InputError(
-            f"{where}: {path} could not be read as a picture; it is damaged or another kind of file"
-        ) from error
-
-
-def _read_with_pillow(path: Path) -> NDArray[Any]:
-    """Read a PNG or JPEG picture. Its size is limited by memory instead of Pillow's fixed limit."""
-    from PIL import Image
-    from skimage import io
-
-    imread: Any = io.imread  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    with _any_size():
-        with Image.open(path, formats=("PNG", "JPEG")) as opened:
-            needed = tiff.BYTES * prod(opened.size) * len(opened.getbands())
-            is_cmyk = opened.mode == "CMYK"
-        if is_cmyk:
-            raise InputError(f"{path}: expected grey or RGB, got inks (CMYK); save it as RGB")
-        check_memory(needed, f"{path}: to read it", "take a smaller picture, or free some memory")
-        return np.asarray(imread(path))
-
-
-@contextmanager
-def _any_size() -> Generator[None]:
-    """Lift Pillow's limit on the number of pixels."""
-    from PIL import Image
-
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-
-
-_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
-    ".npy": npz.array,
-    **dict.fromkeys((".tif", ".tiff"), tiff.picture),
-    **dict.fromkeys((".png", ".jpg", ".jpeg"), _read_with_pillow),
-}

@@ -1,72 +1,214 @@
-"""TIFF files. Silences tifffile's logging and stops at circular lists of pages."""
+"""TIFF files: grey or RGB pages, uncompressed or compressed with Deflate or PackBits.
+
+The list of pages is walked here, since tifffile follows a circular one without end, and the sizes of all strips and
+tiles are checked before tifffile inflates them, which it does without a limit. What a file says of its pages in its
+descriptions (OME, ImageJ) is not used: such texts may name other files.
+"""
 
 from __future__ import annotations
 
+import io
 import logging
+import re
+import struct
+import zlib
 from collections.abc import Generator
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, BinaryIO, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
-BYTES = 24  # of memory per number: as stored, in float64, and a copy of that
-COLOURS = 3, 4  # channels of a colour picture
+from .stored_picture import BYTES, UPRIGHT, StoredPicture, check_single, profile_notes, upright
+
 UNSUPPORTED = {
     "PALETTE": "a palette's colours",
     "SEPARATED": "inks (CMYK)",
     "MINISWHITE": "a picture in which 0 is white",
+    "YCBCR": "luminance and colour differences (YCbCr)",
+    "CFA": "the mosaic of a colour filter",
 }
+CHANNELS = {"MINISBLACK": 1, "RGB": 3}  # of light, by the kind of picture
+BITS = (1, 8, 16, 32, 64)  # per number
+UNCOMPRESSED, DEFLATE, PACKBITS = 1, (8, 32946), 32773
+PREDICTORS = (1, 2)  # none, differences along a row
+MOST_PAGES = 100_000
+PLAIN = {"is_lsm": False, "is_scanimage": False, "is_ndpi": False}  # variants whose pages tifffile arranges itself
+STEP = 1 << 20  # bytes that are inflated at once to measure them
 
 
-def picture(path: Path) -> NDArray[Any]:
-    """Read the first picture or series of pictures in a file, colours last.
+def picture(stream: BinaryIO, path: Path) -> StoredPicture:
+    """Read the picture in a file, colours last.
 
-    Raises InputError for one that does not fit into memory, has an unknown compression, or is neither grey nor RGB, and
-    tifffile's own exceptions for a damaged file.
+    Raises InputError for several pages, one that does not fit into memory, has an unknown compression, or is neither
+    grey nor RGB, and errors of tifffile, or ValueError, for a damaged file.
     """
-    with _opened(path) as file:
-        _check_memory(path, BYTES * prod(file.series[0].shape))
-        pixels = np.asarray(file.asarray())
-    planar = pixels.ndim > 2 and pixels.shape[-1] not in COLOURS and pixels.shape[-3] in COLOURS
-    return np.moveaxis(pixels, -3, -1) if planar else pixels
+    with _opened(stream, path) as found:
+        check_single(path, len(found), "pages")
+        return _read(stream, path, found)[0]
 
 
-def pages(path: Path) -> list[NDArray[Any]]:
-    """Read the pages of a file. Raises as `picture` does."""
-    with _opened(path) as file:
-        sizes = [(prod(page.shape), page.dtype.itemsize) for page in file.pages]
-        _check_memory(path, sum(size * itemsize for size, itemsize in sizes) + BYTES * max(size for size, _ in sizes))
-        return [page.asarray() for page in file.pages]
+def pages(stream: BinaryIO, path: Path) -> list[StoredPicture]:
+    """Read the pages of a file, of which each is a frame. Raises as `picture` does."""
+    with _opened(stream, path) as found:
+        return _read(stream, path, found)
 
 
 @contextmanager
-def _opened(path: Path) -> Generator[Any]:
-    """A tifffile.TiffFile. Raises InputError for unsupported colours and compressions."""
+def _opened(stream: BinaryIO, path: Path) -> Generator[list[Any]]:
+    """The pages of a file as tifffile describes them, except reduced copies of other pages."""
     import tifffile
 
     log = logging.getLogger("tifffile")
     if not log.handlers:  # otherwise its messages appear on stderr
         log.addHandler(logging.NullHandler())
     log.propagate = False
-    with cast(Any, tifffile).TiffFile(path) as file:
-        len(file.pages)  # walks the whole list, which raises if the list is circular
-        stored = UNSUPPORTED.get(getattr(file.pages[0].photometric, "name", ""))
-        if stored is not None:
-            raise InputError(f"{path}: expected grey or RGB, got {stored}; save it as one of these")
-        try:
-            yield file
-        except ValueError as error:
-            if "imagecodecs" not in str(error):
-                raise
-            name = file.pages[0].compression.name
-            raise InputError(f"{path}: its compression {name} is not read; save it without, or with Deflate") from error
+    count = _count_pages(stream)
+    stream.seek(0)
+    with cast(Any, tifffile).TiffFile(stream, name="picture.tif", **PLAIN) as file:
+        found = [file.pages[index] for index in range(count)]
+        _check_listed(path, found)
+        yield [page for page in found if not page.is_reduced] or found[:1]
 
 
-def _check_memory(path: Path, needed: int) -> None:
+def _count_pages(stream: BinaryIO) -> int:
+    """Return the number of pages; a list that returns to an earlier page ends there. Raises ValueError for damage."""
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(0)
+    start = stream.read(16)
+    order = {b"II": "<", b"MM": ">"}.get(start[:2])
+    version = int.from_bytes(start[2:4], "little" if order == "<" else "big")
+    if order is None or version not in (42, 43):
+        raise ValueError("it is no TIFF file")
+    number, offset, tag = ("Q", "Q", 20) if version == 43 else ("H", "I", 12)
+    (place,) = struct.unpack_from(order + offset, start, 8 if version == 43 else 4)
+    known: set[int] = set()
+    while place and place not in known:
+        known.add(place)
+        stream.seek(place)
+        tags = _number(stream, order + number)
+        if place + tags * tag > size or len(known) > MOST_PAGES:
+            raise ValueError("its list of pages is damaged")
+        stream.seek(tags * tag, io.SEEK_CUR)
+        place = _number(stream, order + offset)
+    return len(known)
+
+
+def _number(stream: BinaryIO, kind: str) -> int:
+    content = stream.read(struct.calcsize(kind))
+    if len(content) < struct.calcsize(kind):
+        raise ValueError("its list of pages is cut short")
+    return int(struct.unpack(kind, content)[0])
+
+
+def _read(stream: BinaryIO, path: Path, found: list[Any]) -> list[StoredPicture]:
+    """Read pages after all of them are checked."""
+    if not found:
+        raise ValueError("it has no pages")
+    for page in found:
+        _check_kind(path, page)
+    sizes = [(prod(page.shape), page.dtype.itemsize) for page in found]
+    needed = sum(size * itemsize for size, itemsize in sizes) + BYTES * max(size for size, _ in sizes)
+    needed += max(0 if page.compression == UNCOMPRESSED else 2 * _segment(page) for page in found)
     check_memory(needed, f"{path}: to read it", "take a smaller picture, or free some memory")
+    for page in found:
+        _check_segments(stream, page)
+    return [_page(page) for page in found]
+
+
+def _check_kind(path: Path, page: Any) -> None:
+    """Raise InputError if a page is of a kind that is not read."""
+    name = str(getattr(page.photometric, "name", page.photometric)) if 262 in page.tags else ""
+    alpha, count = len(page.extrasamples), int(page.samplesperpixel)
+    stored = UNSUPPORTED.get(name)
+    if stored is None and name and name not in CHANNELS:
+        stored = f"the kind {name}"
+    if stored is None and count - alpha != CHANNELS.get(name, count - alpha):
+        stored = f"{count} numbers per pixel of the kind {name}"
+    if stored is not None:
+        raise InputError(f"{path}: expected grey or RGB, got {stored}; save it as one of these")
+    compression = getattr(page.compression, "name", page.compression)
+    if page.compression not in (UNCOMPRESSED, *DEFLATE, PACKBITS):
+        raise InputError(f"{path}: its compression {compression} is not read; save it without, or with Deflate")
+    if page.predictor not in PREDICTORS:
+        raise InputError(f"{path}: its predictor {int(page.predictor)} is not read; save it without a predictor")
+    if page.bitspersample not in BITS or page.dtype is None:
+        raise InputError(
+            f"{path}: expected 8, 16 or 32 bits per number, all alike, got {str(page.bitspersample)[:20]}; save it"
+            " with 16"
+        )
+    if page.ndim > 3 or not prod(page.shape):
+        raise ValueError(f"its shape is {page.shape}")
+
+
+def _check_listed(path: Path, found: list[Any]) -> None:
+    """Raise InputError if a file has frames without pages, as ImageJ and tifffile write very many."""
+    text = str(found[0].description) if found else ""
+    images = re.match(r"ImageJ=[^\0]*?\nimages=(\d{1,9})\b", text)
+    if (images and int(images[1]) > len(found)) or (text.startswith("{") and '"truncated": true' in text):
+        raise InputError(f"{path}: expected a page for every frame, got frames without pages; save each as a page")
+
+
+def _segment(page: Any) -> int:
+    """Bytes of a strip or tile of a page."""
+    return prod(page.chunks) * int(page.dtype.itemsize)
+
+
+def _check_segments(stream: BinaryIO, page: Any) -> None:
+    """Raise ValueError if strips or tiles are missing, outside the file, or inflate to more than belongs to them."""
+    size, stored = stream.seek(0, io.SEEK_END), 0
+    offsets, counts = list(page.dataoffsets), list(page.databytecounts)
+    expected = _segment(page) + STEP  # some encoders pad the last one
+    if len(offsets) != len(counts) or len(offsets) < prod(page.chunked):
+        raise ValueError("some of its strips are missing")
+    for offset, count in zip(offsets, counts, strict=True):
+        if offset + count > size:
+            raise ValueError("it is cut short")
+        if page.compression == UNCOMPRESSED:
+            stored += count
+            continue
+        stream.seek(offset)
+        length = _inflated if page.compression in DEFLATE else _unpacked
+        stored += length(stream.read(count), expected)
+    if 8 * stored < prod(page.shape) * page.bitspersample:
+        raise ValueError("it is cut short")
+
+
+def _inflated(deflated: bytes, most: int) -> int:
+    """Return the length of an inflated strip, which is inflated in steps. Raises ValueError if it exceeds `most`."""
+    inflate, length = zlib.decompressobj(), 0
+    while deflated and not inflate.eof:
+        length += len(inflate.decompress(deflated, STEP))
+        deflated = inflate.unconsumed_tail
+        if length > most:
+            raise ValueError("a strip inflates to more than its pixels")
+    return length
+
+
+def _unpacked(packed: bytes, most: int) -> int:
+    """Return the length of an unpacked strip of PackBits. Raises ValueError if it exceeds `most`."""
+    index = length = 0
+    while index < len(packed) and length <= most:
+        head = packed[index]
+        length += head + 1 if head < 128 else 257 - head if head > 128 else 0
+        index += head + 2 if head < 128 else 2 if head > 128 else 1
+    if length > most:
+        raise ValueError("a strip has more than its pixels")
+    return length
+
+
+def _page(page: Any) -> StoredPicture:
+    """Read a checked page, colours last and upright."""
+    pixels = np.asarray(page.asarray())
+    if pixels.ndim == 3 and int(page.planarconfig) != 1:
+        pixels = np.moveaxis(pixels, 0, -1)
+    if page.bitspersample == 1:
+        pixels = pixels.astype(np.bool_)
+    tags = page.tags
+    profile, orientation = tags.valueof(34675), tags.valueof(274)
+    picture = StoredPicture(pixels, notes=profile_notes(profile if isinstance(profile, bytes) else b""))
+    return upright(picture, orientation if isinstance(orientation, int) else UPRIGHT)

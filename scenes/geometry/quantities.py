@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from ommatid.runtime.errors import shortened_repr
 
+from ..tables.table import at_most
 from ..tables.units import Angle, Length, pair
 
 # Height and width in mm. To 2/3: typical sizes of digital cameras (Digital Photography Review, "Sensor sizes", 2002,
@@ -59,8 +60,8 @@ def _size(value: object) -> object:
     if name in named:
         return named[name]
     raise ValueError(
-        f"expected one of the formats {', '.join(FORMATS)}, or height and width of the sensor, such as"
-        f' ["4.55 mm", "6.17 mm"], got {shortened_repr(value)}; the nearest format is "{_nearest(name)}"'
+        f"expected one of the formats {', '.join(FORMATS)}, or height and width, such as"
+        f' ["4.55 mm", "6.17 mm"], got {shortened_repr(value)[:50]}; the nearest format is "{_nearest(name)}"'
     )
 
 
@@ -81,6 +82,7 @@ def _inches(name: str) -> Fraction:
 FNumber = Annotated[float, Field(gt=0, le=1e6)]
 FieldOfView = Annotated[
     tuple[Annotated[Angle, AfterValidator(_below_half_turn)], ...],
+    at_most(2, "angles"),
     BeforeValidator(_one_or_two),
     Field(min_length=1, max_length=2),
     WithJsonSchema(

@@ -21,6 +21,7 @@ from typing import Any, cast
 
 from pydantic import TypeAdapter, ValidationError
 
+from ..tables.camera import MOST_TYPES
 from ..tables.units import Length, Magnification, Pair
 from .quantities import FieldOfView, FNumber
 from .redundancy import contradiction, required_focal_length
@@ -66,11 +67,11 @@ def complete(data: dict[str, Any]) -> tuple[dict[str, Any], str]:
 
 
 def _lens_tables(data: dict[str, Any]) -> list[dict[str, Any]]:
-    """The tables of the lens types; none if the file is malformed."""
+    """The tables of the lens types; none if the file is malformed, or names too many."""
     camera, target = data.get("camera"), data.get("target")
     lenses = cast(dict[str, object], camera).get("lens") if isinstance(camera, dict) else None
     tables = list(cast(Iterable[object], lenses)) if isinstance(lenses, list | tuple) else []
-    if not isinstance(target, dict) or not all(isinstance(table, dict) for table in tables):
+    if not isinstance(target, dict) or len(tables) > MOST_TYPES or not all(isinstance(table, dict) for table in tables):
         return []
     return cast(list[dict[str, Any]], tables)
 

@@ -12,24 +12,21 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import open_input
 
 from ..camera import Camera
 from ..constants import WHITE
-from ..formats import tiff
-from ..formats.picture import decode, grey
+from ..formats.picture import grey
+from .frame_files import FrameNotes, files_in, pictures_of, stored_pictures
 
-SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy")
 TIE = 1e-6  # sensor pixels, rounding error of a position half way between two pixels
 DARK, FLAT = "dark frames", "flat frames"
-TIFF = (".tif", ".tiff")
-COLOURS = 4  # most channels of a picture; a longer last axis is columns
 
 
 @dataclass(frozen=True)
@@ -80,12 +77,16 @@ class SensorLayout:
             ]
         return np.concatenate([np.ravel(patch[::-1, ::-1] if self.rotated else patch) for patch in patches])
 
-    def exposures(self, paths: Sequence[Path], what: str) -> Iterator[tuple[Path, FloatArray]]:
-        """Yield the last file and the numbers, (M,), of each exposure. Raises InputError for another shape."""
+    def exposures(self, paths: Sequence[Path], what: str, notes: FrameNotes) -> Iterator[tuple[Path, FloatArray]]:
+        """Yield the last file and the numbers, (M,), of each exposure. Raises InputError for another shape.
+
+        notes : is told of every picture
+        """
         pictures: list[FloatArray] = []
         for path in paths:
-            for pixels in pictures_of(path, what):
-                picture = grey(pixels, str(path))
+            for stored in stored_pictures(path, what):
+                notes.add(path, stored, what)
+                picture = grey(stored.pixels, str(path))
                 expected = self.shapes[len(pictures)]
                 if picture.shape != expected:
                     raise InputError(
@@ -110,6 +111,7 @@ class RecordedFrames:
     averaged : number of dark or of flat frames, whichever is smaller
     files : the last file of each exposure;  sources : names and SHA-256 of all files
     whole : True if all numbers are integers, rounded by the sensor
+    notes : what is lost or changed when the files are read, a sentence each
     """
 
     layout: SensorLayout
@@ -121,13 +123,15 @@ class RecordedFrames:
     files: list[Path]
     whole: bool
     sources: list[dict[str, str]]
+    notes: list[str]
 
     @property
     def scale(self) -> FloatArray:
         """Units of f per digital number, (M,); NaN for dead pixels."""
         if self.flat is None:
             return np.ones(self.layout.camera.measurements)
-        signal: FloatArray = self.flat if self.dark is None else self.flat - self.dark
+        with np.errstate(over="ignore", invalid="ignore"):
+            signal: FloatArray = self.flat if self.dark is None else self.flat - self.dark
         alive = np.isfinite(signal) & (signal > 0)
         scale: FloatArray = np.full(signal.shape, np.nan)
         scale[alive] = self.settings.flat_value / signal[alive]
@@ -135,7 +139,17 @@ class RecordedFrames:
 
     def values(self) -> FloatArray:
         """(image - dark) / (flat - dark) flat_value, NaN for dead pixels: (exposures, M)."""
-        return (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
+
+    @property
+    def not_numbers(self) -> int:
+        """Count of sensor pixels whose image or dark frame is NaN, infinite or beyond single precision somewhere."""
+        largest = np.finfo(np.float32).max
+        usable: BoolArray = np.abs(self.numbers) <= largest
+        if self.dark is not None:
+            usable &= np.abs(self.dark) <= largest
+        return int(np.sum(~np.min(usable, axis=0)))
 
 
 def read_frames(
@@ -152,9 +166,12 @@ def read_frames(
     if not files:
         raise InputError("expected recorded images, got none; name PNG, TIFF, EXR or NPY files")
     layout = _layout(camera, files, settings, mosaics=mosaics)
-    exposures = list(layout.exposures(files, "images"))
+    notes = FrameNotes()
+    exposures = list(layout.exposures(files, "images", notes))
     numbers = np.array([recorded for _, recorded in exposures])
-    dark_frames, flat_frames = (list(layout.exposures(paths, what)) for paths, what in ((dark, DARK), (flat, FLAT)))
+    dark_frames, flat_frames = (
+        list(layout.exposures(paths, what, notes)) for paths, what in ((dark, DARK), (flat, FLAT))
+    )
     return RecordedFrames(
         layout=layout,
         numbers=numbers,
@@ -165,49 +182,8 @@ def read_frames(
         files=[path for path, _ in exposures],
         whole=bool((numbers == np.rint(numbers)).all()),
         sources=[{"name": path.name, "sha256": _sha256(path)} for path in (*files, *dark, *flat)],
+        notes=notes.describe(),
     )
-
-
-def files_in(path: Path) -> list[Path]:
-    """The file itself, or the pictures in a folder sorted by name. Raises InputError if there is none."""
-    if not path.is_dir():
-        return [path]
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
-    if not files:
-        raise InputError(f"{path}: expected a folder of PNG, TIFF, EXR or NPY files, got none of them in it")
-    return files
-
-
-def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
-    """The pictures in a file as stored: a single one, or all of a (count, rows, columns) array.
-
-    Raises InputError if there is none.
-    """
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: expected {what} as PNG, TIFF, EXR or NPY files, whose numbers are the sensor's")
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file among the {what}")
-    pages = _pages(path) if path.suffix.lower() in TIFF else []
-    if pages:
-        return pages
-    pixels = decode(path, what)
-    # A last axis of up to four is colours; a sensor has more columns.
-    several = pixels.ndim == 3 and pixels.shape[2] > COLOURS
-    pictures = list(pixels) if several else [pixels]
-    if not pictures or pixels.dtype.kind not in "uif":
-        raise InputError(f"{path}: expected whole or floating-point numbers, got {pixels.dtype}, {pixels.shape}")
-    return pictures
-
-
-def _pages(path: Path) -> list[NDArray[Any]]:
-    """Return the pages of a TIFF file with several; none for other files, which are read as a single picture."""
-    try:
-        pages = tiff.pages(path)
-    except InputError:
-        raise
-    except Exception:  # tifffile has many; reading it as a single picture reports the damage
-        return []
-    return pages if len(pages) > 1 and all(page.dtype.kind in "uif" for page in pages) else []
 
 
 def patches(camera: Camera) -> FloatArray:
@@ -264,9 +240,10 @@ def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSetting
 
 
 def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:
-    return np.mean([numbers for _, numbers in exposures], axis=0) if exposures else None
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.mean([numbers for _, numbers in exposures], axis=0) if exposures else None
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    with open_input(path) as stream:
+        return hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()

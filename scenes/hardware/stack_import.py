@@ -64,5 +64,5 @@ def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Rec
 
 def _as_float32(values: FloatArray) -> FloatArray:
     """Values rounded to float32, as the file stores them."""
-    with np.errstate(over="ignore"):  # pixels beyond float32 become infinite and count as dead
+    with np.errstate(over="ignore", invalid="ignore"):  # pixels beyond float32 become infinite and count as dead
         return values.astype(np.float32).astype(np.float64)

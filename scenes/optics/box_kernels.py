@@ -6,11 +6,12 @@ Work is divided into ranges of rows that do not depend on the number of threads,
 # pyright: basic
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from ommatid.runtime.library_caches import compiled
 
-@numba.njit(cache=True, nogil=True)
+
+@compiled
 def average(image, order, row_start, row_share, column_start, column_share, out, first, last):
     """Fill `out` with averages of `image` over boxes, for sensor rows order[first:last]; see `boxes.BoxAxis`."""
     columns = image.shape[1]
@@ -35,7 +36,7 @@ def average(image, order, row_start, row_share, column_start, column_share, out,
                 out[k, l, i, j] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def spread(readings, order, row_start, row_share, column_start, column_share, out, first, last):
     """Add the adjoint of `average`, applied to `readings`, to rows first to last of `out`."""
     columns = out.shape[1]

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 from math import comb
 
-import numba
 import numpy as np
+
+from ommatid.runtime.library_caches import compiled
 
 DEGREE = 5
 BERNSTEIN = np.array([[comb(i, k) / comb(DEGREE, k) for k in range(DEGREE + 1)] for i in range(DEGREE + 1)])
@@ -28,7 +29,7 @@ LEAST_DEPTH = 1e-6  # of W, which is 1 in the middle of a patch, and about 1 all
 MOST_HALVINGS = 40  # roots closer together enclose no area that matters
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def curve(start, other, length, down, k1, k2, project, powers, net):
     """Fill `powers` and `net`, (3, 6), with the coefficients of X, Y, W of an edge in t^k and in Bernstein polynomials.
 
@@ -51,7 +52,7 @@ def curve(start, other, length, down, k1, k2, project, powers, net):
             net[row, i] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def value(powers, t):
     """The values at t of a polynomial and of its derivative."""
     total, slope = powers[5], 0.0
@@ -61,7 +62,7 @@ def value(powers, t):
     return total, slope
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def single_root(powers, low, high, rising):
     """The only root between `low` and `high`, by Newton's method within a shrinking bracket."""
     t = (low + high) / 2
@@ -80,7 +81,7 @@ def single_root(powers, low, high, rising):
     return t
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def crossings(powers, net, tolerance, roots, count):
     """Add to `roots` where a polynomial changes sign between 0 and 1; values below `tolerance` count as 0.
 
@@ -125,7 +126,7 @@ def crossings(powers, net, tolerance, roots, count):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def bounds(net):
     """Bounds (least U, largest U, least V, largest V) of a curve, from the hull of its Bernstein coefficients."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
@@ -136,7 +137,7 @@ def bounds(net):
     return left, right, top, bottom
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def cuts(powers, net, box, size, roots):
     """Fill `roots` with the sorted t, 0 and 1 included, where a curve crosses sides of pixels; return their number.
 
@@ -159,7 +160,7 @@ def cuts(powers, net, box, size, roots):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def add(powers, net, sign, size, first, cells, roots):
     """Add a curve's integrals, times `sign`, to the pixels `cells` that begin at pixel `first` = (row, column)."""
     box = bounds(net)
@@ -186,7 +187,7 @@ def add(powers, net, sign, size, first, cells, roots):
             cells[row, column] += sign * area
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def texel_edges(x, y, row, column, k1, k2, project, powers, nets):
     """Fill `powers` and `nets` with a texel's edges, top, right, bottom, left; return (left, right, top, bottom).
 
@@ -208,7 +209,7 @@ def texel_edges(x, y, row, column, k1, k2, project, powers, nets):
     return left, right, top, bottom
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def shares(x, y, k1, k2, project, size, least):
     """The shares of pixels that texels' images cover, where larger than `least`: indices of pixels, of texels, shares.
 
@@ -240,7 +241,7 @@ def shares(x, y, k1, k2, project, size, least):
     return pixels[:stored], texels[:stored], values[:stored]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def longer(array, capacity):
     """A copy of an array with a larger capacity."""
     copy = np.empty(capacity, array.dtype)

@@ -11,7 +11,7 @@ from ommatid.runtime.errors import shortened_repr
 
 from ..geometry.quantities import FieldOfView, FNumber, SensorSize
 from ..zemax.dispersion import Dispersion
-from .table import Table, allow_absent
+from .table import Table, allow_absent, at_most
 from .units import (
     Angle,
     Corner,
@@ -31,6 +31,8 @@ Distortion = Annotated[float, Field(ge=-1000, le=1000)]
 RAYS = "none"  # wavelength of light that does not diffract
 STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
+MOST_TYPES, MOST_SUB_IMAGERS, MOST_SURFACES = 100, 1024, 200
+SURFACES = at_most(MOST_SURFACES, "surfaces")
 
 
 class Surface(Table):
@@ -133,7 +135,7 @@ class LensTable(Table):
     distortion: Annotated[tuple[Distortion, Distortion], BeforeValidator(pair)] | None = Field(
         default=None, description="k1, k2: magnification times 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner"
     )
-    surfaces: Annotated[tuple[Surface, ...], BeforeValidator(pair), Field(min_length=1)] | str | None = Field(
+    surfaces: Annotated[tuple[Surface, ...], SURFACES, Field(min_length=1)] | str | None = Field(
         default=None,
         description="surfaces of a real lens, from the target to the sensor, or the file with them",
     )
@@ -148,7 +150,10 @@ class LensTable(Table):
         lt=1,
         description="reflectance of each surface to air; absent: uncoated, by Fresnel's equations",
     )
-    sub_imager: Annotated[tuple[SubImagerTable, ...], BeforeValidator(pair), Field(min_length=1)] | None = Field(
+    sub_imager: (
+        Annotated[tuple[SubImagerTable, ...], at_most(MOST_SUB_IMAGERS, "sub_imager tables"), Field(min_length=1)]
+        | None
+    ) = Field(
         default=None, description="sub-imagers with a window or an orientation of their own; absent: all on the grid"
     )
 
@@ -229,7 +234,7 @@ class CameraTable(Table):
     sensor: CameraSensorTable | None = Field(
         default=None, description="outline of the sensor; absent: as large as needed"
     )
-    lens: Annotated[tuple[LensTable, ...], BeforeValidator(pair), Field(min_length=1)]
+    lens: Annotated[tuple[LensTable, ...], at_most(MOST_TYPES, "lens types"), Field(min_length=1)]
 
     @model_validator(mode="after")
     def _check_names(self) -> CameraTable:

@@ -18,7 +18,7 @@ def gallery_names() -> list[str]:
 
 def find_scene(path: Path) -> Path:
     """Return the file of a gallery scene where `path` is its name and no such file exists, else `path`."""
-    if not path.exists() and str(path) in gallery_names():
+    if str(path) in gallery_names() and not path.exists():
         return GALLERY / f"{path}.toml"
     return path
 
@@ -46,20 +46,30 @@ def write_starter(path: Path, name: str = STARTER) -> list[Path]:
     """
     from ommatid.runtime.errors import InputError
     from ommatid.runtime.files import make_folder, write_text
+    from ommatid.runtime.outputs.kinds import check_output
 
     if name != STARTER and name not in gallery_names():
         raise InputError(f"--from {name}: expected a scene of the gallery, {', '.join(gallery_names())}")
+    check_output(path)
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or remove it first")
     texts = {path.parent / file: (GALLERY / file).read_text(encoding="utf-8") for file in _files(name)}
     for target, text in texts.items():
-        if target.exists() and target.read_text(encoding="utf-8", errors="replace") != text:
+        if target.parent.exists():
+            check_output(target)
+        if target.exists() and not _holds(target, text):
             raise InputError(f"{target}: exists already and differs from the file of '{name}'; choose another folder")
     for target, text in texts.items():
         make_folder(target.parent)
         write_text(target, text)
     write_text(path, (GALLERY / f"{name}.toml").read_text(encoding="utf-8"))
     return [path, *texts]
+
+
+def _holds(path: Path, text: str) -> bool:
+    from ommatid.runtime.input_files import read_bytes
+
+    return read_bytes(path) == text.encode()
 
 
 def _tables(name: str) -> dict[str, Any]:

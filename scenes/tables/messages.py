@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import re
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from ommatid.runtime.errors import shortened, shortened_repr
+from ommatid.runtime.errors import shortened_repr
+from ommatid.runtime.printable import printable
 
+LONGEST = 100  # characters of a key that is compared with the known ones
+_SHOULD_HAVE = re.compile(r"^\w+ should have")  # of pydantic
 DERIVED = {  # keys that may follow from others
     "magnification": ", or focal_length with target.distance and both pixel pitches",
     "pixels": ', or "fit", or field_of_view',
@@ -48,10 +52,10 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel]) -> str:
     error_type = problem["type"]
     location = problem["loc"] if error_type == "extra_forbidden" else _keys_only(problem["loc"])
-    key = shortened(_dotted(location, data))
+    key = printable(_dotted(location, data), LONGEST)
     if error_type == "extra_forbidden":
         keys = known_keys(model)
-        bare = ".".join(part for part in location if isinstance(part, str))
+        bare = ".".join(part for part in location if isinstance(part, str))[-LONGEST:]
         near = difflib.get_close_matches(bare, keys, n=1, cutoff=0.5)
         last = bare.rsplit(".", 1)[-1]
         elsewhere = [known for known in keys if known.rsplit(".", 1)[-1] == last]
@@ -64,6 +68,7 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
     message = message.replace("Input should be", "expected").replace(
         "String should match", "expected text that matches"
     )
+    message = _SHOULD_HAVE.sub("expected", message).replace(" after validation", "")
     if "got" not in message:
         message = f"{message}, got {shortened_repr(problem['input'])}"
     return f"{key}: {message}" if key else message

@@ -34,6 +34,8 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str,
         override = shortened(assignment)
         if not equals or not key.strip():
             raise InputError(f"--set {override}: expected KEY=VALUE, such as noise.variance=1e-6")
+        if any(0xD800 <= ord(character) < 0xE000 for character in assignment):
+            raise InputError(f"--set {override}: expected text in UTF-8, got other bytes")
         *tables, last = [part.strip() for part in key.split(".")]
         if len(tables) > toml.DEEPEST:
             raise InputError(f"--set {override}: its key goes deeper than {toml.DEEPEST} tables")

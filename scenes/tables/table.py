@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 LARGEST = 1e12  # of a pixel value: files hold float32, and squares of values must fit too
 
@@ -14,6 +14,20 @@ class Table(BaseModel):
     """A table of the scene file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+def at_most(count: int, what: str) -> BeforeValidator:
+    """Convert a list of TOML to a tuple, and refuse one of more than `count` items before they are looked at."""
+
+    def check(value: object) -> object:
+        if not isinstance(value, list | tuple):
+            return value
+        items = cast(Sequence[object], value)
+        if len(items) > count:
+            raise ValueError(f"expected at most {count} {what}, got {len(items)}")
+        return tuple(items)
+
+    return BeforeValidator(check)
 
 
 def allow_absent(*keys: str) -> Callable[[dict[str, Any]], None]:

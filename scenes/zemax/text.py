@@ -6,6 +6,7 @@ import codecs
 from pathlib import Path
 
 from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.input_files import read_bytes
 
 LARGEST = 2**24  # bytes; the largest catalogues of glass makers have one million
 EXTREME = 1e9  # largest number
@@ -14,14 +15,11 @@ EXTREME = 1e9  # largest number
 def read_text(path: Path, kind: str) -> str:
     """Return the text of a file, such as a "lens file". Raises InputError."""
     try:
-        with path.open("rb") as stream:
-            data = stream.read(LARGEST + 1)
+        data = read_bytes(path, LARGEST)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such {kind}; expected one beside the scene file") from error
     except OSError as error:
         raise InputError(f"{path}: could not be read as a {kind} ({error.strerror or error})") from error
-    if len(data) > LARGEST:
-        raise InputError(f"{path}: expected a {kind} of at most {LARGEST >> 20} MiB, got a larger file")
     try:
         if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             return data.decode("utf-16")

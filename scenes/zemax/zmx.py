@@ -22,12 +22,11 @@ from pydantic import ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
 
-from ..tables.camera import Surface
+from ..tables.camera import MOST_SURFACES, Surface
 from ..tables.messages import explain
 from .text import number, read_text
 
 MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0, "METER": 1000.0}
-MOST_SURFACES = 1000
 ASPHERE = "EVENASPH"
 KINDS = ("STANDARD", ASPHERE)
 TERMS = 8  # of an even asphere, from r^2 on

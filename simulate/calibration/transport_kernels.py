@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ommatid.runtime.library_caches import compiled
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def sums_by_texel(texels, weights):
     """Sum the weights, (P, S), by texel for every pixel, without texels below 0: counts (P,), texels and sums.
 

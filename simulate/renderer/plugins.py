@@ -14,9 +14,8 @@ from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.tables.sampling import Sampler
 
 from ..sampling.samplers import fitting
+from .worlds.building import BLOCK
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
-
-BLOCK = 4  # scalar variants seed by block, and derive its size from the number of threads unless it is given
 
 
 def scene_of(target: dict[str, Any]) -> dict[str, Any]:

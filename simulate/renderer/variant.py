@@ -8,7 +8,9 @@ used. A variant is global to the process.
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +18,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.interpreter import python_command, python_environment
+
+from .worlds.plugin_names import mitsuba_folder
 
 if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
@@ -26,12 +31,13 @@ PREFERENCE = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 
 _PROBE = """
 import json, sys, time
-from ommatid.simulate.renderer.variant import unusable_reason
+from ommatid.simulate.renderer.variant import fix_plugin_folder, unusable_reason
 variant = sys.argv[1]
 reason = unusable_reason(variant)
 speed = 0.0
 if not reason:
     import mitsuba as mi
+    fix_plugin_folder()
     mi.set_variant(variant)
     scene = mi.load_dict({
         "type": "scene", "integrator": {"type": "path", "max_depth": 1},
@@ -102,17 +108,28 @@ def check_transport_variant(variant: str, key: str = "calibration.method") -> No
 
 
 def activate(variant: str) -> None:
-    """Make a variant Mitsuba's current one, and redirect its log to stderr."""
+    """Make a variant Mitsuba's current one, and pass its warnings to Python's log."""
     import mitsuba as mi
 
+    fix_plugin_folder()
     if mi.variant() != variant:
         mi.set_variant(variant)
     logger = cast(Any, mi).logger()
-    if logger is not None and not isinstance(logger.appender(0), _stderr_appender()):
+    if logger is not None and not isinstance(logger.appender(0), _log_appender()):
         logger.clear_appenders()
-        appender: Any = _stderr_appender()
+        appender: Any = _log_appender()
         logger.add_appender(appender())
         logger.set_log_level(mi.LogLevel.Warn)
+
+
+def fix_plugin_folder() -> None:
+    """Make Mitsuba find its plugins and data in its own folder alone, and not in the current one."""
+    import mitsuba as mi
+
+    resolver, folder = cast(Any, mi).file_resolver(), str(mitsuba_folder())
+    if list(resolver) != [folder]:
+        resolver.clear()
+        resolver.append(folder)
 
 
 def release() -> None:
@@ -123,32 +140,38 @@ def release() -> None:
 
 
 INTERRUPTED = "Received interrupt signal"  # suppressed: the command line reports Ctrl-C itself
+_HEADING = re.compile(r"\A[-\d]+ [:\d]+ \w+ +(\S+ +)?\[[^\]]*\] *")  # date, level, thread and line of a log message
 _APPENDERS: dict[str, Any] = {}
 
 
-def _stderr_appender() -> Any:
+def _log_appender() -> Any:
     import mitsuba as mi
 
-    if "stderr" not in _APPENDERS:
+    if "log" not in _APPENDERS:
 
-        class Stderr(mi.Appender):
+        class LogAppender(mi.Appender):
             def append(self, level: object, text: str) -> None:
                 del level
                 if INTERRUPTED not in text:
-                    print(text, file=sys.stderr)
+                    logging.getLogger("mitsuba").warning("%s", _HEADING.sub("", text))
 
             def log_progress(self, *arguments: object) -> None:
                 del arguments
 
-        _APPENDERS["stderr"] = Stderr
-    return _APPENDERS["stderr"]
+        _APPENDERS["log"] = LogAppender
+    return _APPENDERS["log"]
 
 
 def probe(variant: str) -> BackendStatus:
     """Try a variant by a small rendering in a separate process, which a broken backend may kill."""
     try:
         process = subprocess.run(
-            [sys.executable, "-c", _PROBE, variant], capture_output=True, text=True, timeout=PATIENCE, check=False
+            python_command(_PROBE, variant),
+            env=python_environment(),
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return BackendStatus(variant, f"a trial rendering did not end in {PATIENCE} s", 0.0)

@@ -10,24 +10,25 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
+from typing import Any, cast
 
 import numpy as np
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import open_input
+from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.world import FROM_FILE, WorldTable
 
-from .plugins import BLOCK
 from .variant import activate
+from .worlds.building import BLOCK, parse_world
+from .worlds.checked_world import CheckedWorld, check_world_files, reason_of
 from .worlds.placement import FINEST, Placement
+from .worlds.trial import try_world
 
 TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file
-BACKWARDS = "ptracer"  # the integrator that starts at the emitters, and takes no block size
 SENSORS_AT_ORIGIN = ("perspective", "thinlens", "orthographic")  # that stand there without a to_world
 DEEPEST = 8  # segments of a path, if the file has no integrator
 
@@ -76,39 +77,14 @@ def white_of(scene: Scene) -> float:
     return white
 
 
+def checked(scene: Scene) -> CheckedWorld:
+    """Return the checked text of the world's file and of those that it includes. Raises InputError."""
+    return check_world_files(path_of(scene), f"{scene.source}: world.file", scene.allows_outside)
+
+
 def files(scene: Scene) -> list[Path]:
-    """Return the world's file and those beside it that it names, except by `$variables`.
-
-    Raises InputError if there is no such file or it is not XML.
-    """
-    path = path_of(scene)
-    known, waiting = [path], [path]
-    while waiting:
-        for name in _named(waiting.pop(), scene):
-            beside = path.parent / name  # also for names in included files, as Mitsuba resolves them
-            if beside.is_file() and beside not in known:
-                known.append(beside)
-                if beside.suffix.lower() == ".xml":
-                    waiting.append(beside)
-    return known
-
-
-def _named(path: Path, scene: Scene) -> list[str]:
-    where = f"{scene.source}: world.file"
-    try:
-        elements = ElementTree.parse(path).getroot().iter()
-    except FileNotFoundError as error:
-        raise InputError(f"{where}: there is no Mitsuba scene {path}; name one, beside the scene file") from error
-    except (OSError, ValueError, LookupError) as error:
-        raise InputError(f"{where}: {path} could not be read as a Mitsuba scene ({error})") from error
-    except ElementTree.ParseError as error:
-        raise InputError(f"{where}: {path} is not valid XML: {error}; correct it there") from error
-    names = [
-        element.get("value" if element.tag == "string" else "filename")
-        for element in elements
-        if element.tag in ("include", "spectrum") or (element.tag == "string" and element.get("name") == "filename")
-    ]
-    return [name for name in names if name]
+    """Return the world's file and those that it names. Raises InputError for one that may not be read."""
+    return checked(scene).files
 
 
 def describe(scene: Scene) -> dict[str, Any]:
@@ -117,8 +93,8 @@ def describe(scene: Scene) -> dict[str, Any]:
     folder = path_of(scene).parent
     sums: dict[str, str] = {}
     for path in files(scene):
-        with path.open("rb") as stream:
-            sums[os.path.relpath(path, folder)] = hashlib.file_digest(stream, "sha256").hexdigest()
+        with open_input(path) as stream:
+            sums[os.path.relpath(path, folder)] = hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
     place, has_target = world.describe_place(), scene.target.image is not None
     return {"white": world.white, "target": has_target, "files": sums, **({"place": place} if place else {})}
 
@@ -132,43 +108,34 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
     activate(variant)
     import mitsuba as mi
 
-    file = str(path_of(scene))
-    where = f"{scene.source}: world.file: {file}"
-    files(scene)  # its errors are clearer than Mitsuba's
-    config = mi.parser.ParserConfig(variant)
+    where, world = f"{scene.source}: world.file: {printable(path_of(scene))}", checked(scene)
+    try_world(world, variant, where)
     try:
-        state = mi.parser.parse_file(config, file)
-        if state.root.type != mi.ObjectType.Scene:
-            raise InputError(f"{where} holds a single {state.root.type.name.lower()}; expected a whole <scene>")
-        sensors = [node.props for node in _nodes(state) if node.type == mi.ObjectType.Sensor]
-        placement = _placement(scene, sensors, where)
-        has_integrator = _adapt(state, Path(file).parent)
-        mi.parser.transform_all(config, state)
+        parsed = parse_world(world.text, variant)
+        placement = _placement(scene, parsed.sensors, where)
         if target is not None:
             shape: Any = mi.load_dict({**target, "to_world": placement.to_world(target["to_world"])})
             shape.set_id(TARGET)  # by which its parameters are identified
-            state.root.props[TARGET] = shape
-        built: Any = mi.parser.instantiate(config, state)
+            parsed.state.root.props[TARGET] = shape
+        built = parsed.build()
     except (RuntimeError, TypeError) as error:
-        reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
-        raise InputError(f"{where} is no scene that Mitsuba can build: {reason}") from error
+        raise InputError(f"{where} is no scene that Mitsuba can build: {reason_of(str(error), world)}") from error
     if not built.emitters():
         raise InputError(f"{where} has no emitter, so the image is black; add one, such as <emitter type='constant'/>")
-    if not has_integrator:
+    if not parsed.has_integrator:
         direct_only = not (scene.render.complete or has_interreflections(built))
         path = {"type": "path", "max_depth": 1 if direct_only else DEEPEST, "block_size": BLOCK}
-        return StagedWorld(built, mi.load_dict(path), placement, len(sensors), direct_only)
+        return StagedWorld(built, mi.load_dict(path), placement, len(parsed.sensors), direct_only)
     if not isinstance(built.integrator(), mi.SamplingIntegrator):
         raise InputError(f"{where}: its integrator does not follow rays from a camera; expected one such as 'path'")
-    return StagedWorld(built, built.integrator(), placement, len(sensors))
-
-
-def _nodes(state: Any) -> list[Any]:
-    """Return the nodes of a parsed file that stand in its root."""
-    import mitsuba as mi
-
-    root, resolved = state.root.props, mi.Properties.Type.ResolvedReference
-    return [state.nodes[root[key].index()] for key in list(root.keys()) if root.type(key) == resolved]
+    more = built.integrator().aov_names()
+    if more:
+        words = printable(", ".join(more), 60)
+        raise InputError(
+            f"{where}: its integrator returns {len(more)} more channels ({words}); expected the radiance alone, as of"
+            " 'path': remove 'aov' and 'moment'"
+        )
+    return StagedWorld(built, built.integrator(), placement, len(parsed.sensors))
 
 
 def _placement(scene: Scene, sensors: list[Any], where: str) -> Placement:
@@ -201,30 +168,6 @@ def _pose_of_sensor(table: WorldTable, sensors: list[Any], where: str) -> Placem
             f"{asks}: expected a to_world that moves and rotates, got one that shears or stretches; correct it there"
         )
     return placement
-
-
-def _adapt(state: Any, folder: Path) -> bool:
-    """Remove the sensors, make paths of files absolute, and return True if there is an integrator."""
-    import mitsuba as mi
-
-    types = mi.Properties.Type
-    has_integrator = False
-    root = state.root.props
-    for key in list(root.keys()):
-        if root.type(key) == types.ResolvedReference:
-            node_type = state.nodes[root[key].index()].type
-            has_integrator |= node_type == mi.ObjectType.Integrator
-            if node_type == mi.ObjectType.Sensor:
-                del root[key]
-    for node in state.nodes:
-        props = node.props
-        if "filename" in props and props.type("filename") == types.String:
-            beside = folder / props["filename"]
-            if beside.is_file():
-                props["filename"] = str(beside)
-        if node.type == mi.ObjectType.Integrator and props.plugin_name() != BACKWARDS:
-            props["block_size"] = BLOCK
-    return has_integrator
 
 
 def has_interreflections(world: Any) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ommatid.runtime.errors import MachineError
+from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.formats import npz
 
@@ -71,6 +71,8 @@ def open_checkpoint(path: Path, fingerprint: str) -> Generator[Checkpoint]:
     checkpoint = Checkpoint(path, fingerprint)
     try:
         yield checkpoint
+    except InputError:  # the next run would be refused as well
+        raise
     except BaseException:
         try:
             checkpoint.save()

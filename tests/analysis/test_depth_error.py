@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from ommatid.analysis.depth_error import PICTURE, depth_error_of_run, disparity, draw, error_by_depth, rows
 from ommatid.scenes.formats.exr import Part, write
-from ommatid.scenes.formats.picture import decode, write_truth
+from ommatid.scenes.formats.picture import write_truth
+from ommatid.scenes.formats.picture_file import decode
 from ommatid.scenes.scene import TRUTH
 
 from ..examples import camera as camera_of

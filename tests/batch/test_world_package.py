@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import pytest
 from skimage.io import imsave
 
 from ommatid.batch.batch import prepare
-from ommatid.batch.remote import RunObserver, carry_out, outcome_of, packed, unpack
-from ommatid.batch.world_package import packed_world, unpacked_world
+from ommatid.batch.remote import RunObserver, SceneOutcome, carry_out, outcome_of, packed, unpack
+from ommatid.batch.world_package import WorldPackage, packed_world, unpacked_world
 from ommatid.pipeline.stages import open_scene, results, run
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr
@@ -27,6 +28,7 @@ WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_wor
 DEEP = TINY.replace('image = "photo:camera"\norigin = [100, 230]\n', "").replace(
     "[noise]", '[world]\nfile = "places/world.xml"\nwhite = "auto"\n\n[noise]'
 )
+OUTSIDE_TOO = ("--allow-outside",)  # the picture lies beside the folder of the world's file
 
 
 @pytest.fixture
@@ -48,7 +50,7 @@ def without_page(setup: Setup, folder: Path, observer: RunObserver) -> dict[str,
 
 
 def test_a_world_gives_the_same_results_on_a_machine_without_its_files(deep: Path, here: Path) -> None:
-    folder, alone, setup = here / "out", here / "alone", open_scene(deep)
+    folder, alone, setup = here / "out", here / "alone", open_scene(deep, OUTSIDE_TOO)
     assert outcome_of(lambda observer: without_page(setup, alone, observer)).error is None
     prepare(setup, folder)
     package = packed(setup, folder)
@@ -64,14 +66,14 @@ def test_a_world_gives_the_same_results_on_a_machine_without_its_files(deep: Pat
 
 
 def test_a_scene_with_a_world_is_rendered_on_a_cluster(deep: Path, here: Path, address: str, ommatid: Command) -> None:
-    ended = ommatid("render", str(deep), "-o", "out", "--scheduler", address)
+    ended = ommatid("render", str(deep), *OUTSIDE_TOO, "-o", "out", "--scheduler", address)
     assert ended.code == 0, ended.err
     assert {path.name for path in (here / "out" / "deep").iterdir()} == {"scene.toml", "truth.exr", "stack.exr"}
 
 
 def test_messages_about_a_world_name_the_users_files(deep: Path, here: Path) -> None:
     (here / "places" / "wall.xml").write_text('<scene version="3.0.0"></scene>', encoding="utf-8")
-    folder, setup = here / "out" / "deep", open_scene(deep)
+    folder, setup = here / "out" / "deep", open_scene(deep, OUTSIDE_TOO)
     prepare(setup, folder)
     outcome = carry_out(run, packed(setup, folder))
     assert isinstance(outcome.error, InputError)
@@ -79,7 +81,7 @@ def test_messages_about_a_world_name_the_users_files(deep: Path, here: Path) -> 
 
 
 def test_the_files_of_a_world_keep_their_places(deep: Path, tmp_path: Path) -> None:
-    package = packed_world(open_scene(deep).scene)
+    package = packed_world(open_scene(deep, OUTSIDE_TOO).scene)
     assert package.contents.keys() == {"places/world.xml", "places/wall.xml", "pictures/wall.png"}
     assert unpacked_world(package, tmp_path / "copy") == tmp_path / "copy" / "places" / "world.xml"
     for name, written in package.contents.items():
@@ -90,11 +92,46 @@ def test_a_file_with_an_absolute_name_is_refused(deep: Path, here: Path) -> None
     picture = here / "pictures" / "wall.png"
     (here / "places" / "wall.xml").write_text(WALL.format(picture=picture), encoding="utf-8")
     with pytest.raises(InputError, match=r"deep\.toml: world\.file: names .*wall\.png, which other machines"):
-        packed_world(open_scene(deep).scene)
+        packed_world(open_scene(deep, OUTSIDE_TOO).scene)
 
 
 def test_the_file_of_a_spectrum_belongs_to_its_world(deep: Path, here: Path) -> None:
     lamp = '<emitter type="constant"><spectrum name="radiance" filename="lamp.spd"/></emitter>'
     (here / "places" / "wall.xml").write_text(f'<scene version="3.0.0">{lamp}</scene>', encoding="utf-8")
     (here / "places" / "lamp.spd").write_text("400 1\n700 1\n", encoding="utf-8")
-    assert [path.name for path in files(open_scene(deep).scene)] == ["world.xml", "wall.xml", "lamp.spd"]
+    assert [path.name for path in files(open_scene(deep, OUTSIDE_TOO).scene)] == ["world.xml", "wall.xml", "lamp.spd"]
+
+
+OUTSIDE = ("../x", "a/../../x", "/tmp/x", "..", "", "a/b/../../../x")
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_no_file_of_another_machine_is_written_outside_its_folder(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    good = {"run.json": b"1", "b": b"2"}
+    with pytest.raises(InputError, match="expected one inside this folder"):
+        unpack(SceneOutcome({**good, name: b"3"}, {}, {}), folder)
+    with pytest.raises(InputError, match="expected one inside this folder"):
+        unpack(SceneOutcome(good, {}, {}, removed=(name,)), folder)
+    for package in (WorldPackage("/", "b", {**good, name: b"3"}), WorldPackage("/", name, good)):
+        with pytest.raises(InputError, match="expected one inside this folder"):
+            unpacked_world(package, folder)
+    assert [*tmp_path.iterdir()] == [folder]
+    assert [*folder.iterdir()] == []
+
+
+def test_a_package_that_leads_out_of_a_workers_folder_is_refused(
+    deep: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(here / "scratch"))
+    (here / "scratch").mkdir()
+    setup = open_scene(deep, OUTSIDE_TOO)
+    package = packed(setup, here / "out")
+    assert package.world is not None
+    world = replace(package.world, contents={**package.world.contents, "../../escaped": b"x"})
+    outcome = carry_out(run, replace(package, world=world))
+    assert isinstance(outcome.error, InputError)
+    with pytest.raises(InputError, match="expected one inside this folder"):
+        carry_out(run, replace(package, files={"../escaped": b"x"}))
+    assert [*(here / "scratch").iterdir()] == []

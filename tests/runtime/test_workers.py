@@ -20,7 +20,9 @@ import pytest
 from distributed import LocalCluster
 
 from ommatid.runtime.errors import InputError, MachineError
-from ommatid.runtime.execution import pool, workers
+from ommatid.runtime.execution import cluster as cluster_options
+from ommatid.runtime.execution import workers
+from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.dask_cluster import SILENT
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.progress import no_progress
@@ -101,7 +103,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("options", [{}, {"threads": 3}, {"count": 2}, {"scheduler": "address"}], ids=str)
 def test_results_are_in_the_order_of_the_items(options: dict[str, Any], address: str) -> None:
     progress: list[float] = []
-    arguments: dict[str, Any] = {"scheduler": address} if "scheduler" in options else options
+    arguments: dict[str, Any] = {"cluster": Cluster(address)} if "scheduler" in options else options
     with worker_pool(**arguments) as pool:
         results = pool.map(digits_and_process, range(8), progress.append, 8)
     assert [values for values, _ in results] == [digits(seed) for seed in range(8)]
@@ -137,7 +139,7 @@ def test_threads_work_at_the_same_time() -> None:
 @pytest.mark.parametrize("error", [InputError, MachineError, ZeroDivisionError])
 @pytest.mark.parametrize("remote", [False, True])
 def test_a_failure_is_the_same_here_and_on_a_cluster(error: type[Exception], remote: bool, address: str) -> None:
-    with worker_pool(address if remote else "") as pool:
+    with worker_pool(Cluster(address) if remote else None) as pool:
         with pytest.raises(error, match=r"^the picture is upside down; turn it$"):
             pool.map(fine_or_raises, [None, error, None], no_progress, 3)
         ended = {task.index: task for task in pool.each(fine_or_raises, [None, error, None])}
@@ -147,7 +149,7 @@ def test_a_failure_is_the_same_here_and_on_a_cluster(error: type[Exception], rem
 
 
 def test_a_large_item_causes_no_warning(address: str) -> None:
-    with worker_pool(address) as pool:
+    with worker_pool(Cluster(address)) as pool:
         assert pool.map(len, [bytes(20_000_000)], no_progress, 1) == [20_000_000]
 
 
@@ -219,7 +221,7 @@ def test_a_lost_connection_is_reported() -> None:
 
 
 def test_workers_with_other_versions_are_refused(address: str) -> None:
-    with worker_pool(address) as pool:
+    with worker_pool(Cluster(address)) as pool:
         pool.check_versions(python_version)
         expected = rf"--scheduler {address}: .* numpy \d+, here {os.getpid()}; install the same versions"
         with pytest.raises(InputError, match=expected):
@@ -235,7 +237,7 @@ def test_a_scheduler_without_workers_is_refused() -> None:
     with (
         start(n_workers=0, host="127.0.0.1", silence_logs=SILENT, **options) as cluster,
         pytest.raises(InputError, match=r"--scheduler .*has no workers; start some with `dask worker tcp://"),
-        worker_pool(cluster.scheduler_address),
+        worker_pool(Cluster(cluster.scheduler_address)),
     ):
         pass
 
@@ -262,12 +264,13 @@ def test_wrong_options_are_refused_in_one_line(
     [line] = ended.err.splitlines()
     assert line.startswith("ommatid: ")
     assert message in line
+    assert not (here / "out").exists()
 
 
 def test_without_dask_the_message_says_what_to_install(
     here: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pool, "find_spec", lambda _: None)
+    monkeypatch.setattr(cluster_options, "find_spec", lambda _: None)
     ended = ommatid("run", here / "tiny.toml", "-o", "out", "--scheduler", "tcp://127.0.0.1:8786")
     assert ended.code == 2
     expected = "needs Dask, which is not installed; run: pip install 'ommatid[cluster]'"

@@ -226,7 +226,7 @@ def test_light_that_is_not_seen_or_not_detected_is_refused() -> None:
         ("500, 1\n600, nan\n", "line 2: expected a wavelength"),
         ("500, 1\n400, 1\n", "ascending"),
         ("", "got 0"),
-        ("# " + "x" * 2_000_000, "at most 1000000 bytes"),
+        ("# " + "x" * 2_000_000, "at most 1 MB"),
     ],
 )
 def test_damaged_curves_are_refused(content: str, words: str, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +163,25 @@ def test_a_sensor_s_stack_without_frames_is_refused(tmp_path: Path) -> None:
         exr.write(path, parts)
         with pytest.raises(InputError, match=r"part 'A\.01\.00' should say flat_value"):
             stack.read(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_variances_that_cannot_be_are_refused(value: float, tmp_path: Path) -> None:
+    first = example()
+    first.variance[3] = value
+    stack.write(tmp_path / "s.exr", first)
+    with pytest.raises(InputError, match=r"s\.exr: expected"):
+        stack.read(tmp_path / "s.exr")
+
+
+@pytest.mark.parametrize("key", ["surfaces", "shape"])
+def test_a_stack_names_no_file_that_is_read(key: str, tmp_path: Path) -> None:
+    first = example()
+    lenses = (first.scene.camera.lens[0].model_copy(update={"surfaces": "/dev/zero"}), *first.scene.camera.lens[1:])
+    changes = {
+        "surfaces": {"camera": first.scene.camera.model_copy(update={"lens": lenses})},
+        "shape": {"target": first.scene.target.model_copy(update={"shape": None})},
+    }[key]
+    stack.write(tmp_path / "s.exr", replace(first, scene=first.scene.model_copy(update=changes)))
+    with pytest.raises(InputError, match="expected a scene with"):
+        stack.read(tmp_path / "s.exr")

@@ -145,7 +145,7 @@ REFUSED = {
     "dispersion": ("1.5168 64.17", "1.5168 1e-300", "surface 6: expected .* vd .* from 5 to 200, got 1e-300"),
     "stops": ("SURF 4", "SURF 4\n  STOP", "expected one aperture stop at most, got 2"),
     "steep": ("CURV 0.1", "CURV 1e-300", "surface 3: radius: expected"),
-    "many": ("SURF 4", "SURF 4\n" * 2000, "expected at most 1000 surfaces"),
+    "many": ("SURF 4", "SURF 4\n" * 2000, "expected at most 200 surfaces"),
 }
 
 
@@ -171,7 +171,7 @@ def test_files_without_a_lens_are_refused(tmp_path: Path) -> None:
         read_lens(tmp_path / "other.zmx")
     with (tmp_path / "lens.zmx").open("wb") as stream:
         stream.truncate(2**24 + 1)
-    with pytest.raises(InputError, match="at most 16 MiB"):
+    with pytest.raises(InputError, match=r"at most 16\.8 MB"):
         read_lens(tmp_path / "lens.zmx")
 
 

@@ -262,7 +262,7 @@ def test_a_changed_world_or_file_of_it_is_rendered_again(tmp_path: Path) -> None
     ("content", "complaint"),
     [
         ("<shape", "is not valid XML"),
-        ('<shape type="egg"/>', '"egg" not found'),
+        ('<shape type="egg"/>', "a plugin that Mitsuba ships, got type 'egg'"),
         ('<shape type="sphere"><float name="weight" value="1"/></shape>', "unreferenced property"),
         ('<shape type="obj"><string name="filename" value="none.obj"/></shape>', "none.obj"),
         ('<shape type="sphere"/>', "has no emitter"),

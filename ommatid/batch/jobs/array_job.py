@@ -6,9 +6,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 
 AUTO = "auto"
+MOST_JOBS, LONGEST = 100_000, 20  # jobs of a batch, and digits of a number
 TASK, FIRST, LAST, COUNT = (f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "COUNT"))
 INDICES = (TASK, "PBS_ARRAY_INDEX")  # number of this job, as SLURM and PBS say it
 EXPECTED = '--job: expected I/N, such as 2/8, or in a job array /N or "auto"'
@@ -34,14 +35,14 @@ def read_job(text: str, environment: Mapping[str, str]) -> ArrayJob:
     """
     if text == AUTO:
         return _whole_array(environment)
-    match = re.fullmatch(r"(\d*)/(\d+)", text.strip())
+    match = re.fullmatch(r"(\d*)/(\d+)", text.strip(), re.ASCII)
     if match is None:
-        raise InputError(f"{EXPECTED}, got '{text}'")
-    count = int(match[2])
+        raise InputError(f"{EXPECTED}, got '{shortened(text)}'")
+    count = _number("--job", match[2])
     name, index = ("", match[1]) if match[1] else _index(environment, text)
     if not 1 <= _number(name, index) <= count:
         origin = f", which is {name}; submit the jobs as an array from 1 to {count}" if name else ""
-        raise InputError(f"--job {text}: expected a job from 1 to {count}, got {index}{origin}")
+        raise InputError(f"--job {shortened(text)}: expected a job from 1 to {count}, got {index}{origin}")
     return ArrayJob(int(index), count)
 
 
@@ -72,6 +73,9 @@ def _whole_array(environment: Mapping[str, str]) -> ArrayJob:
 
 
 def _number(name: str, text: str) -> int:
-    if not text.isdecimal():
-        raise InputError(f"--job: expected a whole number in {name}, got '{text}'; write I/N, such as 1/8")
+    if not text.isdecimal() or len(text) > LONGEST or int(text) > MOST_JOBS:
+        raise InputError(
+            f"--job: expected a whole number of at most {MOST_JOBS} as {name}, got '{shortened(text)}';"
+            " write I/N, such as 1/8"
+        )
     return int(text)

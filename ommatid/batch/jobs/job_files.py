@@ -10,6 +10,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from ommatid.runtime.input_files import read_text
+
 
 def replace_text(path: Path, text: str, temporary: Path) -> None:
     """Write a file atomically. `temporary` is a name in the same folder that only this job uses."""
@@ -33,7 +35,7 @@ def claimed_text(path: Path, text: str, temporary: Path) -> str:
                 temporary.replace(path)
         temporary.unlink(missing_ok=True)
         try:
-            return path.read_text(encoding="utf-8")
+            return read_text(path)
         except FileNotFoundError:  # removed since
             continue
 

@@ -13,14 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import make_folder
+from ommatid.runtime.input_files import read_bytes, read_text
 
 from ..batch import Member
 from ..sweep_row import SweepRow
-from .array_job import ArrayJob
+from .array_job import MOST_JOBS, ArrayJob
 from .job_files import claimed_text, replace_text
 
 Result = TypeVar("Result")
@@ -41,11 +42,18 @@ class JobPlan(_JobFile):
     shares : indices of the scenes of every job;  versions : those of the machine that made the plan
     """
 
-    jobs: int
+    jobs: int = Field(ge=1, le=MOST_JOBS)
     command: tuple[str, ...]
     scenes: dict[str, tuple[str, ...]]
     versions: dict[str, str]
     shares: tuple[tuple[int, ...], ...] = ()
+
+    @model_validator(mode="after")
+    def _check_shares(self) -> JobPlan:
+        indices = [index for share in self.shares for index in share]
+        if self.shares and (len(self.shares) != self.jobs or sorted(indices) != list(range(len(self.scenes)))):
+            raise ValueError("expected every scene in the share of one job")
+        return self
 
     def difference(self, other: JobPlan) -> str:
         """Say what these jobs do, not those of another plan; empty if they do the same."""
@@ -143,6 +151,9 @@ class JobShare:
                 by_folder |= {scene.folder: scene for scene in _JobRecord.model_validate_json(text).scenes}
             except ValidationError as error:
                 raise InputError(f"{self._record(number)}: is damaged; repeat job {number}") from error
+        for name in self.plan.scenes:
+            if name not in by_folder:
+                raise InputError(f"{self.folder}: no job has a record of {shortened(name)}; repeat the jobs")
         return [by_folder[name] for name in self.plan.scenes]
 
     def begin(self) -> None:
@@ -207,9 +218,12 @@ def join_jobs(
 
 def _read_plan(path: Path) -> JobPlan:
     try:
-        return JobPlan.model_validate_json(path.read_bytes())
-    except ValidationError as error:
+        plan = JobPlan.model_validate_json(read_bytes(path))
+        if not plan.shares:
+            raise ValueError("a plan without shares")
+    except ValueError as error:
         raise InputError(f"{path}: expected the plan of jobs, got something else; delete {path.parent}") from error
+    return plan
 
 
 def _records(plan: JobPlan, folder: Path, number: int) -> dict[int, str]:
@@ -217,7 +231,7 @@ def _records(plan: JobPlan, folder: Path, number: int) -> dict[int, str]:
     records: dict[int, str] = {}
     for job in range(1, plan.jobs + 1):
         with suppress(FileNotFoundError):
-            records[job] = _record(folder, number, job).read_text(encoding="utf-8")
+            records[job] = read_text(_record(folder, number, job))
     return records
 
 

@@ -5,60 +5,130 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import ssl
 import sys
 import warnings
 from collections.abc import Callable, Generator
+from concurrent.futures import Executor, Future
 from contextlib import closing, contextmanager
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from threading import Thread
+from typing import Any, TypeVar
 
 from ..errors import InputError, MachineError
+from ..printable import printable
 from . import workers
+from .cluster import TLS_OPTIONS, Cluster
 from .workers import LOST, Workers
+
+Result = TypeVar("Result")
 
 SILENT = logging.CRITICAL + 1
 _LOGGERS = ("distributed", "distributed.client", "distributed.gc", "tornado", "tornado.application", "asyncio")
 
 
 @contextmanager
-def cluster_workers(address: str) -> Generator[Workers]:
-    """Connect to the cluster whose scheduler is at `address`. Raises InputError if it does not answer or is empty."""
-    with _settings(), _connected(address) as client:
-        yield _ClusterWorkers(client, address)
+def cluster_workers(cluster: Cluster) -> Generator[Workers]:
+    """Connect to a cluster. Raises InputError if its scheduler does not answer, or if it has no workers."""
+    with _settings(), _connected(cluster) as client:
+        yield _ClusterWorkers(client, cluster)
 
 
 class _ClusterWorkers(Workers):
     """Workers whose installations may differ from this one."""
 
-    def __init__(self, client: Any, address: str) -> None:
-        super().__init__(client.get_executor(pure=False), self._count_threads)
+    def __init__(self, client: Any, cluster: Cluster) -> None:
+        self._executor = _CheckingExecutor(client.get_executor(pure=False))
+        super().__init__(self._executor, self._count_threads)
         self._client = client
-        self._address = address
+        self._cluster = cluster
 
     def _count_threads(self) -> int:
         try:
-            return sum(self._client.nthreads().values())
+            return sum(_answer(self._client.nthreads, workers.ANSWER).values())
         except OSError as error:
             raise MachineError(LOST) from error
 
     def check_versions(self, facts: Callable[[], dict[str, str]]) -> None:
         expected = facts()
-        answers: dict[str, dict[str, str] | Exception] = self._client.run(facts, on_error="return")
+        try:
+            answers: dict[str, Any] = _answer(partial(self._client.run, facts, on_error="return"), workers.ANSWER)
+        except TimeoutError as error:
+            raise InputError(
+                f"{self._cluster}: not all workers answered within {workers.ANSWER:g} s; restart those that hang"
+            ) from error
         for worker, answer in answers.items():
             if isinstance(answer, Exception):
-                raise InputError(
-                    f"--scheduler {self._address}: the worker {worker} cannot work for this program"
-                    f" ({type(answer).__name__}: {answer}); install the same version of ommatid there"
-                )
-            different = [
-                f"{name} {answer.get(name)}, here {value}"
-                for name, value in expected.items()
-                if answer.get(name) != value
-            ]
-            if different:
-                raise InputError(
-                    f"--scheduler {self._address}: results would differ, because the worker {worker} has"
-                    f" {'; '.join(different)}; install the same versions on all machines"
-                )
+                raise InputError(_unusable(self._cluster, worker, answer))
+            _check_same(str(self._cluster), worker, expected, answer)
+        self._executor.require(_Requirement(str(self._cluster), facts, expected))
+
+
+@dataclass(frozen=True)
+class _Requirement:
+    """What has to be the same on a worker, also on one that joins the cluster later."""
+
+    cluster: str
+    facts: Callable[[], dict[str, str]]
+    expected: dict[str, str]
+
+    def execute(self, task: Callable[[], Result]) -> Result:
+        """Execute a task on this worker. Raises InputError if the worker differs."""
+        from distributed import get_worker
+
+        _check_same(self.cluster, get_worker().address, self.expected, self.facts())
+        return task()
+
+
+class _CheckingExecutor(Executor):
+    """Sends tasks to a cluster, where each is preceded by the check of its worker."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
+        self._requirement: _Requirement | None = None
+
+    def require(self, requirement: _Requirement) -> None:
+        """Check the workers of all tasks that are submitted from now on."""
+        self._requirement = requirement
+
+    def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
+        if self._requirement is None:
+            return self._executor.submit(fn, *args, **kwargs)
+        return self._executor.submit(self._requirement.execute, partial(fn, *args, **kwargs))
+
+
+def _check_same(cluster: str, worker: str, expected: dict[str, str], facts: dict[str, str]) -> None:
+    """Raise InputError if the facts of a worker are not those expected."""
+    different = [
+        f"{name} {facts.get(name)}, here {value}" for name, value in expected.items() if facts.get(name) != value
+    ]
+    if different:
+        raise InputError(
+            f"{cluster}: results would differ, because the worker {printable(worker)} has"
+            f" {printable('; '.join(different), 120)}; install the same versions on all machines"
+        )
+
+
+def _unusable(cluster: Cluster, worker: str, error: Exception) -> str:
+    return (
+        f"{cluster}: the worker {printable(worker)} cannot work for this program"
+        f" ({printable(f'{type(error).__name__}: {error}', 100)}); install the same version of ommatid there"
+    )
+
+
+def _answer(question: Callable[[], Result], patience: float) -> Result:
+    """Return what a cluster answers. Raises TimeoutError if it does not: Dask itself would wait without end."""
+    answer: Future[Result] = Future()
+
+    def ask() -> None:
+        try:
+            answer.set_result(question())
+        except BaseException as error:  # is raised where the answer is expected
+            answer.set_exception(error)
+
+    Thread(target=ask, daemon=True).start()
+    return answer.result(patience)
 
 
 def scratch_folder() -> str | None:
@@ -74,36 +144,70 @@ def scratch_folder() -> str | None:
 
 
 @contextmanager
-def _connected(address: str) -> Generator[Any]:
+def _connected(cluster: Cluster) -> Generator[Any]:
     """Connect a client to a cluster with at least one worker. Raises InputError."""
     from distributed import Client
 
+    security = _security(cluster)
+    start = partial(Client, cluster.address, security=security, timeout=workers.PATIENCE, set_as_default=False)
     try:
-        asyncio.run(_check_scheduler(address))
-        client = Client(address, timeout=workers.PATIENCE, set_as_default=False)
+        asyncio.run(_check_scheduler(cluster, security))
+        client: Any = _answer(start, 2 * workers.PATIENCE + 1)
     except Exception as error:  # another server at this address may answer anything
-        raise InputError(
-            f"--scheduler {address}: no scheduler answers there; start one with `dask scheduler`,"
-            " or correct the address"
-        ) from error
+        raise InputError(f"{cluster}: {_reason(cluster, error)}") from error
     with closing(client):
         try:
-            client.wait_for_workers(1, workers.PATIENCE)
+            _answer(partial(client.wait_for_workers, 1, workers.PATIENCE), workers.PATIENCE + 1)
         except TimeoutError as error:
             raise InputError(
-                f"--scheduler {address}: the scheduler has no workers; start some with `dask worker {address}`"
+                f"{cluster}: the scheduler has no workers; start some with `dask worker {cluster.address}`"
             ) from error
         yield client
 
 
-async def _check_scheduler(address: str) -> None:
-    """Return if a Dask scheduler answers; at another server's address the client itself would wait forever."""
+def _security(cluster: Cluster) -> Any:
+    """Return the certificates of --tls-ca and its kin, or else those of Dask's configuration. Raises InputError."""
     from distributed import Security
+
+    security: Any = Security
+    if cluster.authority is not None:
+        return security(
+            tls_ca_file=str(cluster.authority),
+            tls_client_cert=str(cluster.certificate),
+            tls_client_key=str(cluster.key),
+            require_encryption=True,
+        )
+    try:
+        configured = security()
+        encrypted = configured.get_connection_args("client").get("ssl_context") is not None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{cluster}: Dask's configuration names files that cannot be used ({error})") from error
+    if cluster.address.startswith("tls://") and not encrypted:
+        raise InputError(
+            f"{cluster}: expected {', '.join(TLS_OPTIONS)} with it, got none, nor are they in Dask's settings"
+        )
+    return configured
+
+
+def _reason(cluster: Cluster, error: BaseException) -> str:
+    """Return why there is no connection, and what to do."""
+    causes: list[BaseException] = []
+    while error not in causes:
+        causes.append(error)
+        error = error.__cause__ or error.__context__ or error
+    if any(isinstance(cause, ssl.SSLCertVerificationError) for cause in causes):
+        return "the certificate of the scheduler was not signed by --tls-ca; take the authority that signed it"
+    if cluster.address.startswith("tls://"):
+        return "no encrypted scheduler answers there that accepts --tls-cert; check the address and the certificates"
+    return "no scheduler answers there; start one with `dask scheduler`, or correct the address"
+
+
+async def _check_scheduler(cluster: Cluster, security: Any) -> None:
+    """Return if a Dask scheduler answers; at another server's address the client itself would wait forever."""
     from distributed.comm.core import connect  # pyright: ignore[reportUnknownVariableType]
 
-    security: Any = Security()  # for tls://, with the certificates of Dask's configuration
     options = security.get_connection_args("client")
-    connecting: Any = connect(address, timeout=workers.PATIENCE, **options)  # pyright: ignore[reportUnknownVariableType]
+    connecting: Any = connect(cluster.address, timeout=workers.PATIENCE, **options)  # pyright: ignore[reportUnknownVariableType]
     comm: Any = await asyncio.wait_for(connecting, workers.PATIENCE + 1)
     await comm.close()
 

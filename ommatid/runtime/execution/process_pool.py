@@ -11,30 +11,33 @@ Ctrl-C in workers, ends them with SIGTERM, repeats no task, and gives a worker n
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import pickle
 import signal
+import subprocess
 import traceback
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from queue import SimpleQueue
 from threading import Lock, Thread
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any, TypeVar
 
 from ..errors import MachineError
+from .interpreter import python_command, python_environment
+from .library_warnings import library_warnings, warn_on_stderr
 
 Result = TypeVar("Result")
 
 ATTEMPTS = 3  # workers that may die of a task before it is given up
 PATIENCE = 10.0  # seconds for a worker to stop after it was interrupted
+POLL = 1.0  # seconds between two checks of a worker for its parent
 GIVEN_UP = "every worker that tried it died; it may need more memory than there is"
 
-_SPAWN = multiprocessing.get_context("spawn")
+_SERVE = "from ommatid.runtime.execution.process_pool import serve; serve(*map(int, sys.argv[1:]))"
 
 
 class ProcessPool(Executor):
@@ -79,7 +82,7 @@ class _Worker:
     def __init__(self, index: int, count: int) -> None:
         self._share = index, count
         self._lock = Lock()  # for starting and stopping, which two threads may request at once
-        self._process: Any = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Any = None
         self._stopped = False
 
@@ -104,34 +107,36 @@ class _Worker:
         """Interrupt the running task; start no other process."""
         with self._lock:
             self._stopped = True
-            if self._process is not None and self._process.is_alive():
-                os.kill(self._process.pid, signal.SIGINT)
+            if self._process is not None:
+                self._process.send_signal(signal.SIGINT)  # not sent if it has ended
 
     def join(self, until: float) -> None:
         """Wait for the process to end; kill it after `until`."""
         with self._lock:
             if self._process is not None:
-                self._process.join(max(0.0, until - monotonic()))
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(max(0.0, until - monotonic()))
                 self._process.kill()
-                self._process.join()
+                self._process.wait()
+                self._pipe.close()
 
     def _started(self) -> Connection:
         with self._lock:
             if self._stopped:
                 raise CancelledError
             if self._process is None:
-                self._pipe, other_end = _SPAWN.Pipe()
-                self._process = _SPAWN.Process(target=_serve, args=(other_end, *self._share), daemon=True)
-                self._process.start()
-                other_end.close()  # leaves the worker's own copy, whose closing shows its death
+                self._pipe, other_end = Pipe()
+                with other_end:  # leaves the worker's own copy, whose closing shows its death
+                    self._process = _start_process(other_end.fileno(), *self._share)
             return self._pipe
 
     def _discard(self) -> None:
         """Terminate a process that has closed its pipe."""
         with self._lock:
             self._pipe.close()
-            self._process.kill()
-            self._process.join()
+            if self._process is not None:
+                self._process.kill()
+                self._process.wait()
             self._process = None
 
 
@@ -140,16 +145,28 @@ def _block_interrupts() -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
-def _serve(pipe: Connection, index: int, count: int) -> None:
+def _start_process(descriptor: int, index: int, count: int) -> subprocess.Popen[bytes]:
+    """Start worker `index` of `count`, which talks to the pipe of `descriptor`.
+
+    multiprocessing starts processes that import from the current folder, and run the main script of a user again.
+    """
+    numbers = map(str, (descriptor, os.getpid(), index, count))
+    command = python_command(_SERVE, *numbers)
+    return subprocess.Popen(command, env=python_environment(), stdin=subprocess.DEVNULL, pass_fds=[descriptor])
+
+
+def serve(descriptor: int, parent: int, index: int, count: int) -> None:
     """Run the worker process: execute tasks until the pipe is closed or Ctrl-C arrives."""
+    pipe = Connection(descriptor)
     try:
         signal.signal(signal.SIGINT, _interrupt_once)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         _restrict_processors(index, count)
-        Thread(target=_exit_with_parent, daemon=True).start()
-        while True:
-            signal.signal(signal.SIGINT, _interrupt_once)  # Mitsuba resets it to a handler that interrupts no waiting
-            pipe.send_bytes(_answer(pipe.recv_bytes()))
+        Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
+        with library_warnings(warn_on_stderr):
+            while True:
+                signal.signal(signal.SIGINT, _interrupt_once)  # Mitsuba resets it to one that interrupts no waiting
+                pipe.send_bytes(_answer(pipe.recv_bytes()))
     except (EOFError, OSError, KeyboardInterrupt):
         os._exit(0)  # checkpoints are saved, and the pipe has no reader
 
@@ -178,9 +195,8 @@ def _restrict_processors(index: int, count: int) -> None:
         os.sched_setaffinity(0, available[index % len(available) :: count])
 
 
-def _exit_with_parent() -> None:
-    """End this process when its parent has been killed."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
+def _exit_with_parent(parent: int) -> None:
+    """End this process when its parent has been killed, and so another process has become the parent."""
+    while os.getppid() == parent:
+        sleep(POLL)
     os._exit(1)

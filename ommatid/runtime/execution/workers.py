@@ -14,14 +14,16 @@ from itertools import islice
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from ..errors import MachineError
+from ..errors import InputError, MachineError
 from ..interrupts import interrupts_remembered
+from ..printable import printable
 from ..progress import Progress
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 PATIENCE = 10.0  # seconds to wait for a scheduler that does not answer, or for a cluster without workers
+ANSWER = 60.0  # seconds to wait for the answer of a scheduler that has answered before, and may be busy
 POLL = 0.5  # seconds between two checks for a dropped Ctrl-C
 LOST = "the connection to the scheduler was lost; check that it is running, and repeat the command"
 
@@ -33,13 +35,23 @@ class Completed(Generic[Result]):
     index: int
     _future: Future[Result]
 
+    @property
+    def is_lost(self) -> bool:
+        """Return True if the connection to the cluster was lost before the task had ended."""
+        return self._future.cancelled() or isinstance(self._future.exception(), CancelledError)
+
     def result(self) -> Result:
-        """Return the function's result, or raise its exception. Raises MachineError if no worker survived the task."""
+        """Return the function's result, or raise its exception. Raises MachineError if no worker survived it."""
         try:
             return self._future.result()
         except CancelledError as error:
             raise MachineError(LOST) from error
         except Exception as error:
+            if isinstance(error, ImportError) or str(error).startswith("Can't get attribute"):  # while unpickling
+                raise InputError(
+                    f"a worker lacks a part of this program ({printable(error, 100)}); install the same version"
+                    " of ommatid on all machines"
+                ) from error
             if type(error).__name__ != "KilledWorker":  # of distributed, which need not be installed
                 raise
             raise MachineError(

@@ -64,7 +64,7 @@ def _remembered(content: bytes, pixels: Pixels) -> bytes:
 
 
 def _luminance(values: Any, largest: int) -> Pixels:
-    """Return the grey values from 0 to 255 of (rows, columns, channels) numbers."""
+    """Return the brightness, 0 to 255, of (rows, columns, channels) numbers."""
     colour = values[..., :3] @ LUMINANCE if values.shape[2] >= 3 else values[..., 0].astype(float)
     return Pixels(colour * (255 / largest))
 

@@ -1,0 +1,100 @@
+"""Kinds of places: results are written to regular files in folders, never to devices, FIFOs or sockets.
+
+A symbolic link in place of a result is replaced by the result, and what it points to stays as it is.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+from ..errors import InputError
+from ..input_files import real_path
+from ..printable import printable
+
+# Suffixes of all files that are written; a folder may hold anything else.
+SUFFIXES = frozenset(
+    (".exr", ".npz", ".npy", ".png", ".svg", ".pdf", ".tiff", ".json", ".jsonl", ".csv", ".md", ".html", ".toml")
+)
+SHORT = 110  # characters of each of two paths in one sentence
+_SYSTEM = Path("/dev"), Path("/proc"), Path("/sys")
+_KINDS = {
+    stat.S_IFREG: "a file",
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+def check_output(path: Path, *inputs: Path) -> None:
+    """Raise InputError if a result could not be written to `path`, or would replace one of its `inputs`."""
+    named, parent, mode = printable(path, SHORT), _mode(path.parent), _mode(path)
+    if parent is None:
+        raise InputError(f"{named}: the folder {printable(path.parent, SHORT)} does not exist; create it first")
+    if not stat.S_ISDIR(parent):
+        folder = printable(path.parent, SHORT)
+        raise InputError(f"{named}: expected a file in a folder, but {folder} is {_kind(parent)}")
+    if mode is not None and stat.S_ISDIR(mode):
+        raise InputError(f"{named}: expected the name of a file, got a folder")
+    if mode is not None and not stat.S_ISREG(mode):
+        raise InputError(f"{named}: expected the name of a file, got {_kind(mode)}; choose another name")
+    _check_place(path, path.parent)
+    for source in inputs:
+        if real_path(path) == real_path(source):
+            raise InputError(f"{named}: would replace the file that is read; choose another name with -o")
+
+
+def check_folder(path: Path) -> None:
+    """Raise InputError if results could not be written into the folder `path`, or read there; it may be missing.
+
+    A FIFO or a device with the name of a result would be waited for when the result is looked for.
+    """
+    mode = _mode(path)
+    if mode is None:
+        return
+    if not stat.S_ISDIR(mode):
+        raise InputError(
+            f"{printable(path)}: expected a folder to write to, but {_kind(mode)} of that name is in the way"
+        )
+    _check_place(path, path)
+    with os.scandir(path) as entries:
+        for entry in entries:
+            inside = _mode(path / entry.name) if Path(entry.name).suffix in SUFFIXES else None
+            if inside is not None and not (stat.S_ISREG(inside) or stat.S_ISDIR(inside)):
+                found = f"{printable(path / entry.name)}: expected a regular file, got {_kind(inside)}"
+                raise InputError(f"{found}; remove it or choose another folder")
+
+
+def input_error(path: Path, error: OSError) -> InputError | None:
+    """Return what is wrong with a path as the user gave it; None for a failure of the machine."""
+    if error.errno == errno.ENAMETOOLONG:
+        return InputError(f"{printable(path)}: expected names of at most 255 bytes, got a longer one; shorten it")
+    if error.errno == errno.ELOOP:
+        return InputError(f"{printable(path)}: expected a file or a folder, got links in a circle; remove them")
+    return None
+
+
+def _mode(path: Path) -> int | None:
+    """Return the mode of what a path names, links followed; None if there is nothing. Raises InputError or OSError."""
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # libraries cannot open such names
+        raise InputError(f"{printable(path)}: expected names in UTF-8, got other bytes; rename the file or folder")
+    try:
+        return path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise (input_error(path, error) or error) from error
+
+
+def _check_place(path: Path, folder: Path) -> None:
+    resolved = real_path(folder)
+    if resolved == _SYSTEM[0] or any(resolved.is_relative_to(system) for system in _SYSTEM[1:]):
+        raise InputError(f"{printable(path)}: expected a place for files, got one of the system's, {resolved}")
+
+
+def _kind(mode: int) -> str:
+    return _KINDS.get(stat.S_IFMT(mode), "something else")

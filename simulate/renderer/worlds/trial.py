@@ -1,0 +1,140 @@
+"""Worlds are built once in a process of their own, which may die; only then in this one.
+
+Mitsuba trusts its files: a damaged one may end the process, take all memory, or never end. The process stays for a
+while, so that further worlds do not wait for the start of Mitsuba, which takes most of the time.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import select
+import signal
+import subprocess
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.interpreter import python_command, python_environment
+from ommatid.runtime.files import fingerprint
+from ommatid.runtime.memory import free_memory
+from ommatid.runtime.printable import printable
+
+from .checked_world import CheckedWorld, reason_of
+
+LONGEST = 600.0  # seconds that a world may take
+RESERVE = 100_000_000  # bytes that a world may take even if less are free
+SHOWN = 100
+MODULE = "ommatid.simulate.renderer.worlds.trial_process"
+
+
+@dataclass
+class WorldTrials:
+    """The process that tries worlds, None while there is none, and the fingerprints of those that it built."""
+
+    process: subprocess.Popen[bytes] | None = None
+    built: set[str] = field(default_factory=lambda: set[str]())
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """Return the process, started if it has ended."""
+        if self.process is None or self.process.poll() is not None:
+            self.stop()
+            self.process = subprocess.Popen(
+                python_command(f"from {MODULE} import main; main()"),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                cwd="/",
+                env=python_environment(),
+            )
+        return self.process
+
+    def stop(self) -> None:
+        """End the process, if there is one."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.communicate()
+            self.process = None
+
+
+_trials = WorldTrials()
+atexit.register(_trials.stop)
+
+
+def try_world(world: CheckedWorld, variant: str, where: str, seconds: float = LONGEST) -> None:
+    """Build a checked world in another process, once for the same files.
+
+    where : start of messages, the scene file and the world's
+    Raises InputError if Mitsuba refuses it, or if that process dies or does not end.
+    """
+    files = {str(path): [plugin, *_version(path)] for path, plugin in world.checked.items()}
+    key = fingerprint([world.text, files, variant])
+    if key in _trials.built:
+        return
+    most = max(free_memory(), RESERVE)
+    task = {"variant": variant, "text": world.text, "files": _plugins(world), "memory": most}
+    try:
+        reason = _answer(task, where, seconds)
+    except BaseException:
+        _trials.stop()
+        raise
+    if reason is not None:
+        _trials.stop()  # which may have changed what the next world finds
+        if "bad_alloc" in reason or "MemoryError" in reason or "out of memory" in reason.lower():
+            raise InputError(f"{where} needs more memory than the {most / 1e9:.3g} GB that are free; make it smaller")
+        raise InputError(f"{where} is no scene that Mitsuba can build: {reason_of(reason, world)}")
+    _trials.built.add(key)
+
+
+def _answer(task: dict[str, Any], where: str, seconds: float) -> str | None:
+    """Return why Mitsuba refuses a world, None if it builds it. Raises InputError if the process dies of it."""
+    message, end, at, rest = json.dumps(task).encode() + b"\n", monotonic() + seconds, "", b""
+    process = _trials.start()
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        process.stdin.write(message)
+        process.stdin.flush()
+    except BrokenPipeError:  # it was about to end, since nothing came
+        _trials.stop()
+        process = _trials.start()
+        return _answer(task, where, seconds)
+    while True:
+        if not select.select([process.stdout], [], [], max(end - monotonic(), 0.0))[0]:
+            raise InputError(f"{where}: Mitsuba takes longer than {seconds:g} s to build {_shown(at)}; make it smaller")
+        part = os.read(process.stdout.fileno(), 65536)
+        if not part:
+            raise InputError(f"{where}: {_death(process)} while Mitsuba built {_shown(at)}; correct or remove it")
+        *lines, rest = (rest + part).split(b"\n")
+        for line in lines:
+            words = json.loads(line)
+            if "at" in words:
+                at = str(words["at"])
+            else:
+                return None if words.get("built") else str(words.get("reason"))
+
+
+def _death(process: subprocess.Popen[bytes]) -> str:
+    code = process.wait()
+    if code >= 0:
+        return f"its process ended with code {code}"
+    try:
+        return f"its process died of signal {-code} ({signal.Signals(-code).name})"
+    except ValueError:
+        return f"its process died of signal {-code}"
+
+
+def _shown(at: str) -> str:
+    return f"the file {printable(Path(at).name, SHOWN)}" if at else "it"
+
+
+def _plugins(world: CheckedWorld) -> list[list[str]]:
+    return [[str(path), plugin] for path, plugin in world.checked.items()]
+
+
+def _version(path: Path) -> list[int]:
+    status = path.stat()
+    return [status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino]

@@ -1,0 +1,77 @@
+"""Numbers of every option of every command: bounded on both sides, or refused by one short sentence."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import pytest
+
+from ommatid.batch.jobs.array_job import read_job
+from ommatid.batch.sweep import members, sweep_axes
+from ommatid.cli import options
+from ommatid.cli.app import app
+from ommatid.runtime.errors import InputError
+
+from ..conftest import Command
+
+UNBOUNDED = {"flat_value", "point_value"}  # checked by `options.positive`
+
+
+def numeric() -> dict[str, Any]:
+    """Typer's description of all options that take a number, of all commands."""
+    found: dict[str, Any] = {}
+    for command in app.registered_commands:
+        assert command.callback is not None
+        for name, hint in get_type_hints(
+            command.callback, vars(inspect.getmodule(command.callback)), None, True
+        ).items():
+            inner = get_args(hint)
+            if inner and {int, float} & {inner[0], *get_args(inner[0])} and hasattr(inner[1], "min"):
+                found[name] = inner[1]
+    return found
+
+
+def test_numbers_of_options_have_bounds() -> None:
+    options_with_numbers = numeric()
+    assert {"workers", "seconds", "figure_resolution", "seed", *UNBOUNDED} <= options_with_numbers.keys()
+    for name, option in options_with_numbers.items():
+        assert None not in (option.min, option.max) or name in UNBOUNDED, name
+
+
+@pytest.mark.parametrize("seconds", ["inf", "nan", "1e300", "-1", "", "9" * 5000])
+def test_a_bench_has_a_finite_time(seconds: str, here: Path, ommatid: Command) -> None:
+    ended = ommatid("bench", here / "tiny.toml", "--seconds", seconds)
+    assert (ended.code, ended.out) == (2, "")
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1e13, 1e308, float("inf"), float("nan")])
+def test_extreme_values_are_refused(value: float) -> None:
+    with pytest.raises(InputError, match="expected a value above 0"):
+        options.positive("--flat-value", value)
+
+
+@pytest.mark.parametrize("number", [str(2**63), "9" * 5000, "-" + "9" * 30, "1e5", "inf", "", "\0"])
+def test_extreme_pixels_are_refused(number: str) -> None:
+    for refused in (
+        lambda: options.acquisition(None, None, 1.0, f"{number},1", None),
+        lambda: options.regions([f"0,0,{number},1"]),
+        lambda: read_job(f"1/{number}", {}),
+        lambda: read_job(f"/{number}", {"PBS_ARRAY_INDEX": "1"}),
+        lambda: read_job("/4", {"PBS_ARRAY_INDEX": number or "x"}),
+    ):
+        with pytest.raises(InputError) as refusal:
+            refused()
+        assert len(str(refusal.value)) <= 300
+
+
+def test_combinations_of_a_sweep_are_counted_before_they_are_made() -> None:
+    values = ",".join(map(str, range(2000)))
+    axes = sweep_axes([f"noise.variance={values}", f"render.seed={values}", f"prior.variance={values}"])
+    with pytest.raises(InputError, match="at most 100000 combinations of values, got 8000000000"):
+        members([Path("s.toml")], axes, Path("out"))
+    with pytest.raises(InputError, match="twice") as refusal:
+        sweep_axes([f"noise.variance={values},7"])
+    assert len(str(refusal.value)) <= 300
+    assert len(members([Path("s.toml")], axes[:1], Path("out"))) == 2000

@@ -1,0 +1,104 @@
+"""Surroundings of a run that must not change its result, and what the result is."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tests.conftest import TINY, interpreter
+from tests.modules import ROOT
+from tests.runs import content
+
+# Wall clock of 2001 that goes back by an hour whenever it is read.
+BACKWARDS = "import itertools, time\ntime.time = (1e9 - 3600.0 * n for n in itertools.count()).__next__\n"
+VARYING = {
+    r"[0-9a-f]{64}": "fingerprint",
+    r"\d{4}-\d\d-\d\dT[\d:+]+": "date",
+    r"<(td|dd)>[\d.e+-]+\s(s|ms|min|%)(?=\s|<)": "time",
+    r"(seconds</th>\s*<td>)[\d.e+-]+": "time",
+    r"<code>ommatid run .*?</code>": "command",
+}
+OF_THE_MACHINE = ("versions", "fingerprint", "sha256", "seal")
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Surroundings of a run: variables, Python code before it, and shell commands."""
+
+    name: str
+    variables: Mapping[str, str] = field(default_factory=dict[str, str])
+    before: str = ""
+    shell: str = ""
+    folder: str = "."
+
+
+VARIATIONS = (
+    Variation("again"),
+    Variation("1 thread", {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}),
+    Variation("2 threads", {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}),
+    Variation("1 processor", before="import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"),
+    Variation("locale C", {"LC_ALL": "C"}),
+    Variation("locale C without UTF-8", {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),
+    Variation("Turkish", {"LC_ALL": "tr_TR.UTF-8"}),
+    Variation("German", {"LC_ALL": "de_DE.UTF-8"}),
+    Variation("time zone +14", {"TZ": "Pacific/Kiritimati"}),
+    Variation("time zone unknown", {"TZ": ":/etc/passwd"}),
+    Variation("hash seed 0", {"PYTHONHASHSEED": "0"}),
+    Variation("hash seed 7", {"PYTHONHASHSEED": "7"}),
+    Variation("python -OO", {"PYTHONOPTIMIZE": "2"}),
+    Variation("umask 077", shell="umask 077;"),
+    Variation("64 open files", shell="ulimit -n 64;"),
+    Variation("closed streams", shell="exec <&- >&- 2>&-;"),
+    Variation("no home", {"HOME": "/dev/null/home"}),
+    Variation("dumb terminal of 10 columns", {"TERM": "dumb", "NO_COLOR": "1", "COLUMNS": "10"}),
+    Variation("clock goes back", before=BACKWARDS),
+    Variation("another folder", folder="größe #1 100% ? 'x' \"y\""),
+    Variation("a path of 3900 bytes", folder="/".join(["d" * 200] * 18)),
+)
+EVERYTHING = Variation(
+    "everything at once",
+    {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "TZ": "Pacific/Kiritimati", "PYTHONHASHSEED": "7"}
+    | {"LC_ALL": "tr_TR.UTF-8", "TERM": "dumb", "NO_COLOR": "1", "COLUMNS": "10"},
+    before=BACKWARDS,
+    shell="umask 077; ulimit -n 64;",
+    folder="größe #1 100% ? 'x' \"y\"/" + "/".join(["d" * 200] * 16),
+)
+
+
+def run(variation: Variation, base: Path, python: Sequence[str] = (), options: Sequence[str] = ()) -> Path:
+    """Run the tiny scene below `base`, and return the folder of its result. Raises CalledProcessError if it fails.
+
+    python : command of another interpreter that runs ommatid;  options : of the command
+    """
+    folder = base / variation.folder
+    folder.mkdir(parents=True)
+    (folder / "tiny.toml").write_text(TINY, encoding="utf-8")
+    words = [*(python or interpreter(variation.before)), "run", "tiny.toml", "-o", "out", *options]
+    command = ["sh", "-c", f'{variation.shell} exec "$@"', "sh", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variation.variables}
+    subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    return folder / "out" / "tiny"
+
+
+def result(folder: Path) -> dict[str, Any]:
+    """Everything that a run wrote, without times, dates, the command and versions."""
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    for pattern, word in VARYING.items():
+        page = re.sub(pattern, word, page)
+    return {name: _plain(value) for name, value in content(folder).items()} | {"report.html": page}
+
+
+def differences(found: Mapping[str, Any], expected: Mapping[str, Any]) -> list[str]:
+    """Names of the parts of a result that differ."""
+    return sorted(name for name in {*found, *expected} if found.get(name) != expected.get(name))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items() if key not in OF_THE_MACHINE}  # pyright: ignore
+    return [_plain(inner) for inner in value] if isinstance(value, list) else value  # pyright: ignore

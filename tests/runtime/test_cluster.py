@@ -1,0 +1,318 @@
+"""Clusters: encrypted ones, other servers at the address, other versions, and a scheduler that is lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+from collections.abc import Callable, Generator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import pytest
+from dask import config
+from distributed import LocalCluster, Security
+
+from ommatid.batch.batch import Batch
+from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.execution import workers
+from ommatid.runtime.execution.cluster import Cluster
+from ommatid.runtime.execution.dask_cluster import SILENT, cluster_workers
+from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.progress import no_progress
+
+from ..conftest import TINY, Command
+
+VERSIONS = {"ommatid": "1"}
+
+
+def versions() -> dict[str, str]:
+    return VERSIONS
+
+
+def squared(number: int) -> int:
+    return number**2
+
+
+@contextmanager
+def started(**options: Any) -> Generator[LocalCluster]:
+    """A cluster in this process, which starts in a fraction of a second."""
+    start: Any = LocalCluster
+    fixed = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "memory_limit": 0, "silence_logs": SILENT}
+    quiet = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}, "host": "127.0.0.1"}
+    with start(**{"protocol": "tcp://", **fixed, **quiet, **options}) as cluster:
+        yield cluster
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # of the workers' files
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "PATIENCE", 0.5)
+    monkeypatch.setattr(workers, "ANSWER", 0.5)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two authorities, a and b, and a certificate of each with its key."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    folder = tmp_path_factory.mktemp("certificates")
+    new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2")
+
+    def openssl(*words: str) -> None:
+        subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True)
+
+    for name in "ab":
+        openssl(
+            "req", "-x509", *new, "-subj", f"/CN=authority-{name}", "-keyout", f"{name}-ca.key", "-out", f"{name}-ca"
+        )
+        openssl("req", *new, "-subj", "/CN=member", "-keyout", f"{name}-key", "-out", f"{name}.csr")
+        authority = ("-CA", f"{name}-ca", "-CAkey", f"{name}-ca.key", "-CAcreateserial", "-days", "2")
+        openssl("x509", "-req", "-in", f"{name}.csr", *authority, "-out", f"{name}-cert")
+    (folder / "text").write_text("no certificate\n")
+    openssl("ec", "-in", "a-key", "-aes256", "-passout", "pass:secret", "-out", "locked")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def encrypted(files: Path) -> Generator[str]:
+    """Address of a cluster that admits clients with certificates of authority a."""
+    names = {
+        f"tls_{role}_{part}": str(files / f"a-{part}")
+        for role in ("scheduler", "worker", "client")
+        for part in ("cert", "key")
+    }
+    with (
+        config.set({"temporary-directory": str(files)}),
+        started(
+            security=Security(tls_ca_file=str(files / "a-ca"), **names, require_encryption=True), protocol="tls://"
+        ) as cluster,
+    ):
+        yield cluster.scheduler_address
+
+
+def tls(address: str, files: Path, authority: str = "a-ca", certificate: str = "a-cert", key: str = "a-key") -> Cluster:
+    return Cluster(address, files / authority, files / certificate, files / key)
+
+
+# --- TLS
+
+
+def test_tasks_are_sent_over_an_encrypted_connection(encrypted: str, files: Path) -> None:
+    assert encrypted.startswith("tls://")
+    with worker_pool(tls(encrypted, files)) as pool:
+        assert pool.map(squared, range(4), no_progress, 4) == [0, 1, 4, 9]
+
+
+def test_a_scene_is_rendered_on_an_encrypted_cluster(encrypted: str, files: Path, ommatid: Command) -> None:
+    Path("tiny.toml").write_text(TINY, encoding="utf-8")
+    names = [f"--tls-{part}={files / f'a-{part}'}" for part in ("ca", "cert", "key")]
+    ended = ommatid("render", "tiny.toml", "-o", "out", "--scheduler", encrypted, *names)
+    assert ended.code == 0, ended.err
+    assert Path("out/tiny/stack.exr").is_file()
+
+
+@pytest.mark.usefixtures("impatient")
+def test_strangers_are_refused_on_both_sides(encrypted: str, files: Path) -> None:
+    plain = encrypted.replace("tls://", "tcp://")
+    for cluster, message in (
+        (tls(encrypted, files, "b-ca"), "was not signed by --tls-ca"),
+        (
+            tls(encrypted, files, "a-ca", "b-cert", "b-key"),
+            "no encrypted scheduler answers there that accepts --tls-cert",
+        ),
+        (Cluster(encrypted), "expected --tls-ca, --tls-cert, --tls-key with it, got none"),
+        (Cluster(plain), "no scheduler answers there"),
+    ):
+        with pytest.raises(InputError, match=message) as refused, worker_pool(cluster):
+            pass
+        assert str(refused.value).startswith(f"--scheduler {cluster.address}: ")
+        assert len(str(refused.value)) < 300
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_scheduler_without_encryption_is_named(files: Path) -> None:
+    with started() as cluster:
+        address = cluster.scheduler_address.replace("tcp://", "tls://")
+        with pytest.raises(InputError, match="no encrypted scheduler answers there"), worker_pool(tls(address, files)):
+            pass
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("gone", "a-cert", "a-key"), r"--tls-ca: .*gone cannot be read \(No such file or directory\)"),
+        (("a-ca", "", "a-key"), r"--tls-cert: .* cannot be read \(Is a directory\)"),
+        (("text", "a-cert", "a-key"), "--tls-ca: .*text: expected a certificate in PEM format"),
+        (("a-ca", "text", "a-key"), "expected a certificate and its own key"),
+        (("a-ca", "a-cert", "text"), "expected a certificate and its own key"),
+        (("a-ca", "a-cert", "b-key"), "expected a certificate and its own key"),
+        (("a-ca", "a-cert", "locked"), "expected a certificate and its own key without a password"),
+        (("a-ca", "fifo", "a-key"), "--tls-cert: .*expected a regular file, got a FIFO"),
+    ],
+)
+def test_files_that_are_no_certificates_are_named(names: tuple[str, str, str], message: str, files: Path) -> None:
+    if "fifo" in names and not (files / "fifo").exists():
+        os.mkfifo(files / "fifo")
+    with pytest.raises(InputError, match=message) as refused, worker_pool(tls("tls://127.0.0.1:1", files, *names)):
+        pass
+    assert len(str(refused.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--tls-ca", "x"), "expected --scheduler tls://HOST:PORT with them, got none"),
+        (
+            ("--scheduler", "tcp://127.0.0.1:1", "--tls-key", "x"),
+            "--tls-key: expected --scheduler tls://HOST:PORT with it, got",
+        ),
+        (
+            ("--scheduler", "tls://127.0.0.1:1", "--tls-ca", "x"),
+            "--tls-cert: expected all of --tls-ca, --tls-cert, --tls-key, got only --tls-ca",
+        ),
+    ],
+)
+def test_tls_options_belong_together(options: tuple[str, ...], message: str, ommatid: Command) -> None:
+    Path("tiny.toml").write_text(TINY, encoding="utf-8")
+    for command in ("render", "run"):
+        ended = ommatid(command, "tiny.toml", "-o", "out", *options)
+        assert (ended.code, ended.err.count("\n")) == (2, 1)
+        assert message in ended.err
+        assert not Path("out").exists()
+
+
+# --- other servers
+
+
+def silent(connection: socket.socket) -> None:
+    del connection
+
+
+def closing(connection: socket.socket) -> None:
+    connection.close()
+
+
+def http(connection: socket.socket) -> None:
+    connection.sendall(b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n")
+    connection.close()
+
+
+def huge(connection: socket.socket) -> None:
+    connection.sendall((1 << 40).to_bytes(8, "little") * 100)
+
+
+def endless(connection: socket.socket) -> None:
+    with suppress(OSError):
+        while True:
+            connection.sendall((10**6).to_bytes(8, "little") * 10_000)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("behaviour", [silent, closing, http, huge, endless], ids=lambda function: function.__name__)
+def test_another_server_is_refused_in_one_sentence(behaviour: Callable[[socket.socket], None]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        connections: list[socket.socket] = []
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    connections.append(server.accept()[0])
+                    with suppress(OSError):
+                        behaviour(connections[-1])
+
+        Thread(target=serve, daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(InputError, match="no scheduler answers there"), worker_pool(Cluster(address)):
+            pass
+        for connection in connections:
+            connection.close()
+
+
+class HangingClient:
+    """A client whose scheduler is connected and does not answer, such as a stopped process."""
+
+    def __init__(self) -> None:
+        self.end = Event()
+
+    def get_executor(self, **options: Any) -> Any:
+        del options
+        return self
+
+    def submit(self, *task: Any) -> Future[Any]:
+        del task
+        return Future()
+
+    def nthreads(self) -> dict[str, int]:
+        self.end.wait(30)
+        return {}
+
+    def run(self, *question: Any, **options: Any) -> dict[str, Any]:
+        del question, options
+        return self.nthreads()
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_scheduler_that_stops_answering_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = HangingClient()
+
+    @contextmanager
+    def connected(cluster: Cluster) -> Generator[HangingClient]:
+        del cluster
+        yield client
+        client.end.set()
+
+    monkeypatch.setattr("ommatid.runtime.execution.dask_cluster._connected", connected)
+    with cluster_workers(Cluster("tcp://h:1")) as pool:
+        with pytest.raises(MachineError, match="connection to the scheduler was lost"):
+            pool.map(squared, range(2), no_progress, 2)
+        with pytest.raises(InputError, match="not all workers answered"):
+            pool.check_versions(versions)
+
+
+# --- workers
+
+
+def test_a_worker_that_joins_later_with_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with started() as cluster, worker_pool(Cluster(cluster.scheduler_address)) as pool:
+        pool.check_versions(versions)
+        assert pool.map(squared, range(2), no_progress, 2) == [0, 1]
+        monkeypatch.setattr(f"{__name__}.VERSIONS", {"ommatid": "2"})  # what the worker says from now on
+        with pytest.raises(InputError, match=r"the worker \S+ has ommatid 2, here 1; install the same versions"):
+            pool.map(squared, range(2), no_progress, 2)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_lost_scheduler_ends_a_batch_and_keeps_what_is_finished(
+    monkeypatch: pytest.MonkeyPatch, ommatid: Command
+) -> None:
+    for name in "abc":
+        Path(f"{name}.toml").write_text(TINY, encoding="utf-8")
+    collect: Any = Batch._collect  # pyright: ignore[reportPrivateUsage]
+    command = "render", "a.toml", "b.toml", "c.toml", "-o", "out"
+    with config.set({"distributed.comm.timeouts.connect": "0.5s"}), started() as cluster:
+
+        def collect_and_lose(*arguments: Any) -> Any:
+            description = collect(*arguments)
+            cluster.close()
+            return description
+
+        monkeypatch.setattr(Batch, "_collect", collect_and_lose)
+        ended = ommatid(*command, "--scheduler", cluster.scheduler_address)
+    *done, last = ended.err.splitlines()
+    assert ended.code == 1
+    assert done == ["render: done, out/a/stack.exr"]
+    assert (
+        last == "ommatid: b.toml and 1 more: the connection to the scheduler was lost; " + workers.LOST.split("; ")[1]
+    )
+    assert {path.parent.name for path in Path("out").glob("*/stack.exr")} == {"a"}
+    repeated = ommatid(*command, "--workers", "1")
+    assert (repeated.code, repeated.err.count("up to date"), repeated.err.count(": done")) == (0, 1, 2)

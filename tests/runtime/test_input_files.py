@@ -1,0 +1,110 @@
+"""Files that are read: regular ones only, opened without waiting, and of limited size."""
+
+from __future__ import annotations
+
+import ast
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import open_input, read_bytes, read_text, real_path
+
+from ..modules import modules
+
+# Modules that open files themselves, and what these are.
+OWN = {
+    "ommatid.runtime.input_files": "the one that opens inputs",
+    "ommatid.runtime.files": "temporary files, which it writes",
+    "ommatid.cli.failures": "/dev/null",
+    "ommatid.cli.streams": "/dev/null",
+    "ommatid.runtime.outputs.occupied": "lock files, which it makes",
+    "ommatid.page.document": "templates of the installation",
+    "ommatid.page.cached": "modules and templates of the installation",
+    "ommatid.pipeline.calibration": "a temporary file, which it writes",
+    "ommatid.batch.jobs.job_files": "a file that it creates",
+    "ommatid.batch.frames": "a file that it wrote into a folder of its own",
+    "ommatid.batch.remote": "results that it wrote",
+    "ommatid.batch.world_package": "files of a world, which have been read before",
+    "ommatid.bench.resources": "/proc",
+    "ommatid.runtime.processors": "/proc",
+    "ommatid.bench.scheduler": "a journal, which it appends to",
+    "ommatid.scenes.tables.gallery": "scenes of the installation",
+    "ommatid.scenes.formats.npz": "a stream that is open, and members of an archive",
+    "ommatid.scenes.formats.picture": "pictures, which are checked before",
+    "ommatid.scenes.formats.png": "bytes in memory",
+    "ommatid.scenes.formats.jpeg": "a stream that is open",
+    "ommatid.scenes.formats.exr": "/dev/null",
+    "ommatid.simulate.renderer.world": "files of a world",
+    "ommatid.simulate.sampling.checkpoint": "a temporary file, which it writes",
+    "ommatid.reconstruct.output.estimate_formats": "temporary files, which it writes",
+}
+OPENING = {"read_text", "read_bytes", "load", "fromfile", "loadtxt", "genfromtxt", "memmap", "TiffFile", "copyfile"}
+
+
+def opening(path: Path) -> Iterator[str]:
+    """Names of the calls in a module that open a file by its path."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.Call):
+            continue
+        if isinstance(node.func, ast.Name) and node.func.id == "open":
+            yield "open"
+        elif isinstance(node.func, ast.Attribute):
+            base = ast.unparse(node.func.value)
+            if (node.func.attr in ("read_text", "read_bytes", "open") and base != "self") or (
+                node.func.attr in OPENING and base in ("np", "numpy", "json", "pickle", "tomllib")
+            ):
+                yield f"{base}.{node.func.attr}"
+
+
+def test_no_other_module_opens_inputs() -> None:
+    found = {name: [*opening(path)] for name, path in modules().items()}
+    assert {name: calls for name, calls in found.items() if calls and name not in OWN} == {}
+
+
+@pytest.fixture(params=["FIFO", "device", "folder", "socket", "link to a device"])
+def irregular(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A path that names no regular file."""
+    monkeypatch.chdir(tmp_path)  # addresses of sockets are short
+    path = Path("input")
+    if request.param == "FIFO":
+        os.mkfifo(path)
+    elif request.param == "folder":
+        path.mkdir()
+    elif request.param == "socket":
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(str(path))
+    else:
+        path.symlink_to("/dev/zero")
+    return path
+
+
+def test_other_things_than_files_are_refused_without_waiting(irregular: Path) -> None:
+    for read in (read_bytes, read_text):
+        with pytest.raises((InputError, OSError)):
+            read(irregular)
+    with pytest.raises((InputError, OSError)), open_input(irregular):
+        pass
+
+
+def test_large_files_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "large"
+    with path.open("wb") as stream:
+        stream.truncate(2**40)  # takes no space
+    with pytest.raises(InputError, match="at most 64 MB, got a larger one"):
+        read_bytes(path)
+    path.write_bytes(b"12345")
+    assert read_bytes(path, 5) == b"12345"
+    with pytest.raises(InputError, match="larger"):
+        read_bytes(path, 4)
+
+
+def test_links_in_a_circle_have_a_path(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    assert real_path(tmp_path / "a" / "c").is_absolute()
+    with pytest.raises(OSError, match="symbolic links"):
+        read_bytes(tmp_path / "a")

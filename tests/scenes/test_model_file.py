@@ -1,0 +1,182 @@
+"""Files of models that were made to mislead: every one is refused by one sentence, before it is read or afterwards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import digest
+from ommatid.scenes import model_file
+from ommatid.scenes.formats import npz
+from ommatid.scenes.formats.provenance import checked
+from ommatid.scenes.setup import Setup
+from ommatid.simulate.ideal import ideal_model
+
+from ..examples import scene
+
+Arrays = dict[str, NDArray[Any]]
+Change = Callable[[Arrays], object]
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model with entries."""
+    setup = Setup.from_scene(scene(calibration={"method": "transport"}))
+    model = ideal_model(setup.resolved, setup.camera)
+    path = tmp_path_factory.mktemp("model") / "model.npz"
+    model_file.write(path, model)
+    return path
+
+
+def sealed(path: Path, arrays: Arrays) -> None:
+    """Write arrays as a model with a valid checksum."""
+    record = json.loads(str(arrays["ommatid"][()]))
+    inside = {name: each for name, each in arrays.items() if name not in ("format", "_is_array", "ommatid")}
+    content = digest(*(inside[name] for name in sorted(inside)))
+    record["sha256"] = hashlib.sha256(f"{content}{record['description']}".encode()).hexdigest()
+    npz.write(path, {**arrays, "ommatid": np.array(json.dumps(record))})
+
+
+def described(arrays: Arrays, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the description of a model."""
+    record = json.loads(str(arrays["ommatid"][()]))
+    description = json.loads(record["description"])
+    change(description)
+    arrays["ommatid"] = np.array(json.dumps({**record, "description": json.dumps(description)}))
+
+
+def typed(name: str, dtype: str) -> Change:
+    """Convert an array to another type."""
+    return lambda arrays: arrays.update({name: arrays[name].astype(dtype)})
+
+
+def twice(arrays: Arrays) -> None:
+    """Split the first entry into two of the same place."""
+    arrays["data"][0] /= 2
+    for name in ("data", "indices", "variance"):
+        arrays[name] = np.insert(arrays[name], 0, arrays[name][0])
+    arrays["batches"] = np.zeros((0, arrays["data"].size), np.float32)
+    arrays["indptr"][1:] += 1
+
+
+def swapped(arrays: Arrays) -> None:
+    """Exchange two entries of a row."""
+    for name in ("data", "indices"):
+        arrays[name][[0, 1]] = arrays[name][[1, 0]]
+
+
+def put(name: str, value: float) -> Change:
+    """Change one number of an array."""
+    return lambda arrays: arrays[name].__setitem__(-1, value)
+
+
+MISLEADING: dict[str, Change] = {
+    **{f"{name} {dtype}": typed(name, dtype) for name in ("data", "variance") for dtype in ("f2", "g", ">f8", "c16")},
+    **{f"{name} {dtype}": typed(name, dtype) for name in ("indices", "indptr") for dtype in ("i2", "u4", "f8", ">i4")},
+    "entry twice": twice,
+    "columns out of order": swapped,
+    "row before the first": put("indptr", -1),
+    "rows end early": put("indptr", 3),
+    "rows end late": put("indptr", 2**30),
+    "column beyond": put("indices", 10**6),
+    "column before": put("indices", -1),
+    "not a number": put("data", np.nan),
+    "infinite": put("variance", np.inf),
+    "negative variance": put("variance", -1.0),
+    "fewer variances": lambda arrays: arrays.update(variance=arrays["variance"][1:]),
+    "three sizes": lambda arrays: arrays.update(shape=np.array([1, 2, 3])),
+    "negative size": lambda arrays: arrays.update(shape=-arrays["shape"]),
+    "many batches": lambda arrays: arrays.update(batches=np.zeros((2000, arrays["data"].size), np.float32)),
+    "texts as batches": lambda arrays: arrays.update(batches=np.zeros((3, arrays["data"].size), "S1")),
+    "empty texts": lambda arrays: arrays.update(shape=np.zeros(10**6, "U0")),
+}
+
+
+@pytest.mark.parametrize("change", MISLEADING.values(), ids=MISLEADING.keys())
+def test_misleading_arrays_are_refused(change: Change, original: Path, tmp_path: Path) -> None:
+    arrays = npz.read(original)
+    change(arrays)
+    path = tmp_path / "m.npz"
+    sealed(path, arrays)
+    with pytest.raises(InputError) as refusal:
+        model_file.read(path)
+    assert len(str(refusal.value).replace(str(path), "")) <= 300
+
+
+def test_a_sealed_model_is_read(original: Path, tmp_path: Path) -> None:
+    sealed(tmp_path / "m.npz", npz.read(original))
+    assert model_file.read(tmp_path / "m.npz").entries == model_file.read(original).entries
+
+
+STORED_FILES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "lens": lambda scene: scene["camera"]["lens"][0].update(surfaces="/dev/zero"),
+    "glass": lambda scene: scene["camera"].update(glass_catalogue="../all.agf"),
+    "light": lambda scene: scene.update(light={"spectrum": "/dev/zero.txt"}),
+    "picture": lambda scene: scene["target"].pop("shape"),
+}
+
+
+@pytest.mark.parametrize("change", STORED_FILES.values(), ids=STORED_FILES.keys())
+def test_a_stored_scene_opens_no_other_file(
+    change: Callable[[dict[str, Any]], object], original: Path, tmp_path: Path
+) -> None:
+    arrays = npz.read(original)
+    described(arrays, lambda description: change(description["scene"]))
+    sealed(tmp_path / "m.npz", arrays)
+    with pytest.raises(InputError, match=r"expected a scene with"):
+        model_file.read(tmp_path / "m.npz")
+
+
+@pytest.mark.parametrize("value", [-1, -0.5, 10**400, float("inf"), float("nan"), True, "1", None, [], {}])
+@pytest.mark.parametrize("key", ["seconds", "samples", "passes", "seed", "versions", "agreement", "fit", "rays"])
+def test_records_hold_what_can_be(key: str, value: object) -> None:
+    if (key, value) == ("versions", {}):
+        return
+    with pytest.raises(ValueError, match=f"its record should have .* as {key}, got"):
+        checked({key: value})
+
+
+def member(archive: zipfile.ZipFile, name: str, header: bytes, version: bytes = b"\1\0") -> None:
+    """Add an array of which only the header is there."""
+    size = len(header).to_bytes(2 if version == b"\1\0" else 4, "little")
+    archive.writestr(f"{name}.npy", b"\x93NUMPY" + version + size + header)
+
+
+ARCHIVES: dict[str, Callable[[zipfile.ZipFile], object]] = {
+    "empty texts": lambda archive: member(
+        archive, "shape", b"{'descr': '<U0', 'fortran_order': False, 'shape': (300000000,)}\n"
+    ),
+    "long header": lambda archive: member(archive, "shape", b" " * 20_000_000, b"\2\0"),
+    "many members": lambda archive: [archive.writestr(f"{number}.npy", b"") for number in range(25_000)],
+    "a name twice": lambda archive: [member(archive, name, b"") for name in ("a", "b")] and archive.writestr("a", b""),
+    "structured": lambda archive: member(
+        archive, "shape", b"{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (2,)}\n"
+    ),
+    "more than there is": lambda archive: member(
+        archive, "shape", b"{'descr': '<f8', 'fortran_order': False, 'shape': (300000000,)}\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("fill", ARCHIVES.values(), ids=ARCHIVES.keys())
+def test_archives_are_refused_within_little_memory(fill: Callable[[zipfile.ZipFile], object], tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "m.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        fill(archive)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as refusal:
+            model_file.read(tmp_path / "m.npz")
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+    assert len(str(refusal.value).replace(str(tmp_path), "")) <= 300

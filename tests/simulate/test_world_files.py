@@ -1,0 +1,132 @@
+"""Worlds are checked without Mitsuba: hostile ones are refused in one sentence, others become the text it parses."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from ommatid.interface import read_scene
+from ommatid.runtime.errors import InputError
+from ommatid.simulate.renderer.worlds.checked_world import check_world_files
+
+from ..conftest import TINY, Command
+from ..examples import GALLERY
+from .hostile_worlds import FAMILIES, hostile_world, mesh, ply, scene, serialized
+
+WHERE = "test.toml: world.file"
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 1 2 3\n"
+EACH = 6  # worlds of each family
+
+
+@pytest.mark.parametrize("family", range(len(FAMILIES)), ids=list(FAMILIES))
+def test_hostile_worlds_are_refused_in_one_short_sentence(tmp_path: Path, family: int) -> None:
+    for number in range(family, family + EACH * len(FAMILIES), len(FAMILIES)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        path = hostile_world(number, folder)
+        with pytest.raises(InputError) as refused:
+            check_world_files(path, WHERE)
+        sentence = str(refused.value)
+        assert sentence.startswith(f"{WHERE}: ")
+        assert sentence.isprintable()
+        assert len(sentence) <= 300 + 2 * len(str(folder))
+
+
+@pytest.mark.parametrize("order", "=<>")
+@pytest.mark.parametrize("index", ["int", "uint", "uchar", "short"])
+def test_sound_meshes_are_read(tmp_path: Path, order: str, index: str) -> None:
+    (tmp_path / "m.ply").write_bytes(ply(4, [(0, 1, 2), (1, 2, 3)], order, index))
+    (tmp_path / "m.obj").write_text(OBJ, encoding="utf-8")
+    (tmp_path / "m.serialized").write_bytes(serialized(4, [(0, 1, 2), (1, 2, 3)]))
+    for name in ("m.ply", "m.obj", "m.serialized"):
+        path = tmp_path / "world.xml"
+        path.write_text(mesh(name), encoding="utf-8")
+        checked = check_world_files(path, WHERE)
+        assert checked.files == [path, tmp_path / name]
+        assert f'value="{tmp_path / name}"' in checked.text
+
+
+def test_includes_and_variables_become_one_text_with_its_places(tmp_path: Path) -> None:
+    part = '<shape version="3.0.0"\n type="$kind" id="a">\n<float name="radius" value="$$half\\$"/></shape>'
+    (tmp_path / "part.xml").write_text(part.replace("$$half", "${half}".replace("{half}", "r")), encoding="utf-8")
+    content = (
+        '<default name="kind" value="sphere"/>\n<default name="r" value="2"/>\n<include filename="part.xml" name="b"/>'
+    )
+    path = tmp_path / "world.xml"
+    path.write_text(scene(content), encoding="utf-8")
+    checked = check_world_files(path, WHERE)
+    assert checked.text.splitlines()[1:4] == [
+        '<shape type="sphere" id="a" name="b">',
+        '<float name="radius" value="2\\$"/>',
+        "</shape>",
+    ]
+    assert checked.place(3) == "part.xml (line 3)"
+    assert checked.files == [path, tmp_path / "part.xml"]
+
+
+def test_the_option_opens_files_outside(tmp_path: Path) -> None:
+    inside = tmp_path / "in"
+    inside.mkdir()
+    (tmp_path / "m.obj").write_text(OBJ, encoding="utf-8")
+    path = inside / "world.xml"
+    path.write_text(mesh("../m.obj"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"in the folder of the world's file, got '../m.obj' .* --allow-outside"):
+        check_world_files(path, WHERE)
+    assert check_world_files(path, WHERE, allow_outside=True).files[1].resolve() == tmp_path / "m.obj"
+
+
+@pytest.mark.parametrize("content", ['<include filename="f"/>', mesh("f.ply"), '<spectrum name="a" filename="f"/>'])
+def test_fifos_are_refused_without_waiting(tmp_path: Path, content: str) -> None:
+    for name in ("f", "f.ply"):
+        os.mkfifo(tmp_path / name)
+    path = tmp_path / "world.xml"
+    path.write_text(content if "scene" in content else scene(content), encoding="utf-8")
+    with pytest.raises(InputError, match="expected a regular file, got a FIFO"):
+        check_world_files(path, WHERE)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(InputError, match="expected a regular file, got a FIFO"):
+        check_world_files(path, WHERE)
+
+
+def test_a_changed_file_is_checked_again(tmp_path: Path) -> None:
+    (tmp_path / "m.obj").write_text(OBJ, encoding="utf-8")
+    path = tmp_path / "world.xml"
+    path.write_text(mesh("m.obj"), encoding="utf-8")
+    first = check_world_files(path, WHERE)
+    assert check_world_files(path, WHERE) is first
+    (tmp_path / "m.obj").write_text(OBJ + "f 1 2 9\n", encoding="utf-8")
+    with pytest.raises(InputError, match="indices from 1 to 3"):
+        check_world_files(path, WHERE)
+
+
+@pytest.mark.parametrize("path", sorted((GALLERY / "worlds").glob("*.xml")), ids=lambda path: path.stem)
+def test_the_worlds_of_the_gallery_are_sound(path: Path) -> None:
+    assert check_world_files(path, WHERE).files == [path]
+
+
+def test_the_option_reaches_every_command_that_reads_a_world(here: Path, ommatid: Command) -> None:
+    (here / "in").mkdir()
+    (here / "m.obj").write_text("v -500 -500 1000\nv 500 -500 1000\nv 0 500 1000\nf 1 3 2\n", encoding="utf-8")
+    (here / "in" / "world.xml").write_text(mesh("../m.obj"), encoding="utf-8")
+    table = TINY.replace('image = "photo:camera"\norigin = [100, 230]\n', "")
+    (here / "in" / "tiny.toml").write_text(f'{table}\n[world]\nfile = "world.xml"\n', encoding="utf-8")
+    for command in ("show", "render", "run", "calibrate"):
+        arguments = ["in/tiny.toml", *({"calibrate": ["-o", "m.npz"], "show": []}.get(command, ["-o", "out"]))]
+        refused = ommatid(command, *arguments)
+        assert (refused.code, refused.out) == (2, "")
+        assert "got '../m.obj' outside it; move it there, or add --allow-outside" in refused.err
+        assert sorted(path.name for path in here.iterdir()) == ["in", "m.obj", "tiny.toml"], "nothing is left behind"
+    shown = ommatid("show", "in/tiny.toml", "--allow-outside", "--json")
+    assert shown.code == 0, shown.err
+    rendered = ommatid("render", "in/tiny.toml", "-o", "out", "--allow-outside")
+    assert rendered.code == 0, rendered.err
+
+
+def test_the_python_interface_has_the_option(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY, encoding="utf-8")
+    assert not read_scene(path).allows_outside
+    assert read_scene(path, set="noise.variance=1e-3", allow_outside=True).allows_outside

@@ -1,0 +1,125 @@
+"""Worlds are built in a process that may die, and neither plugins nor data come from the current folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.setup import Setup
+from ommatid.simulate.ground_truth import truth
+from ommatid.simulate.renderer.variant import activate
+from ommatid.simulate.renderer.worlds import trial
+from ommatid.simulate.renderer.worlds.checked_world import CheckedWorld, check_world_files
+
+from .world_files import world
+
+ENDS = {
+    "signal": r"^w: its process died of signal 11 \(SIGSEGV\) while Mitsuba built the file cup.ply; correct or remove",
+    "code": r"^w: its process ended with code 3 while Mitsuba built the file cup.ply; correct or remove it$",
+    "hang": r"^w: Mitsuba takes longer than 1 s to build the file cup.ply; make it smaller$",
+    "memory": r"^w needs more memory than the \S+ GB that are free; make it smaller$",
+}
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> trial.WorldTrials:
+    """Trials of this test alone, which knows no world."""
+    trials = trial.WorldTrials()
+    monkeypatch.setattr(trial, "_trials", trials)
+    return trials
+
+
+def checked(folder: Path, content: str) -> CheckedWorld:
+    path = folder / "world.xml"
+    path.write_text(f'<scene version="3.0.0">{content}</scene>', encoding="utf-8")
+    return check_world_files(path, "w")
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_the_file_is_named_that_ends_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alone: trial.WorldTrials, end: str
+) -> None:
+    monkeypatch.setattr(trial, "MODULE", "tests.simulate.dying_process")
+    with pytest.raises(InputError, match=ENDS[end]):
+        trial.try_world(checked(tmp_path, f"<!-- --><bsdf type='diffuse' id='{end}'/>"), "scalar_rgb", "w", seconds=1.0)
+    assert alone.process is None
+    assert not alone.built
+
+
+def test_a_world_is_tried_once_and_its_process_serves_the_next(tmp_path: Path, alone: trial.WorldTrials) -> None:
+    sphere = checked(tmp_path, '<shape type="sphere"/>')
+    trial.try_world(sphere, "scalar_rgb", "w")
+    process = alone.process
+    assert process is not None
+    trial.try_world(checked(tmp_path, '<shape type="cube"/>'), "scalar_rgb", "w")
+    assert alone.process is process
+    assert len(alone.built) == 2
+    alone.stop()
+    trial.try_world(sphere, "scalar_rgb", "w")
+    assert alone.process is None
+    process = alone.start()
+    process.kill()  # as if it had ended since nothing came
+    process.wait()
+    trial.try_world(checked(tmp_path, '<shape type="disk"/>'), "scalar_rgb", "w")
+    with pytest.raises(
+        InputError, match=r'w is no scene that Mitsuba can build: in world.xml \(line 1\): could not .* "x"'
+    ):
+        trial.try_world(checked(tmp_path, '<float name="a" value="x"/>'), "scalar_rgb", "w")
+    alone.stop()
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    ['<integrator type="aov"><string name="aovs" value="a:depth"/>', '<integrator type="moment">'],
+)
+def test_integrators_of_more_channels_are_refused(tmp_path: Path, integrator: str) -> None:
+    content = f'<emitter type="constant"/>{integrator}<integrator type="path"/></integrator>'
+    described, camera = world(tmp_path, content, variant="scalar_rgb")
+    with pytest.raises(
+        InputError, match=r"its integrator returns \d+ more channels \(.*\); expected the radiance alone"
+    ):
+        truth(Setup(described, camera))
+
+
+def test_no_library_of_the_current_folder_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither under a new name nor in place of a plugin or a data file that Mitsuba ships."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    (tmp_path / "evil.c").write_text(
+        "#include <fcntl.h>\n"
+        f'__attribute__((constructor)) static void run(void) {{ creat("{tmp_path}/ran", 0600); }}\n',
+        encoding="utf-8",
+    )
+    (tmp_path / "plugins").mkdir()
+    library = tmp_path / "plugins" / "evil.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", str(library), str(tmp_path / "evil.c")], check=True)
+    (tmp_path / "data").mkdir()
+    os.mkfifo(tmp_path / "data" / "srgb.coeff")
+    for name in (
+        "cylinder",
+        "point",
+        "path",
+        "independent",
+        "hdrfilm",
+        "diffuse",
+        "bitmap",
+        "area",
+        "rectangle",
+        "cone",
+    ):
+        shutil.copy(library, tmp_path / "plugins" / f"{name}.so")
+    monkeypatch.chdir(tmp_path)
+    activate("scalar_rgb")
+    described, camera = world(tmp_path, '<shape type="cylinder"/><emitter type="point"/>', variant="scalar_rgb")
+    truth(Setup(described, camera))
+    for kind in ("evil", "cone", "../evil", "../plugins/evil", str(library)[:-3]):
+        described, camera = world(tmp_path, f'<shape type="{kind}"/>', variant="scalar_rgb")
+        with pytest.raises(InputError, match="expected a plugin that Mitsuba ships"):
+            truth(Setup(described, camera))
+    assert not (tmp_path / "ran").exists()

@@ -13,7 +13,7 @@ from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.constants import WHITE
-from ommatid.scenes.formats import exr, npz
+from ommatid.scenes.formats import exr, npz, tiff
 
 Format = Literal["npy", "tiff16", "tiff32"]
 STEPS = 257  # of a 16-bit value per grey level: 65535 stands for 255, as in pictures that are read
@@ -88,14 +88,11 @@ def shows_estimate(path: Path, estimate: Path) -> bool:
     """Whether a .npy file holds the estimate of an OpenEXR file, or a .tiff file was written for one."""
     if not path.is_file():
         return False
-    from tifffile import TiffFile, TiffFileError
-
-    with suppress(OSError, ValueError, KeyError, IndexError, EOFError, InputError, TiffFileError):
+    with suppress(OSError, ValueError, KeyError, InputError):
         if path.suffix == ".npy":
             image = exr.read(estimate)[0].channels["estimate"]
             return np.array_equal(npz.array(path), image, equal_nan=True)
-        with TiffFile(path) as file:
-            return str(file.pages.first.description).startswith(MARK)
+        return tiff.description(path).startswith(MARK)
     return False
 
 

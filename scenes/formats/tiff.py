@@ -21,6 +21,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.input_files import open_input
 from ommatid.runtime.memory import check_memory
 
 from .stored_picture import BYTES, UPRIGHT, StoredPicture, check_single, profile_notes, upright
@@ -56,6 +57,17 @@ def pages(stream: BinaryIO, path: Path) -> list[StoredPicture]:
     """Read the pages of a file, of which each is a frame. Raises as `picture` does."""
     with _opened(stream, path) as found:
         return _read(stream, path, found)
+
+
+def description(path: Path) -> str:
+    """Return the description of the first page of a file. Raises ValueError or InputError if there is none."""
+    try:
+        with open_input(path) as stream, _opened(stream, path) as found:
+            return str(found[0].description)
+    except (InputError, OSError):
+        raise
+    except Exception as error:  # tifffile has many
+        raise ValueError("it is damaged") from error
 
 
 @contextmanager

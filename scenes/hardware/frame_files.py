@@ -31,7 +31,7 @@ class FrameNotes:
 
     def add(self, path: Path, stored: StoredPicture, what: str) -> None:
         """Note one picture."""
-        self.sentences.setdefault(what, notes_of(path.name, stored))
+        self.sentences.setdefault(what, notes_of(str(path), stored))
         dtype = stored.pixels.dtype
         bits = 8 * dtype.itemsize if stored.bits is None else stored.bits
         self.types.setdefault(FLOATING if dtype.kind == "f" else f"{bits}-bit", what)

@@ -84,6 +84,7 @@ class Renderer:
                 self._generators[group] = RayGenerator(camera, types, sampler, world is not None)
         self._unit = 1.0  # radiance of a value of 1
         self.staged: StagedWorld | None = None
+        self._sound: Callable[[FloatArray], FloatArray] = lambda readings: readings  # raises for a world's wrong light
         self._placement = MILLIMETRES_AT_ORIGIN
         self._texels = "target.emitter.radiance.data"
         self._texture: Any = None
@@ -162,7 +163,7 @@ class Renderer:
 
         choices: Any = {"sensor": sensor, "integrator": self._integrator, "spp": samples, "seed": seed}
         rendered: Any = mi.render(self._scene, **choices)
-        return np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1)
+        return self._sound(np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1))
 
     def expose_alone(
         self, index: int, pixels: IntArray, work: Plan, seed: Callable[[int], int], sobol: bool = False
@@ -221,8 +222,9 @@ class Renderer:
         else:
             light = self._radiance(rays.ray)
         if rays.weight is None:
-            return rays.sums(light)[0] / rays.samples / self._unit
+            return self._sound(rays.sums(light)[0] / rays.samples / self._unit)
         total, weight = rays.sums(light * rays.weight, rays.weight)
+        self._sound(total / rays.samples / self._unit)
         share = self.captured(group) / self._unit
         return np.divide(total * share, weight, out=np.full(weight.size, np.nan), where=weight > 0)
 
@@ -272,12 +274,11 @@ class Renderer:
         """Use a world, whose white is a number, as the scene, with the target in it if it has a picture."""
         from .world import TARGET, stage, white_of
 
-        self._unit = white_of(world) / WHITE
-        has_target = world.target.image is not None
+        self._unit, has_target = white_of(world) / WHITE, world.target.image is not None
         target = target_of(self.camera, black(self.camera, self.channels)) if has_target else None
-        staged = stage(world, variant, target)
-        self.staged, self._scene, self._integrator = staged, staged.scene, staged.integrator
-        self._placement = staged.placement
+        self.staged = staged = stage(world, variant, target)
+        self._scene, self._integrator, self._placement = staged.scene, staged.integrator, staged.placement
+        self._sound = staged.sound_readings
         self._texels = f"{TARGET}.{self._texels.partition('.')[2]}" if has_target else ""
         for generator in self._generators.values():
             generator.follow(partial(staged.distance, far=FAR * self.camera.distance), staged.placement)

@@ -8,9 +8,7 @@ used. A variant is global to the process.
 from __future__ import annotations
 
 import json
-import logging
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -20,6 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
 
+from .messages import redirect_log
 from .worlds.plugin_names import mitsuba_folder
 
 if TYPE_CHECKING:
@@ -114,12 +113,7 @@ def activate(variant: str) -> None:
     fix_plugin_folder()
     if mi.variant() != variant:
         mi.set_variant(variant)
-    logger = cast(Any, mi).logger()
-    if logger is not None and not isinstance(logger.appender(0), _log_appender()):
-        logger.clear_appenders()
-        appender: Any = _log_appender()
-        logger.add_appender(appender())
-        logger.set_log_level(mi.LogLevel.Warn)
+    redirect_log()
 
 
 def fix_plugin_folder() -> None:
@@ -137,29 +131,6 @@ def release() -> None:
     dr = sys.modules.get("drjit")
     if dr is not None:
         dr.flush_malloc_cache()
-
-
-INTERRUPTED = "Received interrupt signal"  # suppressed: the command line reports Ctrl-C itself
-_HEADING = re.compile(r"\A[-\d]+ [:\d]+ \w+ +(\S+ +)?\[[^\]]*\] *")  # date, level, thread and line of a log message
-_APPENDERS: dict[str, Any] = {}
-
-
-def _log_appender() -> Any:
-    import mitsuba as mi
-
-    if "log" not in _APPENDERS:
-
-        class LogAppender(mi.Appender):
-            def append(self, level: object, text: str) -> None:
-                del level
-                if INTERRUPTED not in text:
-                    logging.getLogger("mitsuba").warning("%s", _HEADING.sub("", text))
-
-            def log_progress(self, *arguments: object) -> None:
-                del arguments
-
-        _APPENDERS["log"] = LogAppender
-    return _APPENDERS["log"]
 
 
 def probe(variant: str) -> BackendStatus:

@@ -16,12 +16,14 @@ from typing import Any, cast
 
 import numpy as np
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import open_input
 from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.world import FROM_FILE, WorldTable
 
+from .messages import ignored_samples
 from .variant import activate
 from .worlds.building import BLOCK, parse_world
 from .worlds.checked_world import CheckedWorld, check_world_files, reason_of
@@ -30,6 +32,8 @@ from .worlds.trial import try_world
 
 TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file
 SENSORS_AT_ORIGIN = ("perspective", "thinlens", "orthographic")  # that stand there without a to_world
+MOST_LIGHT = 1e15  # whose square float32 still holds
+NOISE = 1e-6  # of the largest reading, by which others may be below 0
 DEEPEST = 8  # segments of a path, if the file has no integrator
 
 
@@ -38,6 +42,7 @@ class StagedWorld:
     """A world with the target in it as a Mitsuba scene, its integrator, and where the camera stands in it.
 
     direct_only : True if interreflections are left out, since nothing reflects;  sensors : number of them in the file
+    where : start of messages;  signed : True if a picture on the target may have negative values
     """
 
     scene: Any
@@ -45,6 +50,8 @@ class StagedWorld:
     placement: Placement
     sensors: int
     direct_only: bool = False
+    where: str = ""
+    signed: bool = False
 
     def distance(self, origin: tuple[Any, Any, Any], direction: tuple[Any, Any, Any], far: float) -> Any:
         """Return the distance along z, mm, of the surface that rays meet first, `far` where they meet none."""
@@ -55,6 +62,21 @@ class StagedWorld:
         ray = mi.Ray3f(*self.placement.carry(mi.Point3f(*origin), along))
         met = self.scene.ray_intersect_preliminary(ray, coherent=False)
         return dr.minimum(dr.select(met.is_valid(), met.t * (along.z * self.placement.unit), far), far)
+
+    def sound_readings(self, readings: FloatArray) -> FloatArray:
+        """Return readings of the world, at any scale. Raises InputError for those that no light yields."""
+        if ignored_samples() or not np.isfinite(readings).all():
+            got = "samples that are negative or not finite"
+        elif readings.size and np.abs(readings).max() > MOST_LIGHT:
+            got = f"{np.abs(readings).max():.3g}"
+        elif not self.signed and readings.size and readings.min() < -NOISE * np.abs(readings).max():
+            got = f"{readings.min():.3g}"
+        else:
+            return readings
+        raise InputError(
+            f"{self.where}: expected readings of 0 to {MOST_LIGHT:g}, where white is 255, got {got}; correct its lamps"
+            " and pictures"
+        )
 
 
 def world_of(scene: Scene) -> WorldTable:
@@ -125,7 +147,9 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
     if not parsed.has_integrator:
         direct_only = not (scene.render.complete or has_interreflections(built))
         path = {"type": "path", "max_depth": 1 if direct_only else DEEPEST, "block_size": BLOCK}
-        return StagedWorld(built, mi.load_dict(path), placement, len(parsed.sensors), direct_only)
+        return StagedWorld(
+            built, mi.load_dict(path), placement, len(parsed.sensors), direct_only, where, target is not None
+        )
     if not isinstance(built.integrator(), mi.SamplingIntegrator):
         raise InputError(f"{where}: its integrator does not follow rays from a camera; expected one such as 'path'")
     more = built.integrator().aov_names()
@@ -135,7 +159,9 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
             f"{where}: its integrator returns {len(more)} more channels ({words}); expected the radiance alone, as of"
             " 'path': remove 'aov' and 'moment'"
         )
-    return StagedWorld(built, built.integrator(), placement, len(parsed.sensors))
+    return StagedWorld(
+        built, built.integrator(), placement, len(parsed.sensors), where=where, signed=target is not None
+    )
 
 
 def _placement(scene: Scene, sensors: list[Any], where: str) -> Placement:

@@ -19,7 +19,7 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Generator[tuple[subproc
         yield process, here
 
 
-@pytest.mark.parametrize("name", ["single run", "shares of --job", "frames"])
+@pytest.mark.parametrize("name", ["single run", "frames"])
 def test_killed_commands_are_resumed_to_the_same_bits(name: str, starter: tuple[subprocess.Popen[str], Path]) -> None:
     tally = campaign(*starter, name, kills=1, seed=3)
     assert tally.wrong == []

@@ -71,7 +71,7 @@ def test_frames_of_different_bits_are_said(tmp_path: Path) -> None:
 def test_colour_and_orientation_are_said_once_per_kind_of_frames(tmp_path: Path) -> None:
     colour = made.png(RNG.integers(0, 255, (8, 9, 3)), 2, 8, made.chunk(b"eXIf", made.exif(3)))
     said = noted(tmp_path, images=colour, dark=colour)
-    assert [sentence.split()[0] for sentence in said] == ["images.png"] * 2 + ["dark.png"] * 2
+    assert [Path(sentence.split()[0]).name for sentence in said] == ["images.png"] * 2 + ["dark.png"] * 2
     assert "only its luminance is used" in said[0]
     assert "orientation 3 of EXIF" in said[1]
 

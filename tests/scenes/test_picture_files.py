@@ -15,7 +15,9 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
+from ommatid.reconstruct.output.estimate_formats import shows_estimate
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.formats import exr
 from ommatid.scenes.formats.picture import LUMINANCE, conversions, load
 from ommatid.scenes.formats.picture_file import read_picture
 from ommatid.scenes.formats.stored_picture import orientation_of
@@ -381,15 +383,15 @@ def test_an_exr_of_another_kind_is_named(channels: Any, shown: Any, words: str, 
 def test_deep_pictures_and_several_parts_are_refused(tmp_path: Path) -> None:
     import OpenEXR
 
-    exr: Any = OpenEXR
+    library: Any = OpenEXR
     pixels = np.zeros((8, 10), np.float32)
-    parts = [exr.Part({}, {"Y": pixels}, name=name) for name in ("left", "right")]
-    exr.File(parts).write(str(tmp_path / "a.exr"))
+    parts = [library.Part({}, {"Y": pixels}, name=name) for name in ("left", "right")]
+    library.File(parts).write(str(tmp_path / "a.exr"))
     assert "expected one picture, got 2 parts" in refusal(tmp_path / "a.exr")
     deep = np.empty((8, 10), object)
     for index in np.ndindex(deep.shape):
         deep[index] = np.ones(2, np.float32)
-    exr.File({"type": exr.deepscanline, "compression": exr.ZIPS_COMPRESSION}, {"Y": deep}).write(
+    library.File({"type": library.deepscanline, "compression": library.ZIPS_COMPRESSION}, {"Y": deep}).write(
         str(tmp_path / "b.exr")
     )
     assert "got a deep picture" in refusal(tmp_path / "b.exr")
@@ -430,3 +432,22 @@ def test_only_regular_files_are_opened(suffix: str, tmp_path: Path) -> None:
     path.symlink_to(path.name)
     with pytest.raises(InputError, match="there is no picture"):
         load(looking_at(path))
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".npy"])
+def test_damaged_files_beside_a_result_are_other_files(
+    suffix: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Their headers state much, their lists of pages have no end."""
+    exr.write(tmp_path / "estimate.exr", [exr.Part("one", {"estimate": np.zeros((4, 4), np.float32)}, {})])
+    path = tmp_path / f"estimate{suffix}"
+    text = b"{'descr': '<f8', 'fortran_order': False, 'shape': (300000000, 40), }\n"
+    contents = [b"", b"II*\0", b"\x93NUMPY\1\0" + struct.pack("<H", len(text)) + text + bytes(64)]
+    contents += [save_tiff(tmp_path / "a.tif", LETTER).read_bytes()[:length] for length in (9, 40, 200)]
+    for content in contents:
+        path.write_bytes(content)
+        assert not shows_estimate(path, tmp_path / "estimate.exr")
+    path.unlink()
+    os.mkfifo(path)
+    assert not shows_estimate(path, tmp_path / "estimate.exr")
+    assert capfd.readouterr() == ("", "")

@@ -107,7 +107,7 @@ def _answer(task: dict[str, Any], where: str, seconds: float) -> str | None:
             raise InputError(f"{where}: Mitsuba takes longer than {seconds:g} s to build {_shown(at)}; make it smaller")
         part = os.read(process.stdout.fileno(), 65536)
         if not part:
-            raise InputError(f"{where}: {_death(process)} while Mitsuba built {_shown(at)}; correct or remove it")
+            raise InputError(f"{where}: {_death(process)} while it built {_shown(at)}; correct or remove it")
         *lines, rest = (rest + part).split(b"\n")
         for line in lines:
             words = json.loads(line)
@@ -120,15 +120,15 @@ def _answer(task: dict[str, Any], where: str, seconds: float) -> str | None:
 def _death(process: subprocess.Popen[bytes]) -> str:
     code = process.wait()
     if code >= 0:
-        return f"its process ended with code {code}"
+        return f"Mitsuba's process ended with code {code}"
     try:
-        return f"its process died of signal {-code} ({signal.Signals(-code).name})"
+        return f"Mitsuba's process died of signal {-code} ({signal.Signals(-code).name})"
     except ValueError:
-        return f"its process died of signal {-code}"
+        return f"Mitsuba's process died of signal {-code}"
 
 
 def _shown(at: str) -> str:
-    return f"the file {printable(Path(at).name, SHOWN)}" if at else "it"
+    return f"the file {printable(Path(at).name, SHOWN)}" if at else "the world"
 
 
 def _plugins(world: CheckedWorld) -> list[list[str]]:

@@ -182,7 +182,7 @@ def ply(rng: Random, original: bytes) -> bytes:
     faces = [list(face) for face in FACES]
     counts = [str(len(points)), str(len(faces))]
     kind = rng.choice(("ascii", "binary_little_endian", "binary_big_endian"))
-    change = rng.randrange(5)
+    change = rng.randrange(6)
     if change == 0:
         faces[rng.randrange(2)][rng.randrange(3)] = rng.choice(INDICES)
     elif change == 1:
@@ -191,12 +191,14 @@ def ply(rng: Random, original: bytes) -> bytes:
         points[rng.randrange(4)][rng.randrange(3)] = rng.choice((np.nan, np.inf, 1e38, 1e300))
     elif change == 3:
         faces[0] = faces[0][: rng.choice((0, 1, 2))] if rng.random() < 0.5 else faces[0] * rng.choice((2, 80))
+    version, types, names = "1.0", ["float"] * 3, rng.choice(("vertex_index", "vertex_indices"))
+    if change == 4:
+        version, names = rng.choice(("1.0", "9.9", "x")), rng.choice((names, "x", "vertex_index x"))
+        types[rng.randrange(3)] = rng.choice(("float", "double", "uchar", "x", "list uchar float"))
+    properties = "".join(f"property {kind_of} {axis}\n" for kind_of, axis in zip(types, "xyz", strict=True))
     header = (
-        f"ply\nformat {kind} {rng.choice(('1.0', '1.0', '1.0', '9.9', 'x'))}\nelement vertex {counts[0]}\n"
-        + "".join(
-            f"property {rng.choice(('float', 'float', 'float', 'double', 'uchar', 'x'))} {axis}\n" for axis in "xyz"
-        )
-        + f"element face {counts[1]}\nproperty list uchar int vertex_index{rng.choice(('', 'es'))}\nend_header\n"
+        f"ply\nformat {kind} {version}\nelement vertex {counts[0]}\n{properties}"
+        f"element face {counts[1]}\nproperty list uchar int {names}\nend_header\n"
     )
     return header.encode() + _ply_body(kind, points, faces)
 

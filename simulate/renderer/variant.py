@@ -15,8 +15,9 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
+from ommatid.runtime.printable import printable
 
 from .messages import redirect_log
 from .worlds.plugin_names import mitsuba_folder
@@ -65,8 +66,15 @@ class BackendStatus:
 
 
 def unusable_reason(variant: str) -> str:
-    """Return why a variant cannot be used here, or "" if it can, without loading a backend that kills the process."""
-    import drjit as dr
+    """Return why a variant cannot be used here, or "" if it can, without loading a backend that kills the process.
+
+    Raises MachineError if Mitsuba cannot be loaded at all.
+    """
+    try:
+        import drjit as dr
+    except (ImportError, NameError) as error:  # NameError: Dr.Jit's, of a system library that it does not find
+        reason = printable(str(error.__context__ or error))
+        raise MachineError(f"Mitsuba could not be loaded ({reason}); install what is missing") from error
 
     if variant.startswith("cuda"):
         return "" if dr.has_backend(dr.JitBackend.CUDA) else "no CUDA device was found"

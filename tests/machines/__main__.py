@@ -58,7 +58,7 @@ def compare(
     try:
         found = result(run(variation, base, python, options))
     except subprocess.CalledProcessError as error:
-        return f"exit code {error.returncode}: {error.stderr}"
+        return f"exit code {error.returncode}: {' '.join(error.stderr.splitlines()[-1:])}"
     return ", ".join(differences(found, expected)) or "the same bits"
 
 

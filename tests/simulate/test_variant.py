@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, MachineError
 from ommatid.simulate.renderer import variant
 from ommatid.simulate.renderer.variant import BackendStatus, choose, diagnosis, probe, unusable_reason
 
@@ -82,3 +82,13 @@ def test_the_remedy_is_one_command() -> None:
     slow = [BackendStatus("llvm_ad_mono", "none", 0), BackendStatus("scalar_rgb", "", 1e6)]
     assert "slow" in diagnosis(slow)
     assert "nothing to repair" in diagnosis([BackendStatus("llvm_ad_mono", "", 1e7)])
+
+
+def test_a_library_that_mitsuba_does_not_find_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Dr.Jit hides the reason behind a NameError: small systems lack libatomic.so.1."""
+    package = "try:\n    raise ImportError('libatomic.so.1: cannot open')\nexcept ImportError:\n    missing_name\n"
+    (tmp_path / "drjit.py").write_text(package, encoding="utf-8")
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(MachineError, match=r"^Mitsuba could not be loaded \(libatomic.so.1: cannot open\); install"):
+        unusable_reason("scalar_rgb")

@@ -92,9 +92,9 @@ def run(
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
     pool = cluster(scheduler, tls_ca, tls_cert, tls_key), workers
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
-    report = partial(_print_run, None if as_json else detail)
     check = (check_within if within else check_run) if force else None
-    batch = scene_batch(*asked, with_options(with_figures(stages, figures), check, others), observer, report)
+    stages, report = with_figures(stages, figures), partial(_print_run, None if as_json else detail)
+    batch = scene_batch(*asked, with_options(stages, check, others), observer, report)
     files: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures, "share": share}
     finish_batch(run_batch(batch, members, failures.report, *pool, **files), as_json, strict)
 

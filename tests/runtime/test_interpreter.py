@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -61,17 +60,16 @@ def run(command: Sequence[str], folder: Path, **variables: str) -> str:
     return ended.stdout
 
 
-def test_workers_in_a_hostile_folder_open_only_what_was_named(hostile: Path, finished: Path, tmp_path: Path) -> None:
-    for name in "ab":
-        shutil.copy(finished / "stack.exr", tmp_path / f"{name}.exr")
+def test_workers_in_a_hostile_folder_open_only_what_was_named(hostile: Path, tmp_path: Path) -> None:
+    for name in ("a.toml", "b.toml"):
+        (tmp_path / name).write_text(TINY, encoding="utf-8")
     (tmp_path / "watch").mkdir()
     (tmp_path / "watch" / "sitecustomize.py").write_text(WATCH, encoding="utf-8")
     (tmp_path / "log").touch()
     watched = {"WATCH_LOG": str(tmp_path / "log"), "WATCHED": str(hostile), "PYTHONPATH": str(tmp_path / "watch")}
-    files = [str(path) for path in (tmp_path / "a.exr", tmp_path / "b.exr", finished / "model.npz")]
-    command = [sys.executable, "-P", "-m", "ommatid", "reconstruct", *files, "-o", str(tmp_path / "out")]
-    run([*command, "--workers", "2"], hostile, **watched)
-    assert (tmp_path / "out" / "a" / "estimate.exr").is_file()
+    scenes, output = [str(tmp_path / "a.toml"), str(tmp_path / "b.toml")], str(tmp_path / "out")
+    command = [sys.executable, "-P", "-m", "ommatid", "render", *scenes, "-o", output, "--workers", "2"]
+    run(command, hostile, **watched)
     events = (tmp_path / "log").read_text(encoding="utf-8").splitlines()
     assert sum(event.startswith("process") for event in events) == 3
     assert [event for event in events if not event.startswith("process")] == []

@@ -49,7 +49,6 @@ def test_hostile_inputs_are_refused_with_a_message_or_read_for_what_they_hold(
         own = [result for result in results if result.kind == name]
         verdicts = {result.verdict for result in own}
         assert [result.number for result in own] == list(numbers[name])
-        assert REFUSED in verdicts
         if isinstance(family, FileType):
             assert {REFUSED} < verdicts, "some damage is detected, some is harmless"
             assert not family.sealed or verdicts == {REFUSED, UNCHANGED}

@@ -21,10 +21,11 @@ from ..command_family import CommandCase, CommandFamily
 from ..damage import damaged
 from ..file_type import RUN, SCENE
 from ..formats import npz_damaged
+from ..verdicts import run_command
 
 PARTIAL = f"{RUN}/.stack.exr.partial.npz"  # an interrupted rendering
 PLAN = "out/.jobs/1.plan.json"
-JOB_1 = ("render", SCENE, "base.toml", "-o", "out", "--job", "1/2")
+JOB_1 = ("render", SCENE, "-o", "out", "--job", "1/1")
 TEXTS = (
     "\x1b[31mred\x1b[0m",
     "\x1b]0;title\x07",
@@ -120,6 +121,8 @@ def beside(
 
     def case(rng: Random, folder: Path) -> CommandCase:
         path = folder / file
+        if file == PLAN:
+            run_command(JOB_1)
         original = path.read_bytes() if path.exists() else b""
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(damage(rng, original))

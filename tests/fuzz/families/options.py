@@ -122,7 +122,8 @@ def option_case(rng: Random, folder: Path) -> CommandCase:
         words.append(rng.choice(option.opts + option.secondary_opts))
         if not option.is_flag:
             words.append(_value(rng, option))
-    return CommandCase(tuple(words), outputs=_outputs(words))
+    named = _outputs(["-o", *words[1:2], *words]) if name == "init" else _outputs(words)
+    return CommandCase(tuple(words), outputs=named)
 
 
 def _outputs(words: list[str]) -> tuple[str, ...]:

@@ -263,7 +263,9 @@ def serialized(rng: Random, original: bytes) -> bytes:
         return damaged(rng, original)
     points, faces = np.array(POINTS, "<f4"), np.array(FACES, "<u4")
     counts = [len(points), len(faces)]
-    change = rng.randrange(4)
+    change = rng.randrange(5)
+    if change == 4:
+        return serialized_mesh()
     if change == 0:
         faces[rng.randrange(2), rng.randrange(3)] = rng.choice(INDICES) % 2**32
     elif change == 1:

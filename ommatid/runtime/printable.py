@@ -10,8 +10,8 @@ import re
 import unicodedata
 
 LONGEST = 200  # characters of a text that came from outside
-LONGEST_SENTENCE = 300  # characters of the message of an error
-LONGEST_MESSAGE = 500  # characters of a line on stderr
+LONGEST_SENTENCE = 500  # characters of the message of an error
+LONGEST_MESSAGE = 600  # characters of a line on stderr
 LONGEST_LABEL = 100  # characters of a text in a figure
 LONGEST_WORD = 60  # characters of a word in a message that is too long
 GAP = " ... "

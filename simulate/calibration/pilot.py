@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
+from ommatid.runtime.errors import MachineError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
@@ -96,8 +97,8 @@ def reason_against(setup: Setup) -> str:
     try:
         if choose("auto").startswith("scalar"):
             return SCALAR
-    except ImportError:
-        return "Mitsuba is not installed"
+    except MachineError:
+        return "Mitsuba is not installed, or cannot be loaded"
     if setup.camera.measurements * BATCHES * FEWEST_SAMPLES > 2 * MOST_RAYS:
         return f"{setup.camera.measurements} sensor pixels are too many for a pilot"
     return ""

@@ -51,7 +51,7 @@ def test_the_number_of_a_job_is_written_or_that_of_the_array(
         ("three", {}, "expected I/N, such as 2/8"),
         ("/3", {}, "neither SLURM_ARRAY_TASK_ID nor PBS_ARRAY_INDEX is set"),
         ("/3", array(ID=0), "got 0, which is SLURM_ARRAY_TASK_ID; submit the jobs as an array from 1 to 3"),
-        ("/3", {"PBS_ARRAY_INDEX": "x"}, "expected a whole number in PBS_ARRAY_INDEX, got 'x'"),
+        ("/3", {"PBS_ARRAY_INDEX": "x"}, "as PBS_ARRAY_INDEX, got 'x'"),
         ("auto", {"PBS_ARRAY_INDEX": "1"}, "write I/N, or /N in an array of PBS"),
         ("auto", array(ID=0, MIN=0, MAX=3, COUNT=4), "got 4 of 0 to 3"),
         ("auto", array(ID=2, MIN=2, MAX=2, COUNT=1), "got 1 of 2 to 2; to repeat some jobs write /N"),

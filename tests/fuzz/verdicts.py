@@ -18,7 +18,7 @@ from ommatid.runtime.errors import InputError
 
 REFUSED, UNCHANGED, VALID = "refused", "read unchanged", "valid, but different"
 VERDICTS = (REFUSED, UNCHANGED, VALID)
-LONGEST_MESSAGE = 300  # characters of an error of the library
+LONGEST_MESSAGE = 500  # characters of an error of the library
 LONGEST_SENTENCE = 1000  # characters of a line that a command writes to stderr
 MEMORY = 1 << 30  # bytes that the process may need beyond those at the start
 ROOT = Path(__file__).parent.parent.parent

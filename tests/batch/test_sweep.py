@@ -78,7 +78,7 @@ def test_a_batch_without_a_sweep_has_a_folder_per_scene() -> None:
         (["noise.variance=1,,2"], "without an empty value"),
         (["=1,2"], "expected KEY=VALUE"),
         (["noise.variance=1,1"], "got '1' twice"),
-        (["noise.variance=1", "noise.variance=2"], "got 'noise.variance' twice"),
+        (["noise.variance=1", "noise.variance=2"], "--sweep noise.variance=2: expected every key once, got it twice"),
         (["noise.varience=1,2"], "unknown key 'noise.varience'; the nearest known key is 'noise.variance'"),
         (["noice.variance=1,2"], "unknown key 'noice'"),
         (["camera.lens.II.pixels=[2,2]"], "no lens type is called 'II'; there are 'I'"),

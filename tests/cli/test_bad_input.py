@@ -211,7 +211,7 @@ PICTURES = [
 FILES = [
     Case("a missing scene", ("run", "none.toml", "-o", "new"), ("none.toml", "ommatid init")),
     Case("a folder for a scene", ("run", "out", "-o", "new"), ("out", "scene file")),
-    Case("a scene that is not UTF-8", RUN, ("tiny.toml", "utf-8"), latin_1),
+    Case("a scene that is not UTF-8", RUN, ("tiny.toml", "UTF-8"), latin_1),
     *[
         Case(f"a stack cut at {part}", RECONSTRUCT, ("out/tiny/stack.exr",), cut("out/tiny/stack.exr", part))
         for part in (0, 0.01, 0.1, 0.3, 0.6, 0.9, 0.97, 0.999)

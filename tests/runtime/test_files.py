@@ -85,7 +85,9 @@ def test_temporary_files_of_dead_processes_are_removed_and_of_living_ones_are_no
     assert {left.name: left.read_bytes() for left in tmp_path.iterdir()} == {path.name: b"whole", other.name: b"half"}
 
 
-@pytest.mark.parametrize("name", ["a.npz", "x" * 251 + ".npz", "é" * 125 + ".exr", "a." + "y" * 253, "日" * 85], ids=len)
+@pytest.mark.parametrize(
+    "name", ["a.npz", "x" * 251 + ".npz", "é" * 125 + ".exr", "a." + "y" * 253, "日" * 85], ids=len
+)
 def test_names_as_long_as_the_file_system_takes_are_written_and_cleared(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     seen: list[Path] = []

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -83,3 +85,13 @@ def test_temporary_files_of_dead_processes_are_removed_and_of_living_ones_are_no
 
     files.write_whole(path, write)
     assert {left.name: left.read_bytes() for left in tmp_path.iterdir()} == {path.name: b"whole", other.name: b"half"}
+
+
+def test_a_fifo_named_like_a_temporary_file_is_not_waited_for(tmp_path: Path) -> None:
+    for name in ("result.json", "other"):
+        os.mkfifo(tmp_path / f".0123abcd{files.PART}{name}")
+    work = Thread(target=lambda: (files.write_text(tmp_path / "result.json", "{}"), files.clear_abandoned(tmp_path)))
+    work.daemon = True
+    work.start()
+    work.join(20)
+    assert not work.is_alive()

@@ -81,7 +81,7 @@ def _temporary_file(path: Path) -> Generator[Path]:
 def clear_abandoned(folder: Path, name: str | None = None) -> None:
     """Remove temporary files of dead processes (their locks are free), of the file `name` or of all files."""
     for temporary in folder.glob(f".{'[0-9a-f]' * 8}{PART}{'*' if name is None else escape(short_name(name))}"):
-        with suppress(OSError), temporary.open("rb") as stream:  # in use, or removed meanwhile
+        with suppress(OSError, InputError), open_input(temporary) as stream:  # in use, removed meanwhile, or no file
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             temporary.unlink()
 
@@ -93,6 +93,21 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # of names that are not UTF-8
 
     write_whole(path, write)
+
+
+def append_text(path: Path, text: str) -> None:
+    """Append UTF-8 text to a file, and wait until the disk has it; a link in its place is replaced, as by write_whole.
+
+    Raises OSError.
+    """
+    with suppress(FileNotFoundError):
+        if path.is_symlink() or path.lstat().st_nlink > 1:
+            path.unlink()
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    with os.fdopen(descriptor, "a", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:

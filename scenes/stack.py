@@ -28,6 +28,7 @@ from .tables.table import LARGEST
 CHANNELS = ("Y", "variance")
 SENSOR_CHANNELS = ("dark", "flat")
 FLAT_VALUE = "flat_value"
+AGAIN = "make it again"
 
 STRAIGHT = "straight"  # key of a record: interreflection was skipped, since nothing in the world reflects light
 
@@ -79,6 +80,8 @@ def write(path: Path, stack: Stack) -> None:
     channels = {"Y": stack.values, "variance": stack.variance}
     if stack.recording is not None:
         channels |= {"Y": stack.recording.digital, "dark": stack.recording.dark, "flat": stack.recording.flat}
+    dead = np.isnan(channels["Y"]) if stack.recording is None else False
+    _check_range(path, "make the target or its light darker", **channels | {"Y": np.where(dead, 0.0, channels["Y"])})
     parts: list[exr.Part] = []
     for sub, pixels in zip(stack.camera.sub_imagers, stack.camera.slices(), strict=True):
         record: dict[str, Any] = {
@@ -119,11 +122,11 @@ def read(path: Path) -> Stack:
         raise InputError(f"{path}: expected variances of 0 or more, got others; make it again")
     if scene.sensor is None:
         values = _joined(parts, "Y")
-        _check_range(path, variance=variance, Y=values[~np.isnan(values)])  # of dead pixels
+        _check_range(path, AGAIN, variance=variance, Y=values[~np.isnan(values)])  # of dead pixels
         return Stack(scene, camera, values, variance, record)
     sizes = [sub.type.pixels[0] * sub.type.pixels[1] for sub in camera.sub_imagers]
     digital, dark, flat = (_joined(parts, name) for name in ("Y", *SENSOR_CHANNELS))
-    _check_range(path, variance=variance, Y=digital, dark=dark, flat=flat)
+    _check_range(path, AGAIN, variance=variance, Y=digital, dark=dark, flat=flat)
     recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts, sizes))
     return stack_from_recording(scene, camera, recording, variance, record)
 
@@ -145,13 +148,11 @@ def _described(path: Path, first: dict[str, Any]) -> tuple[Scene, Camera, dict[s
     return scene, derive(scene), record
 
 
-def _check_range(path: Path, **channels: FloatArray) -> None:
-    """Raise InputError for values that are not finite, or too large for their squares."""
+def _check_range(path: Path, cure: str, **channels: FloatArray) -> None:
+    """Raise InputError for values that are not finite, or too large for their squares, with `cure`, the advice."""
     for name, values in channels.items():
         if values.size and not (values.min() >= -(LARGEST**2) and values.max() <= LARGEST**2):
-            raise InputError(
-                f"{path}: expected finite numbers up to {LARGEST**2:g} as {name}, got others; make it again"
-            )
+            raise InputError(f"{path}: expected finite numbers up to {LARGEST**2:g} as {name}, got others; {cure}")
 
 
 def _joined(parts: list[exr.Part], channel: str) -> FloatArray:

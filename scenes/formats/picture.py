@@ -21,6 +21,7 @@ from ommatid.runtime.printable import printable
 
 from ..constants import WHITE
 from ..scene import Scene
+from ..tables.table import LARGEST
 from .exr import Part, write
 from .picture_file import read_picture
 from .stored_picture import BYTES, StoredPicture
@@ -35,7 +36,7 @@ def load(scene: Scene) -> FloatArray:
 
     A target without a picture, of a scene with a world, is zero: its image is not known before it is rendered.
     Raises InputError if there is neither picture nor world, or the picture is unreadable, too small for the crop or
-    contains NaN.
+    contains NaN or values beyond LARGEST.
     """
     target = scene.target
     where = f"{scene.source}: target.image"
@@ -51,35 +52,19 @@ def load(scene: Scene) -> FloatArray:
             prod(target.shape) * target.detail**2 * BYTES, f"{scene.source}: target.shape", "take a smaller one"
         )
         return np.zeros(finer(target.shape, target.detail))
-    stored = _stored(target.image, where)
-    picture = luminance(stored.pixels, where) * (1.0 if stored.bits is None else _step(stored.bits))
-    if target.origin is None:
-        if target.shape is not None and finer(target.shape, target.detail) != picture.shape:
-            rows, columns = finer(target.shape, target.detail)
-            raise InputError(
-                f"{scene.source}: target.shape asks for {rows} x {columns} pixels, but the picture has"
-                f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it"
-            )
-        crop = picture[tuple(slice(size - size % target.detail) for size in picture.shape)]
-    else:
-        crop = _crop(picture, scene)
-    with np.errstate(over="ignore", invalid="ignore"):
-        rounded = crop.astype(np.float32).astype(np.float64)  # the precision of the renderer and of truth.exr
-    if not np.isfinite(rounded).all():
-        raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
-    return rounded
+    return _part_asked_for(scene, _stored(target.image, where))
 
 
 def conversions(scene: Scene) -> list[str]:
     """Return what is lost or rescaled when the target's picture is read, a sentence each.
 
-    Raises InputError if the picture is missing or unreadable.
+    Raises InputError as `load` does for a picture.
     """
     image = scene.target.image
     if image is None:
         return []
-    where = f"{scene.source}: target.image"
-    stored = _stored(image, where)
+    stored = _stored(image, f"{scene.source}: target.image")
+    _part_asked_for(scene, stored)
     sentences = notes_of(image, stored)
     dtype = stored.pixels.dtype
     if dtype.kind == "u" and dtype.itemsize == 2:
@@ -164,6 +149,32 @@ def grey(pixels: NDArray[Any], where: str) -> FloatArray:
         if not (alpha.min() == alpha.max() >= full):
             raise InputError(f"{where}: the picture is at least partly transparent; save it without an alpha channel")
     return values[..., :3] @ np.array(LUMINANCE) if channels >= 3 else values[..., 0]
+
+
+def _part_asked_for(scene: Scene, stored: StoredPicture) -> FloatArray:
+    """The crop of a picture in the scene's range of values, rounded to float32. Raises InputError."""
+    target, where = scene.target, f"{scene.source}: target.image"
+    picture = luminance(stored.pixels, where) * (1.0 if stored.bits is None else _step(stored.bits))
+    if target.origin is None:
+        if target.shape is not None and finer(target.shape, target.detail) != picture.shape:
+            rows, columns = finer(target.shape, target.detail)
+            raise InputError(
+                f"{scene.source}: target.shape asks for {rows} x {columns} pixels, but the picture has"
+                f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it"
+            )
+        crop = picture[tuple(slice(size - size % target.detail) for size in picture.shape)]
+    else:
+        crop = _crop(picture, scene)
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = crop.astype(np.float32).astype(np.float64)  # the precision of the renderer and of truth.exr
+    if not np.isfinite(rounded).all():
+        raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
+    largest = float(np.abs(rounded).max(initial=0.0))
+    if largest > LARGEST:
+        raise InputError(
+            f"{where}: expected values up to {LARGEST:g} in {target.image}, got one of size {largest:.3g}; scale them"
+        )
+    return rounded
 
 
 def _crop(picture: FloatArray, scene: Scene) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError, MachineError
-from ommatid.runtime.files import write_whole
+from ommatid.runtime.files import short_name, write_whole
 from ommatid.scenes.formats import npz
 
 State = dict[str, NDArray[Any]]
@@ -68,7 +68,7 @@ class Checkpoint:
 
 
 def _beside(path: Path) -> Path:
-    return path.with_name(f".{path.name}.partial.npz")
+    return path.with_name(f".{short_name(path.name)}.partial.npz")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skimage import data, io
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.formats.picture import LUMINANCE, load, luminance, write_truth
+from ommatid.scenes.formats.picture import LUMINANCE, conversions, load, luminance, write_truth
 from ommatid.scenes.scene import Scene, with_changes
 
 from ..examples import scene
@@ -98,6 +98,17 @@ def test_nan_is_refused_only_inside_the_crop(tmp_path: Path, bad: float) -> None
     with pytest.raises(InputError, match="NaN"):
         load(looking_at(path))
     load(looking_at(path, origin=[1, 1]))
+
+
+@pytest.mark.parametrize("bad", [3e38, -3e38, 1.1e12])
+def test_values_whose_squares_files_cannot_hold_are_refused(tmp_path: Path, bad: float) -> None:
+    pixels = np.ones((20, 30), dtype=np.float32)
+    pixels[3, 4] = bad
+    described = looking_at(save(tmp_path / "vast.npy", pixels))
+    for read in (load, conversions):
+        with pytest.raises(InputError, match=r"expected values up to 1e\+12 in .*vast.npy, got one of size"):
+            read(described)
+    assert load(looking_at(tmp_path / "vast.npy", origin=[4, 0])).max() == 1.0
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,15 @@ def sensor_example(seed: int = 0) -> Stack:
     )
 
 
+@pytest.mark.parametrize(("channel", "value"), [("values", 3e38), ("values", np.inf), ("variance", 1e40)])
+def test_readings_beyond_float32_are_not_written(tmp_path: Path, channel: str, value: float) -> None:
+    first = example()
+    changed = replace(first, **{channel: np.full_like(first.values, value)})
+    with pytest.raises(InputError, match=r"expected finite numbers up to 1e\+24 as .*; make the target or its light"):
+        stack.write(tmp_path / "stack.exr", changed)
+    assert not list(tmp_path.iterdir())
+
+
 def test_write_then_read_is_the_identity(tmp_path: Path) -> None:
     first = example()
     stack.write(tmp_path / "stack.exr", first)
@@ -167,9 +176,10 @@ def test_a_sensor_s_stack_without_frames_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
 def test_variances_that_cannot_be_are_refused(value: float, tmp_path: Path) -> None:
-    first = example()
-    first.variance[3] = value
-    stack.write(tmp_path / "s.exr", first)
+    stack.write(tmp_path / "s.exr", example())
+    parts = exr.read(tmp_path / "s.exr")
+    parts[0].channels["variance"][0, 0] = value
+    exr.write(tmp_path / "s.exr", parts)
     with pytest.raises(InputError, match=r"s\.exr: expected"):
         stack.read(tmp_path / "s.exr")
 

@@ -119,6 +119,8 @@ def _kernels(arrays: dict[str, NDArray[Any]], camera: Camera, prefix: str) -> Ke
         return None
     description = parse_json(str(own.pop(DESCRIPTION)[()]))
     for name, values in own.items():
+        if values.dtype.kind != "f":
+            raise ValueError(f"expected floating-point numbers as {prefix}{name}, got {values.dtype}")
         check_range(f"{prefix}{name}", values)
     return read_kernels(camera, description, own)
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import digest, write_whole
+from ommatid.runtime.input_files import parse_json
 
 from .camera import Camera, derive
 from .fitted.fitted_matrix import FittedMatrix, Views
@@ -69,7 +70,7 @@ def read(path: Path) -> Model:
     """Read a model. Raises InputError if the file is missing, damaged, pickled or of another kind."""
     arrays, description = _arrays(path)
     try:
-        content = json.loads(description)
+        content = parse_json(description)
         scene = parse_stored(content["scene"], path)
         record = checked(content["record"])
         method = record["method"]
@@ -105,7 +106,10 @@ def _fitted(arrays: dict[str, NDArray[Any]], camera: Camera) -> FittedMatrix | N
         if len(views[lens.name].numbers) != lens.count:
             raise ValueError(f"lens type {lens.name} has {len(views[lens.name].numbers)} views, expected {lens.count}")
     kernels = {lens.name: _kernels(arrays, camera, f"{KERNELS}{lens.name}.") for lens in camera.types}
-    return FittedMatrix(camera, views, {name: each for name, each in kernels.items() if each is not None})
+    fitted = FittedMatrix(camera, views, {name: each for name, each in kernels.items() if each is not None})
+    if "data" not in arrays and not all(views[name].explained.all() for name in views.keys() - fitted.kernels.keys()):
+        raise ValueError("it has sub-imagers that neither numbers nor entries describe")
+    return fitted
 
 
 def _kernels(arrays: dict[str, NDArray[Any]], camera: Camera, prefix: str) -> KernelFootprints | None:
@@ -113,8 +117,10 @@ def _kernels(arrays: dict[str, NDArray[Any]], camera: Camera, prefix: str) -> Ke
     own = {name.removeprefix(prefix): each for name, each in arrays.items() if name.startswith(prefix)}
     if not own:
         return None
-    description = json.loads(str(own.pop(DESCRIPTION)[()]))
+    description = parse_json(str(own.pop(DESCRIPTION)[()]))
     for name, values in own.items():
+        if values.dtype.kind != "f":
+            raise ValueError(f"expected floating-point numbers as {prefix}{name}, got {values.dtype}")
         check_range(f"{prefix}{name}", values)
     return read_kernels(camera, description, own)
 
@@ -133,7 +139,7 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
             names += ENTRIES
         names += [name for name in content if name.startswith((PREFIX, KERNELS))] if layout == VIEWS else []
         arrays = {name: content[name] for name in names}
-        record = json.loads(str(content["ommatid"][()]))
+        record = parse_json(str(content["ommatid"][()]))
         description, seal = record["description"], record["sha256"]
     except InputError:
         raise

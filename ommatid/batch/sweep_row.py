@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
-from ommatid.runtime.input_files import read_bytes
+from ommatid.runtime.input_files import check_unique_keys, read_bytes
 from ommatid.scenes.tables.overrides import value_of
 
 NUMBERS = "sweep.json"
@@ -121,11 +121,14 @@ def write_rows(path: Path, rows: Sequence[SweepRow]) -> None:
 def read_rows(path: Path) -> list[SweepRow]:
     """Read sweep.json. Raises InputError if it is missing, damaged or another file."""
     try:
-        return TypeAdapter(list[SweepRow]).validate_json(read_bytes(path))
+        content = read_bytes(path)
+        rows = TypeAdapter(list[SweepRow]).validate_json(content)
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror}); `ommatid run --sweep` writes it") from error
     except ValidationError as error:
         raise InputError(f"{path}: expected the table of a sweep, got something else; repeat the sweep") from error
+    check_unique_keys(path, content)
+    return rows
 
 
 def _for_json(text: str) -> Any:

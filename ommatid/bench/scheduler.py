@@ -17,7 +17,7 @@ import numpy as np
 
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import append_text
-from ommatid.runtime.input_files import read_text
+from ommatid.runtime.input_files import parse_json, read_text
 from ommatid.runtime.progress import Progress
 
 from .resources import Cost
@@ -90,7 +90,7 @@ class Journal:
 
     def _load(self, line: str) -> None:
         try:
-            entry = json.loads(line)
+            entry = parse_json(line)
             if entry["fingerprint"] != self._fingerprint:
                 return
             if "cell" in entry:

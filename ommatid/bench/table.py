@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, Valid
 
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import write_csv, write_text
-from ommatid.runtime.input_files import read_bytes, real_path
+from ommatid.runtime.input_files import check_unique_keys, read_bytes, real_path
 
 JSON, CSV = "bench.json", "bench.csv"
 ALONE = "alone"  # the setting of a dense form without refinement, which a scene cannot ask for
@@ -195,7 +195,8 @@ def write(folder: Path, table: BenchTable) -> None:
 def read(path: Path) -> BenchTable:
     """Read bench.json. Raises InputError if the file is missing, truncated or not written by `ommatid bench`."""
     try:
-        return BenchTable.model_validate_json(read_bytes(path), strict=True)
+        content = read_bytes(path)
+        table = BenchTable.model_validate_json(content, strict=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); run `ommatid bench` to create it") from error
     except ValidationError as error:
@@ -205,6 +206,8 @@ def read(path: Path) -> BenchTable:
             f"{path}: expected the output of `ommatid bench`, but {field} is not valid ({reason});"
             " run `ommatid bench` again"
         ) from error
+    check_unique_keys(path, content)
+    return table
 
 
 def bench_tables(folder: Path, camera: Mapping[str, Any]) -> Iterator[BenchTable]:

@@ -5,14 +5,17 @@ Opening a FIFO waits for a writer, and a device may have no end.
 
 from __future__ import annotations
 
+import json
 import os
 import stat
+from collections import Counter
 from collections.abc import Generator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
-from .errors import InputError
+from .errors import InputError, shortened_repr
 
 LARGEST_TEXT = 64_000_000  # bytes of a description: a scene, a lens, a table or a report
 
@@ -57,9 +60,33 @@ def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
     return read_bytes(path, largest).decode("utf-8")
 
 
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON document. Raises ValueError if it is none, or has a key twice in one table.
+
+    Readers differ in which of two equal keys they take, so that such a document has no certain meaning.
+    """
+    return json.loads(text, object_pairs_hook=_table)
+
+
+def check_unique_keys(path: Path, content: bytes) -> None:
+    """Raise InputError if a JSON document, which has been read, has a key twice in one table."""
+    try:
+        json.loads(content, object_pairs_hook=_table, parse_int=len, parse_float=len)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: {error}; delete it and make it again") from error
+
+
 def real_path(path: Path) -> Path:
     """Return the absolute path without symbolic links; one with links in a circle as far as it can be followed."""
     return Path(os.path.realpath(path))
+
+
+def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"expected each key of a table once, got {shortened_repr(twice)} twice")
+    return table
 
 
 def _check_kind(path: Path, mode: int) -> None:

@@ -14,7 +14,7 @@ from pydantic import AliasChoices, Field, ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import write_text
-from ommatid.runtime.input_files import read_bytes
+from ommatid.runtime.input_files import check_unique_keys, read_bytes
 from ommatid.scenes.formats.provenance import FitRecord
 
 from .held_out_report import HeldOutReport
@@ -279,7 +279,8 @@ def read(folder: Path) -> RunReport:
     """Read run.json of a folder. Raises InputError where there is none, or where a key is missing or wrong."""
     path = folder / RUN
     try:
-        report = RunReport.model_validate_json(read_bytes(path))
+        content = read_bytes(path)
+        report = RunReport.model_validate_json(content)
     except OSError as error:
         raise InputError(
             f"{path}: expected the results of a run, got no file that can be read ({error.strerror})"
@@ -291,6 +292,7 @@ def read(folder: Path) -> RunReport:
             f"{path}: expected the results of a run, got a file whose {key} is wrong: {shortened(first['msg'])};"
             " delete it and run the scene again"
         ) from error
+    check_unique_keys(path, content)
     if not report.fingerprint:
         raise InputError(f"{path}: expected the results of a run, got a file without fingerprint; run the scene again")
     return report

@@ -18,10 +18,12 @@ from ommatid.runtime.arrays import BoolArray, FloatArray
 
 from ..camera import Camera
 from ..lens_type import LensType, SubImager
+from ..tables.table import LARGEST
 from .kernels import KernelFootprints
 from .real_boxes import RealBoxes, real_box
-from .view import COUNT, K1, ROTATION, designed, displacements, entries
+from .view import COUNT, K1, LEAST, MOST, ROTATION, designed, displacements, entries
 
+STRUCTURES = {"own", "shared", "designed"}
 ALIKE = 0.05  # pixels of f that views may be displaced by where error maps take H as designed
 
 
@@ -66,10 +68,14 @@ class Views:
         count = len(numbers)
         if numbers.shape != (count, COUNT) or explained.shape != (count,) or len(structure) != COUNT:
             raise ValueError(f"the views {name} have arrays of other shapes")
-        if own.shape[:2] != (count, COUNT) or shared.shape[:2] != (count, COUNT):
+        if any(each.ndim != 3 or each.shape[:2] != (count, COUNT) for each in (own, shared)):
             raise ValueError(f"the errors of the views {name} have arrays of other shapes")
-        if not all(np.isfinite(each).all() for each in (numbers, own, shared)):
-            raise ValueError(f"the views {name} have numbers that are not finite")
+        if not ((numbers >= LEAST) & (numbers <= MOST)).all():
+            raise ValueError(f"the views {name} have numbers that are not finite or out of range")
+        if not all((np.abs(each) <= LARGEST).all() for each in (own, shared)):
+            raise ValueError(f"the errors of the views {name} are not finite or out of range")
+        if not set(structure) <= STRUCTURES:
+            raise ValueError(f"the views {name} are none of {', '.join(sorted(STRUCTURES))}")
         return cls(numbers, explained, own, shared, structure)
 
 

@@ -21,6 +21,7 @@ from numpy.polynomial import legendre
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.errors import shortened_repr
 
 from ..camera import Camera
 from ..lens_type import LensType
@@ -28,6 +29,7 @@ from ..optics.boxes import by_rows
 from .wide_correlation import WideCorrelation
 
 PIXELS_AT_ONCE = 2**14
+MOST_DEGREE = 50  # of polynomials in a file
 WIDE = 24  # pixels of f of the narrowest kernels that Fourier transforms apply faster than sums
 
 _Tables = tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, IntArray, int, IntArray]
@@ -290,7 +292,9 @@ class KernelFootprints:
 
 
 def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, FloatArray]) -> KernelFootprints:
-    """Return the kernels of a file: the inverse of `description` and `arrays`."""
+    """Return the kernels of a file: the inverse of `description` and `arrays`. Raises ValueError for others."""
+    margin, degree = description["margin"], description["degree"]
+    if any(type(each) is not int or each < 0 for each in (margin, degree)) or degree > MOST_DEGREE:
+        raise ValueError(f"expected a margin and a degree of kernels, got {shortened_repr((margin, degree))}")
     (lens_type,) = (each for each in camera.types if each.name == description["lens"])
-    places = KernelPlaces(camera, lens_type, int(description["margin"]))
-    return KernelFootprints(places, int(description["degree"]), **arrays)
+    return KernelFootprints(KernelPlaces(camera, lens_type, margin), degree, **arrays)

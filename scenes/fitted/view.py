@@ -9,7 +9,7 @@ and turns with the sensor.
 from __future__ import annotations
 
 from dataclasses import replace
-from math import hypot
+from math import hypot, pi
 
 import numpy as np
 from scipy import sparse
@@ -28,6 +28,8 @@ UNITS = {
     "k1": "at r = 1, the target's corner",
 }
 COUNT = len(UNITS)
+LEAST = np.array([-1e6, -1e6, -0.99, -2 * pi, -1e6])  # of the numbers in a file
+MOST = np.array([1e6, 1e6, 99.0, 2 * pi, 1e6])
 ROW, COLUMN, MAGNIFICATION, ROTATION, K1 = range(COUNT)
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint, write_whole
-from ommatid.runtime.input_files import check_regular
+from ommatid.runtime.input_files import check_regular, parse_json
 from ommatid.runtime.memory import check_memory
 from ommatid.runtime.printable import printable
 
@@ -226,7 +226,7 @@ def _checked_record(path: Path, name: str, attribute: str | None) -> tuple[dict[
     if not isinstance(attribute, str):
         raise InputError(f"{where} has no attribute '{ATTRIBUTE}'; expected a file that ommatid wrote")
     try:
-        record = json.loads(attribute)
+        record = parse_json(attribute)
         seal = record.pop("seal")
         intact = fingerprint(record) == seal
         pixels = record.pop("sha256")

@@ -12,6 +12,9 @@ import tifffile
 
 from ommatid.analysis import study
 from ommatid.batch.remote import RunObserver, carry_out, packed, unpack
+from ommatid.batch.sweep_row import read_rows
+from ommatid.reconstruct.output import run_json
+from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
@@ -203,3 +206,19 @@ def test_every_report_says_that_h_as_designed_was_taken(
         assert json.loads((here / folder / "run.json").read_text(encoding="utf-8"))["verdict"]["notes"][-1] == note
         assert "although the scene asks for" in (here / folder / "report.html").read_text(encoding="utf-8")
     assert ommatid("report", kept).err == ""
+
+
+# --- documents of results
+
+
+def test_a_document_with_a_key_twice_is_refused(finished: Path, tmp_path: Path) -> None:
+    report = (finished / "run.json").read_text(encoding="utf-8")
+    row = '{"scene": "a.toml", "folder": "a", "values": {}, "psnr": 1.0}'
+    (tmp_path / "sweep.json").write_text(f"[{row}]", encoding="utf-8")
+    (tmp_path / "run.json").write_text(report, encoding="utf-8")
+    assert (run_json.read(tmp_path), len(read_rows(tmp_path / "sweep.json"))) == (run_json.read(finished), 1)
+    (tmp_path / "sweep.json").write_text(f"[{row[:-1]}, {row[1:]}]", encoding="utf-8")
+    (tmp_path / "run.json").write_text('{"fingerprint": "x",' + report.lstrip()[1:], encoding="utf-8")
+    for read_again in (lambda: read_rows(tmp_path / "sweep.json"), lambda: run_json.read(tmp_path)):
+        with pytest.raises(InputError, match=r"expected each key of a table once, got '\w+' twice; delete it"):
+            read_again()

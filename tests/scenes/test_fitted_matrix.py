@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,3 +141,32 @@ def test_rotation_and_distortion_need_entries() -> None:
         sub, place = cam.sub_imagers[1], cam.slices()[1]
         exact = entries(cam, sub, designed(sub) + 1e-3 * (np.arange(COUNT) == number))
         assert abs(fitted.to_sparse()[place] - exact).max() == 0
+
+
+def number(index: int, value: float) -> Callable[[dict[str, Any]], object]:
+    """Change one number of the first sub-imager."""
+
+    def change(arrays: dict[str, Any]) -> None:
+        arrays["v.numbers"] = arrays["v.numbers"].copy()
+        arrays["v.numbers"][0, index] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *(number(2, value) for value in (-1.0, -2.0, -0.9999999, 1e18)),
+        *(number(index, value) for index in range(COUNT) for value in (np.nan, -np.inf, 1e300)),
+        *(lambda arrays, key=key: arrays.update({key: arrays[key][..., 0]}) for key in ("v.own", "v.shared")),
+        *(lambda arrays, key=key: arrays.update({key: arrays[key] + 1e200}) for key in ("v.own", "v.shared")),
+        lambda arrays: arrays.update({"v.structure": np.array(["free"] * COUNT)}),
+    ],
+)
+def test_views_that_no_camera_has_are_refused(change: Callable[[dict[str, Any]], object]) -> None:
+    errors = np.full((3, COUNT, 1), 1e-3)
+    arrays = Views(np.zeros((3, COUNT)), np.ones(3, bool), errors, errors, ("own",) * COUNT).arrays("v")
+    assert Views.from_arrays(arrays, "v").structure == ("own",) * COUNT
+    change(arrays)
+    with pytest.raises(ValueError, match="views v "):
+        Views.from_arrays(arrays, "v")

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import make_folder
-from ommatid.runtime.input_files import read_bytes, read_text
+from ommatid.runtime.input_files import check_unique_keys, read_bytes, read_text
 from ommatid.runtime.outputs.kinds import check_inside
 
 from ..batch import Member
@@ -150,7 +150,8 @@ class JobShare:
         for number, text in records.items():
             try:
                 by_folder |= {scene.folder: scene for scene in _JobRecord.model_validate_json(text).scenes}
-            except ValidationError as error:
+                check_unique_keys(self._record(number), text.encode())
+            except ValueError as error:
                 raise InputError(f"{self._record(number)}: is damaged; repeat job {number}") from error
         for name in self.plan.scenes:
             if name not in by_folder:
@@ -220,7 +221,9 @@ def join_jobs(
 
 def _read_plan(path: Path) -> JobPlan:
     try:
-        plan = JobPlan.model_validate_json(read_bytes(path))
+        content = read_bytes(path)
+        plan = JobPlan.model_validate_json(content)
+        check_unique_keys(path, content)
         if not plan.shares:
             raise ValueError("a plan without shares")
     except ValueError as error:

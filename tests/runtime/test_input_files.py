@@ -108,3 +108,12 @@ def test_links_in_a_circle_have_a_path(tmp_path: Path) -> None:
     assert real_path(tmp_path / "a" / "c").is_absolute()
     with pytest.raises(OSError, match="symbolic links"):
         read_bytes(tmp_path / "a")
+
+
+def test_a_refused_input_does_not_stay_open(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    before = set(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    for path in (tmp_path, tmp_path / "fifo", tmp_path / "missing"):
+        with pytest.raises((InputError, OSError)):
+            read_bytes(path)
+    assert set(os.listdir("/proc/self/fd")) == before  # noqa: PTH208

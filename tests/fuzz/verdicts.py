@@ -93,7 +93,8 @@ def command_verdict(ended: CommandEnd, words: Sequence[str], results: bool = Fal
     if max(map(len, lines), default=0) > LONGEST_SENTENCE:
         faults.append(f"a sentence of {max(map(len, lines))} characters: {max(lines, key=len)[:200]!r}")
     if code == 2:
-        if not lines or not lines[-1].startswith(("ommatid: ", "warning: ")) or (out and not results):
+        last = ("ommatid: ", "warning: ", *(("job ",) if "--job" in words else ()))  # which says what all jobs did
+        if not lines or not lines[-1].startswith(last) or (out and not results):
             faults.append(f"refused with {err[:300]!r} and printed {out[:60]!r}")
     elif code not in (0, 3):
         faults.append(f"ended with {code}: {err[:300]!r}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.renderer.worlds import trial
+from ommatid.simulate.renderer.worlds.building import parse_world
 from ommatid.simulate.renderer.worlds.checked_world import CheckedWorld, check_world_files
 
 from .world_files import world
@@ -84,6 +86,19 @@ def test_integrators_of_more_channels_are_refused(tmp_path: Path, integrator: st
         InputError, match=r"its integrator returns \d+ more channels \(.*\); expected the radiance alone"
     ):
         truth(Setup(described, camera))
+
+
+@pytest.mark.parametrize(
+    ("most", "sure", "endless"), [(-1, 20_000, True), (20_000, 30_000, True), (-1, 5, False), (20, 10**9, False)]
+)
+def test_paths_that_may_be_endless_are_refused(most: int, sure: int, endless: bool, tmp_path: Path) -> None:
+    numbers = f'<integer name="max_depth" value="{most}"/><integer name="rr_depth" value="{sure}"/>'
+    (tmp_path / "numbers.xml").write_text(f'<scene version="3.0.0">{numbers}</scene>', encoding="utf-8")
+    integrator = '<integrator type="path"><include filename="numbers.xml"/></integrator>'
+    found = checked(tmp_path, integrator)
+    activate("scalar_rgb")
+    with pytest.raises(RuntimeError, match="at most 10000 segments") if endless else nullcontext():
+        parse_world(found.text, "scalar_rgb")
 
 
 def test_no_library_of_the_current_folder_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

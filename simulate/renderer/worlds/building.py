@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 BLOCK = 4  # scalar variants seed by block, and derive its size from the number of threads unless it is given
+MOST_SEGMENTS = 10_000  # of a path, before it may end at random: between white walls others never end
 BACKWARDS = "ptracer"  # the integrator that starts at the emitters, and takes no block size
 
 
@@ -48,4 +49,16 @@ def parse_world(text: str, variant: str) -> ParsedWorld:
         if node.type == mi.ObjectType.Integrator and node.props.plugin_name() != BACKWARDS:
             node.props["block_size"] = BLOCK
     mi.parser.transform_all(config, state)
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Integrator:
+            _check_lengths(node.props)
     return ParsedWorld(config, state, sensors, has_integrator)
+
+
+def _check_lengths(integrator: Any) -> None:
+    """Raise RuntimeError for an integrator whose paths may be endless: a max_depth below 0 is none."""
+    most, sure = integrator.get("max_depth", -1), integrator.get("rr_depth", 5)
+    if isinstance(most, int) and isinstance(sure, int) and min(sure, most if most >= 0 else sure) > MOST_SEGMENTS:
+        raise RuntimeError(
+            f"expected paths of at most {MOST_SEGMENTS} segments, got rr_depth {sure} and max_depth {most}; lower one"
+        )

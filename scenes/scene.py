@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_text, real_path
+from ommatid.runtime.printable import printable
 
 from .geometry.solution import complete
 from .tables import toml
@@ -184,13 +185,15 @@ def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) ->
     return _with_source(scene, source)
 
 
-def parse_stored(data: dict[str, Any], source: Path) -> Scene:
+def parse_stored(data: object, source: Path) -> Scene:
     """Validate the scene that a stack or a model stores, which needs no other file.
 
     Raises InputError as `parse` does, and for a scene that names files of lenses, glasses or curves, which a scene has
     only until they are read: a file that was received is not to open others.
     """
-    scene = parse(data, source)
+    if not isinstance(data, dict):
+        raise InputError(f"{source}: expected the tables of a scene, got {printable(repr(data), 40)}; make it again")
+    scene = parse(cast(dict[str, Any], data), source)
     named = [f"camera.lens.{lens.name}.surfaces" for lens in scene.camera.lens if isinstance(lens.surfaces, str)]
     named += [] if scene.camera.glass_catalogue is None else ["camera.glass_catalogue"]
     named += [] if scene.light is None or scene.light.file is None else ["light.spectrum"]

@@ -16,7 +16,7 @@ from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import LOST, Completed
 from ommatid.runtime.files import clear_abandoned, make_folder
-from ommatid.runtime.outputs.kinds import check_folder, check_output
+from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_output
 from ommatid.runtime.outputs.occupied import new_folder, occupied
 from ommatid.runtime.processors import processors
 from ommatid.scenes.formats.picture import write_truth
@@ -194,6 +194,7 @@ def check_files(setup: Setup, folder: Path) -> None:
     """Raise InputError if a scene has no picture, or if its results would replace a file that it is read from."""
     scene, _ = setup.scene, setup.picture
     check_folder(folder)
+    check_inside(folder)
     if folder.is_dir():
         read = scene.source, *([Path(scene.target.image)] if scene.target.image else [])
         for name in (*PICTURES, *OTHERS, *([WORLD_PICTURE] if setup.camera.detail > 1 else [])):

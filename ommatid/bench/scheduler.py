@@ -8,7 +8,6 @@ number of samples precede all others, since each gives as much information as th
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.files import append_text
 from ommatid.runtime.input_files import parse_json, read_text
 from ommatid.runtime.progress import Progress
 
@@ -112,10 +112,7 @@ class Journal:
             line = json.dumps({**entry, "why": cell}, allow_nan=False)
         self.seconds += seconds
         try:
-            with self._path.open("a", encoding="utf-8") as stream:
-                stream.write(f"\n{line}\n")  # a new line, even after a truncated one
-                stream.flush()
-                os.fsync(stream.fileno())
+            append_text(self._path, f"\n{line}\n")  # a new line, even after a truncated one
         except OSError as error:
             reason = error.strerror or str(error)
             raise MachineError(f"{self._path}: could not be written ({reason}); free some space") from error

@@ -96,10 +96,11 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     """Write index.html of a batch unless it is up to date or there is no folder, and return True if it was written.
 
     folders : of the batch, in order, each with its failure or an empty text; other runs in `output` follow
-    Raises MachineError for a full disk.
+    Raises MachineError for a full disk, and InputError as `check_index` does.
     """
     if not output.is_dir():
         return False
+    check_index(output)
     others = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
     entries = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *others)]
     sweep = read_sweep(output / NUMBERS)
@@ -110,6 +111,15 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     stamp = fingerprint([content, sources_digest()])
     name = real_path(output).name
     return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
+
+
+def check_index(output: Path) -> None:
+    """Raise InputError if a page of another program would be replaced by the index of a batch."""
+    path = output / INDEX
+    if path.is_file() and not path.is_symlink() and path.stat().st_size and read_stamp(path)[1] is None:
+        raise InputError(
+            f"{path}: would be replaced, but is a page of another program; move it, or choose another folder with -o"
+        )
 
 
 def _entry(folder: Path, failure: str) -> BatchEntry:

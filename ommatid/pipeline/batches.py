@@ -19,7 +19,7 @@ from ommatid.batch.remote import RunObserver, Stages
 from ommatid.batch.sweep_row import SweepRow, summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
-from ommatid.page.batch_index import cached_index
+from ommatid.page.batch_index import cached_index, check_index
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.outputs.kinds import check_folder
@@ -149,6 +149,8 @@ def run_batch(
     for folder in (index_folder, sweep_folder):
         if folder is not None:
             check_folder(folder)  # before any work
+    if index_folder is not None:
+        check_index(index_folder)
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]

@@ -24,7 +24,7 @@ from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import file_digest, write_text, write_whole
 from ommatid.runtime.input_files import read_text, real_path
-from ommatid.runtime.outputs.kinds import check_folder, check_output
+from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_output
 from ommatid.runtime.outputs.names import check_name
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress
@@ -231,6 +231,8 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
         return ReportOutcome((path,), None, ())
     if not folders:
         raise InputError(f"{path}: expected a stack, or a folder with stack.exr or with folders of runs, got none")
+    for folder in folders:
+        check_inside(folder)
     for number, folder in enumerate(folders):
         with occupied(folder):
             _write_page(folder)

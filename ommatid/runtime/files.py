@@ -30,6 +30,7 @@ Made = TypeVar("Made")
 LONGEST_FIELD = 1000  # characters of a text in a CSV file
 _SIGNED = re.compile(r"[-+](?:[\d.]+(?:[eE][-+]?\d+)?\s*[^\W\d_]*|inf|nan)")  # a number, also with a unit
 PART = ".part."  # in the name of a file that is still being written
+LONGEST_NAME = 100  # bytes of a name that is part of a temporary one, which file systems limit to 255 or 143
 written: set[Path] = set()  # absolute paths of the files that this process wrote
 
 
@@ -54,11 +55,17 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         ) from error
 
 
+def short_name(name: str) -> str:
+    """Return a name as part of the names of files beside it: of at most LONGEST_NAME bytes, with the same ending."""
+    content = os.fsencode(name)
+    return name if len(content) <= LONGEST_NAME else f"{hashlib.sha256(content).hexdigest()[:16]}{name[-20:]}"
+
+
 @contextmanager
 def _temporary_file(path: Path) -> Generator[Path]:
     """Create an empty file beside `path`, locked while it is being written; remove it unless it was renamed."""
     while True:
-        temporary = path.with_name(f".{secrets.token_hex(4)}{PART}{path.name}")
+        temporary = path.with_name(f".{secrets.token_hex(4)}{PART}{short_name(path.name)}")
         with temporary.open("xb") as stream:
             with suppress(OSError):  # on file systems without locks, clear_abandoned removes nothing
                 fcntl.flock(stream, fcntl.LOCK_EX)
@@ -73,8 +80,8 @@ def _temporary_file(path: Path) -> Generator[Path]:
 
 def clear_abandoned(folder: Path, name: str | None = None) -> None:
     """Remove temporary files of dead processes (their locks are free), of the file `name` or of all files."""
-    for temporary in folder.glob(f".{'[0-9a-f]' * 8}{PART}{'*' if name is None else escape(name)}"):
-        with suppress(OSError), temporary.open("rb") as stream:  # in use, or removed meanwhile
+    for temporary in folder.glob(f".{'[0-9a-f]' * 8}{PART}{'*' if name is None else escape(short_name(name))}"):
+        with suppress(OSError, InputError), open_input(temporary) as stream:  # in use, removed meanwhile, or no file
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             temporary.unlink()
 
@@ -86,6 +93,21 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # of names that are not UTF-8
 
     write_whole(path, write)
+
+
+def append_text(path: Path, text: str) -> None:
+    """Append UTF-8 text to a file, and wait until the disk has it; a link in its place is replaced, as by write_whole.
+
+    Raises OSError.
+    """
+    with suppress(FileNotFoundError):
+        if path.is_symlink() or path.lstat().st_nlink > 1:
+            path.unlink()
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    with os.fdopen(descriptor, "a", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:

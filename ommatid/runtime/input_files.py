@@ -32,7 +32,12 @@ _KINDS = {
 def open_input(path: Path) -> Generator[BufferedReader]:
     """Open a regular file for reading. Raises InputError for anything else, OSError if it cannot be opened."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    with os.fdopen(descriptor, "rb") as stream:
+    try:
+        opened = os.fdopen(descriptor, "rb")
+    except OSError:  # a folder
+        os.close(descriptor)
+        raise
+    with opened as stream:
         _check_kind(path, os.fstat(descriptor).st_mode)
         yield stream
 

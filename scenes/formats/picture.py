@@ -144,9 +144,10 @@ def grey(pixels: NDArray[Any], where: str) -> FloatArray:
         return values
     channels = values.shape[2]
     if channels in (2, 4):
-        opaque = values[..., -1].max() == values[..., -1].min()
-        if not opaque:
-            raise InputError(f"{where}: the picture is partly transparent; save it without an alpha channel")
+        alpha = values[..., -1]
+        full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "iu" else 1.0
+        if not (alpha.min() == alpha.max() >= full):
+            raise InputError(f"{where}: the picture is at least partly transparent; save it without an alpha channel")
     return values[..., :3] @ np.array(LUMINANCE) if channels >= 3 else values[..., 0]
 
 

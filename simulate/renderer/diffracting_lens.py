@@ -146,7 +146,8 @@ class BandTable:
         import mitsuba as mi
 
         low, high = (0.0, np.abs(ends).max()) if ends.min() < 0 < ends.max() else np.sort(np.abs(ends))
-        self._nodes = _nodes(low, min(high, MOST_TABULATED)) if high - low >= SAME else np.array([(low + high) / 2])
+        limited = min(low, MOST_TABULATED / GROWTH), min(high, MOST_TABULATED)
+        self._nodes = _nodes(*limited) if high - low >= SAME else np.array([(low + high) / 2])
         self._steps = steps
         tables, self.captured = _radii_and_slants(tuple(self._nodes.tolist()), weight, steps)
         self._radii, self._slants = (mi.Float(table) for table in tables)

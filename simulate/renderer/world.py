@@ -28,6 +28,7 @@ from .variant import activate
 from .worlds.building import BLOCK, parse_world
 from .worlds.checked_world import CheckedWorld, check_world_files, reason_of
 from .worlds.placement import FINEST, Placement
+from .worlds.surfaces import check_positions
 from .worlds.trial import try_world
 
 TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file
@@ -142,6 +143,7 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
         built = parsed.build()
     except (RuntimeError, TypeError) as error:
         raise InputError(f"{where} is no scene that Mitsuba can build: {reason_of(str(error), world)}") from error
+    check_positions(built, where)
     if not built.emitters():
         raise InputError(f"{where} has no emitter, so the image is black; add one, such as <emitter type='constant'/>")
     if not parsed.has_integrator:

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError, MachineError
-from ommatid.runtime.files import write_whole
+from ommatid.runtime.files import short_name, write_whole
 from ommatid.scenes.formats import npz
 
 State = dict[str, NDArray[Any]]
 
 SPACING = 30.0  # seconds between two savings: the work that a power cut may lose
+# Exceptions of a computation that continues from a state of other arrays than it saves.
+_UNUSABLE = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 SHARE = 0.02  # of the time, at most, that goes into saving: after a large state the next one waits longer
 
 
@@ -30,6 +32,7 @@ class Checkpoint:
         self._fingerprint = fingerprint
         self._saved, self._spacing = monotonic(), SPACING
         self._latest: Callable[[], State] | None = None
+        self.continued = False  # from a state that was saved
 
     def state(self) -> State:
         """Return the state that an earlier run saved; empty if there is none or its fingerprint differs."""
@@ -37,7 +40,10 @@ class Checkpoint:
             state = npz.read(self._path)
         except ValueError:
             return {}
-        return state if str(state.pop("fingerprint", "")) == self._fingerprint else {}
+        if str(state.pop("fingerprint", "")) != self._fingerprint:
+            return {}
+        self.continued = bool(state)
+        return state
 
     def offer(self, latest: Callable[[], State]) -> None:
         """Register the current state, written every 30 seconds or more, and when the computation is interrupted."""
@@ -62,18 +68,25 @@ class Checkpoint:
 
 
 def _beside(path: Path) -> Path:
-    return path.with_name(f".{path.name}.partial.npz")
+    return path.with_name(f".{short_name(path.name)}.partial.npz")
 
 
 @contextmanager
 def open_checkpoint(path: Path, fingerprint: str) -> Generator[Checkpoint]:
-    """Open the checkpoint of the result at `path`: saved if the computation is interrupted, removed when it ends."""
+    """Open the checkpoint of the result at `path`: saved if the computation is interrupted, removed when it ends.
+
+    Raises InputError where the computation fails because it continued from a state that it did not save.
+    """
     checkpoint = Checkpoint(path, fingerprint)
     try:
         yield checkpoint
     except InputError:  # the next run would be refused as well
         raise
-    except BaseException:
+    except BaseException as error:
+        if checkpoint.continued and isinstance(error, _UNUSABLE):
+            raise InputError(
+                f"{_beside(path)}: expected the state of an interrupted run, got another; delete it"
+            ) from error
         try:
             checkpoint.save()
         except MachineError:  # the original exception is the one to report

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +137,16 @@ class Counter:
             return Repeat(1 / samples + 1e-3 * repeat, Cost(guess, 2**20), 2.0)
 
         return Job("render", "independent", None, samples, "", guess, work)
+
+
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+def test_a_link_in_place_of_the_journal_is_replaced(link: Callable[[Path, Path], None], tmp_path: Path) -> None:
+    other, path = tmp_path / "other", tmp_path / "partial"
+    other.write_text("of another program", encoding="utf-8")
+    link(other, path)
+    Journal(path, "a").add("render", "no time", 1.0)
+    assert other.read_text(encoding="utf-8") == "of another program"
+    assert Journal(path, "a").refused == {"render": "no time"}
 
 
 def test_finished_jobs_are_not_repeated_after_an_interruption(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ LONGEST_MESSAGE = 500  # characters of an error of the library
 LONGEST_SENTENCE = 1000  # characters of a line that a command writes to stderr
 MEMORY = 1 << 30  # bytes that the process may need beyond those at the start
 ROOT = Path(__file__).parent.parent.parent
+KEPT_PROCESSES = ("resource_tracker", "trial_process")  # that end when this one ends
 NOT_PRINTABLE = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # general categories of Unicode
 LIBRARY_NOISE = re.compile(r"\w*Warning: |^\d{4}-\d\d-\d\d .* (WARN|ERROR) |Traceback|Exception ignored|^  File ", re.M)
 
@@ -92,7 +93,8 @@ def command_verdict(ended: CommandEnd, words: Sequence[str], results: bool = Fal
     if max(map(len, lines), default=0) > LONGEST_SENTENCE:
         faults.append(f"a sentence of {max(map(len, lines))} characters: {max(lines, key=len)[:200]!r}")
     if code == 2:
-        if not lines or not lines[-1].startswith(("ommatid: ", "warning: ")) or (out and not results):
+        last = ("ommatid: ", "warning: ", *(("job ",) if "--job" in words else ()))  # which says what all jobs did
+        if not lines or not lines[-1].startswith(last) or (out and not results):
             faults.append(f"refused with {err[:300]!r} and printed {out[:60]!r}")
     elif code not in (0, 3):
         faults.append(f"ended with {code}: {err[:300]!r}")
@@ -167,7 +169,7 @@ def children() -> set[int]:
         int(child)
         for task in Path("/proc/self/task").iterdir()
         for child in (task / "children").read_text(encoding="ascii").split()
-        if "resource_tracker" not in _command_line(int(child))
+        if not any(name in _command_line(int(child)) for name in KEPT_PROCESSES)
     }
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -83,3 +85,41 @@ def test_temporary_files_of_dead_processes_are_removed_and_of_living_ones_are_no
 
     files.write_whole(path, write)
     assert {left.name: left.read_bytes() for left in tmp_path.iterdir()} == {path.name: b"whole", other.name: b"half"}
+
+
+@pytest.mark.parametrize(
+    "name", ["a.npz", "x" * 251 + ".npz", "é" * 125 + ".exr", "a." + "y" * 253, "日" * 85], ids=len
+)
+def test_names_as_long_as_the_file_system_takes_are_written_and_cleared(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    seen: list[Path] = []
+
+    def write(temporary: Path) -> None:
+        assert temporary.name.endswith(name[-5:])
+        temporary.write_bytes(b"whole")
+        seen.append(temporary)
+
+    files.write_whole(path, write)
+    seen[0].write_bytes(b"half")
+    (tmp_path / f"{seen[0].name[:-1]}_").write_bytes(b"of another name")
+    files.clear_abandoned(tmp_path, name)
+    assert len(list(tmp_path.iterdir())) == 2, "that of the same name is removed"
+    files.clear_abandoned(tmp_path)
+    assert [left.name for left in tmp_path.iterdir()] == [name]
+    assert path.read_bytes() == b"whole"
+
+
+def test_long_names_that_differ_have_temporary_files_that_differ() -> None:
+    first, second = (files.short_name(letter + "x" * 250) for letter in "ab")
+    assert first != second
+    assert max(map(len, (first, second))) < 100
+
+
+def test_a_fifo_named_like_a_temporary_file_is_not_waited_for(tmp_path: Path) -> None:
+    for name in ("result.json", "other"):
+        os.mkfifo(tmp_path / f".0123abcd{files.PART}{name}")
+    work = Thread(target=lambda: (files.write_text(tmp_path / "result.json", "{}"), files.clear_abandoned(tmp_path)))
+    work.daemon = True
+    work.start()
+    work.join(20)
+    assert not work.is_alive()

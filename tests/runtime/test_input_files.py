@@ -122,3 +122,12 @@ def test_other_documents_pass() -> None:
     document = b'{"a": [1, 2.5, null, {"a": NaN}], "b": ' + b"9" * 5000 + b"}"
     check_unique_keys(Path("run.json"), document)
     assert parse_json('{"a": [1, {"a": "x"}]}') == {"a": [1, {"a": "x"}]}
+
+
+def test_a_refused_input_does_not_stay_open(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    before = set(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    for path in (tmp_path, tmp_path / "fifo", tmp_path / "missing"):
+        with pytest.raises((InputError, OSError)):
+            read_bytes(path)
+    assert set(os.listdir("/proc/self/fd")) == before  # noqa: PTH208

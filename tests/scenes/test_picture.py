@@ -72,6 +72,9 @@ def test_colour_becomes_luminance() -> None:
     opaque[0, 0, 3] = 7
     with pytest.raises(InputError, match="transparent"):
         luminance(opaque, "here")
+    for alpha in (0, 128):  # evenly transparent
+        with pytest.raises(InputError, match="transparent"):
+            luminance(np.dstack([colour, np.full(colour.shape[:2], alpha, np.uint8)]), "here")
 
 
 def test_crops_follow_origin_and_shape(tmp_path: Path) -> None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.setup import Setup
+from ommatid.simulate import render
 from ommatid.simulate.cache import cached_model, cached_stack
 from ommatid.simulate.sampling import checkpoint
 from ommatid.simulate.sampling.checkpoint import Checkpoint, open_checkpoint
@@ -126,6 +129,18 @@ def test_a_damaged_checkpoint_is_ignored(tmp_path: Path) -> None:
     for damaged in (b"", whole[: len(whole) // 2], b"PK" + whole[7:], whole[:200] + b"\0" * 50 + whole[250:]):
         kept.write_bytes(damaged)
         assert Checkpoint(path, "mine").state() == {}
+
+
+@pytest.mark.parametrize(
+    "state", [{"other": np.array(1)}, {"mean": np.zeros(2), "variance": np.array("x"), "band": np.array(0)}]
+)
+def test_a_checkpoint_of_other_arrays_is_named(state: dict[str, Any], tmp_path: Path) -> None:
+    setup, path = tiny(), tmp_path / "stack.exr"
+    with pytest.raises(Interruption), open_checkpoint(path, render.made_from(setup)) as one:  # noqa: PT012
+        one.offer(lambda: state)
+        raise Interruption
+    with pytest.raises(InputError, match=r"partial\.npz: expected the state of an interrupted run"):
+        cached_stack(path, setup, no_progress)
 
 
 def test_checkpoints_are_written_regularly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

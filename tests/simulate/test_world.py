@@ -258,6 +258,11 @@ def test_a_changed_world_or_file_of_it_is_rendered_again(tmp_path: Path) -> None
     assert keep() == (pytest.approx(255 / 2), True)
 
 
+def shape_at(change: str, value: str) -> str:
+    where = f'<transform name="to_world"><{change} z="{value}"/></transform>'
+    return f'<emitter type="constant"/><shape type="cube" id="far">{where}</shape>'
+
+
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
@@ -266,6 +271,10 @@ def test_a_changed_world_or_file_of_it_is_rendered_again(tmp_path: Path) -> None
         ('<shape type="sphere"><float name="weight" value="1"/></shape>', "unreferenced property"),
         ('<shape type="obj"><string name="filename" value="none.obj"/></shape>', "none.obj"),
         ('<shape type="sphere"/>', "has no emitter"),
+        (shape_at("translate", "1e400"), "finite positions, got shape 'far' from -1, -1, inf to"),
+        (shape_at("translate", "-inf"), "finite positions, got shape 'far'"),
+        (shape_at("scale", "nan"), "finite positions, got shape 'far' from -1, -1, nan to"),
+        (shape_at("scale", "1e308"), "finite positions, got shape 'far'"),
         ('<emitter type="constant"/><integrator type="ptracer"/>', "does not follow rays from a camera"),
     ],
 )

@@ -19,6 +19,8 @@ from .traps import LIBRARIES, make_traps
 ALL = [(name, *words) for name, many in COMMANDS.items() for words in many]
 IN_ONE_PROCESS = """
 import json, os, sys
+from ommatid.runtime.execution.interpreter import leave_current_folder
+leave_current_folder()  # as the console script does
 from tests.fuzz.verdicts import run_command
 for words in json.loads(sys.argv[1]):
     done = run_command(words)

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import make_folder
 from ommatid.runtime.input_files import check_unique_keys, read_bytes, read_text
+from ommatid.runtime.outputs.kinds import check_inside
 
 from ..batch import Member
 from ..sweep_row import SweepRow
@@ -188,6 +189,7 @@ def join_jobs(
     Raises InputError if jobs of another command, or of other versions, have not all ended in this folder.
     """
     folder = output / FOLDER
+    check_inside(folder)
     make_folder(folder)
     here = versions()
     wanted = JobPlan(

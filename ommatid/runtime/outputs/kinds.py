@@ -69,6 +69,15 @@ def check_folder(path: Path) -> None:
                 raise InputError(f"{found}; remove it or choose another folder")
 
 
+def check_inside(folder: Path) -> None:
+    """Raise InputError if a folder is a link that leads out of the folder where it stands, as in a folder received."""
+    if folder.is_symlink() and not real_path(folder).is_relative_to(real_path(folder.parent)):
+        raise InputError(
+            f"{printable(folder, SHORT)}: expected a folder, got a link to {printable(real_path(folder), SHORT)};"
+            " remove it, or choose another folder with -o"
+        )
+
+
 def input_error(path: Path, error: OSError) -> InputError | None:
     """Return what is wrong with a path as the user gave it; None for a failure of the machine."""
     if error.errno == errno.ENAMETOOLONG:

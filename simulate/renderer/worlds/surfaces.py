@@ -8,8 +8,26 @@ from typing import Any
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable
 
 from .placement import Placement
+
+
+def check_positions(scene: Any, where: str) -> None:
+    """Raise InputError for a surface that is somewhere infinite or nowhere, which rays would pass without a word."""
+    for shape in scene.shapes():
+        box = shape.bbox()
+        ends = np.array([box.min, box.max], dtype=np.float64)
+        if not np.isfinite(ends).all():
+            raise InputError(
+                f"{where}: expected surfaces at finite positions, got shape '{printable(shape.id(), 60)}' from"
+                f" {_listed(ends.reshape(2, 3)[0])} to {_listed(ends.reshape(2, 3)[1])}; correct its numbers"
+            )
+
+
+def _listed(values: FloatArray) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
 
 
 def depths_met(scene: Any, placement: Placement, origins: FloatArray, directions: FloatArray) -> FloatArray:

@@ -123,7 +123,8 @@ def option_case(rng: Random, folder: Path) -> CommandCase:
         if not option.is_flag:
             words.append(_value(rng, option))
     named = _outputs(["-o", *words[1:2], *words]) if name == "init" else _outputs(words)
-    return CommandCase(tuple(words), outputs=named)
+    recorded = named if "--job" in words else ()  # the record of a share that failed
+    return CommandCase(tuple(words), outputs=named, finished=recorded)
 
 
 def _outputs(words: list[str]) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -206,6 +207,14 @@ def test_every_report_says_that_h_as_designed_was_taken(
         assert json.loads((here / folder / "run.json").read_text(encoding="utf-8"))["verdict"]["notes"][-1] == note
         assert "although the scene asks for" in (here / folder / "report.html").read_text(encoding="utf-8")
     assert ommatid("report", kept).err == ""
+
+
+def test_packed_files_do_not_depend_on_the_clock(kept: Path) -> None:
+    for number, path in enumerate(sorted(kept.iterdir(), reverse=True)):
+        os.utime(path, (1e9 + number, 1e9 + number))
+    scene = read(Path("tiny.toml"))
+    sent = list(packed(Setup.from_scene(scene), kept).files)
+    assert sent == [*sorted(set(sent) - {"run.json"}), "run.json"]
 
 
 # --- documents of results

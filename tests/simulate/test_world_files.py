@@ -10,6 +10,7 @@ import pytest
 from ommatid.interface import read_scene
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.renderer.worlds.checked_world import check_world_files
+from ommatid.simulate.renderer.worlds.mesh_files import check_obj
 
 from ..conftest import TINY, Command
 from ..examples import GALLERY
@@ -130,3 +131,18 @@ def test_the_python_interface_has_the_option(tmp_path: Path) -> None:
     path.write_text(TINY, encoding="utf-8")
     assert not read_scene(path).allows_outside
     assert read_scene(path, set="noise.variance=1e-3", allow_outside=True).allows_outside
+
+
+@pytest.mark.parametrize("face", ["1 2 3", "1/1 2/1 3/1", "1//1 2//1 3//1", "1/1/1 2/1/1 3/1/1", "1/ 2/ 3/", "1 2/1 3"])
+def test_a_wrong_line_among_many_is_named(face: str, tmp_path: Path) -> None:
+    """Lines of one kind are checked together, and a line that stands out by itself."""
+    path, lines = (
+        tmp_path / "m.obj",
+        ["v 0 0 1", "v 1 0 1", "v 0 1.5 -1e-2", "vt 0 0", "vn 0 0 1", *[f"f {face}"] * 300],
+    )
+    path.write_text("\n".join(lines), encoding="utf-8")
+    check_obj(path)
+    for at, wrong in ((200, f"f {face.replace('3', '4')}"), (100, f"f {face.replace('1', '0', 1)}"), (2, "v 1 2 nan")):
+        path.write_text("\n".join([*lines[:at], wrong, *lines[at:]]), encoding="utf-8")
+        with pytest.raises(InputError, match=rf"\(line {at + 1}\): expected"):
+            check_obj(path)

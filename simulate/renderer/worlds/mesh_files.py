@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from math import isfinite
 from pathlib import Path
@@ -18,32 +19,81 @@ LONGEST_LINE = 10_000
 MOST_MESHES = 100_000  # of a serialized file
 DENSEST = 1100  # bytes that a byte of zlib becomes at most, rounded up
 SERIALIZED, VERSIONS = 0x041C, (3, 4)
+BLOCK = 2**18  # bytes of an OBJ mesh that are checked at once
+_END = rb"[ \t]*+\r?+\n"
+_NUMBER = rb"[ \t]{1,8}+[-+]?+[0-9]{1,40}+(?:\.[0-9]{0,40}+)?+(?:[eE][-+]?+[0-9]{1,2}+)?+"
+_NUMBERS = {  # lines of one kind in their usual form, one after another
+    kind: re.compile(rb"(?:%b(?:%b){%d,8}+%b)++" % (kind, _NUMBER, least, _END))
+    for kind, least in ((b"v", 3), (b"vt", 2), (b"vn", 3))
+}
+_FACES = {
+    kinds: re.compile(rb"(?:f(?:[ \t]{1,8}+%b){3,100}+%b)++" % (indices, _END))
+    for kinds, indices in (
+        ((b"v",), rb"[0-9]{1,11}+(?!/)"),
+        ((b"v", b"vt"), rb"[0-9]{1,11}+/[0-9]{1,11}+(?!/)"),
+        ((b"v", b"vn"), rb"[0-9]{1,11}+//[0-9]{1,11}+(?!/)"),
+        ((b"v", b"vt", b"vn"), rb"[0-9]{1,11}+/[0-9]{1,11}+/[0-9]{1,11}+(?!/)"),
+    )
+}
 NORMALS, TEXTURED, COLOURED, DOUBLE = 0x1, 0x2, 0x8, 0x2000  # flags
 
 
 def check_obj(path: Path) -> None:
     """Check an OBJ mesh. Raises InputError that names the file, OSError if it cannot be read."""
     shown, counts = printable(path), {b"v": 0, b"vt": 0, b"vn": 0}
-    faces = 0
+    number = faces = 0
     with open_input(path) as stream:
         check_memory(8 * path.stat().st_size, f"{shown}: a mesh", "make it smaller")
-        number = 0
-        while line := stream.readline(LONGEST_LINE + 1):
-            number += 1
-            place = f"{shown} (line {number})"
-            if len(line) > LONGEST_LINE or b"\0" in line:
-                raise InputError(f"{place}: expected text of at most {LONGEST_LINE} characters a line, got more")
-            words = line.split()
-            if not words:
-                continue
-            if words[0] in counts:
-                counts[words[0]] += 1
-                _check_numbers(words[1:4], 2 if words[0] == b"vt" else 3, place)
-            elif words[0] == b"f":
-                faces += 1
-                _check_face(words[1:], counts, place)
+        while block := stream.read(BLOCK):
+            block += stream.readline(LONGEST_LINE + 1)
+            start = by_line = 0
+            while start < len(block):
+                kind, end, lines = b"", start, 0
+                if start >= by_line:
+                    kind, end, lines = _checked_run(block, start, counts)
+                if not lines:
+                    by_line = max(by_line, end)
+                    kind, lines = _checked_line(block, start, counts, f"{shown} (line {number + 1})"), 1
+                    end = block.find(b"\n", start) + 1 or len(block)
+                number, start, faces = number + lines, end, faces + lines * (kind == b"f")
+                if kind in counts:
+                    counts[kind] += lines
     if not faces:
         raise InputError(f"{shown}: expected an OBJ mesh with vertices and faces, got no face")
+
+
+def _checked_run(block: bytes, start: int, counts: dict[bytes, int]) -> tuple[bytes, int, int]:
+    """Return the kind, the end and the number of lines of one kind in their usual form, if all are correct.
+
+    The number is 0 if there are none, or if one of those up to the end is wrong.
+    """
+    for kind, pattern in _NUMBERS.items():
+        if run := pattern.match(block, start):
+            return kind, run.end(), run.group().count(b"\n")
+    for kinds, pattern in _FACES.items():
+        if run := pattern.match(block, start):
+            text = run.group()
+            indices = np.array(text.replace(b"f", b" ").replace(b"/", b" ").split(), dtype=np.int64)
+            columns = indices.reshape(-1, len(kinds))
+            if columns.min() >= 1 and (columns.max(axis=0) <= [counts[kind] for kind in kinds]).all():
+                return b"f", run.end(), text.count(b"\n")
+            return b"f", run.end(), 0
+    return b"", start, 0
+
+
+def _checked_line(block: bytes, start: int, counts: dict[bytes, int], place: str) -> bytes:
+    """Return the first word of a line. Raises InputError that begins with `place`."""
+    line = block[start : block.find(b"\n", start) + 1 or len(block)]
+    if len(line) > LONGEST_LINE or b"\0" in line:
+        raise InputError(f"{place}: expected text of at most {LONGEST_LINE} characters a line, got more")
+    words = line.split()
+    if not words:
+        return b""
+    if words[0] in counts:
+        _check_numbers(words[1:4], 2 if words[0] == b"vt" else 3, place)
+    elif words[0] == b"f":
+        _check_face(words[1:], counts, place)
+    return words[0]
 
 
 def _check_numbers(words: list[bytes], least: int, place: str) -> None:

@@ -46,10 +46,10 @@ def _with_options(
 
 
 def clear_results(folder: Path, setup: Setup) -> None:
-    """Remove the results in a folder, so that all stages run again. Files that the scene is read from stay."""
+    """Remove the results in a folder, so that all stages run again. Folders stay, and files of the scene."""
     scene = setup.scene
     names = RESULTS if scene.world is None else (*RESULTS, TRUTH)
     read = {real_path(scene.source), real_path(Path(scene.target.image or ""))}
     for path in (path for name in names for path in folder.glob(name)):
-        if real_path(path) not in read:
+        if not path.is_dir() and real_path(path) not in read:
             path.unlink()

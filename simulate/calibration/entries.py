@@ -124,7 +124,7 @@ def agreement(matrix: sparse.csr_array, variance: FloatArray, camera: Camera, pa
         return {"rms_difference_from_ideal": 0.0, "max_z": 0.0, "p_value": 1.0}
     known = sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
     # Where no ray has hit there is no scatter either: such an entry counts as uncertain as the others are on average.
-    unseen = float(variance.mean())
+    unseen = float(variance.mean()) if variance.size else np.inf
     variances = np.asarray(known[difference.nonzero()], dtype=np.float64).ravel()
     variances[variances == 0] = unseen
     values = np.asarray(difference[difference.nonzero()], dtype=np.float64).ravel()

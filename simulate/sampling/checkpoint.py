@@ -71,6 +71,11 @@ def _beside(path: Path) -> Path:
     return path.with_name(f".{short_name(path.name)}.partial.npz")
 
 
+def _remove(path: Path) -> None:
+    if not path.is_dir():  # one of another program
+        path.unlink(missing_ok=True)
+
+
 @contextmanager
 def open_checkpoint(path: Path, fingerprint: str) -> Generator[Checkpoint]:
     """Open the checkpoint of the result at `path`: saved if the computation is interrupted, removed when it ends.
@@ -89,7 +94,7 @@ def open_checkpoint(path: Path, fingerprint: str) -> Generator[Checkpoint]:
             ) from error
         try:
             checkpoint.save()
-        except MachineError:  # the original exception is the one to report
-            _beside(path).unlink(missing_ok=True)
+        except (InputError, MachineError):  # the original exception is the one to report
+            _remove(_beside(path))
         raise
-    _beside(path).unlink(missing_ok=True)
+    _remove(_beside(path))

@@ -76,6 +76,14 @@ def scene_mutated(rng: Random, original: bytes) -> bytes:
     return mutations.scene(rng, tomllib.loads(original.decode())).encode()
 
 
+def tiny_scene_mutated(rng: Random, original: bytes) -> bytes:
+    """Alter a scene without making it large: a target without a shape is all of its picture."""
+    altered = scene_mutated(rng, original)
+    while b"\nshape = " not in altered:
+        altered = scene_mutated(rng, original)
+    return altered
+
+
 def settings_mutated(rng: Random, original: bytes) -> bytes:
     return json.dumps(mutations.settings(rng, mutations.keys_of(tomllib.loads(original.decode())))).encode()
 
@@ -247,7 +255,7 @@ FILE_TYPES = {
     for file_type in (
         FileType("scene, bytes", "scene.toml", SCENES, damaged, read_scene, SHOW),
         FileType("scene, keys and values", "scene.toml", SCENES, scene_mutated, read_scene, SHOW),
-        FileType("scene, predicted", "scene.toml", TINY_SCENES, scene_mutated, read_scene, PREDICT),
+        FileType("scene, predicted", "scene.toml", TINY_SCENES, tiny_scene_mutated, read_scene, PREDICT),
         FileType("settings", "settings.json", from_folder(BASE), settings_mutated, read_with_settings, SET),
         FileType("lens, TOML", "lens.toml", LENSES_TOML, damaged, read_lens, LENS),
         FileType("lens, keys and values", "lens.toml", LENSES_TOML, scene_mutated, read_lens, LENS),

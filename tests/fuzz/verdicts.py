@@ -168,9 +168,16 @@ def children() -> set[int]:
     return {
         int(child)
         for task in Path("/proc/self/task").iterdir()
-        for child in (task / "children").read_text(encoding="ascii").split()
+        for child in _children(task)
         if not any(name in _command_line(int(child)) for name in KEPT_PROCESSES)
     }
+
+
+def _children(task: Path) -> list[str]:
+    try:
+        return (task / "children").read_text(encoding="ascii").split()
+    except OSError:
+        return []  # the thread has ended meanwhile
 
 
 def _command_line(process: int) -> str:

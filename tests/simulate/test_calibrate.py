@@ -99,6 +99,9 @@ def test_a_wrong_entry_disagrees_with_the_ideal_model() -> None:
     missing.eliminate_zeros()
     kept = np.delete(found.variance, 40)
     assert entries.agreement(sparse.csr_array(missing), kept, camera, 16)["p_value"] < 1e-4
+    dark = entries.agreement(sparse.csr_array(found.matrix.shape), np.empty(0), camera, 16)
+    assert (dark["max_z"], dark["p_value"]) == (0.0, 1.0), "no ray has hit, so nothing is known"
+    assert dark["rms_difference_from_ideal"] > 0
 
 
 def test_ideal_calibration_has_no_uncertainty() -> None:

@@ -170,3 +170,19 @@ def test_large_checkpoints_take_a_small_share_of_the_time(tmp_path: Path, monkey
     assert writes[0] == pytest.approx(31)
     assert all(later - earlier >= 3 / checkpoint.SHARE for earlier, later in pairwise(writes))
     assert 3.0 * len(writes) <= 2 * checkpoint.SHARE * now[0]
+
+
+def test_a_folder_in_place_of_the_checkpoint_stays(tmp_path: Path) -> None:
+    folder = tmp_path / ".result.exr.partial.npz"
+    folder.mkdir()
+    with open_checkpoint(tmp_path / "result.exr", "one") as opened:
+        assert opened.state() == {}
+
+    def interrupted() -> None:
+        with open_checkpoint(tmp_path / "result.exr", "one") as opened:
+            opened.offer(lambda: {"number": np.array(1)})
+            raise Interruption
+
+    with pytest.raises(Interruption):
+        interrupted()
+    assert folder.is_dir()

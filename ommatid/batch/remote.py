@@ -135,11 +135,13 @@ def _write_bytes(content: bytes, path: Path) -> None:
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
-    """Read the files of a folder by name, in alphabetical order, the last one written at the end, without hidden ones.
+    """Read the files of a folder by name, in alphabetical order, the last one written at the end.
 
-    A folder that does not exist has none.
+    Hidden files and links are left out; a link may lead to a file that is not to be sent to other machines. A folder
+    that does not exist has none.
     """
     if not folder.is_dir():
         return {}
-    files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    regular = [path for path in folder.iterdir() if path.is_file() and not path.is_symlink()]
+    files = [path for path in regular if not path.name.startswith(".")]
     return {path.name: path.read_bytes() for path in sorted(files, key=lambda path: (path.name == LAST, path.name))}

@@ -105,6 +105,12 @@ def test_what_a_worker_removes_is_removed_here(kept: Path, here: Path) -> None:
     assert names(kept) == before - {"stack.exr"}
 
 
+def test_links_in_a_folder_are_not_sent_to_other_machines(kept: Path, here: Path) -> None:
+    (here / "private.json").write_text("{}", encoding="utf-8")
+    (kept / "linked.json").symlink_to(here / "private.json")
+    assert packed(Setup.from_scene(read(here / "tiny.toml")), kept).files.keys() == names(kept) - {"linked.json"}
+
+
 # --- a command that is refused
 
 

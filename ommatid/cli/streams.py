@@ -52,4 +52,5 @@ def use_utf8_names() -> None:
     if sys.getfilesystemencoding().lower() in ("utf-8", "utf8") or sys.flags.utf8_mode:
         return
     os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")
-    os.execv(sys.executable, [sys.executable, "-P", "-X", "utf8", *sys.orig_argv[1:]])
+    executable = sys.executable
+    os.execv(executable, [executable, "-P", "-X", "utf8", *sys.orig_argv[1:]])

@@ -164,12 +164,12 @@ def _status(key: str) -> int:
 
 
 def children() -> set[int]:
-    """Return the processes that this one has started and that still run."""
+    """Return the processes that this one has started and that still run; those that have ended have no command line."""
     return {
         int(child)
         for task in Path("/proc/self/task").iterdir()
         for child in _children(task)
-        if not any(name in _command_line(int(child)) for name in KEPT_PROCESSES)
+        if (line := _command_line(int(child))) and not any(name in line for name in KEPT_PROCESSES)
     }
 
 
@@ -184,4 +184,4 @@ def _command_line(process: int) -> str:
     try:
         return Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
     except OSError:
-        return "resource_tracker"  # it has ended meanwhile
+        return ""  # it has ended meanwhile

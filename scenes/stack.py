@@ -80,8 +80,7 @@ def write(path: Path, stack: Stack) -> None:
     channels = {"Y": stack.values, "variance": stack.variance}
     if stack.recording is not None:
         channels |= {"Y": stack.recording.digital, "dark": stack.recording.dark, "flat": stack.recording.flat}
-    dead = np.isnan(channels["Y"]) if stack.recording is None else False
-    _check_range(path, "make the target or its light darker", **channels | {"Y": np.where(dead, 0.0, channels["Y"])})
+    _check_range(path, "make the target or its light darker", **channels)
     parts: list[exr.Part] = []
     for sub, pixels in zip(stack.camera.sub_imagers, stack.camera.slices(), strict=True):
         record: dict[str, Any] = {
@@ -122,7 +121,7 @@ def read(path: Path) -> Stack:
         raise InputError(f"{path}: expected variances of 0 or more, got others; make it again")
     if scene.sensor is None:
         values = _joined(parts, "Y")
-        _check_range(path, AGAIN, variance=variance, Y=values[~np.isnan(values)])  # of dead pixels
+        _check_range(path, AGAIN, variance=variance, Y=values)
         return Stack(scene, camera, values, variance, record)
     sizes = [sub.type.pixels[0] * sub.type.pixels[1] for sub in camera.sub_imagers]
     digital, dark, flat = (_joined(parts, name) for name in ("Y", *SENSOR_CHANNELS))
@@ -149,8 +148,12 @@ def _described(path: Path, first: dict[str, Any]) -> tuple[Scene, Camera, dict[s
 
 
 def _check_range(path: Path, cure: str, **channels: FloatArray) -> None:
-    """Raise InputError for values that are not finite, or too large for their squares, with `cure`, the advice."""
+    """Raise InputError for values that are infinite, or too large for their squares, with `cure`, the advice.
+
+    NaN marks dead pixels in all channels but the variance.
+    """
     for name, values in channels.items():
+        values = values if name == "variance" else values[~np.isnan(values)]
         if values.size and not (values.min() >= -(LARGEST**2) and values.max() <= LARGEST**2):
             raise InputError(f"{path}: expected finite numbers up to {LARGEST**2:g} as {name}, got others; {cure}")
 

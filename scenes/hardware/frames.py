@@ -27,6 +27,7 @@ from .frame_files import FrameNotes, files_in, pictures_of, stored_pictures
 
 TIE = 1e-6  # sensor pixels, rounding error of a position half way between two pixels
 DARK, FLAT = "dark frames", "flat frames"
+LARGEST_NUMBER = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -140,15 +141,16 @@ class RecordedFrames:
     def values(self) -> FloatArray:
         """(image - dark) / (flat - dark) flat_value, NaN for dead pixels: (exposures, M)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
+            values: FloatArray = (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
+        values[~(np.abs(values) <= LARGEST_NUMBER)] = np.nan
+        return values
 
     @property
     def not_numbers(self) -> int:
         """Count of sensor pixels whose image or dark frame is NaN, infinite or beyond single precision somewhere."""
-        largest = np.finfo(np.float32).max
-        usable: BoolArray = np.abs(self.numbers) <= largest
+        usable: BoolArray = np.abs(self.numbers) <= LARGEST_NUMBER
         if self.dark is not None:
-            usable &= np.abs(self.dark) <= largest
+            usable &= np.abs(self.dark) <= LARGEST_NUMBER
         return int(np.sum(~np.min(usable, axis=0)))
 
 

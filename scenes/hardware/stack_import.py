@@ -63,6 +63,7 @@ def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Rec
 
 
 def _as_float32(values: FloatArray) -> FloatArray:
-    """Values rounded to float32, as the file stores them."""
-    with np.errstate(over="ignore", invalid="ignore"):  # pixels beyond float32 become infinite and count as dead
-        return values.astype(np.float32).astype(np.float64)
+    """Values rounded to float32, as the file stores them; NaN beyond its range, which marks dead pixels."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = values.astype(np.float32).astype(np.float64)
+    return np.where(np.isinf(rounded), np.nan, rounded)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import socket
 import subprocess
+import warnings
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -49,8 +51,12 @@ def started(**options: Any) -> Generator[LocalCluster]:
 
 
 @pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # of the workers' files
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[None]:  # of the workers' files
     monkeypatch.chdir(tmp_path)
+    yield
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # Dask leaves the sockets of lost connections open
+        gc.collect()
 
 
 @pytest.fixture

@@ -164,14 +164,7 @@ def run_batch(
             failures[member] = reason or type(error).__name__
             results[member] = {**document, "error": reason, "exit_code": codes[-1]}
     documents = [results[member] for member in members]
-    ended = [
-        EndedScene(
-            folder=member.folder.name,
-            failure=failures.get(member, ""),
-            row=summary(results[member]) if member.changes else None,
-        )
-        for member in members
-    ]
+    ended = [_ended_scene(member, results[member], failures.get(member, "")) for member in members]
     describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
     if share is None:
         if len(failures) == len(members):  # leaves nothing behind
@@ -181,6 +174,11 @@ def run_batch(
     described, jobs = share.end(ended, describe)
     sections, code = described or _describe(None, None, figures, report_failure, ended)
     return BatchOutcome(documents, sections, max(*codes, code), jobs)
+
+
+def _ended_scene(member: Member, description: Description, failure: str) -> EndedScene:
+    row = summary(description) if member.changes else None
+    return EndedScene(folder=member.folder.name, failure=failure, row=row)
 
 
 def _describe(

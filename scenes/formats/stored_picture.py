@@ -63,19 +63,22 @@ def upright(picture: StoredPicture, orientation: int) -> StoredPicture:
 
 def orientation_of(exif: bytes) -> int:
     """Return the orientation that EXIF data state; 1, upright, if they state none or are damaged."""
-    content = exif.removeprefix(b"Exif\0\0")
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(content[:4])
-    if order is None:
-        return UPRIGHT
     try:
+        return _stated_orientation(exif.removeprefix(b"Exif\0\0"))
+    except struct.error:  # damaged
+        return UPRIGHT
+
+
+def _stated_orientation(content: bytes) -> int:
+    """Return the orientation of EXIF data that begin with their byte order. Raises struct.error if they are cut."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(content[:4])
+    if order is not None:
         (start,) = struct.unpack_from(f"{order}I", content, 4)
         (count,) = struct.unpack_from(f"{order}H", content, start)
         for index in range(count):
             tag, kind, values, value = struct.unpack_from(f"{order}HHIH", content, start + 2 + 12 * index)
             if (tag, kind, values) == (ORIENTATION_TAG, SHORT, 1):
                 return int(value)
-    except struct.error:
-        pass
     return UPRIGHT
 
 

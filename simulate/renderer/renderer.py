@@ -76,7 +76,6 @@ class Renderer:
         self.channels = 3 if variant.endswith("rgb") and world is None else 1
         self.exact_below = EXACT_SUMS[fast]
         self._generators: dict[str, RayGenerator] = {}
-        self._sensors: dict[str, dict[int, Any]] = {}
         if fast:
             from .rays import RayGenerator
 
@@ -95,12 +94,11 @@ class Renderer:
             self._integrator: Any = self._scene.integrator()
         else:
             self._build_world(world, variant)
-        if not fast:
-            far = 2.0 if world is None else FAR
-            self._sensors = {
-                group: stock_sensors(camera, types, sampler, self.channels, far, self._placement)
-                for group, types in self.groups.items()
-            }
+        far = 2.0 if world is None else FAR
+        self._sensors: dict[str, dict[int, Any]] = {
+            group: stock_sensors(camera, types, sampler, self.channels, far, self._placement)
+            for group, types in ({} if fast else self.groups).items()
+        }
         self._parameters = mi.traverse(self._scene)
 
     @property

@@ -15,7 +15,7 @@ import subprocess
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import IO, Any, cast
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
@@ -93,19 +93,18 @@ def _answer(task: dict[str, Any], where: str, seconds: float) -> str | None:
     """Return why Mitsuba refuses a world, None if it builds it. Raises InputError if the process dies of it."""
     message, end, at, rest = json.dumps(task).encode() + b"\n", monotonic() + seconds, "", b""
     process = _trials.start()
-    assert process.stdin is not None
-    assert process.stdout is not None
+    stdin, stdout = cast(IO[bytes], process.stdin), cast(IO[bytes], process.stdout)  # both are pipes
     try:
-        process.stdin.write(message)
-        process.stdin.flush()
+        stdin.write(message)
+        stdin.flush()
     except BrokenPipeError:  # it was about to end, since nothing came
         _trials.stop()
         process = _trials.start()
         return _answer(task, where, seconds)
     while True:
-        if not select.select([process.stdout], [], [], max(end - monotonic(), 0.0))[0]:
+        if not select.select([stdout], [], [], max(end - monotonic(), 0.0))[0]:
             raise InputError(f"{where}: Mitsuba takes longer than {seconds:g} s to build {_shown(at)}; make it smaller")
-        part = os.read(process.stdout.fileno(), 65536)
+        part = os.read(stdout.fileno(), 65536)
         if not part:
             raise InputError(f"{where}: {_death(process)} while it built {_shown(at)}; correct or remove it")
         *lines, rest = (rest + part).split(b"\n")

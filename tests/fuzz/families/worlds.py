@@ -36,7 +36,7 @@ PLUGINS = (
     *(
         "../x/evil",
         "./evil",
-        "/tmp/evil",
+        "/elsewhere/evil",
         "evil",
         "plugins/evil",
         "evil.so",

@@ -8,15 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-LINKED = ("scenes", "simulate", "reconstruct")  # top-level folders that symbolic links make part of ommatid
+LINKED = ("scenes", "simulate", "reconstruct")  # packages to which symbolic links at the top lead
 
 
 @cache
 def modules() -> dict[str, Path]:
     """Paths of all modules by the name under which they are imported."""
-    own = {_name(path): path for path in sorted((ROOT / "ommatid").glob("**/*.py")) if not _linked(path)}
-    linked = [path for package in LINKED for path in sorted((ROOT / package).glob("**/*.py"))]
-    return own | {f"ommatid.{_name(path)}": path for path in linked}
+    return {_name(path): path for path in sorted((ROOT / "ommatid").glob("**/*.py"))}
 
 
 def existing(*names: str) -> set[str]:
@@ -74,10 +72,6 @@ def _absolute(name: str, path: Path, node: ast.ImportFrom) -> str:
     package = name if path.stem == "__init__" else name.rpartition(".")[0]
     parts = package.split(".")[: len(package.split(".")) - node.level + 1]
     return ".".join([*parts, *([node.module] if node.module else [])])
-
-
-def _linked(path: Path) -> bool:
-    return path.relative_to(ROOT / "ommatid").parts[0] in LINKED
 
 
 def _name(path: Path) -> str:

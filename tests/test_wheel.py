@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from .modules import LINKED, ROOT, modules
+from .modules import ROOT, modules
 
 pytest.importorskip("hatchling", reason="the wheel is built by hatchling, of the [dev] dependencies")
 
@@ -49,12 +49,6 @@ def names(wheel: Path) -> list[str]:
         return [name for name in archive.namelist() if not name.endswith("/")]
 
 
-def installed(path: Path) -> str:
-    """The name in a wheel of a file of the repository."""
-    name = path.relative_to(ROOT).as_posix()
-    return f"ommatid/{name}" if name.split("/")[0] in LINKED else name
-
-
 def run(unpacked: Path, script: str, cwd: Path, *arguments: str) -> str:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     script = AWAY.replace("WHEEL", str(unpacked)) + script
@@ -72,14 +66,14 @@ def test_it_installs_one_name(wheel: Path) -> None:
 def test_every_file_is_in_it_once(wheel: Path) -> None:
     assert {name: count for name, count in Counter(names(wheel)).items() if count > 1} == {}
     python = [name for name in names(wheel) if name.endswith(".py")]
-    assert sorted(python) == sorted(installed(path) for path in modules().values())
+    assert sorted(python) == sorted(path.relative_to(ROOT).as_posix() for path in modules().values())
 
 
 def test_the_gallery_and_the_templates_are_in_it(wheel: Path) -> None:
-    files = {path for pattern in DATA for path in (ROOT / "scenes").glob(pattern)}
+    files = {path for pattern in DATA for path in (ROOT / "ommatid" / "scenes").glob(pattern)}
     files |= {path for path in (ROOT / "ommatid").glob("*/templates/*") if path.is_file()}
     assert {".toml", ".xml", ".dat", ".html", ".css", ".js"} <= {path.suffix for path in files}
-    expected = {installed(path) for path in files} | {"ommatid/py.typed"}
+    expected = {path.relative_to(ROOT).as_posix() for path in files} | {"ommatid/py.typed"}
     assert expected - set(names(wheel)) == set()
 
 

@@ -8,7 +8,7 @@ from .modules import ROOT
 
 PERSONS = re.compile(r"\b(whoever|somebody|nobody)\b", re.IGNORECASE)
 SUFFIXES = (".py", ".md", ".html", ".toml", ".js", ".css", ".cff")
-FOLDERS = ("docs", "ommatid", "reconstruct", "scenes", "simulate", "tests")
+FOLDERS = ("docs", "ommatid", "tests")
 
 
 # Other names of things that docs/glossary.md names.

@@ -5,7 +5,7 @@ BIN := .venv/bin
 READY := .venv/ready
 DOCS_READY := .venv/docs-ready
 
-.PHONY: demo test matrix figures docs check bench setup llvm browser clean
+.PHONY: demo test test-slow test-all matrix figures docs check bench setup llvm browser clean
 
 demo: setup
 	$(BIN)/ommatid run scenes/tile19.toml scenes/photo.toml -o out
@@ -14,6 +14,13 @@ demo: setup
 # One thread for linear algebra: the matrices are small, and on busy cores waiting threads take minutes for seconds.
 test: setup browser
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
+# The tests that `make test` leaves out because they take long, and both together.
+test-slow: setup browser
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m 'slow and not figures'
+
+test-all: setup browser
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m 'not figures'
 
 # Every version of Python that is installed here, each in an environment of its own; others are skipped.
 matrix: setup

@@ -1,4 +1,4 @@
-"""A tiny scene, one finished run of it, and the command line."""
+"""A folder and an environment of its own for every test, a tiny scene, one finished run of it, and the command line."""
 
 from __future__ import annotations
 
@@ -13,11 +13,16 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+from hypothesis.database import DirectoryBasedExampleDatabase
 
 from ommatid.cli import app as program
 
-settings.register_profile("any machine", deadline=None)  # no test depends on the speed of the machine
+ROOT = Path(__file__).parent.parent
+EXAMPLES = DirectoryBasedExampleDatabase(ROOT / ".hypothesis" / "examples")
+settings.register_profile("any machine", deadline=None, database=EXAMPLES)  # no test depends on the machine's speed
 settings.load_profile("any machine")
+
+USERS_SETTINGS = ("OMMATID_", "DASK_", "DISTRIBUTED_", "MPL", "MATPLOTLIB", "NUMBA_", "DRJIT_", "MI_", "PYTHONPATH")
 
 TINY = """
 title = "Tiny"
@@ -79,6 +84,25 @@ def shell(*arguments: str | Path, cwd: Path, before: str = "") -> Ended:
     return Ended(ended.returncode, ended.stdout, ended.stderr)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_environment(tmp_path_factory: pytest.TempPathFactory) -> Generator[None]:
+    """Settings and a current folder without those of the user, for fixtures that several tests share."""
+    folder = tmp_path_factory.mktemp("own")
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [name for name in os.environ if name.startswith(USERS_SETTINGS) and name != "DRJIT_LIBLLVM_PATH"]:
+            patch.delenv(name)
+        for name in ("DASK_CONFIG", "DASK_ROOT_CONFIG", "XDG_CONFIG_HOME"):
+            patch.setenv(name, str(folder / "settings"))
+        patch.chdir(folder)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def own_folder(own_environment: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A current folder that is empty: what lies in the checkout changes no result, and nothing is left there."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a finished run of the tiny scene. It is shared: tests must not write to it."""
@@ -90,10 +114,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path: Path) -> Path:
     """The current folder, which holds only tiny.toml."""
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 

@@ -24,6 +24,29 @@ settings.load_profile("any machine")
 
 USERS_SETTINGS = ("OMMATID_", "DASK_", "DISTRIBUTED_", "MPL", "MATPLOTLIB", "NUMBA_", "DRJIT_", "MI_", "PYTHONPATH")
 
+
+def files_of_others() -> set[str]:
+    """Files in the checkout that git neither tracks nor ignores."""
+    command = ["git", "status", "--porcelain", "--untracked-files=all"]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    return {line for line in ended.stdout.splitlines() if line.startswith("??")}
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """List the files of others; in the process that ends last, when tests run in several."""
+    if not hasattr(session.config, "workerinput"):
+        session.config.stash[BEFORE] = files_of_others()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail if the tests left something in the checkout that .gitignore does not name."""
+    left = files_of_others() - session.config.stash.get(BEFORE, files_of_others())
+    if left and session.exitstatus == pytest.ExitCode.OK:
+        print("\nleft in the checkout by the tests:", *sorted(left), sep="\n")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+BEFORE = pytest.StashKey[set[str]]()
 TINY = """
 title = "Tiny"
 

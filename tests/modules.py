@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 LINKED = ("scenes", "simulate", "reconstruct")  # packages to which symbolic links at the top lead
+
+
+def tracked(pattern: str) -> list[Path]:
+    """Files of the repository that match a pattern from its top, `**` included; without git, all files that do."""
+    command = ["git", "ls-files", "-z", f":(glob){pattern}"]
+    try:
+        listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return sorted(path for path in ROOT.glob(pattern) if path.is_file())
+    return sorted(path for name in listed.split("\0") if name and (path := ROOT / name).is_file())
 
 
 @cache

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 
-from .modules import ROOT
+from .modules import ROOT, tracked
 
 PERSONS = re.compile(r"\b(whoever|somebody|nobody)\b", re.IGNORECASE)
 SUFFIXES = (".py", ".md", ".html", ".toml", ".js", ".css", ".cff")
-FOLDERS = ("docs", "ommatid", "tests")
 
 
 # Other names of things that docs/glossary.md names.
@@ -29,14 +28,11 @@ def test_a_thing_has_one_name() -> None:
 
 def lines_with(words: re.Pattern[str]) -> list[str]:
     """Return the lines of code and documentation in which a word occurs."""
-    files = [path for name in FOLDERS for path in (ROOT / name).rglob("*") if path.suffix in SUFFIXES]
-    files += [path for path in ROOT.iterdir() if path.suffix in SUFFIXES]
-    checked = {path.resolve() for path in files}
-    assert len(checked) > 300, "the walk finds the repository"
-    checked.remove(ROOT.joinpath("tests", "test_words.py").resolve())
+    checked = [path for path in tracked("**") if path.suffix in SUFFIXES and path.name != "test_words.py"]
+    assert len(checked) > 300, "the list is that of the repository"
     return [
-        f"{path.relative_to(ROOT.resolve())}:{number}: {line.strip()}"
-        for path in sorted(checked)
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
+        for path in checked
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         if words.search(line)
     ]

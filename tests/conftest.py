@@ -121,7 +121,7 @@ def own_environment(tmp_path_factory: pytest.TempPathFactory) -> Generator[None]
 
 
 @pytest.fixture(autouse=True)
-def own_folder(own_environment: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A current folder that is empty: what lies in the checkout changes no result, and nothing is left there."""
     monkeypatch.chdir(tmp_path)
 

@@ -1,6 +1,7 @@
 # `make demo` and `make test` need Python 3.11 or newer, git and make; everything else goes into .venv.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
+# A folder in the checkout.
 VENV ?= .venv
 # Versions of all dependencies, so that a new release breaks nobody's installation; empty: the newest that pip finds.
 CONSTRAINTS ?= constraints.txt
@@ -65,6 +66,8 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 		{ echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable '.[dev]'
+	@# Python before 3.13 reads this file in the locale's encoding, which may not have all letters of the folder's name.
+	@echo ../../../.. >$$(echo $(VENV)/lib/python3*/site-packages)/_ommatid.pth
 	@touch $(READY)
 
 $(DOCS_READY): $(READY)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from . import failures, frames, options, output
-from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, TlsCa, TlsCert, TlsKey, Verbose
+from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, Verbose
 
 if TYPE_CHECKING:
     from ommatid.pipeline.reconstruction import ReconstructionRequest
@@ -80,9 +80,6 @@ def reconstruct(
     lens: Lenses = "",
     region: Regions = None,
     scheduler: TileScheduler = "",
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     workers: TileWorkers = None,
     formats: Formats = "",
     force: Force = False,
@@ -103,7 +100,7 @@ def reconstruct(
         frames.reconstruct(request, file, scheduler, workers, strict, None if as_json else detail)
         return
     request = reconstruction.ReconstructionRequest(stacks[0], model, *asked, force)
-    pool = options.cluster(scheduler, tls_ca, tls_cert, tls_key), workers
+    pool = options.cluster(scheduler), workers
     _reconstruct_one(request, file, pool, others, None if as_json else detail, strict)
 
 

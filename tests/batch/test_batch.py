@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_info, threadpool_limits  # pyright: ignore[
 
 from ommatid.batch import batch
 from ommatid.batch.batch import Batch, Member, Runs
-from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
+from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
 from ommatid.reconstruct import method_choice
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files

@@ -12,7 +12,7 @@ from skimage.io import imsave
 
 from ommatid.batch.batch import prepare
 from ommatid.batch.remote import RunObserver, SceneOutcome, carry_out, outcome_of, packed, unpack
-from ommatid.batch.world_package import WorldPackage, packed_world, unpacked_world
+from ommatid.batch.remote import WorldPackage, packed_world, unpacked_world
 from ommatid.pipeline.stages import open_scene, results, run
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr

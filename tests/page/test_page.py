@@ -28,7 +28,7 @@ from ommatid.page import batch_index, data, tables, words
 from ommatid.page.cached import cached_page
 from ommatid.page.document import page, page_of
 from ommatid.page.panels import error_groups, point_response, sensor, time_curves
-from ommatid.page.panels.embedded import decoded
+from ommatid.page.panels.maps import decoded
 from ommatid.reconstruct.output.run_json import (
     DepthBin,
     DiagnosticsReport,

@@ -23,7 +23,7 @@ from ommatid.batch.batch import Batch
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import workers
 from ommatid.runtime.execution.cluster import Cluster
-from ommatid.runtime.execution.dask_cluster import SILENT, cluster_workers
+from ommatid.runtime.execution.cluster import SILENT, cluster_workers
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.progress import no_progress
 
@@ -276,7 +276,7 @@ def test_a_scheduler_that_stops_answering_is_not_waited_for(monkeypatch: pytest.
         yield client
         client.end.set()
 
-    monkeypatch.setattr("ommatid.runtime.execution.dask_cluster._connected", connected)
+    monkeypatch.setattr("ommatid.runtime.execution.cluster._connected", connected)
     with cluster_workers(Cluster("tcp://h:1")) as pool:
         with pytest.raises(MachineError, match="connection to the scheduler was lost"):
             pool.map(squared, range(2), no_progress, 2)

@@ -23,7 +23,7 @@ from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import cluster as cluster_options
 from ommatid.runtime.execution import workers
 from ommatid.runtime.execution.cluster import Cluster
-from ommatid.runtime.execution.dask_cluster import SILENT
+from ommatid.runtime.execution.cluster import SILENT
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.progress import no_progress
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
-
 from ommatid.batch.jobs.array_job import read_job
+
 from ommatid.batch.sweep import members, sweep_axes
 from ommatid.cli import options
 from ommatid.cli.app import app

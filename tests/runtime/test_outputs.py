@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import make_folder, write_text
-from ommatid.runtime.outputs.kinds import SUFFIXES, check_folder, check_output
-from ommatid.runtime.outputs.kinds import LONGEST, check_name, shortened_name
+from ommatid.runtime.outputs.kinds import LONGEST, SUFFIXES, check_folder, check_name, check_output, shortened_name
 from ommatid.runtime.outputs.occupied import LOCK, occupied
 
 FIFO = stat.S_IFIFO

@@ -14,6 +14,8 @@ import pytest
 
 from .variations import EVERYTHING, differences, result, run
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:

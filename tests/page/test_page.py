@@ -5,10 +5,13 @@ Their behaviour in a browser is tested in test_page_in_browser.py.
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -28,7 +31,6 @@ from ommatid.page import batch_index, data, tables, words
 from ommatid.page.cached import cached_page
 from ommatid.page.document import page, page_of
 from ommatid.page.panels import error_groups, point_response, sensor, time_curves
-from ommatid.page.panels.maps import decoded
 from ommatid.reconstruct.output.run_json import (
     DepthBin,
     DiagnosticsReport,
@@ -107,6 +109,12 @@ def group_of(text: str, name: str) -> dict[str, Any]:
 def maps_of(text: str, name: str = "maps") -> dict[str, NDArray[Any]]:
     """The stored arrays of a group of maps by name."""
     return {shown["name"]: decoded(shown["values"]) for shown in group_of(text, name)["maps"] if "values" in shown}
+
+
+def decoded(content: Mapping[str, Any]) -> NDArray[Any]:
+    """The array that a page holds as text."""
+    values = gzip.decompress(base64.b64decode(content["data"]))
+    return np.frombuffer(values, dtype=np.dtype(content["dtype"]).newbyteorder("<")).reshape(content["shape"])
 
 
 @pytest.fixture(scope="module")

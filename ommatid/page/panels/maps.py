@@ -177,12 +177,6 @@ def encoded(values: NDArray[Any]) -> dict[str, Any]:
     return {"dtype": values.dtype.name, "shape": list(values.shape), "data": base64.b64encode(compressed).decode()}
 
 
-def decoded(content: Mapping[str, Any]) -> NDArray[Any]:
-    """Return the array of `encoded`."""
-    values = gzip.decompress(base64.b64decode(content["data"]))
-    return np.frombuffer(values, dtype=np.dtype(content["dtype"]).newbyteorder("<")).reshape(content["shape"])
-
-
 def document(groups: Sequence[Mapping[str, Any]]) -> Markup:
     """Return groups of maps that move together as JSON that can stand in HTML, with the palettes."""
     content = {"palettes": PALETTES, "missing": MISSING_COLOUR, "groups": list(groups)}

@@ -11,8 +11,8 @@ import os
 import ssl
 import sys
 import warnings
-from collections.abc import Callable, Generator
-from concurrent.futures import Executor, Future
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -24,8 +24,9 @@ from urllib.parse import urlsplit
 from ..errors import InputError, MachineError
 from ..printable import printable
 from . import workers
-from .workers import LOST, Workers
+from .workers import LOST, Completed, Workers
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 EXAMPLE = "192.168.1.5:8786"
@@ -73,10 +74,10 @@ class _ClusterWorkers(Workers):
     """Workers whose installations may differ from this one."""
 
     def __init__(self, client: Any, cluster: Cluster) -> None:
-        self._executor = _CheckingExecutor(client.get_executor(pure=False))
-        super().__init__(self._executor, self._count_threads)
+        super().__init__(client.get_executor(pure=False), self._count_threads)
         self._client = client
         self._cluster = cluster
+        self._requirement: _Requirement | None = None
 
     def _count_threads(self) -> int:
         try:
@@ -96,7 +97,12 @@ class _ClusterWorkers(Workers):
             if isinstance(answer, Exception):
                 raise InputError(_unusable(self._cluster, worker, answer))
             _check_same(str(self._cluster), worker, expected, answer)
-        self._executor.require(_Requirement(str(self._cluster), facts, expected))
+        self._requirement = _Requirement(str(self._cluster), facts, expected)
+
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Completed[Result]]:
+        """Apply `function` as `Workers.each`; each task is preceded by the check of its worker."""
+        checked = function if self._requirement is None else partial(self._requirement.execute, function)
+        return super().each(checked, items)
 
 
 @dataclass(frozen=True)
@@ -107,29 +113,12 @@ class _Requirement:
     facts: Callable[[], dict[str, str]]
     expected: dict[str, str]
 
-    def execute(self, task: Callable[[], Result]) -> Result:
+    def execute(self, function: Callable[[Item], Result], item: Item) -> Result:
         """Execute a task on this worker. Raises InputError if the worker differs."""
         from distributed import get_worker
 
         _check_same(self.cluster, get_worker().address, self.expected, self.facts())
-        return task()
-
-
-class _CheckingExecutor(Executor):
-    """Sends tasks to a cluster, where each is preceded by the check of its worker."""
-
-    def __init__(self, executor: Executor) -> None:
-        self._executor = executor
-        self._requirement: _Requirement | None = None
-
-    def require(self, requirement: _Requirement) -> None:
-        """Check the workers of all tasks that are submitted from now on."""
-        self._requirement = requirement
-
-    def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
-        if self._requirement is None:
-            return self._executor.submit(fn, *args, **kwargs)
-        return self._executor.submit(self._requirement.execute, partial(fn, *args, **kwargs))
+        return function(item)
 
 
 def _check_same(cluster: str, worker: str, expected: dict[str, str], facts: dict[str, str]) -> None:

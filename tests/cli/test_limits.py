@@ -267,6 +267,16 @@ raise SystemExit
 """
 
 
+def test_a_request_beyond_the_memory_is_refused(here: Path, ommatid: Command) -> None:
+    (here / "huge.png").write_bytes(png_of(100000, 100000))
+    for command, changes in CASES[-3:-1]:
+        ended = ommatid(*command, *(word for change in changes for word in ("--set", change)))
+        assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1)
+        assert "GB" in ended.err
+    assert not (here / "new").exists()
+
+
+@pytest.mark.slow
 def test_requests_beyond_the_memory_are_refused_before_allocation(here: Path) -> None:
     (here / "huge.png").write_bytes(png_of(100000, 100000))
     (here / "world.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>', encoding="utf-8")

@@ -124,6 +124,7 @@ def elements(path: Path) -> Elements:
     return parser
 
 
+@pytest.mark.slow
 def test_a_hostile_title_adds_nothing_to_pages_and_figures(scene: Path, finished: Path, ommatid: Command) -> None:
     check(ommatid("run", scene.name, "-o", "out", "--figure-format", "svg"), 0)
     check(ommatid("run", scene.name, "-o", "out", "-v"), 0)

@@ -167,6 +167,7 @@ def test_the_task_of_a_killed_process_is_repeated(tmp_path: Path) -> None:
     assert results == [digits(seed) for seed in range(8)]
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_every_process_is_given_up_and_the_others_are_done(
     capfd: pytest.CaptureFixture[str],
 ) -> None:

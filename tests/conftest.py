@@ -170,7 +170,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Generator[str]:
     """Address of a cluster of two workers."""
     from distributed import LocalCluster
 
-    from ommatid.runtime.execution.dask_cluster import SILENT
+    from ommatid.runtime.execution.cluster import SILENT
 
     start: Any = LocalCluster
     with start(

@@ -1,6 +1,7 @@
 """Batches of scenes, in this process, in several, or on a cluster; failures of scenes are independent.
 
-The numbers do not depend on where a scene is run, nor on the scenes beside it.
+The numbers do not depend on where a scene is run, nor on the scenes beside it. A scene's folder is checked and prepared
+before its stages, which can be wrapped: to make everything again, and to write the estimate in more formats.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ommatid.reconstruct.output.estimate_formats import Format, write_formats
 from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import LOST, Completed
 from ommatid.runtime.files import clear_abandoned, make_folder
+from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_output
 from ommatid.runtime.outputs.occupied import new_folder, occupied
 from ommatid.runtime.processors import processors
@@ -33,6 +36,13 @@ PICTURES = (
     *("scene.toml", TRUTH),
 )
 OTHERS = "model.npz", "run.json", "report.html"
+
+# What the stages write; the calibrated models of a study and interrupted work are beside them.
+ESTIMATES = ("estimate.exr", "estimate.npy", "estimate.tiff")
+RENDERED = "stack.exr"
+RESULTS = (RENDERED, "model*.npz", "run.json", *ESTIMATES, "study.json", "report.html", ".*.partial.npz")
+
+Check = Callable[[Setup, Path], None]  # raises InputError where the stages would, and writes nothing
 
 
 @dataclass(frozen=True)
@@ -214,6 +224,38 @@ def prepare(setup: Setup, folder: Path) -> None:
         write_truth(folder / TRUTH, setup.image)
         if setup.camera.detail > 1:
             write_truth(folder / WORLD_PICTURE, setup.picture)
+
+
+def with_options(stages: Stages, force: Check | None, formats: tuple[Format, ...]) -> Stages:
+    """Return stages that last write `formats`, and first remove the results of an earlier run if `force` is given.
+
+    One process at a time runs them in a folder. A scene that is refused before it is rendered leaves nothing there.
+
+    force : check of the stages, which comes before anything is removed; None: what is up to date stays
+    """
+    return partial(_with_options, stages, force, formats)
+
+
+def _with_options(
+    stages: Stages, force: Check | None, formats: tuple[Format, ...], setup: Setup, folder: Path, observer: RunObserver
+) -> dict[str, Any]:
+    with occupied(folder, RENDERED):
+        if force is not None:
+            force(setup, folder)
+            clear_results(folder, setup)
+        description = stages(setup, folder, observer)
+        write_formats(folder / "estimate.exr", formats)
+        return description
+
+
+def clear_results(folder: Path, setup: Setup) -> None:
+    """Remove the results in a folder, so that all stages run again. Folders stay, and files of the scene."""
+    scene = setup.scene
+    names = RESULTS if scene.world is None else (*RESULTS, TRUTH)
+    read = {real_path(scene.source), real_path(Path(scene.target.image or ""))}
+    for path in (path for name in names for path in folder.glob(name)):
+        if not path.is_dir() and real_path(path) not in read:
+            path.unlink()
 
 
 def _raise(error: Exception) -> Description:

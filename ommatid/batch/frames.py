@@ -27,8 +27,7 @@ from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint
 from ommatid.runtime.input_files import real_path
-from ommatid.runtime.outputs.kinds import check_folder
-from ommatid.runtime.outputs.names import check_name
+from ommatid.runtime.outputs.kinds import check_folder, check_name
 from ommatid.runtime.outputs.occupied import new_folder
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import origin

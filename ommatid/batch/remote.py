@@ -6,25 +6,25 @@ are not made again, and returns new and changed files.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError, MachineError
-from ommatid.runtime.execution.dask_cluster import scratch_folder
+from ommatid.runtime.execution.cluster import scratch_folder
 from ommatid.runtime.files import write_whole
+from ommatid.runtime.printable import printable
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import command, command_line
 from ommatid.scenes.camera import derive
-from ommatid.scenes.scene import parse
+from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
-
-from .world_package import WorldPackage, packed_world, path_inside, unpacked_world
 
 WORLD = "world"  # folder inside that of the scene, on a worker
 LAST = "run.json"  # is written last, since it vouches for the other files
@@ -43,6 +43,19 @@ class RunObserver:
 
 
 Stages = Callable[[Setup, Path, RunObserver], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class WorldPackage:
+    """A world's file and those that it names.
+
+    root : the folder that holds all of them;  file : the world's, relative to it
+    contents : of the files, by their paths relative to `root`
+    """
+
+    root: str
+    file: str
+    contents: dict[str, bytes]
 
 
 @dataclass(frozen=True)
@@ -145,3 +158,44 @@ def _contents(folder: Path) -> dict[str, bytes]:
     regular = [path for path in folder.iterdir() if path.is_file() and not path.is_symlink()]
     files = [path for path in regular if not path.name.startswith(".")]
     return {path.name: path.read_bytes() for path in sorted(files, key=lambda path: (path.name == LAST, path.name))}
+
+
+def packed_world(scene: Scene) -> WorldPackage:
+    """Pack the world of a scene. Raises InputError for a file that it names by an absolute path."""
+    from ommatid.simulate.renderer.world import files, path_of
+
+    paths = [Path(os.path.normpath(path)) for path in files(scene)]
+    root = Path(os.path.commonpath([path.parent for path in paths]))
+    contents = {str(path.relative_to(root)): path.read_bytes() for path in paths}
+    named = b"".join(content for name, content in contents.items() if name.endswith(".xml"))
+    for path in paths:
+        if str(path).encode() in named:
+            raise InputError(
+                f"{scene.source}: world.file: names {path}, which other machines may not have;"
+                " name it relative to the world's file, or leave out --scheduler"
+            )
+    return WorldPackage(str(root), str(Path(os.path.normpath(path_of(scene))).relative_to(root)), contents)
+
+
+def unpacked_world(package: WorldPackage, folder: Path) -> Path:
+    """Write the files of a world into a folder, and return the path of the world's own.
+
+    Raises InputError before anything is written if a name leads out of the folder.
+    """
+    world, paths = path_inside(folder, package.file), {name: path_inside(folder, name) for name in package.contents}
+    for name, content in package.contents.items():
+        path = paths[name]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return world
+
+
+def path_inside(folder: Path, name: str) -> Path:
+    """Return the path of a file that another machine names, inside a folder. Raises InputError if it leads out."""
+    parts = PurePath(name).parts
+    if not parts or ".." in parts or PurePath(name).is_absolute():
+        raise InputError(
+            f"{folder}: another machine sent a file '{printable(name)}', expected one inside this folder; nothing was"
+            " written, check the cluster"
+        )
+    return folder / name

@@ -1,7 +1,7 @@
-"""Sweeps: a scene for every combination of values of some keys, each with its own folder.
+"""The scenes of a batch: one for every combination of swept values, each with its own folder, and the shares of jobs.
 
 `--sweep noise.variance=1e-6,1e-4 --sweep camera.lens.I.magnification=1/2,1/3` makes four scenes of one. Values are
-read like those of `--set`.
+read like those of `--set`. `--job I/N` takes every N-th scene of this list, from the I-th on.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import prod
@@ -18,7 +18,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
-from ommatid.runtime.outputs.names import check_name, shortened_name
+from ommatid.runtime.outputs.kinds import check_name, shortened_name
 from ommatid.scenes.scene import read
 
 from .batch import Member
@@ -26,6 +26,8 @@ from .batch import Member
 EXAMPLE = "such as --sweep noise.variance=1e-6,1e-4"
 MOST_SCENES = 100_000
 LONGEST = 40  # characters of a value in a folder's name
+MOST_JOBS = 100_000
+INDICES = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX")  # the number of a job of an array, as SLURM and PBS say it
 _PAIRS = {"]": "[", "}": "{", ")": "("}
 
 
@@ -78,6 +80,31 @@ def members(scenes: Sequence[Path], axes: Sequence[SweepAxis], output: Path) -> 
         changes = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
         by_folder[folder] = Member(scene, folder, changes)
     return list(by_folder.values())
+
+
+def job_numbers(text: str, environment: Mapping[str, str]) -> tuple[int, int]:
+    """Read `--job I/N`: the number of a job, from 1, and that of all jobs. `/N` takes I from a job array.
+
+    Raises InputError, also for an array that is not numbered from 1.
+    """
+    match = re.fullmatch(r"(\d{0,9})/(\d{1,9})", text.strip(), re.ASCII)
+    if match is None or int(match[2]) > MOST_JOBS:
+        also = "; `auto` is withdrawn, since N is part of the command" if text.strip() == "auto" else ""
+        raise InputError(
+            f"--job {shortened(text)}: expected I/N, such as 2/8, or /N in a job array, with N up to {MOST_JOBS}{also}"
+        )
+    variable = "" if match[1] else next((name for name in INDICES if environment.get(name)), "")
+    if not match[1] and not variable:
+        raise InputError(
+            f"--job {text}: neither {' nor '.join(INDICES)} is set, so this is no job of an array; write I/N"
+        )
+    number, count = match[1] or environment[variable], int(match[2])
+    if re.fullmatch(r"\d{1,9}", number, re.ASCII) is None or not 1 <= int(number) <= count:
+        origin = f", which is {variable}; submit the jobs as an array from 1 to {count}" if variable else ""
+        raise InputError(
+            f"--job {shortened(text)}: expected a job from 1 to {count}, got '{shortened(number)}'{origin}"
+        )
+    return int(number), count
 
 
 def check_keys(scene: Path, axes: Sequence[SweepAxis], changes: Sequence[str], lenses: Sequence[str]) -> None:

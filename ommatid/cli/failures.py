@@ -19,6 +19,14 @@ from ommatid.runtime.printable import printable
 
 from .output import say
 
+# Options that are no longer, with what takes their place.
+_TLS = "name the file in Dask's own configuration, as by DASK_DISTRIBUTED__COMM__TLS__"
+WITHDRAWN = {
+    "--tls-ca": f"{_TLS}CA_FILE",
+    "--tls-cert": f"{_TLS}CLIENT__CERT",
+    "--tls-key": f"{_TLS}CLIENT__KEY",
+}
+
 NOT_TRUSTED = 3  # exit code of --strict
 INTERRUPTED = 130  # exit code of a command stopped by Ctrl-C
 
@@ -56,6 +64,9 @@ def report(error: Exception) -> int:
         return 1
     if hasattr(error, "format_message"):  # raised by the parser of the command line
         message = cast(Any, error).format_message()
+        option = getattr(error, "option_name", "")
+        if option in WITHDRAWN:
+            message = f"{option}: this option is withdrawn; {WITHDRAWN[option]}"
         if type(error).__name__ == "NoArgsIsHelpError":
             print(message, file=sys.stderr)
         else:

@@ -61,12 +61,6 @@ Sweeps = Annotated[
 Scheduler = Annotated[
     str, typer.Option("--scheduler", metavar="ADDRESS", help="Send the scenes to this Dask cluster: tcp://host:port.")
 ]
-TlsCa = Annotated[
-    Path | None,
-    typer.Option("--tls-ca", metavar="FILE", help="Certificate of the authority of a cluster at tls://host:port."),
-]
-TlsCert = Annotated[Path | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate signed by --tls-ca.")]
-TlsKey = Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="Private key of --tls-cert.")]
 Workers = Annotated[
     int | None,
     typer.Option(
@@ -74,10 +68,7 @@ Workers = Annotated[
     ),
 ]
 Job = Annotated[
-    str,
-    typer.Option(
-        "--job", metavar="I/N", help="Do the share of job I of N in the folder of all; /N or auto in a job array."
-    ),
+    str, typer.Option("--job", metavar="I/N", help="Run every N-th scene, from the I-th on; /N in a job array.")
 ]
 Strict = Annotated[
     bool, typer.Option("--strict", help="Exit with code 3 if the results are not to be trusted; they are written.")
@@ -163,13 +154,11 @@ def changes(sets: list[str] | None, complete: bool = False, allow_outside: bool 
     return (*(sets or ()), *(("render.complete=true",) if complete else ()), *outside)
 
 
-def cluster(scheduler: str, authority: Path | None, certificate: Path | None, key: Path | None) -> Cluster | None:
-    """Collect the options of a cluster; None without one. Raises InputError for --tls-ca and its kin without one."""
+def cluster(scheduler: str) -> Cluster | None:
+    """Return the cluster of `--scheduler`; None without the option."""
     from ommatid.runtime.execution.cluster import Cluster
 
-    if not scheduler and (authority or certificate or key):
-        raise InputError("--tls-ca, --tls-cert, --tls-key: expected --scheduler tls://HOST:PORT with them, got none")
-    return Cluster(scheduler, authority, certificate, key) if scheduler else None
+    return Cluster(scheduler) if scheduler else None
 
 
 def figure_files(formats: str, resolution: int, always: str = "png") -> FigureFiles:

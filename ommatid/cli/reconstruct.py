@@ -1,18 +1,25 @@
-"""The commands that need no scene file: reconstruct, report and check."""
+"""The commands that need no scene file: reconstruct, of one stack or of several of one camera, report and check."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from . import failures, frames, options, output
-from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, TlsCa, TlsCert, TlsKey, Verbose
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.printable import printable_sentence
+
+from . import failures, options, output
+from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, Verbose
 
 if TYPE_CHECKING:
+    from ommatid.batch.frames import Frame, FrameOptions
     from ommatid.pipeline.reconstruction import ReconstructionRequest
     from ommatid.reconstruct.output.estimate_formats import Format
+    from ommatid.reconstruct.output.run_json import RunReport
     from ommatid.runtime.execution.cluster import Cluster
 
 StackAndModel = Annotated[
@@ -80,9 +87,6 @@ def reconstruct(
     lens: Lenses = "",
     region: Regions = None,
     scheduler: TileScheduler = "",
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     workers: TileWorkers = None,
     formats: Formats = "",
     force: Force = False,
@@ -92,6 +96,7 @@ def reconstruct(
     as_json: Json = False,
 ) -> None:
     """Reconstruct from files: one frame, or several of one camera."""
+    from ommatid.batch.frames import FrameOptions
     from ommatid.pipeline import reconstruction
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
@@ -99,11 +104,13 @@ def reconstruct(
     *stacks, model = files
     asked = options.changes(sets), options.lens_names(lens), options.regions(region)
     if len(stacks) != 1:
-        request = frames.FrameRequest(stacks, model, *asked, others, force)
-        frames.reconstruct(request, file, scheduler, workers, strict, None if as_json else detail)
+        if scheduler:
+            raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
+        common = FrameOptions(model, *asked, others, force=force)
+        _reconstruct_many(stacks, common, file, workers, strict, None if as_json else detail)
         return
     request = reconstruction.ReconstructionRequest(stacks[0], model, *asked, force)
-    pool = options.cluster(scheduler, tls_ca, tls_cert, tls_key), workers
+    pool = options.cluster(scheduler), workers
     _reconstruct_one(request, file, pool, others, None if as_json else detail, strict)
 
 
@@ -137,6 +144,76 @@ def _reconstruct_one(
         output.print_report(str(file), page, report, [(str(file), run_table.rows(report))], detail)
     if strict and not is_trusted(report):
         raise failures.BatchError(failures.NOT_TRUSTED)
+
+
+def _reconstruct_many(
+    stacks: Sequence[Path],
+    common: FrameOptions,
+    folder: Path,
+    workers: int | None,
+    strict: bool,
+    detail: output.Detail | None,
+) -> None:
+    """Reconstruct every stack with one model, and print a row, a table or a verdict for each; None: as JSON.
+
+    Raises InputError before anything is written if a stack is not of the model's camera, and BatchError at the end if a
+    frame failed or, if `strict`, if one is not to be trusted.
+    """
+    from ommatid.batch.frames import reconstruct_frames
+
+    if not stacks:
+        raise InputError(f"{common.model}: expected stacks and then their model, got one file; name a stack before it")
+    described: dict[Path, DescribedFrame] = {}
+    with output.progress_bar("reconstruct") as progress:
+        for frame, work in reconstruct_frames(stacks, folder, common, workers, progress):
+            described[frame.stack] = _described(frame, work, strict, quiet=detail == "verdict")
+    _print_frames(folder, [described[stack] for stack in stacks], detail)
+    worst = max(frame.code for frame in described.values())
+    if worst:
+        raise failures.BatchError(worst)
+
+
+@dataclass(frozen=True)
+class DescribedFrame:
+    """A frame's JSON object, its row, its exit code, and its report; None for one that failed."""
+
+    document: dict[str, Any]
+    row: tuple[str, str]
+    code: int
+    report: RunReport | None
+
+
+def _print_frames(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
+    from ommatid.analysis import run_table
+    from ommatid.pipeline.summary_lines import verdict_line
+
+    if detail is None:
+        output.print_json([frame.document for frame in frames])
+    elif detail == "verdict":
+        output.print_lines(verdict_line(frame.row[0], frame.report) for frame in frames if frame.report is not None)
+    elif detail == "table":
+        pairs = [(frame.row[0], frame.report) for frame in frames if frame.report is not None]
+        output.print_tables((name, run_table.rows(report)) for name, report in pairs)
+    else:
+        output.print_tables([(f"{len(frames)} frames: {folder}", [frame.row for frame in frames])])
+
+
+def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict: bool, quiet: bool) -> DescribedFrame:
+    """Finish a frame, and return what is printed of it."""
+    from ommatid.analysis.run_table import frame_row
+    from ommatid.reconstruct.output.verdict_words import is_trusted
+
+    name, heading = frame.output.name, {"file": str(frame.output), "stack": str(frame.stack)}
+    try:
+        report, made = work()
+    except Exception as error:
+        code, reason = failures.report(error), printable_sentence(error)
+        document = {**heading, "error": reason, "exit_code": code}
+        return DescribedFrame(document, (name, f"failed: {reason}"), code, None)
+    if not quiet:
+        output.say_done("reconstruct", made, frame.output)
+    code = failures.NOT_TRUSTED if strict and not is_trusted(report) else 0
+    return DescribedFrame({**heading, **report.plain()}, frame_row(name, report), code, report)
 
 
 def report(path: StackOrFolder, folder: ResultFolder = None, as_json: Json = False) -> None:

@@ -28,9 +28,6 @@ from .options import (
     Sets,
     Strict,
     Sweeps,
-    TlsCa,
-    TlsCert,
-    TlsKey,
     Verbose,
     Within,
     Workers,
@@ -54,9 +51,6 @@ def run(
     lens: Lenses = "",
     sweep: Sweeps = None,
     scheduler: Scheduler = "",
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
@@ -73,30 +67,28 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
-    from ommatid.batch.stage_options import with_options
+    from ommatid.batch.batch import with_options
     from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch, share_of_job
     from ommatid.pipeline.stages import check_run, with_figures
     from ommatid.pipeline.time_budget import check_within, stages_within
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
-    figures, words = figure_files(figure_formats, figure_resolution), _job_words(within, formats, figure_formats)
+    figures = figure_files(figure_formats, figure_resolution)
     asked = changes(sets, complete, allow_outside), lens_names(lens)
-    members = batch_members(scenes, folder, sweep, *asked)
-    share = share_of_job("" if dry_run else job, members, folder, words, *asked, scheduler)
-    members = members if share is None else share.members
+    members, job_words = share_of_job(job, batch_members(scenes, folder, sweep, *asked), scheduler)
     output.warn_all(batch_warnings(members, *asked))
     if dry_run:
         _print_plans(members, *asked, force, as_json)
         return
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
-    pool = cluster(scheduler, tls_ca, tls_cert, tls_key), workers
+    pool = cluster(scheduler), workers
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
     check = (check_within if within else check_run) if force else None
     stages, report = with_figures(stages, figures), partial(_print_run, None if as_json else detail)
     batch = scene_batch(*asked, with_options(stages, check, others), observer, report)
-    files: dict[str, Any] = {"sweep_folder": folder, "index_folder": folder, "figures": figures, "share": share}
-    finish_batch(run_batch(batch, members, failures.report, *pool, **files), as_json, strict)
+    files: dict[str, Any] = {"sweep_folder": None if job else folder, "index_folder": folder, "figures": figures}
+    finish_batch(run_batch(batch, members, failures.report, *pool, **files), as_json, strict, job_words)
 
 
 def _print_run(detail: output.Detail | None, member: Member, description: dict[str, Any]) -> dict[str, Any]:
@@ -130,12 +122,6 @@ def _print_plans(
         output.print_lines(plan.lines(member.folder.name, described))
 
 
-def _job_words(within: str, formats: str, figure_formats: str) -> tuple[str, ...]:
-    """Return the command and those of its options that all jobs of a batch must agree on."""
-    options = (("--within", within), ("--format", formats), ("--figure-format", figure_formats))
-    return ("run", *(f"{option} {value}" for option, value in options if value))
-
-
 def render(
     scenes: SceneFiles,
     folder: Folder = Path("out"),
@@ -143,9 +129,6 @@ def render(
     lens: Lenses = "",
     sweep: Sweeps = None,
     scheduler: Scheduler = "",
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     workers: Workers = None,
     job: Job = "",
     complete: Complete = False,
@@ -154,7 +137,7 @@ def render(
     as_json: Json = False,
 ) -> None:
     """Render the sub-images alone."""
-    from ommatid.batch.stage_options import with_options
+    from ommatid.batch.batch import with_options
     from ommatid.pipeline import stages
     from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch, share_of_job
 
@@ -162,25 +145,23 @@ def render(
         return {"file": str(member.folder / "stack.exr"), **description}
 
     asked = changes(sets, complete, allow_outside), lens_names(lens)
-    members = batch_members(scenes, folder, sweep, *asked)
-    share = share_of_job(job, members, folder, ("render",), *asked, scheduler)
-    members = members if share is None else share.members
+    members, job_words = share_of_job(job, batch_members(scenes, folder, sweep, *asked), scheduler)
     output.warn_all(batch_warnings(members, *asked))
     check = stages.check_render if force else None
     batch = scene_batch(*asked, with_options(stages.render, check, ()), output.observer, report)
-    pool = cluster(scheduler, tls_ca, tls_cert, tls_key), workers
-    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=folder, share=share)
-    finish_batch(outcome, as_json)
+    pool = cluster(scheduler), workers
+    outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=None if job else folder)
+    finish_batch(outcome, as_json, job_words=job_words)
 
 
-def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False) -> None:
-    """Print the documents of a batch, or the table of a sweep.
+def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False, job_words: str = "") -> None:
+    """Print the documents of a batch, or the table of a sweep, and a sentence on the job that ran it, if any.
 
     Raises BatchError if a scene failed or, if `strict`, if the results of one are not to be trusted.
     """
     output.print_result(outcome.documents, outcome.sections, as_json)
-    if outcome.jobs:
-        output.say(outcome.jobs)
+    if job_words:
+        output.say(job_words)
     verdicts = [document["verdict"]["trusted"] for document in outcome.documents if "verdict" in document]
     code = max(outcome.exit_code, failures.NOT_TRUSTED if strict and not all(verdicts) else 0)
     if code:

@@ -8,8 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from fractions import Fraction
-from math import isfinite, sqrt
+from math import sqrt
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -17,9 +16,10 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from ommatid.batch.sweep_row import NUMBERS, read_rows
+from ommatid.batch.sweep_table import PICTURE as SWEEP_PICTURE
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
-from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.output.verdict_words import heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
@@ -29,14 +29,12 @@ from ommatid.runtime.printable import printable
 from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.scene import read as read_scene
-from ommatid.scenes.tables.units import length
 
 from .cached import REPORT, read_stamp, sources_digest
-from .panels.charts import COLOURS, ChartAxis, ChartSeries, chart
+from .panels.charts import ChartAxis, ChartSeries, chart
 from .words import agreement
 
 INDEX = "index.html"
-SweepPoint = tuple[float, float | None, float]  # value of the first key, measured error, predicted error
 
 
 @dataclass(frozen=True)
@@ -86,10 +84,12 @@ class SweepTable:
     """Varied keys, and for each scene the link to its page, the values, measured and predicted error.
 
     The link is empty for a failed scene.
+    picture : name of the figure's file, empty without one
     """
 
     keys: tuple[str, ...]
     rows: list[tuple[str, tuple[str, ...], float | None, float | None]]
+    picture: str = ""
 
 
 def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
@@ -158,14 +158,14 @@ def read_sweep(path: Path) -> SweepTable | None:
         )
         for scene in scenes
     ]
-    return SweepTable(keys, rows) if keys and rows else None
+    picture = SWEEP_PICTURE if path.with_name(SWEEP_PICTURE).is_file() else ""
+    return SweepTable(keys, rows, picture) if keys and rows else None
 
 
 def page(entries: list[BatchEntry], sweep: SweepTable | None, name: str, stamp: str) -> str:
     """Return the index as HTML; without figures if there is nothing to compare."""
     from .document import fill
 
-    figures = _figures(entries, sweep)
     content: dict[str, Any] = {
         "entries": entries,
         "sweep": sweep,
@@ -173,7 +173,7 @@ def page(entries: list[BatchEntry], sweep: SweepTable | None, name: str, stamp: 
         "words": words(entries),
         "page_file": REPORT,
         "picture_file": PICTURE,
-        "figures": figures,
+        "figure": _scenes_figure(entries),
         "document": "",
         "stamp": stamp,
     }
@@ -194,15 +194,12 @@ def words(entries: list[BatchEntry]) -> str:
     return f"{sentence}."
 
 
-def _figures(entries: list[BatchEntry], sweep: SweepTable | None) -> dict[str, Markup]:
+def _scenes_figure(entries: list[BatchEntry]) -> Markup:
+    """Draw measured against predicted error; nothing if there is nothing to compare."""
     errors = [(entry.title, entry.report.error) for entry in entries if entry.report]
-    known = [(title, error) for title, error in errors if error.mse and error.predicted_mse]
-    figures = {"scenes": _scenes_figure(known)} if len(known) > 1 else {}
-    series = {} if sweep is None else _series(sweep)
-    return figures if sweep is None or not series else figures | {"sweep": _sweep_figure(sweep, series)}
-
-
-def _scenes_figure(scenes: list[tuple[str, ErrorReport]]) -> Markup:
+    scenes = [(title, error) for title, error in errors if error.mse and error.predicted_mse]
+    if len(scenes) < 2:
+        return Markup("")
     points = [(title, error.predicted_mse, error.mse or 0.0, error.expected_given_truth) for title, error in scenes]
     dots = ChartSeries(
         "measured, with the 99 % interval expected for the image",
@@ -219,47 +216,3 @@ def _scenes_figure(scenes: list[tuple[str, ErrorReport]]) -> Markup:
     equal = ChartSeries("measured equals predicted", ends, ends, "dashed", 0)
     x, y = (ChartAxis(f"{name} mean squared error", True) for name in ("predicted", "measured"))
     return chart("scenes", x, y, [equal, dots], "measured against predicted error of the scenes")
-
-
-def _series(sweep: SweepTable) -> dict[str, list[SweepPoint]]:
-    """Return the points of the scenes by the values of the keys after the first.
-
-    The dictionary is empty if the values of the first key are not positive numbers or lengths, or all the same.
-    """
-    series: dict[str, list[SweepPoint]] = {}
-    units: set[str] = set()
-    for _, values, mse, predicted in sweep.rows:
-        if not predicted:
-            continue
-        number, unit = _quantity(values[0])
-        if number is None:
-            return {}
-        units.add(unit)
-        others = ", ".join(f"{key} {value}" for key, value in zip(sweep.keys[1:], values[1:], strict=True))
-        series.setdefault(others or "measured", []).append((number, mse, predicted))
-    varies = len({number for points in series.values() for number, _, _ in points}) > 1
-    return {name: sorted(points) for name, points in series.items()} if varies and len(units) == 1 else {}
-
-
-def _quantity(text: str) -> tuple[float | None, str]:
-    """Return a positive number and its unit, which is "" or millimetres; None for everything else."""
-    try:
-        number, unit = float(Fraction(text)), ""
-    except (ValueError, ZeroDivisionError):
-        try:
-            number, unit = length(text), "mm"
-        except ValueError:
-            return None, ""
-    return (number if isfinite(number) and number > 0 else None), unit
-
-
-def _sweep_figure(sweep: SweepTable, series: dict[str, list[SweepPoint]]) -> Markup:
-    key, unit = sweep.keys[0], _quantity(sweep.rows[0][1][0])[1]
-    drawn: list[ChartSeries] = []
-    for index, (name, points) in enumerate(series.items()):
-        colour, known = 1 + index % COLOURS, [(x, mse, predicted) for x, mse, predicted in points if mse]
-        tips = [f"{name}, {key} {x:.4g} {unit}: {mse:.4g}, predicted {predicted:.4g}" for x, mse, predicted in known]
-        drawn.append(ChartSeries(name, [x for x, _, _ in points], [z for _, _, z in points], "dashed", colour))
-        drawn.append(ChartSeries("", [x for x, _, _ in known], [y for _, y, _ in known], "dots", colour, tips=tips))
-    axes = ChartAxis(f"{key} ({unit})" if unit else key, True), ChartAxis("mean squared error", True)
-    return chart("sweep", *axes, drawn, "the values are in the table beside the figure")

@@ -1,4 +1,4 @@
-"""Input of a page: the files in a run's folder, and maps reduced to a size that a page can hold.
+"""Input of a page: the files in a run's folder, maps reduced to a size that a page can hold, and one sub-image.
 
 Maps are (rows, columns) in the target's pixels, row 0 at the top; values are in the target's units, 0 to 255.
 """
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import ESTIMATE
 from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.output.single_sub_image import best_single_sub_image, enlarged
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import real_path
@@ -166,3 +167,32 @@ def reduced(image: NDArray[Any], block: int) -> Float32Array:
 def _block_sums(image: FloatArray, block: int) -> FloatArray:
     rows, columns = (np.arange(0, size, block, dtype=np.int64) for size in image.shape)
     return np.add.reduceat(np.add.reduceat(image.astype(np.float64), rows, axis=0), columns, axis=1)
+
+
+@dataclass(frozen=True)
+class ShownSubImage:
+    """A sub-image on f's grid, (rows, columns), its name, and whether it is the one of least error."""
+
+    name: str
+    image: FloatArray
+    is_best: bool
+
+    @property
+    def title(self) -> str:
+        """The title of its map."""
+        return f"{'Best single' if self.is_best else 'Single'} sub-image ({self.name}, bicubic)"
+
+
+def shown_sub_image(stack: Stack, truth: FloatArray | None) -> ShownSubImage:
+    """Return the best sub-image, or without the truth the central one of the type with the finest pixels."""
+    best = best_single_sub_image(stack, truth)
+    if best is not None:
+        return ShownSubImage(best.name, best.image, True)
+    camera = stack.camera
+    index = min(range(len(camera.types)), key=lambda index: camera.types[index].ratio)
+    lens_type = camera.types[index]
+    k, l = (count // 2 for count in lens_type.array)  # noqa: E741
+    part = camera.type_slices()[index].start + (k * lens_type.array[1] + l) * lens_type.pixels[0] * lens_type.pixels[1]
+    size = lens_type.pixels[0] * lens_type.pixels[1]
+    sub, pixels = camera.sub_imager(index, k, l), stack.values[part : part + size].reshape(lens_type.pixels)
+    return ShownSubImage(sub.name, enlarged(camera, sub, pixels, np.arange(float(camera.rows))), False)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass, field
+from functools import lru_cache
 from math import sqrt
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from ommatid.analysis.held_out import maps as held_out_maps
 from ommatid.analysis.held_out import table
@@ -22,12 +26,13 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from . import tables, words
-from .data import Contents, ResultMaps, Run, maps
-from .drawing import drawing_of
-from .panels import embedded, error_groups, point_response, resolution, sensor, time_curves
+from .data import Contents, ResultMaps, Run, ShownSubImage, maps, shown_sub_image
+from .panels import error_groups, point_response, resolution, sensor, time_curves
 from .panels import maps as result_maps
 from .panels.point_response import IdealMatrix
-from .single import ShownSubImage, shown_sub_image
+
+DRAWN_TABLES = ("target", "camera", "world", "light")  # of the scene file, which the drawing shows
+KEPT_DRAWINGS = 8
 
 
 def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dict[str, Any]:
@@ -63,7 +68,7 @@ def of_sensor(stack: Stack, groups: list[dict[str, Any]], most: int) -> dict[str
     return {
         "mosaic": mosaic,
         "mosaic_words": sensor.words(mosaic),
-        "document": embedded.document([*groups, sensor.group(mosaic)]),
+        "document": result_maps.document([*groups, sensor.group(mosaic)]),
     }
 
 
@@ -84,7 +89,7 @@ def of_contents(contents: Contents) -> dict[str, Any]:
     if described is not None:
         content |= _camera(described.scene, described.camera)
         content["scene_text"] = tables.scene_text(described.scene)
-    content["document"] = embedded.document(groups)
+    content["document"] = result_maps.document(groups)
     return content if contents.stack is None else content | of_sensor(contents.stack, groups, sensor.MOST_VALUES)
 
 
@@ -178,3 +183,27 @@ def _time(run: Run, bench: BenchTable | None) -> dict[str, Any]:
 def _camera(scene: Scene, camera: Camera) -> dict[str, Any]:
     lenses, facts = tables.geometry(scene, camera)
     return {"lenses": lenses, "facts": facts, "drawing": drawing_of(scene, camera)}
+
+
+@dataclass(frozen=True)
+class DrawnCamera:
+    """A camera and its scene, equal to another one that is drawn alike: one with the same `key`."""
+
+    key: str
+    scene: Scene = field(compare=False)
+    camera: Camera = field(compare=False)
+
+
+def drawing_of(scene: Scene, camera: Camera) -> Markup:
+    """Return the drawing of a camera without title and table."""
+    tables = scene.plain()
+    key = json.dumps({name: tables[name] for name in DRAWN_TABLES if name in tables}, sort_keys=True, default=str)
+    return _drawn(DrawnCamera(key, scene, camera))
+
+
+@lru_cache(maxsize=KEPT_DRAWINGS)
+def _drawn(drawn: DrawnCamera) -> Markup:
+    from ommatid.figures.camera_drawing import camera_drawing
+    from ommatid.figures.saving import svg_text
+
+    return Markup(svg_text(camera_drawing(drawn.scene, drawn.camera, described=False)))

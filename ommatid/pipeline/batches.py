@@ -12,9 +12,6 @@ from typing import Any
 
 from ommatid.batch import sweep
 from ommatid.batch.batch import Batch, Description, Member
-from ommatid.batch.cost_model import estimate_cost
-from ommatid.batch.jobs.array_job import read_job
-from ommatid.batch.jobs.job_plan import EndedScene, JobShare, join_jobs
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.batch.sweep_row import SweepRow, summary
 from ommatid.batch.sweep_table import lines, write_sweep
@@ -26,7 +23,7 @@ from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
-from ommatid.scenes.scene import ALLOW_OUTSIDE, read
+from ommatid.scenes.scene import read
 
 from .sections import Section
 from .stages import library_versions, open_member, process_count
@@ -34,15 +31,11 @@ from .stages import library_versions, open_member, process_count
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """The results of a batch: a JSON document per scene, the table of a sweep, and the worst exit code.
-
-    jobs : a sentence on the jobs that share the batch; empty where there are none
-    """
+    """The results of a batch: a JSON document per scene, the table of a sweep, and the worst exit code."""
 
     documents: list[Description]
     sections: list[Section]
     exit_code: int
-    jobs: str = ""
 
 
 def batch_members(
@@ -87,42 +80,19 @@ def scene_batch(
     return Batch(open_scene, stages, observe, report, library_versions, count)
 
 
-def share_of_job(
-    job: str,
-    members: Sequence[Member],
-    folder: Path,
-    words: Sequence[str],
-    changes: Sequence[str],
-    lenses: Sequence[str],
-    scheduler: str = "",
-) -> JobShare | None:
-    """Return the share of the job that `--job` names, None without that option.
+def share_of_job(job: str, members: Sequence[Member], scheduler: str = "") -> tuple[list[Member], str]:
+    """Return the scenes of the job that `--job` names, all without that option, and a sentence on the job.
 
-    folder : of the batch, in which the jobs agree;  words : of the command that are not in the other arguments
-    Raises InputError if the option cannot be read, or if jobs of another command have not ended in the folder.
+    Raises InputError if the option cannot be read.
     """
     if not job:
-        return None
+        return list(members), ""
     if scheduler:
         raise InputError("--job and --scheduler: expected one of them; both distribute the scenes over machines")
-    changed = (change if change == ALLOW_OUTSIDE else f"--set {change}" for change in changes)
-    command = (*words, *changed, *([f"--lens {','.join(lenses)}"] if lenses else []))
-
-    def seconds(member: Member) -> float:
-        return estimate_cost(member, changes, lenses).seconds
-
-    def facts() -> dict[str, str]:
-        return library_versions(any(_selects_variant(member, changes, lenses) for member in members))
-
-    return join_jobs(read_job(job, os.environ), members, folder, command, seconds, facts)
-
-
-def _selects_variant(member: Member, changes: Sequence[str], lenses: Sequence[str]) -> bool:
-    """Whether a scene leaves the variant to the machine; False for one with errors, which are reported later."""
-    try:
-        return read(member.scene, (*changes, *member.changes), lenses).render.variant == "auto"
-    except InputError:
-        return False
+    number, count = sweep.job_numbers(job, os.environ)
+    share = list(members[number - 1 :: count])
+    tables = "; once all jobs have ended, the same command without --job writes the table" if members[0].changes else ""
+    return share, f"job {number} of {count}: {len(share)} of {len(members)} scenes{tables}"
 
 
 def run_batch(
@@ -135,7 +105,6 @@ def run_batch(
     sweep_folder: Path | None = None,
     index_folder: Path | None = None,
     with_folders: bool = True,
-    share: JobShare | None = None,
     figures: FigureFiles = SCREEN_PNG,
 ) -> BatchOutcome:
     """Run every scene of a batch, even if others fail.
@@ -143,7 +112,6 @@ def run_batch(
     report_failure : returns the exit code of an exception;  with_folders : documents of a sweep name the folders
     figures : files of the sweep's figure
     sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
-    share : of a job, whose scenes `members` are; the last job writes table and page
     Where all scenes fail, neither table nor page is written.
     """
     for folder in (index_folder, sweep_folder):
@@ -164,41 +132,18 @@ def run_batch(
             failures[member] = reason or type(error).__name__
             results[member] = {**document, "error": reason, "exit_code": codes[-1]}
     documents = [results[member] for member in members]
-    ended = [_ended_scene(member, results[member], failures.get(member, "")) for member in members]
-    describe = partial(_describe, sweep_folder, index_folder, figures, report_failure)
-    if share is None:
-        if len(failures) == len(members):  # leaves nothing behind
-            describe = partial(_describe, None, None, figures, report_failure)
-        sections, code = describe(ended)
-        return BatchOutcome(documents, sections, max(*codes, code))
-    described, jobs = share.end(ended, describe)
-    sections, code = described or _describe(None, None, figures, report_failure, ended)
-    return BatchOutcome(documents, sections, max(*codes, code), jobs)
-
-
-def _ended_scene(member: Member, description: Description, failure: str) -> EndedScene:
-    row = summary(description) if member.changes else None
-    return EndedScene(folder=member.folder.name, failure=failure, row=row)
-
-
-def _describe(
-    sweep_folder: Path | None,
-    index_folder: Path | None,
-    figures: FigureFiles,
-    report_failure: Callable[[Exception], int],
-    ended: Sequence[EndedScene],
-) -> tuple[list[Section], int]:
-    """Write the table of a sweep and the page of a batch; return the printed table, and an exit code."""
-    rows = [scene.row for scene in ended if scene.row is not None]
-    folder = sweep_folder if rows else index_folder
+    rows = [summary(results[member]) for member in members if member.changes]
+    if len(failures) == len(members):  # leaves nothing behind
+        sweep_folder = index_folder = None
+    folder = (sweep_folder if rows else None) or index_folder
     with nullcontext() if folder is None or not (rows or folder.is_dir()) else occupied(folder):
         sections = _sweep_sections(rows, sweep_folder, figures) if rows else []
         if index_folder is not None:
             try:
-                cached_index(index_folder, {index_folder / scene.folder: scene.failure for scene in ended})
+                cached_index(index_folder, {member.folder: failures.get(member, "") for member in members})
             except Exception as error:
-                return sections, report_failure(error)
-        return sections, 0
+                codes.append(report_failure(error))
+    return BatchOutcome(documents, sections, max(codes))
 
 
 def _heading(member: Member, with_folder: bool) -> dict[str, Any]:

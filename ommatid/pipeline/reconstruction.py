@@ -24,8 +24,7 @@ from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import file_digest, write_text, write_whole
 from ommatid.runtime.input_files import read_text, real_path
-from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_output
-from ommatid.runtime.outputs.names import check_name
+from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_name, check_output
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions

@@ -54,7 +54,7 @@ def open_member(changes: Sequence[str], lenses: Sequence[str], member: Member) -
 
 def process_count(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
     """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
-    from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
+    from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
 
     costs = [estimate_cost(member, changes, lenses) for member in members]
     most = min(concurrent_by_memory([cost.memory for cost in costs]), len(members), processors())

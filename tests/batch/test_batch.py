@@ -1,105 +1,24 @@
-"""Batches that are interrupted at any moment: the next run repeats nothing finished and gives the same files."""
+"""Batches: what a killed run left is removed, the number of processes, and threads of linear algebra."""
 
 from __future__ import annotations
 
-import csv
-import json
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
 from ommatid.batch import batch
 from ommatid.batch.batch import Batch, Member, Runs
-from ommatid.batch.cost_model import concurrent_by_memory, estimate_cost, fastest_process_count
+from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
 from ommatid.reconstruct import method_choice
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files
 from ommatid.runtime.processors import one_thread, processors
 
-from ..conftest import TINY, Command, shell
-from ..runs import FILES, MADE, assert_same_content, content
-from .attempts import attempt, modification_times
-
-COMMAND = ("run", "tiny.toml", "-o", "out", "--sweep", "render.seed=1,2", "--json")
-SCENES = ("tiny+render.seed=1", "tiny+render.seed=2")
-SHARED = ("index.html", "sweep.csv", "sweep.json", "sweep.png")
-OUTPUT = {*SHARED, *(f"{scene}/{name}" for scene in SCENES for name in FILES)}
-MOST_CHANGES = 60  # of files: a command is killed after a random number of changes up to this
-
-
-def finished_files(times: dict[str, int], scene: str) -> dict[str, int]:
-    """Files of finished stages. Those of the reconstruction are finished once run.json, the last, is there."""
-    here = {name: times[f"{scene}/{name}"] for name in MADE if f"{scene}/{name}" in times}
-    finished = MADE if "run.json" in here else ("stack.exr", "model.npz")
-    return {f"{scene}/{name}": here[name] for name in finished if name in here}
-
-
-def kill_and_resume(starter: subprocess.Popen[str], here: Path, workers: int, random: np.random.Generator) -> int:
-    """Run a batch, kill it and resume it until it ends; check each attempt, and return the number of kills.
-
-    workers : of the first attempt; the others use one process
-    """
-    here.mkdir()
-    (here / "tiny.toml").write_text(TINY, encoding="utf-8")
-    kills = 0
-    while True:
-        before = modification_times(here / "out")
-        count = 1 if kills else workers
-        ended = attempt(starter, here, (*COMMAND, "--workers", str(count)), int(random.integers(1, MOST_CHANGES)))
-        after = modification_times(here / "out")
-        finished = {scene: finished_files(before, scene) for scene in SCENES}
-        for scene, times in finished.items():
-            if f"{scene}/report.html" not in times:  # the time of the page is added to run.json once there is one
-                times = {name: time for name, time in times.items() if name != f"{scene}/run.json"}
-            assert {name: after.get(name) for name in times} == times, f"repeated after {kills} kills"
-        if not ended.killed:
-            break
-        kills += 1
-    for scene in SCENES:
-        line = f"render: up to date, nothing to do, {Path('out') / scene / 'stack.exr'}"
-        assert (line in ended.err) == (f"{scene}/stack.exr" in finished[scene])
-    for name, stage in (("model.npz", "calibrate"), ("run.json", "reconstruct")):
-        count = sum(f"{scene}/{name}" in finished[scene] for scene in SCENES)
-        assert ended.err.count(f"{stage}: up to date") == count
-    assert [document["values"] for document in json.loads(ended.out)] == [{"render.seed": "1"}, {"render.seed": "2"}]
-    return kills
-
-
-def rows_without_times(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    return [{name: value for name, value in row.items() if not name.startswith("seconds")} for row in rows]
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory, starter: subprocess.Popen[str]) -> Path:
-    """Output folder of a batch that is not killed."""
-    here = tmp_path_factory.mktemp("uninterrupted")
-    (here / "tiny.toml").write_text(TINY, encoding="utf-8")
-    assert not attempt(starter, here, (*COMMAND, "--workers", "1"), sys.maxsize).killed
-    assert modification_times(here / "out").keys() == OUTPUT
-    return here / "out"
-
-
-@pytest.mark.parametrize(("workers", "kills"), [(1, 8), (2, 1)])
-def test_a_batch_that_is_killed_at_any_moment_is_resumed(
-    workers: int, kills: int, starter: subprocess.Popen[str], tmp_path: Path, uninterrupted: Path
-) -> None:
-    random, killed = np.random.default_rng(5), 0
-    expected = {scene: content(uninterrupted / scene) for scene in SCENES}
-    while killed < kills:
-        here = tmp_path / str(killed)
-        killed += kill_and_resume(starter, here, workers, random)
-        assert modification_times(here / "out").keys() == OUTPUT, "files are left over, or missing"
-        for scene in SCENES:
-            assert_same_content(here / "out" / scene, expected[scene])
-        assert rows_without_times(here / "out" / "sweep.csv") == rows_without_times(uninterrupted / "sweep.csv")
+from ..conftest import Command, shell
+from ..runs import FILES, assert_same_content, content
 
 
 def test_a_run_removes_the_temporary_files_of_a_killed_one(kept: Path, ommatid: Command) -> None:
@@ -184,6 +103,7 @@ def test_linear_algebra_uses_one_thread_whatever_the_setting() -> None:
         assert blas_threads() == {2} or processors() == 1
 
 
+@pytest.mark.slow
 def test_a_run_with_more_threads_for_linear_algebra_gives_the_same_files(finished: Path, here: Path) -> None:
     before = "import os\nos.environ['OPENBLAS_NUM_THREADS'] = '2'"
     ended = shell("run", "tiny.toml", "-o", "out", cwd=here, before=before)

@@ -1,4 +1,4 @@
-"""Batches on processes, clusters and jobs: the same files and messages as of one process, and a clean end by Ctrl-C."""
+"""Batches on processes and clusters: the same files and messages as of one process, and a clean end by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Generator
@@ -16,7 +15,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import pytest
 
@@ -27,10 +25,8 @@ from ommatid.scenes.setup import Setup
 
 from ..conftest import TINY, Command, Ended, interpreter, shell
 from ..runs import FILES, assert_same_content, content, numbers, without
-from .attempts import attempt
 
 SEEDS = (1, 2, 3)
-FILES_OF_A_RUN = 12  # changes of files, at the very least, that a scene needs: a job is killed before them
 
 
 def write_scenes(folder: Path) -> list[str]:
@@ -58,16 +54,25 @@ def documents(out: str) -> list[dict[str, Any]]:
     return [numbers(document) for document in json.loads(out)]
 
 
-def with_address(options: list[str], address: str) -> list[str]:
-    return [address if option == "address" else option for option in options]
+def with_address(options: list[str], request: pytest.FixtureRequest) -> list[str]:
+    """Options with the address of the cluster, which is started for those that need it."""
+    return [request.getfixturevalue(option) if option == "address" else option for option in options]
 
 
-@pytest.mark.parametrize("options", [[], ["--workers", "3"], ["--scheduler", "address"]], ids=" ".join)
+ON_A_CLUSTER = pytest.param(["--scheduler", "address"], marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("options", [["--workers", "3"], ON_A_CLUSTER])
 def test_a_batch_gives_the_same_files_wherever_it_is_done(
-    options: list[str], scenes: list[str], here: Path, address: str, alone: tuple[Path, Ended], ommatid: Command
+    options: list[str],
+    scenes: list[str],
+    here: Path,
+    request: pytest.FixtureRequest,
+    alone: tuple[Path, Ended],
+    ommatid: Command,
 ) -> None:
     folder, expected = alone
-    shared = ommatid("run", *scenes, "-o", "out", "--json", *with_address(options, address))
+    shared = ommatid("run", *scenes, "-o", "out", "--json", *with_address(options, request))
     assert shared.code == 0, shared.err
     assert sorted(shared.err.splitlines()) == sorted(expected.err.splitlines())
     assert documents(shared.out) == documents(expected.out)
@@ -80,83 +85,14 @@ def test_a_batch_gives_the_same_files_wherever_it_is_done(
     assert len(estimates) == len(scenes), "seeds differ, and so do the pictures: the comparison can fail"
 
 
-def test_jobs_of_which_one_is_killed_give_the_same_files(
-    scenes: list[str], here: Path, starter: subprocess.Popen[str], alone: tuple[Path, Ended]
-) -> None:
-    command = ("run", *scenes, "-o", "out", "--json", "--job")
-    changes = int(np.random.default_rng().integers(2, FILES_OF_A_RUN))
-    attempts = [attempt(starter, here, (*command, f"{job}/3"), sys.maxsize) for job in (3, 1)]
-    attempts.append(attempt(starter, here, (*command, "2/3"), changes))
-    assert [ended.killed for ended in attempts] == [False, False, True], f"not killed after {changes} changes of files"
-    assert not (here / "out" / "index.html").exists()
-    attempts.append(attempt(starter, here, (*command, "2/3"), sys.maxsize))
-    assert [ended.err.splitlines()[-1] for ended in attempts if not ended.killed] == [
-        "job 3 of 3: done; not ended yet: 1, 2",
-        "job 1 of 3: done; not ended yet: 2",
-        "job 2 of 3: done; all jobs have ended",
-    ]
-    folder, expected = alone
-    printed = [document for ended in (attempts[1], attempts[3], attempts[0]) for document in documents(ended.out)]
-    assert printed == documents(expected.out)
-    for name in (Path(scene).stem for scene in scenes):
-        assert {path.name for path in (here / "out" / name).iterdir()} == FILES
-        assert_same_content(here / "out" / name, content(folder / name))
-    written = {path.name for path in (here / "out").iterdir()}
-    assert written == {".jobs", *(path.name for path in folder.iterdir())}
-    assert not {path.name for path in (here / "out" / ".jobs").iterdir() if not path.name.endswith(".json")}
-
-
-def test_jobs_write_the_table_of_a_sweep_as_one_process_does(here: Path, ommatid: Command) -> None:
-    sweep = ("render", "tiny.toml", "--sweep", "render.seed=1,2", "--sweep", "camera.lens.I.magnification=1/3,2")
-    expected = ommatid(*sweep, "-o", "alone")
-    codes = [ommatid(*sweep, "-o", "out", "--job", f"{job}/3").code for job in (3, 1, 2)]
-    assert expected.code == max(codes) == 2
-    assert 0 in codes, "a job has the code of its own scenes"
-    tables = [
-        [
-            {key: value for key, value in row.items() if not key.startswith(("seconds", "folder"))}
-            for row in json.loads((here / folder / "sweep.json").read_text(encoding="utf-8"))
-        ]
-        for folder in ("alone", "out")
-    ]
-    assert tables[0] == tables[1]
-    assert [row.get("failed") is not None for row in tables[1]] == [False, True, False, True]
-
-
-def test_the_index_of_jobs_names_the_failures_of_all(
-    here: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, magnification in (("two", "2"), ("three", "3")):
-        (here / f"{name}.toml").write_text(TINY.replace('"1/3"', magnification), encoding="utf-8")
-    for job in ("1", "2"):
-        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", job)
-        ended = ommatid("run", "two.toml", "three.toml", "-o", "out", "--job", "/2")
-        assert ended.code == 2
-        assert (here / "out" / "index.html").exists() == (job == "2")
-    assert ended.err.endswith("job 2 of 2: done; all jobs have ended; 2 of 2 scenes failed\n")
-    index = (here / "out" / "index.html").read_text(encoding="utf-8")
-    for name in ("two.toml", "three.toml"):
-        assert f"{name}: camera.lens" in index
-
-
-def test_a_job_of_another_command_is_refused_before_anything_is_done(here: Path, ommatid: Command) -> None:
-    first = ommatid("render", "tiny.toml", "other.toml", "-o", "out", "--job", "2/2")
-    assert first.err.endswith("job 2 of 2: done; not ended yet: 1\n")
-    ended = ommatid("render", "tiny.toml", "other.toml", "-o", "out", "--set", "noise.bits=8", "--job", "1/2")
-    assert ended.code == 2
-    assert "expected 'render', not 'render --set noise.bits=8'" in ended.err
-    assert {path.name for path in (here / "out").iterdir()} == {".jobs"}
-    assert ommatid("run", "tiny.toml", "--job", "1/2", "--scheduler", "tcp://localhost:1").err.startswith(
-        "ommatid: --job and --scheduler: expected one of them"
-    )
-
-
+@pytest.mark.slow
 def test_a_batch_on_processes_imports_no_dask(here: Path) -> None:
     scenes = write_scenes(here)
     ended = shell("render", *scenes, "-o", "out", "--workers", "2", cwd=here, before=without("distributed"))
     assert ended.code == 0, ended.err
 
 
+@pytest.mark.slow
 def test_results_that_are_up_to_date_here_are_not_made_again_on_a_cluster(
     scenes: list[str], here: Path, address: str, alone: tuple[Path, Ended], ommatid: Command
 ) -> None:
@@ -178,9 +114,9 @@ def test_results_that_are_up_to_date_here_are_not_made_again_on_a_cluster(
     }
 
 
-@pytest.mark.parametrize("options", [["--workers", "2"], ["--scheduler", "address"]], ids=" ".join)
+@pytest.mark.parametrize("options", [["--workers", "2"], ON_A_CLUSTER])
 def test_failures_of_scenes_are_independent_and_their_messages_the_same(
-    options: list[str], here: Path, scenes: list[str], address: str, ommatid: Command
+    options: list[str], here: Path, scenes: list[str], request: pytest.FixtureRequest, ommatid: Command
 ) -> None:
     (here / "bad.toml").write_text(TINY.replace('"1/3"', "2"), encoding="utf-8")
     large = TINY.replace("origin = [100, 230]\n", "").replace("shape = [12, 12]\n", "shape = [512, 512]\n")
@@ -188,7 +124,7 @@ def test_failures_of_scenes_are_independent_and_their_messages_the_same(
     (here / "large.toml").write_text(large + '\n[estimator]\nmemory = "20 MB"\n', encoding="utf-8")
     batch = ("run", scenes[0], "bad.toml", "large.toml", "missing.toml", scenes[1], "--json")
     alone = ommatid(*batch, "-o", "alone", "--workers", "1")
-    shared = ommatid(*batch, "-o", "shared", *with_address(options, address))
+    shared = ommatid(*batch, "-o", "shared", *with_address(options, request))
     assert alone.code == shared.code == 2
     messages = [
         [re.sub(r"[\d.]+ GB", "some GB", line) for line in ended.err.splitlines() if line.startswith("ommatid: ")]
@@ -200,6 +136,7 @@ def test_failures_of_scenes_are_independent_and_their_messages_the_same(
     assert [document["scene"] for document in json.loads(shared.out)] == list(batch[1:-1])
 
 
+@pytest.mark.slow
 def test_renderings_can_be_shared(scenes: list[str], here: Path, address: str, ommatid: Command) -> None:
     ended = ommatid("render", *scenes, "-o", "out", "--scheduler", address, "--json")
     assert ended.code == 0, ended.err
@@ -247,6 +184,7 @@ def wait_for(path: Path) -> None:
     raise TimeoutError(f"{path} does not appear")
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_finished_files_and_leaves_no_processes(here: Path, scenes: list[str]) -> None:
     (here / "long.toml").write_text(LONG, encoding="utf-8")
     scratch = here / "scratch"
@@ -282,6 +220,7 @@ gc.set_threshold(1)
 """
 
 
+@pytest.mark.slow
 def test_ctrl_c_that_a_callback_drops_is_noticed(here: Path, scenes: list[str]) -> None:
     (here / "long.toml").write_text(LONG, encoding="utf-8")
     with started("run", scenes[0], "long.toml", "-o", "out", "--workers", "2", before=SLOW_CALLBACK) as command:
@@ -297,6 +236,7 @@ def test_ctrl_c_that_a_callback_drops_is_noticed(here: Path, scenes: list[str]) 
     assert command.returncode == 1
 
 
+@pytest.mark.slow
 def test_workers_end_when_the_command_is_killed(here: Path) -> None:
     for name in ("one", "two"):
         (here / f"{name}.toml").write_text(LONG, encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from hypothesis import strategies as st
 
 from ommatid.analysis.predict import predict_scene
 from ommatid.analysis.prediction_table import json_of
-from ommatid.batch import sweep_figure
-from ommatid.batch.sweep import SweepAxis, members, sweep_axes
+from ommatid.batch import sweep_table
+from ommatid.batch.sweep import SweepAxis, job_numbers, members, sweep_axes
 from ommatid.batch.sweep_row import SweepRow, read_rows, summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.runtime.errors import InputError
@@ -70,9 +71,8 @@ def test_a_batch_without_a_sweep_has_a_folder_per_scene() -> None:
         members([Path("x/tile19.toml"), Path("tile19.toml")], (), Path("out"))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_wrong_sweeps_are_refused_before_any_work(here: Path, ommatid: Command) -> None:
+    for options, message in (
         (["noise.variance"], "expected KEY=VALUE,VALUE,..."),
         (["noise.variance="], "without an empty value"),
         (["noise.variance=1,,2"], "without an empty value"),
@@ -84,18 +84,71 @@ def test_a_batch_without_a_sweep_has_a_folder_per_scene() -> None:
         (["camera.lens.II.pixels=[2,2]"], "no lens type is called 'II'; there are 'I'"),
         (["camera.lens.I.pixles=[2,2]"], "unknown key 'camera.lens.I.pixles'"),
         (["noise.variance.x=1"], "noise.variance.x"),
-    ],
-)
-@pytest.mark.parametrize("command", ["run", "render", "predict"])
-def test_wrong_sweeps_are_refused_before_any_work(
-    command: str, options: list[str], message: str, here: Path, ommatid: Command
-) -> None:
-    ended = ommatid(command, "tiny.toml", "-o", "out", *(part for option in options for part in ("--sweep", option)))
-    assert (ended.code, ended.out) == (2, "")
-    [line] = ended.err.splitlines()
-    assert line.startswith("ommatid: --sweep ")
-    assert message in line
+    ):
+        words = (part for option in options for part in ("--sweep", option))
+        ended = ommatid("predict", "tiny.toml", "-o", "out", *words)
+        assert (ended.code, ended.out) == (2, "")
+        [line] = ended.err.splitlines()
+        assert line.startswith("ommatid: --sweep ")
+        assert message in line
+    for command in ("run", "render"):
+        ended = ommatid(command, "tiny.toml", "-o", "out", "--sweep", "noice.variance=1,2")
+        assert "unknown key 'noice'" in ended.err
     assert not (here / "out").exists()
+
+
+# --- shares of jobs
+
+
+def test_the_number_of_a_job_is_written_or_that_of_the_array() -> None:
+    for text, environment, expected in (
+        ("2/3", {}, (2, 3)),
+        ("2/3", {"SLURM_ARRAY_TASK_ID": "1"}, (2, 3)),  # what is written counts
+        ("/8", {"SLURM_ARRAY_TASK_ID": "3"}, (3, 8)),
+        ("/8", {"PBS_ARRAY_INDEX": "8"}, (8, 8)),
+    ):
+        assert job_numbers(text, environment) == expected
+    for text, environment, message in (
+        ("0/3", {}, "expected a job from 1 to 3, got '0'"),
+        ("4/3", {}, "expected a job from 1 to 3, got '4'"),
+        ("three", {}, "expected I/N, such as 2/8"),
+        ("1/200000", {}, "with N up to 100000"),
+        ("auto", {"SLURM_ARRAY_TASK_ID": "1"}, "`auto` is withdrawn"),
+        ("/3", {}, "neither SLURM_ARRAY_TASK_ID nor PBS_ARRAY_INDEX is set"),
+        (
+            "/3",
+            {"SLURM_ARRAY_TASK_ID": "0"},
+            "got '0', which is SLURM_ARRAY_TASK_ID; submit the jobs as an array from 1",
+        ),
+        ("/3", {"PBS_ARRAY_INDEX": "x"}, "got 'x', which is PBS_ARRAY_INDEX"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)):
+            job_numbers(text, environment)
+
+
+def test_jobs_do_every_scene_once_and_the_command_without_them_writes_the_table(here: Path, ommatid: Command) -> None:
+    """Four scenes of which two fail, in three jobs; the seventh of nine jobs has none."""
+    sweep = ("--sweep", "render.seed=1,2", "--sweep", "camera.lens.I.magnification=1/3,2")
+    render = ("render", "tiny.toml", *sweep, "-o", "out", "--json")
+    scenes: list[str] = []
+    for job, code in ((3, 0), (1, 2), (2, 2)):
+        ended = ommatid(*render, "--job", f"{job}/3")
+        documents = json.loads(ended.out)
+        scenes += [str(document["values"]) for document in documents]
+        assert (ended.code, len(documents)) == (code, 2 if job == 1 else 1)
+        assert ended.err.endswith(
+            f"job {job} of 3: {len(documents)} of 4 scenes; once all jobs have ended, the same command without --job"
+            " writes the table\n"
+        )
+    assert len(set(scenes)) == 4
+    assert not [*(here / "out").glob("sweep.*")]
+    assert json.loads(ommatid(*render, "--job", "7/9").out) == []
+    whole = ommatid(*render)
+    assert whole.err.count("up to date, nothing to do") == 2
+    assert [row.failed is not None for row in read_rows(here / "out" / "sweep.json")] == [False, True, False, True]
+    assert ommatid("run", "tiny.toml", "--job", "1/2", "--scheduler", "tcp://localhost:1").err.startswith(
+        "ommatid: --job and --scheduler: expected one of them"
+    )
 
 
 # --- the table
@@ -176,13 +229,6 @@ def test_a_sweep_of_renderings_has_a_table_and_no_figure(here: Path, ommatid: Co
     assert [line["render.samples"] for line in table(here / "out" / "sweep.csv")] == ["16", "64"]
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[{}]", '[{"scene": "a.toml", "values": {}, "mse": "small"}]'])
-def test_a_damaged_table_is_refused(content: str, tmp_path: Path) -> None:
-    (tmp_path / "sweep.json").write_text(content, encoding="utf-8")
-    with pytest.raises(InputError, match=r"sweep\.json: expected the table of a sweep"):
-        read_rows(tmp_path / "sweep.json")
-
-
 # --- the figure
 
 
@@ -223,7 +269,7 @@ def test_measured_points_are_at_their_values(rows_of_tolerance: list[SweepRow], 
 
 def test_a_sweep_says_where_the_error_is_twice_the_smallest(rows_of_tolerance: list[SweepRow]) -> None:
     """Between decades the logarithm is interpolated, which is exact for the power that these errors follow."""
-    axis, found = sweep_figure.crossings(rows_of_tolerance)
+    axis, found = sweep_table.crossings(rows_of_tolerance)
     assert [crossing.values["calibration.method"] for crossing in found] == ["ideal", "transport"]
     assert [crossing.position for crossing in found] == pytest.approx([200**0.5, 20000**0.5], rel=1e-9)
     assert axis.limit(found[1].position, found[1].good) == "up to 140 nm"
@@ -232,11 +278,11 @@ def test_a_sweep_says_where_the_error_is_twice_the_smallest(rows_of_tolerance: l
     named = [
         row.model_copy(update={"values": {"render.sampler": name}}) for name, row in zip("abc", NAMED, strict=True)
     ]
-    assert sweep_figure.crossings(named)[1] == []
+    assert sweep_table.crossings(named)[1] == []
     falling = [row.model_copy(update={"values": {"noise.bits": bits}}) for bits, row in zip("642", NAMED, strict=True)]
-    assert sweep_figure.crossings(falling)[1] == [], "one value alone is below twice the smallest error"
+    assert sweep_table.crossings(falling)[1] == [], "one value alone is below twice the smallest error"
     needed = [*falling, NAMED[0].model_copy(update={"values": {"noise.bits": "8"}})]
-    [bits] = sweep_figure.crossings(needed)[1]
+    [bits] = sweep_table.crossings(needed)[1]
     assert bits.position == pytest.approx(4), "the error of 4 bits is twice that of 6 and 8"
 
 
@@ -277,7 +323,7 @@ def test_a_run_that_is_not_to_be_trusted_has_a_hollow_point_and_no_prediction(
     lines_drawn = [line for line in figure.axes[0].lines if line.get_marker() == "None" and len(line.get_xdata()) == 4]
     assert [int(np.isfinite(line.get_ydata()).sum()) for line in lines_drawn] == [2, 4]
     assert "measured, not to be trusted" in [text.get_text() for text in figure.legends[0].get_texts()]
-    ideal, _ = sweep_figure.crossings(doubted)[1]
+    ideal, _ = sweep_table.crossings(doubted)[1]
     measured = 11  # at 100 nm; 0.1 is predicted at 10 nm, and 0.2 is between them
     assert ideal.position == pytest.approx(10 ** (1 + np.log(2) / np.log(measured / 0.1)))
 
@@ -303,7 +349,7 @@ def rows_of_tolerance() -> list[SweepRow]:
 
 def drawn(rows: list[SweepRow], folder: Path) -> Any:
     figures = KeptFigures()
-    sweep_figure.write_figure(folder / "sweep.png", rows, figures)
+    sweep_table.write_figure(folder / "sweep.png", rows, figures)
     return figures.kept["sweep"]
 
 

@@ -1,4 +1,7 @@
-"""Invalid input yields one sentence, exit code 2, and no new file."""
+"""Invalid input yields one sentence, exit code 2, and no new file: what people do, one case of each kind.
+
+Damaged files and extreme values are those of tests/fuzz.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ommatid.cli.failures import WITHDRAWN
 from ommatid.scenes import stack
 
 from ..conftest import TINY, Command, Ended, shell
@@ -78,17 +82,6 @@ def cut(name: str, part: float) -> Callable[[Path], None]:
     return prepare
 
 
-def flip(name: str, offset: int) -> Callable[[Path], None]:
-    """Flip a bit of one byte; `offset` counts from the end."""
-
-    def prepare(folder: Path) -> None:
-        altered = bytearray((folder / name).read_bytes())
-        altered[-offset] ^= 4
-        (folder / name).write_bytes(altered)
-
-    return prepare
-
-
 class _WritesFile:
     """Writes a file when it is unpickled."""
 
@@ -104,11 +97,6 @@ def pickled(folder: Path) -> None:
 
 def other_arrays(folder: Path) -> None:
     np.savez(folder / "out/tiny/model.npz", x=np.eye(3))
-
-
-def one_array(folder: Path) -> None:
-    with (folder / "out/tiny/model.npz").open("wb") as stream:
-        np.save(stream, np.eye(3))
 
 
 def latin_1(folder: Path) -> None:
@@ -137,44 +125,24 @@ KEYS = [
     edited("[noise]", SECOND_LENS, "camera", "'I' twice"),
     edited("samples = 16", "samples = 8", "render.samples", "16", "got 8"),
     edited("variance = 1e-2", "variance = ", "not valid TOML"),
-    edited("[target]", "[target", "TOML"),
 ]
 
 VALUES = [
     setting("target.distance=1", "target.distance", "length with its unit", "bare number 1"),
-    setting("target.distance='1'", "target.distance", "length with its unit"),
-    setting("target.distance=1 s", "target.distance", "length with its unit", "'1 s'"),
     setting("target.distance=1 parsnip", "target.distance", "'1 parsnip'"),
-    setting("target.distance=0 m", "target.distance", "above zero"),
     setting("target.distance=-1 m", "target.distance", "above zero"),
-    setting("camera.pixel_pitch=true", "camera.pixel_pitch", "length with its unit"),
     setting("camera.lens.I.magnification=2", "camera.lens.I.magnification", "at most 1", "got 2"),
-    setting("camera.lens.I.magnification=0", "camera.lens.I.magnification", "above 0", "got 0"),
-    setting("camera.lens.I.magnification='-1/3'", "camera.lens.I.magnification", "above 0"),
     setting("camera.lens.I.magnification='abc'", "camera.lens.I.magnification", "ratio", "'abc'"),
-    setting("camera.lens.I.magnification='1/0'", "camera.lens.I.magnification", "ratio", "'1/0'"),
     setting("camera.lens.I.array=[13,3]", "camera.lens.I.array", "13 x 3", "12 x 12"),
-    setting("camera.lens.I.array=[3,true]", "camera.lens.I.array", "integer"),
-    setting("camera.lens.I.array=[0,3]", "camera.lens.I.array", "got 0"),
-    setting("camera.lens.I.array=[3]", "camera.lens.I.array"),
     setting("camera.lens.I.pixels=[4,3]", "camera.lens.I.pixels", "4 x 3", "at most 3 x 3"),
     setting("camera.lens.I.pixels='fill'", "camera.lens.I.pixels", '"fit"'),
-    setting("camera.lens.I.step=-1", "camera.lens.I.step", "0 or more"),
     setting("camera.lens.I.name='I.b'", "name", "'I.b'"),
-    setting("camera.lens.I.name=[1]", "name"),
     setting("camera.lens=[]", "camera.lens"),
     setting("camera.lens_pitch=10 um", "camera.lens_pitch", "I.00.00", "overlap"),
     setting("noise.bits=true", "noise.bits", "integer", "True"),
-    setting("noise.bits=0", "noise.bits", "got 0"),
-    setting("noise.variance=-1", "noise.variance", "got -1"),
     setting("noise.variance=nan", "noise.variance", "finite"),
-    setting("prior.variance=0", "prior.variance", "got 0"),
-    setting("render.seed=true", "render.seed", "integer", "True"),
     setting("render.seed=1.5", "render.seed", "integer", "1.5"),
-    setting("render.samples=8", "render.samples", "16", "got 8"),
     setting("render.variant='fast'", "render.variant", "'scalar_rgb'", "'fast'"),
-    setting("target.image=5", "target.image", "string", "got 5"),
-    setting("target.shape=[0,12]", "target.shape", "got 0"),
     setting("target=", "'target' is missing"),
 ]
 
@@ -183,7 +151,6 @@ PICTURES = [
     setting("target.image='photo:unknown'", "target.image", "'photo:unknown'", "camera"),
     setting("target.image=tiny.toml", "target.image", "tiny.toml", "PNG"),
     setting("target.origin=[505,0]", "target.origin", "[505, 0]", "512 x 512"),
-    setting("target.origin=[-1,0]", "target.origin", "got -1"),
     setting("target.origin=", "target.shape", "12 x 12", "512 x 512", "target.origin"),
     Case(
         "an empty crop",
@@ -191,14 +158,10 @@ PICTURES = [
         ("target.origin", "0 x 512", "empty"),
     ),
     picture("note.tif", note, "note.tif could not be read as a picture"),
-    picture("note.npy", note, "note.npy could not be read as a picture"),
     picture("note.exr", note, "note.exr", "OpenEXR"),
     picture("nan.npy", with_nan, "nan.npy", "NaN"),
-    picture("infinite.npy", save(np.full((12, 12), np.inf)), "infinite.npy", "infinite"),
     picture("small.npy", save(np.ones((11, 12))), "target.shape", "12 x 12", "11 x 12"),
-    picture("complex.npy", save(np.ones((12, 12), complex)), "complex128"),
     picture("cube.npy", save(np.ones((12, 12, 7))), "(12, 12, 7)"),
-    picture("empty.npy", save(np.ones((0, 12))), "(0, 12)"),
     picture("object.npy", save(np.array([[_WritesFile()]], dtype=object)), "could not be read as a picture"),
     Case(
         "a picture cut short",
@@ -212,35 +175,10 @@ FILES = [
     Case("a missing scene", ("run", "none.toml", "-o", "new"), ("none.toml", "ommatid init")),
     Case("a folder for a scene", ("run", "out", "-o", "new"), ("out", "scene file")),
     Case("a scene that is not UTF-8", RUN, ("tiny.toml", "UTF-8"), latin_1),
-    *[
-        Case(f"a stack cut at {part}", RECONSTRUCT, ("out/tiny/stack.exr",), cut("out/tiny/stack.exr", part))
-        for part in (0, 0.01, 0.1, 0.3, 0.6, 0.9, 0.97, 0.999)
-    ],
-    *[
-        Case(
-            f"a stack altered {offset} bytes from its end",
-            RECONSTRUCT,
-            ("stack.exr",),
-            flip("out/tiny/stack.exr", offset),
-        )
-        for offset in (1, 20, 40, 75)  # the pixels of the last sub-image, compressed
-    ],
-    *[
-        Case(f"a model cut at {part}", RECONSTRUCT, ("out/tiny/model.npz",), cut("out/tiny/model.npz", part))
-        for part in (0, 0.01, 0.3, 0.6, 0.9, 0.999)
-    ],
-    *[
-        Case(
-            f"a model altered {offset} bytes from its end",
-            RECONSTRUCT,
-            ("model.npz",),
-            flip("out/tiny/model.npz", offset),
-        )
-        for offset in (1200, 2000, 4000)
-    ],
+    Case("a stack cut short", RECONSTRUCT, ("out/tiny/stack.exr",), cut("out/tiny/stack.exr", 0.9)),
+    Case("a model cut short", RECONSTRUCT, ("out/tiny/model.npz",), cut("out/tiny/model.npz", 0.9)),
     Case("a model with pickled objects", RECONSTRUCT, ("out/tiny/model.npz", "pickled"), pickled),
     Case("another kind of .npz", RECONSTRUCT, ("out/tiny/model.npz", "a model that ommatid wrote"), other_arrays),
-    Case("an array that is no archive", RECONSTRUCT, ("out/tiny/model.npz", "a model that ommatid wrote"), one_array),
     Case("a missing stack", RECONSTRUCT, ("out/tiny/stack.exr", "no such file"), removed("out/tiny/stack.exr")),
     Case("a missing model", RECONSTRUCT, ("out/tiny/model.npz", "no such file"), removed("out/tiny/model.npz")),
     Case(
@@ -308,13 +246,25 @@ def assert_refused(ended: Ended, *words: str, code: int = 2) -> None:
         assert word in line
 
 
-@pytest.mark.parametrize("case", [*KEYS, *VALUES, *PICTURES, *FILES, *OPTIONS], ids=lambda case: case.name)
-def test_invalid_input_yields_one_sentence_and_no_file(case: Case, here: Path, kept: Path, ommatid: Command) -> None:
+def test_invalid_input_yields_one_sentence_and_no_file(here: Path, kept: Path, ommatid: Command) -> None:
     assert kept.is_dir()
-    case.prepare(here)
-    before = contents(here)
-    assert_refused(ommatid(*case.arguments), *case.words)
-    assert contents(here) == before
+    sound = {path: path.read_bytes() for path in here.rglob("*") if path.is_file()}
+    for case in (*KEYS, *VALUES, *PICTURES, *FILES, *OPTIONS):
+        case.prepare(here)
+        before = contents(here)
+        assert_refused(ommatid(*case.arguments), *case.words)
+        assert contents(here) == before, case.name
+        for path, content in sound.items():
+            path.write_bytes(content)
+
+
+def test_a_withdrawn_option_names_what_replaces_it(here: Path, ommatid: Command) -> None:
+    """One test for all options that are no longer."""
+    assert {"--tls-ca", "--tls-cert", "--tls-key"} <= WITHDRAWN.keys()
+    for option, replacement in WITHDRAWN.items():
+        for given in ((option, "x"), (f"{option}=x",)):
+            assert_refused(ommatid(*RUN, *given), f"{option}: this option is withdrawn; {replacement}")
+    assert [path.name for path in here.iterdir()] == ["tiny.toml"]
 
 
 def test_the_pickled_file_would_run_code_if_it_were_loaded(here: Path, kept: Path) -> None:
@@ -324,38 +274,20 @@ def test_the_pickled_file_would_run_code_if_it_were_loaded(here: Path, kept: Pat
     assert (here / "unpickled").exists()
 
 
-@pytest.mark.parametrize("name", ["note.png", "note.jpg"])
-def test_a_text_file_with_the_suffix_of_a_picture_is_refused(name: str, here: Path) -> None:
-    # In a process of its own, since decoders that fail leave the file open, which is a warning here.
-    note(here / name)
-    before = contents(here)
-    ended = shell(*RUN, "--set", f"target.image={name}", cwd=here)
-    assert_refused(ended, "target.image", f"{name} could not be read as a picture")
-    assert contents(here) == before
-
-
-@pytest.mark.parametrize(
-    ("setting", "key"),
-    [
+def test_a_stack_and_a_model_of_different_cameras_are_refused(here: Path, kept: Path, ommatid: Command) -> None:
+    for changed, key in (
         ("camera.lens.I.array=[2,2]", "camera.lens.I"),
-        ("camera.lens.I.magnification='1/2'", "camera.lens.I"),
         ("camera.lens.I.name=J", "camera.lens.I"),
         ("camera.pixel_pitch=5 um", "camera.pixel_pitch"),
-        ("camera.lens_pitch=1 mm", "camera.lens_pitch"),
         ("target.shape=[12,13]", "target.shape"),
-        ("target.pixel_pitch=2 mm", "target.pixel_pitch"),
         ("target.distance=2 m", "target.distance"),
-    ],
-)
-def test_a_stack_and_a_model_of_different_cameras_are_refused(
-    setting: str, key: str, here: Path, kept: Path, ommatid: Command
-) -> None:
-    options = ("--set", "calibration.method=ideal", "--set", setting)
-    assert ommatid("calibrate", "tiny.toml", "-o", "other.npz", *options).code == 0
-    before = contents(here)
-    ended = ommatid("reconstruct", kept / "stack.exr", "other.npz", "-o", "new.exr")
-    assert_refused(ended, "stack.exr", "other.npz", "do not belong together", f"{key} is ")
-    assert contents(here) == before
+    ):
+        options = ("--set", "calibration.method=ideal", "--set", changed)
+        assert ommatid("calibrate", "tiny.toml", "-o", "other.npz", *options).code == 0
+        before = contents(here)
+        ended = ommatid("reconstruct", kept / "stack.exr", "other.npz", "-o", "new.exr")
+        assert_refused(ended, "stack.exr", "other.npz", "do not belong together", f"{key} is ")
+        assert contents(here) == before
 
 
 def test_a_model_fits_stacks_of_other_pictures_noise_and_seeds(here: Path, kept: Path, ommatid: Command) -> None:
@@ -370,6 +302,7 @@ def full_after(size: int) -> str:
     return f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))"
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_old_stack(here: Path, kept: Path) -> None:
     old = contents(kept)
     room = max(len(old["scene.toml"]), len(old["truth.exr"])) + 100  # written first, and small enough
@@ -386,10 +319,8 @@ def test_a_full_disk_leaves_the_old_stack(here: Path, kept: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "file", "room"),
     [
-        (("calibrate", "tiny.toml", "-o", "new.npz"), "new.npz", 2000),
-        (("calibrate", "tiny.toml", "-o", "new.npz"), "new.npz", 0),
-        (RECONSTRUCT, "new.exr", 1000),
-        (RECONSTRUCT, "new.exr", 0),
+        pytest.param(("calibrate", "tiny.toml", "-o", "new.npz"), "new.npz", 0, marks=pytest.mark.slow),
+        pytest.param(RECONSTRUCT, "new.exr", 1000, marks=pytest.mark.slow),
         (("init", "new.toml"), "new.toml", 1000),
     ],
 )
@@ -402,10 +333,9 @@ def test_a_full_disk_leaves_no_file(arguments: tuple[str, ...], file: str, room:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-@pytest.mark.parametrize("options", [(), ("--json",)], ids=["table", "json"])
-def test_output_that_cannot_be_printed_is_an_error(options: tuple[str, ...], here: Path) -> None:
+def test_output_that_cannot_be_printed_is_an_error(here: Path) -> None:
     before = "import os; os.dup2(os.open('/dev/full', os.O_WRONLY), 1)"
-    assert_refused(shell("show", "tiny.toml", *options, cwd=here, before=before), "No space left", code=1)
+    assert_refused(shell("show", "tiny.toml", "--json", cwd=here, before=before), "No space left", code=1)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -14,7 +14,7 @@ import pytest
 
 from ommatid.runtime.errors import InputError, shortened, shortened_repr
 from ommatid.runtime.memory import check_memory, free_memory
-from ommatid.scenes import camera, model_file, scene, stack
+from ommatid.scenes import camera, model_file, scene
 from ommatid.scenes.formats import exr, lens_file, npz, picture_file
 from ommatid.scenes.hardware import frames
 from ommatid.scenes.optics.blur import blur_of
@@ -33,75 +33,57 @@ def read(path: Path, *changes: str) -> Any:
     return described, camera.derive(described)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("9**9**9 m", "9**9**9**9 m", "(9**9)**(9**9) m", "1 m**9**9**9", "9⁹⁹⁹⁹⁹⁹⁹⁹ m", "1e999999999 m", "1e400 m"),
-        *("9 squared squared squared squared squared squared m", "1" * 100000 + " m", "1 " + "a" * 100000),
-        *("1 " + "m*" * 5000 + "m", "(" * 5000 + "1 m", "1e16 mm", "1e-16 mm", "nan m", "m"),
-    ],
-    ids=lambda text: text[:20],
-)
-def test_a_length_is_a_number_and_a_unit(text: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"target.distance: expected a length") as refused:
-        read(tmp_path, f"target.distance='{text}'")
-    assert len(str(refused.value)) < 400
+def test_lengths_and_ratios_are_numbers_of_few_digits(tmp_path: Path) -> None:
+    """Powers of powers and thousands of digits once took minutes; tests/fuzz tries many more."""
+    lengths = (
+        "9**9**9 m",
+        "9⁹⁹⁹⁹⁹⁹⁹⁹ m",
+        "1e999999999 m",
+        "1" * 100000 + " m",
+        "(" * 5000 + "1 m",
+        "1e16 mm",
+        "nan m",
+        "m",
+    )
+    ratios = ("1e-9999999999", "1/" + "9" * 4000, "0." + "3" * 10**6)
+    for key, texts, expected in (
+        ("target.distance", lengths, "a length"),
+        ("camera.lens.I.magnification", ratios, "a ratio"),
+        ("camera.lens.I.step", ratios, "a ratio"),
+    ):
+        for text in texts:
+            with pytest.raises(InputError, match=f"{key}: expected {expected}") as refused:
+                read(tmp_path, f"{key}='{text}'")
+            assert len(str(refused.value)) < 400
 
 
-@pytest.mark.parametrize(
-    ("text", "length"),
-    [
-        ("6 um", 6e-3),
-        ("1e-3 m", 1.0),
-        ("1/2 mm", 0.5),
-        ("1_000 µm", 1.0),
-        ("2mm", 2.0),
-        ("3*mm", 3.0),
-        ("1 m**2/m", 1e3),
-    ],
-)
-def test_lengths_are_still_written_in_many_ways(text: str, length: float, tmp_path: Path) -> None:
-    described, _ = read(tmp_path, f"target.distance='{text}'")
-    assert described.target.distance == pytest.approx(length, rel=1e-12)
+def test_quantities_are_still_written_in_many_ways(tmp_path: Path) -> None:
+    lengths = {"6 um": 6e-3, "1e-3 m": 1.0, "1/2 mm": 0.5, "1_000 µm": 1.0, "2mm": 2.0, "3*mm": 3.0, "1 m**2/m": 1e3}
+    for text, length in lengths.items():
+        described, _ = read(tmp_path, f"target.distance='{text}'")
+        assert described.target.distance == pytest.approx(length, rel=1e-12)
+    for text in ("500 lm/m**2", "500 lm / m^2", "500 lm/m²", "0.5 klux"):
+        sensor = f'{{illuminance = "{text}", exposure = "1 ms"}}'
+        changes = (f"sensor={sensor}", "noise=", "camera.lens.I.aperture='0.1 mm'")
+        assert read(tmp_path, *changes)[0].sensor.illuminance == pytest.approx(500, rel=1e-12)
 
 
-@pytest.mark.parametrize("text", ["500 lm/m**2", "500 lm / m^2", "500 lm/m²", "0.5 klux"])
-def test_illuminances_are_still_written_in_many_ways(text: str, tmp_path: Path) -> None:
-    sensor = f'{{illuminance = "{text}", exposure = "1 ms"}}'
-    changes = (f"sensor={sensor}", "noise=", "camera.lens.I.aperture='0.1 mm'")
-    assert read(tmp_path, *changes)[0].sensor.illuminance == pytest.approx(500, rel=1e-12)
-
-
-@pytest.mark.parametrize("text", ["1e-9999999999", "1e99999999", "1/" + "9" * 4000, "0." + "3" * 10**6, "9" * 5000])
-@pytest.mark.parametrize("key", ["magnification", "step"])
-def test_a_ratio_is_one_of_few_digits(key: str, text: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"camera.lens.I.{key}: expected a ratio") as refused:
-        read(tmp_path, f"camera.lens.I.{key}='{text}'")
-    assert len(str(refused.value)) < 400
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
+def test_excessive_numbers_and_nesting_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "x.toml"
+    for value, words in (
         ("9" * 5000, "thousands of digits"),
         ("0x" + "f" * 5000, "64 bits"),
-        ("9" * 30, "64 bits"),
         ("[" * 100000, "brackets go deeper"),
-        ("[" * 2000 + "]" * 2000, "go deeper"),
         ("[" * 100 + "]" * 100, "go deeper"),
         ("{a." + "a." * 500 + "a = 1}", "go deeper"),
-    ],
-    ids=["digits", "bits", "digits of 64 bits", "open", "closed", "deep", "dotted"],
-)
-def test_excessive_numbers_and_nesting_are_refused(value: str, words: str, tmp_path: Path) -> None:
-    file = tmp_path / "x.toml"
-    file.write_text(f"title = {value}\n{TINY.partition('[target]')[2]}", encoding="utf-8")
-    with pytest.raises(InputError, match=words):
-        scene.read(file)
-    with pytest.raises(InputError, match="title"):  # on the command line what is no TOML is text
-        read(tmp_path, f"title.x={value}")
-    with pytest.raises(InputError, match="not valid TOML"):
-        lens_file.read_lens(file)
+    ):
+        file.write_text(f"title = {value}\n{TINY.partition('[target]')[2]}", encoding="utf-8")
+        with pytest.raises(InputError, match=words):
+            scene.read(file)
+        with pytest.raises(InputError, match="title"):  # on the command line what is no TOML is text
+            read(tmp_path, f"title.x={value}")
+        with pytest.raises(InputError, match="not valid TOML"):
+            lens_file.read_lens(file)
 
 
 def test_a_key_of_too_many_tables_is_refused(tmp_path: Path) -> None:
@@ -109,11 +91,11 @@ def test_a_key_of_too_many_tables_is_refused(tmp_path: Path) -> None:
         read(tmp_path, "a." * 5000 + "b=1")
 
 
-@pytest.mark.parametrize("key", ["target.image", "world.file", "camera.lens.I.surfaces"])
-@pytest.mark.parametrize("name", [r"a\u0000b", "b" * 300, "c/" * 3000, " "], ids=["NUL", "long", "deep", "none"])
-def test_impossible_file_names_are_refused(key: str, name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"{key}.*expected the name of a file"):
-        read(tmp_path, f'{key}="{name}"')
+def test_impossible_file_names_are_refused(tmp_path: Path) -> None:
+    for key in ("target.image", "world.file", "camera.lens.I.surfaces"):
+        for name in (r"a\u0000b", "b" * 300, "c/" * 3000, " "):
+            with pytest.raises(InputError, match=f"{key}.*expected the name of a file"):
+                read(tmp_path, f'{key}="{name}"')
 
 
 def test_messages_stay_short(tmp_path: Path) -> None:
@@ -133,12 +115,6 @@ def test_messages_stay_short(tmp_path: Path) -> None:
     assert len(str(refused.value)) < 2500
 
 
-def test_a_lens_radius_close_to_zero_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "lens.dat").write_text("1e-40 1 1.5 2\n-10 0 1 2\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"line 1: radius: expected a radius of curvature"):
-        lens_file.read_lens(tmp_path / "lens.dat")
-
-
 def test_a_blur_that_cannot_be_computed_is_refused() -> None:
     lens = example().camera.lens[0]
     for update in ({"aperture": 1e4, "focus": 1.0}, {"aperture": 1e-3}):
@@ -151,29 +127,7 @@ def test_a_blur_that_cannot_be_computed_is_refused() -> None:
 # Files
 
 
-def write_circular_tiff(path: Path) -> None:
-    """Write two pages, the second of which names the first as the next."""
-    import tifffile
-
-    page = np.zeros((20, 20), np.uint16)
-    tifffile.imwrite(path, np.stack([page, page]), photometric="minisblack", metadata=None)
-    data = bytearray(path.read_bytes())
-    with tifffile.TiffFile(path) as file:
-        first, second = (int(page.offset) for page in file.pages)
-    entries = int.from_bytes(data[second : second + 2], "little")
-    offset = second + 2 + 12 * entries
-    data[offset : offset + 4] = first.to_bytes(4, "little")
-    path.write_bytes(data)
-
-
-def test_a_tiff_with_a_circular_list_of_pages_is_read_once(tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    write_circular_tiff(path)
-    assert len(frames.pictures_of(path, "images")) == 2
-    with pytest.raises(InputError, match="expected one picture, got 2 pages"):
-        picture_file.decode(path, "here")
-
-
+@pytest.mark.slow
 def test_many_pages_need_the_memory_of_their_own_number_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import tifffile
 
@@ -193,8 +147,8 @@ def npy_of(shape: str, kind: str = "<f8") -> bytes:
     return b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text + bytes(64)
 
 
-@pytest.mark.parametrize("shape", ["(100000, 100000)", "(9223372036854775807, 9)", "(-1, 2)", "x", "[" * 900])
-def test_an_array_smaller_than_its_header_states_is_refused(shape: str, tmp_path: Path) -> None:
+def test_an_array_smaller_than_its_header_states_is_refused(tmp_path: Path) -> None:
+    shape = "(100000, 100000)"
     (tmp_path / "a.npy").write_bytes(npy_of(shape))
     with pytest.raises(InputError, match="could not be read as a picture"):
         picture_file.decode(tmp_path / "a.npy", "here")
@@ -209,8 +163,6 @@ def test_an_array_smaller_than_its_header_states_is_refused(shape: str, tmp_path
 def test_headers_of_old_versions_are_read_without_a_warning(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(npy_of("(2L, 4L)"))  # as Python 2 wrote them
     assert picture_file.decode(tmp_path / "a.npy", "here").shape == (2, 4)
-    (tmp_path / "a.npy").write_bytes(npy_of("(8,)", "|a8"))
-    assert npz.array(tmp_path / "a.npy").shape == (8,)
 
 
 def png_of(rows: int, columns: int) -> bytes:
@@ -231,6 +183,7 @@ def test_a_picture_beyond_the_memory_is_refused(tmp_path: Path) -> None:
         picture_file.decode(tmp_path / "a.png", "here")
 
 
+@pytest.mark.slow
 def test_a_large_picture_is_read_without_a_warning(tmp_path: Path) -> None:
     from PIL import Image
 
@@ -243,48 +196,12 @@ def test_a_large_picture_is_read_without_a_warning(tmp_path: Path) -> None:
     assert limit == Image.MAX_IMAGE_PIXELS
 
 
+@pytest.mark.slow
 def test_an_exr_picture_beyond_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exr.write(tmp_path / "a.exr", [exr.Part("one", {"Y": np.zeros((4000, 4000), np.float32)}, {})])
     monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 10**8)
     with pytest.raises(InputError, match=r"a.exr: to read it needs 0.128 GB of memory, 0.1 GB are free"):
         exr.read_channels(tmp_path / "a.exr")
-
-
-def with_record(path: Path, change: Any) -> None:
-    """Change the record of a stack, with valid checksums."""
-    parts = exr.read(path)
-    parts[0].record["record"] = change(parts[0].record["record"])
-    exr.write(path, parts)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [lambda _: 3, lambda _: ["x"], lambda old: {**old, "versions": "1"}, lambda old: {**old, "seconds": float("nan")}],
-    ids=["number", "list", "versions", "NaN"],
-)
-def test_an_invalid_record_is_refused(change: Any, kept: Path) -> None:
-    with_record(kept / "stack.exr", lambda old: old)
-    assert stack.read(kept / "stack.exr").record["passes"] == 16
-    with_record(kept / "stack.exr", change)
-    with pytest.raises(InputError, match=r"stack.exr: .*; make it again"):
-        stack.read(kept / "stack.exr")
-
-
-@pytest.mark.parametrize(
-    ("name", "index", "value"),
-    [("data", 0, np.nan), ("data", 0, 1e300), ("variance", 0, -1.0), ("indptr", 3, 10**6), ("indices", 0, 10**6)],
-)
-def test_an_invalid_matrix_is_refused(name: str, index: int, value: float, kept: Path) -> None:
-    path = kept / "model.npz"
-    with np.load(path) as file:
-        arrays: dict[str, Any] = {key: file[key] for key in ("shape", "variance", "batches", *model_file.ENTRIES)}
-        description = json.loads(str(file["ommatid"][()]))["description"]
-    arrays[name][index] = value
-    seal = model_file._seal(arrays, description)  # pyright: ignore[reportPrivateUsage]
-    record = json.dumps({"description": description, "sha256": seal})
-    np.savez_compressed(path, format=np.array(b"csr"), ommatid=record, **arrays)
-    with pytest.raises(InputError, match="holds no usable observation matrix"):
-        model_file.read(path)
 
 
 # Memory
@@ -350,6 +267,16 @@ raise SystemExit
 """
 
 
+def test_a_request_beyond_the_memory_is_refused(here: Path, ommatid: Command) -> None:
+    (here / "huge.png").write_bytes(png_of(100000, 100000))
+    for command, changes in CASES[-3:-1]:
+        ended = ommatid(*command, *(word for change in changes for word in ("--set", change)))
+        assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1)
+        assert "GB" in ended.err
+    assert not (here / "new").exists()
+
+
+@pytest.mark.slow
 def test_requests_beyond_the_memory_are_refused_before_allocation(here: Path) -> None:
     (here / "huge.png").write_bytes(png_of(100000, 100000))
     (here / "world.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>', encoding="utf-8")

@@ -9,16 +9,15 @@ import pytest
 from ..conftest import Command
 
 
-@pytest.mark.parametrize("link", ["tiny", ".jobs"])
-def test_a_link_out_of_the_output_folder_is_refused(link: str, here: Path, ommatid: Command) -> None:
+def test_a_link_out_of_the_output_folder_is_refused(here: Path, ommatid: Command) -> None:
     others = here / "others"
     for folder in (others, here / "out"):
         folder.mkdir()
-    for name in ("run.json", "scene.toml", "1.job-1.json", "job-1.part"):
+    for name in ("run.json", "scene.toml"):
         (others / name).write_text("of another program", encoding="utf-8")
-    (here / "out" / link).symlink_to(others)
+    (here / "out" / "tiny").symlink_to(others)
     before = {path: path.stat().st_mtime_ns for path in others.iterdir()}
-    ended = ommatid("run", "tiny.toml", "--job", "1/1")
+    ended = ommatid("run", "tiny.toml")
     assert (ended.code, "got a link to" in ended.err) == (2, True)
     assert {path: path.stat().st_mtime_ns for path in others.iterdir()} == before
 

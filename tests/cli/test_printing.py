@@ -66,9 +66,9 @@ def scene(here: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
+@pytest.mark.usefixtures("scene")
+def test_a_hostile_title_is_printed_harmlessly(ommatid: Command) -> None:
+    for command in (
         ("show", "titled.toml"),
         ("show", "titled.toml", "--json"),
         ("predict", "titled.toml", "--no-rays"),
@@ -77,19 +77,15 @@ def scene(here: Path) -> Path:
         ("run", "titled.toml", "--dry-run"),
         ("run", "titled.toml", "--dry-run", "--sweep", "title=\x1b[31m,\u202e"),
         ("calibrate", "titled.toml", "-o", "\x1b[31m.npz", *QUICK),
-    ],
-    ids=lambda command: " ".join(command[:3:2]),
-)
-@pytest.mark.usefixtures("scene")
-def test_a_hostile_title_is_printed_harmlessly(command: tuple[str, ...], ommatid: Command) -> None:
-    check(ommatid(*command), 0)
+    ):
+        check(ommatid(*command), 0)
 
 
 @pytest.mark.usefixtures("scene")
-@pytest.mark.parametrize("seed", range(4))
-def test_hostile_arguments_are_refused_harmlessly(seed: int, here: Path, ommatid: Command) -> None:
-    text = hostile(seed).replace("\x00", "")
-    name = file_name(seed)
+def test_hostile_arguments_are_refused_harmlessly(here: Path, ommatid: Command) -> None:
+    """One text; the family of texts in tests/fuzz has many."""
+    text = hostile(0).replace("\x00", "")
+    name = file_name(0)
     for arguments in (
         *((option, text) for option in ("--set", "--lens", "--format", "--within", "--job", "--figure-format")),
         *(("--set", f"{key}={text}") for key in ("target.image", "noise.variance", "camera.lens.I.name", text[:20])),
@@ -106,24 +102,6 @@ def test_hostile_arguments_are_refused_harmlessly(seed: int, here: Path, ommatid
     ):
         check(ommatid(*command, name), 2)
     assert sorted(path.name for path in here.iterdir()) == ["tiny.toml", "titled.toml"]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_hostile_scene_files_are_refused_harmlessly(seed: int, here: Path, ommatid: Command) -> None:
-    text = hostile(seed, 10)
-    path = here / f"{file_name(seed)}.toml"
-    for content in (
-        f"{TINY}\n[{quoted(text)}]\n{quoted(text)} = 1",
-        TINY.replace('"I"', quoted(text)),
-        TINY.replace('"1/3"', quoted(text)),
-        TINY.replace('"photo:camera"', quoted(text)),
-        TINY.replace("[3, 3]", f"[{quoted(text)}, {{{quoted(text)} = 1}}]"),
-        TINY + "".join(f"\n[{quoted(text + str(number))}]" for number in range(300)),
-        f"title = {text}",
-        f"[a]\n[{quoted(text)}]\n[{quoted(text)}]",
-    ):
-        path.write_text(content, encoding="utf-8")
-        check(ommatid("show", path.name), 2)
 
 
 class Elements(HTMLParser):
@@ -146,6 +124,7 @@ def elements(path: Path) -> Elements:
     return parser
 
 
+@pytest.mark.slow
 def test_a_hostile_title_adds_nothing_to_pages_and_figures(scene: Path, finished: Path, ommatid: Command) -> None:
     check(ommatid("run", scene.name, "-o", "out", "--figure-format", "svg"), 0)
     check(ommatid("run", scene.name, "-o", "out", "-v"), 0)
@@ -177,28 +156,17 @@ def test_names_that_terminals_do_not_show_are_escaped(scene: Path, kept: Path, o
     assert all(re.match(r"#|data:|[\w%.+-]+/", address) for address in index.addresses)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "utf-8:surrogateescape"])
-def test_terminals_of_any_encoding_show_tables(encoding: str, here: Path) -> None:
+@pytest.mark.slow
+def test_terminals_without_unicode_show_tables(here: Path) -> None:
     (here / "tiny.toml").rename(here / "t\x9bµ.toml")
     script = 'import sys; sys.argv[1:] = ["show", "t\\x9b\\xb5.toml"]'
-    environment = {**os.environ, "PYTHONIOENCODING": encoding, "TERM": "dumb", "COLUMNS": "40"}
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "TERM": "dumb", "COLUMNS": "40"}
     ended = subprocess.run(interpreter(script), cwd=here, env=environment, capture_output=True, check=False)
     assert (ended.returncode, ended.stderr) == (0, b"")
     assert not {byte for byte in ended.stdout if byte < 32 and byte != 10}
     assert b"Tiny" in ended.stdout
-    if encoding == "ascii":
-        assert ended.stdout.isascii()
-        assert max(map(len, ended.stdout.splitlines())) <= 41
-
-
-@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])
-def test_a_closed_stream_is_no_failure(closed: str, here: Path) -> None:
-    command = " ".join(
-        [*(f"'{word}'" for word in interpreter()), "show", "tiny.toml", "--set", "noise.variance=1", closed]
-    )
-    ended = subprocess.run(["/bin/sh", "-c", command], cwd=here, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout == ""
+    assert ended.stdout.isascii()
+    assert max(map(len, ended.stdout.splitlines())) <= 41
 
 
 def test_other_modules_print_printable_sentences_alone() -> None:

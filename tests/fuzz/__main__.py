@@ -1,17 +1,22 @@
-"""Long campaign: `python -m tests.fuzz --inputs 10000 --seed 1`; or one input of it again."""
+"""Long campaign: `python -m tests.fuzz --inputs 20000 --seed 1 --journal FILE`; or one input of it again.
+
+A campaign that was stopped goes on with the families that its journal lacks.
+"""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 
 from ..conftest import TINY, shell
 from .campaign import campaign, command_for
 from .families import FAMILIES, inputs_of
-from .file_type import SCENE, FileType
+from .family import SCENE, FileType
 from .sandbox import prepare
 from .verdicts import REFUSED, UNCHANGED, VALID
 from .worker import Result
@@ -46,6 +51,7 @@ def main() -> None:
     parser.add_argument("--only", type=int, metavar="NUMBER", help="only this input of --kind")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="write the damaged input of --only to this file")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--journal", type=Path, help="file of the results of families that have ended")
     options = parser.parse_args()
     names = [options.kind] if options.kind else list(FAMILIES)
     with tempfile.TemporaryDirectory() as folder:
@@ -56,14 +62,23 @@ def main() -> None:
             print(*campaign({names[0]: [options.only]}, options.seed, finished), sep="\n")
             return
         numbers = inputs_of(names, options.inputs) if options.kind is None else {names[0]: range(options.inputs)}
-        groups = [names[start :: options.workers] for start in range(min(options.workers, len(names)))]
-        with ThreadPoolExecutor(len(groups)) as threads:
-            campaigns = threads.map(
-                lambda group: campaign({name: numbers[name] for name in group}, options.seed, finished), groups
-            )
-            every = [result for results in campaigns for result in results]
+        every = _journal(options.journal)
+        left = [name for name in names if name not in {result.kind for result in every}]
+        with ThreadPoolExecutor(options.workers) as threads:
+            for results in threads.map(lambda name: campaign({name: numbers[name]}, options.seed, finished), left):
+                every += results
+                if options.journal is not None:
+                    with options.journal.open("a", encoding="utf-8") as stream:
+                        stream.writelines(f"{json.dumps(asdict(result))}\n" for result in results)
     _print({name: [result for result in every if result.kind == name] for name in names}, options.seed)
     sys.exit(any(result.wrong for result in every))
+
+
+def _journal(path: Path | None) -> list[Result]:
+    """Return the results of a journal; none if there is no such file."""
+    if path is None or not path.exists():
+        return []
+    return [Result(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def _input(name: str, seed: int, number: int, finished: Path) -> bytes:

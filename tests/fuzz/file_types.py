@@ -18,7 +18,7 @@ from ommatid.scenes.zemax.agf import read_catalogue
 from ..conftest import TINY
 from . import mutations
 from .damage import damaged, damaged_near
-from .file_type import BASE, SCENE, FileType, Originals, fingerprint, from_folder, gallery_files
+from .family import BASE, SCENE, FileType, Originals, fingerprint, from_folder, gallery_files
 from .formats import encoded, exr_damaged, model_resealed, npy_damaged, npz_damaged, stack_resealed
 
 EVERYTHING = (

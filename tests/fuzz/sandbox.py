@@ -13,7 +13,7 @@ import numpy as np
 
 from ..examples import GALLERY
 from .families.documents import add_documents
-from .file_type import BASE, RUN, SCENE
+from .family import BASE, RUN, SCENE
 from .file_types import EVERYTHING
 
 SMALL = 1 << 20  # bytes

@@ -16,9 +16,8 @@ from pathlib import Path
 from random import Random
 from time import process_time
 
-from .command_family import CommandFamily
 from .families import FAMILIES
-from .file_type import FileType
+from .family import CommandFamily, FileType
 from .sandbox import Sandbox
 from .verdicts import REFUSED, VALID, VERDICTS, PeakMemory, children, command_verdict, read_verdict, run_command
 

@@ -30,7 +30,6 @@ from ommatid.reconstruct.output import run_json
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 
-from ..batch.attempts import STARTER
 from ..conftest import TINY
 from ..runs import numbers, without_times
 
@@ -55,6 +54,34 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "frames": (FRAMES,),
     "stack and model": (("reconstruct", f"{INPUTS}/a.exr", f"{INPUTS}/{MODEL}", "-o", f"{OUT}/a"),),
 }
+
+
+# Forks commands from a process that has imported everything, so that each begins its work at once.
+STARTER = """
+import os, sys
+import mitsuba, numba, scipy.linalg, skimage.metrics, matplotlib.backends.backend_agg
+import ommatid.pipeline.stages, ommatid.analysis.depth_error, ommatid.analysis.study, ommatid.batch.sweep_table
+import ommatid.reconstruct.output.figures, ommatid.reconstruct.output.run_json, ommatid.reconstruct.output.result_files
+from ommatid.cli import app
+for line in sys.stdin:
+    number = os.fork()
+    if number:
+        print(number, os.waitpid(number, 0)[1], flush=True)
+        continue
+    os.setsid()
+    folder, *sys.argv[1:] = line.split()
+    os.chdir(folder)
+    os.dup2(os.open("stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
+    os.dup2(os.open("stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
+    open("number.new", "w").write(str(os.getpid()))
+    os.rename("number.new", "number")
+    try:
+        app.main()
+    except SystemExit as ended:
+        os._exit(ended.code)
+    finally:
+        os._exit(99)
+"""
 
 
 @dataclass

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from .campaign import campaign, prepared
+from .campaign import COMMANDS, campaign, prepared
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +21,7 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Generator[tuple[subproc
         yield process, here
 
 
-@pytest.mark.parametrize("name", ["single run", "frames"])
+@pytest.mark.parametrize("name", COMMANDS)
 def test_killed_commands_are_resumed_to_the_same_bits(name: str, starter: tuple[subprocess.Popen[str], Path]) -> None:
     tally = campaign(*starter, name, kills=1, seed=3)
     assert tally.wrong == []

@@ -1,6 +1,6 @@
 """The result does not depend on the machine's settings, and nothing is written elsewhere.
 
-`python -m tests.machines` tries each setting alone, a wheel, and other interpreters.
+tests/test_wheel.py runs the wheel, and `nox` other interpreters.
 """
 
 from __future__ import annotations
@@ -12,7 +12,11 @@ from pathlib import Path
 import matplotlib
 import pytest
 
-from .variations import EVERYTHING, differences, result, run
+from ommatid.simulate.renderer.variant import unusable_reason
+
+from .variations import EVERYTHING, VARIATIONS, Variation, differences, result, run
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +30,24 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return base
 
 
+@pytest.mark.parametrize("variation", VARIATIONS, ids=lambda variation: variation.name)
+def test_no_setting_changes_the_result(variation: Variation, finished: Path, tmp_path: Path) -> None:
+    assert differences(result(run(variation, tmp_path)), result(finished)) == []
+
+
 def finished_folder(elsewhere: Path) -> Path:
     return elsewhere / "scenes" / EVERYTHING.folder / "out" / "tiny"
 
 
 def test_the_result_is_the_same_bit_for_bit(elsewhere: Path, finished: Path) -> None:
     assert differences(result(finished_folder(elsewhere)), result(finished)) == []
+
+
+@pytest.mark.skipif(bool(unusable_reason("llvm_ad_mono")), reason="needs the fast backend")
+def test_the_fast_backend_gives_the_same_bits_again(tmp_path: Path) -> None:
+    options = ("--set", "render.variant=llvm_ad_mono", "--set", "calibration.method=transport")
+    first, second = (run(one, tmp_path / one.name[:5], options) for one in (VARIATIONS[0], EVERYTHING))
+    assert differences(result(second), result(first)) == []
 
 
 def test_nothing_is_written_elsewhere(elsewhere: Path) -> None:

@@ -70,15 +70,12 @@ EVERYTHING = Variation(
 )
 
 
-def run(variation: Variation, base: Path, python: Sequence[str] = (), options: Sequence[str] = ()) -> Path:
-    """Run the tiny scene below `base`, and return the folder of its result. Raises CalledProcessError if it fails.
-
-    python : command of another interpreter that runs ommatid;  options : of the command
-    """
+def run(variation: Variation, base: Path, options: Sequence[str] = ()) -> Path:
+    """Run the tiny scene below `base`, and return the folder of its result. Raises CalledProcessError if it fails."""
     folder = base / variation.folder
     folder.mkdir(parents=True)
     (folder / "tiny.toml").write_text(TINY, encoding="utf-8")
-    words = [*(python or interpreter(variation.before)), "run", "tiny.toml", "-o", "out", *options]
+    words = [*interpreter(variation.before), "run", "tiny.toml", "-o", "out", *options]
     command = ["sh", "-c", f'{variation.shell} exec "$@"', "sh", *words]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **variation.variables}
     subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)

@@ -5,10 +5,13 @@ Their behaviour in a browser is tested in test_page_in_browser.py.
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -28,7 +31,6 @@ from ommatid.page import batch_index, data, tables, words
 from ommatid.page.cached import cached_page
 from ommatid.page.document import page, page_of
 from ommatid.page.panels import error_groups, point_response, sensor, time_curves
-from ommatid.page.panels.embedded import decoded
 from ommatid.reconstruct.output.run_json import (
     DepthBin,
     DiagnosticsReport,
@@ -107,6 +109,12 @@ def group_of(text: str, name: str) -> dict[str, Any]:
 def maps_of(text: str, name: str = "maps") -> dict[str, NDArray[Any]]:
     """The stored arrays of a group of maps by name."""
     return {shown["name"]: decoded(shown["values"]) for shown in group_of(text, name)["maps"] if "values" in shown}
+
+
+def decoded(content: Mapping[str, Any]) -> NDArray[Any]:
+    """The array that a page holds as text."""
+    values = gzip.decompress(base64.b64decode(content["data"]))
+    return np.frombuffer(values, dtype=np.dtype(content["dtype"]).newbyteorder("<")).reshape(content["shape"])
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +292,7 @@ def test_of_too_many_sub_imagers_the_central_ones_are_shown() -> None:
     assert max(patch.k for patch in shown.patches) == 46
 
 
-@pytest.mark.parametrize("shape", [(512, 512), (200, 600)])
+@pytest.mark.parametrize("shape", [(200, 600), pytest.param((512, 512), marks=pytest.mark.slow)])
 def test_a_large_frame_is_reduced_to_means_and_fits(shape: tuple[int, int], run: data.Run) -> None:
     frame = synthetic(run, shape)
     text = page(frame, None, None, "0")
@@ -351,13 +359,6 @@ def test_a_page_shows_the_run_time_and_the_effect_of_more_samples(run: data.Run)
     assert "chose render.samples = 700, calibration.samples = auto." in text
 
 
-def test_commands_in_the_sentence_are_marked_and_the_rest_is_escaped(
-    run: data.Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ommatid.page.words.sentence", lambda _: "a < b; `ommatid design` & more")
-    assert "a &lt; b; <code>ommatid design</code> &amp; more</p>" in html_of(run)
-
-
 # --- error groups, point-spread functions, error against time
 
 
@@ -368,6 +369,7 @@ def with_errors(seed: int, deviation: NDArray[np.float64], predicted: NDArray[np
     return replace(run, truth=zero, estimate=error.astype(np.float32), variance=variance)
 
 
+@pytest.mark.slow
 def test_errors_that_are_as_predicted_are_inside_the_interval_as_often_as_it_says(run: data.Run) -> None:
     deviation = np.sqrt(np.geomspace(0.5, 8, 900)).reshape(30, 30)
     runs = [with_errors(seed, deviation, deviation, run) for seed in range(100)]
@@ -379,6 +381,7 @@ def test_errors_that_are_as_predicted_are_inside_the_interval_as_often_as_it_say
     assert not any(group.is_inside for group in error_groups.groups(larger))
 
 
+@pytest.mark.slow
 def test_intervals_allow_for_correlated_errors(run: data.Run) -> None:
     """Groups of correlated errors vary more than independent ones: their intervals are wider, and contain them."""
     rows, columns = np.divmod(np.arange(400), 20)
@@ -401,7 +404,7 @@ def test_intervals_allow_for_correlated_errors(run: data.Run) -> None:
     assert independent / total < 0.9
 
 
-@pytest.mark.parametrize("misalignment", ["robust", "fit"])
+@pytest.mark.parametrize("misalignment", ["robust", pytest.param("fit", marks=pytest.mark.slow)])
 def test_what_a_trusting_estimator_alone_has_is_left_out_of_others(misalignment: str, run: data.Run) -> None:
     """Kernels, correlations and other types are computed with H as it is and independent noise."""
     plain: dict[str, Any] = run.stack.scene.plain() | {"estimator": {"misalignment": misalignment}}
@@ -424,6 +427,12 @@ def test_pixels_of_equal_deviation_are_one_group(run: data.Run) -> None:
     deviation = np.full((40, 40), 2**0.5)
     [group] = error_groups.groups(with_errors(1, deviation, deviation, run))
     assert (group.pixels, group.predicted) == (1600, pytest.approx(2**0.5, rel=2**-23))
+    # The sum of 1600 independent squares is chi-squared with as many degrees of freedom.
+    quantiles = stats.chi2.ppf([0.005, 0.995], 1600)
+    assert group.interval == pytest.approx(group.predicted * np.sqrt(quantiles / 1600), rel=1e-9)
+    assert group.is_inside
+    [wrong] = error_groups.groups(with_errors(1, 1.2 * deviation, deviation, run))
+    assert not wrong.is_inside
 
 
 def test_point_spread_functions_are_columns_of_h(finished: Path) -> None:
@@ -581,17 +590,19 @@ def test_spurious_information_is_reported_before_the_numbers(finished: Path, htm
 # --- folders without a complete run
 
 
-@pytest.mark.parametrize("held", [("stack.exr",), ("model.npz",), ("estimate.exr",), ("stack.exr", "model.npz")])
-def test_a_page_of_a_folder_shows_what_is_there(held: tuple[str, ...], finished: Path, tmp_path: Path) -> None:
-    for name in held:
-        shutil.copy(finished / name, tmp_path)
-    text = page_of(tmp_path)
-    reader = parsed(text)
-    assert (reader.open, reader.mismatched) == ([], [])
-    assert ('data-map="packed"' in text) == ("stack.exr" in held)
-    assert ('data-map="response-I-measured"' in text) == ("model.npz" in held)
-    assert ('data-map="estimate"' in text) == ("estimate.exr" in held)
-    assert "no finished run: there is no verdict" in text
+def test_a_page_of_a_folder_shows_what_is_there(finished: Path, tmp_path: Path) -> None:
+    for number, held in enumerate((("stack.exr",), ("model.npz",), ("estimate.exr",), ("stack.exr", "model.npz"))):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        for name in held:
+            shutil.copy(finished / name, folder)
+        text = page_of(folder)
+        reader = parsed(text)
+        assert (reader.open, reader.mismatched) == ([], [])
+        assert ('data-map="packed"' in text) == ("stack.exr" in held)
+        assert ('data-map="response-I-measured"' in text) == ("model.npz" in held)
+        assert ('data-map="estimate"' in text) == ("estimate.exr" in held)
+        assert "no finished run: there is no verdict" in text
 
 
 def test_a_page_of_a_complete_run_is_its_report(finished: Path, tmp_path: Path) -> None:
@@ -679,47 +690,28 @@ def run_area(folder: Path) -> float:
     return camera.measurements * camera.pixel_pitch**2
 
 
-def test_an_index_of_a_sweep_shows_its_values_and_errors(finished: Path, tmp_path: Path) -> None:
+def test_an_index_of_a_sweep_shows_its_values_errors_and_figure(finished: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         shutil.copytree(finished, tmp_path / name)
-    listed = [
+    listed: list[dict[str, Any]] = [
         {"folder": "a", "values": {"noise.variance": "1e-4", "lens": "1/2"}, "mse": 2.0, "predicted_mse": 2.5},
         {"folder": "b", "values": {"noise.variance": "1e-2", "lens": "1/2"}, "mse": 3.0, "predicted_mse": 3.5},
+        {"folder": "c", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"},
     ]
-    listed = [{"scene": "a.toml", **row} for row in listed]
-    (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")
-    assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": ""})
+    (tmp_path / "sweep.json").write_text(json.dumps([{"scene": "a.toml", **row} for row in listed]), encoding="utf-8")
+    folders = {tmp_path / "a": "", tmp_path / "b": "", tmp_path / "c": "below 0"}
+    assert batch_index.cached_index(tmp_path, folders)
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "noise.variance" in parsed(text).text["th"]
-    assert 'id="chart-sweep"' in text
-    lengths = [
-        row | {"values": {"camera.tolerance.position": value}, "mse": mse}
-        for row, value, mse in zip(listed, ("1 nm", "1 um"), (2.0, None), strict=True)
-    ]
-    (tmp_path / "sweep.json").write_text(json.dumps(lengths), encoding="utf-8")
-    assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": ""})
-    drawn = (tmp_path / "index.html").read_text(encoding="utf-8").split('id="chart-sweep"')[1]
-    assert "camera.tolerance.position (mm)" in drawn
-    assert ">1e-6<" in drawn
-    assert drawn.count("<circle") == 1, "an error that was not measured has no dot"
-    failed = {"scene": "a.toml", "values": {"noise.variance": "-1", "lens": "1/2"}, "failed": "below 0"}
-    listed.append({"folder": "c", **failed})
-    (tmp_path / "sweep.json").write_text(json.dumps(listed), encoding="utf-8")
-    assert batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": "", tmp_path / "c": "below 0"})
-    text = (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert 'id="chart-sweep"' in text
+    assert "<td>1e-2</td><td>1/2</td><td>3</td><td>3.5</td>" in text
     assert "c/report.html" not in text
+    assert "sweep.png" not in text
+    (tmp_path / "sweep.png").touch()
+    assert batch_index.cached_index(tmp_path, folders)
+    assert '<img src="sweep.png"' in (tmp_path / "index.html").read_text(encoding="utf-8")
     for damaged in ("{}", "[{}]", "nothing"):
         (tmp_path / "sweep.json").write_text(damaged, encoding="utf-8")
         assert batch_index.read_sweep(tmp_path / "sweep.json") is None
-
-
-def test_a_batch_has_its_index_even_if_scenes_fail(kept: Path, here: Path, ommatid: Command) -> None:
-    assert kept.is_dir()
-    assert ommatid("run", "tiny.toml", "missing.toml", "-o", "out").code == 2
-    text = (here / "out" / "index.html").read_text(encoding="utf-8")
-    assert 'href="tiny/report.html"' in text
-    assert "failed: missing.toml: no such scene file" in text
 
 
 def test_a_page_that_is_up_to_date_is_not_made_again(

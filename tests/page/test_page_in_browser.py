@@ -174,6 +174,7 @@ def test_a_letter_is_upright_with_square_pixels(letter: Path, shown: Opened) -> 
         assert right - left == pytest.approx(bottom - top, abs=1)
 
 
+@pytest.mark.slow
 def test_errors_are_the_difference_of_two_maps(letter: Path, run: Run, shown: Opened) -> None:
     assert run.truth is not None
     error = run.estimate - run.truth
@@ -185,6 +186,7 @@ def test_errors_are_the_difference_of_two_maps(letter: Path, run: Run, shown: Op
     np.testing.assert_array_equal((colours[..., 0] > colours[..., 2])[strong], error[strong] > 0)  # red or blue
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height", "screens"), [(390, 844, 5), (1280, 800, 3)])
 def test_what_matters_fits_a_few_screens_with_large_images(
     width: int, height: int, screens: int, letter: Path, shown: Opened
@@ -201,6 +203,7 @@ def test_what_matters_fits_a_few_screens_with_large_images(
         assert page.locator("details[open]").count() == 0
 
 
+@pytest.mark.slow
 def test_a_dark_colour_scheme_darkens_page_and_charts_but_not_maps(letter: Path, shown: Opened) -> None:
     def look(page: Page) -> list[str]:
         return page.evaluate("""() => [
@@ -222,6 +225,7 @@ def test_a_dark_colour_scheme_darkens_page_and_charts_but_not_maps(letter: Path,
 # --- interaction
 
 
+@pytest.mark.slow
 def test_the_wheel_zooms_all_maps_with_ctrl_and_scrolls_the_page_without(letter: Path, shown: Opened) -> None:
     with shown(letter) as page:
         page.mouse.move(*position(page, "error", 6, 6))
@@ -240,6 +244,7 @@ def test_the_wheel_zooms_all_maps_with_ctrl_and_scrolls_the_page_without(letter:
         assert top > 0
 
 
+@pytest.mark.slow
 def test_dragging_moves_all_maps_and_keys_and_buttons_zoom(letter: Path, shown: Opened) -> None:
     with shown(letter) as page:
         tools = page.locator("#image .tools")
@@ -275,6 +280,7 @@ def touches(session: CDPSession, kind: str, *points: tuple[float, float]) -> Non
     session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
 
 
+@pytest.mark.slow
 def test_two_fingers_zoom_and_one_scrolls_the_page_until_a_map_is_zoomed(letter: Path, shown: Opened) -> None:
     with shown(letter, width=390, height=844, touch=True) as page:
         assert canvas(page, "compare").evaluate("canvas => canvas.style.touchAction") == "pan-y"
@@ -298,6 +304,7 @@ def test_two_fingers_zoom_and_one_scrolls_the_page_until_a_map_is_zoomed(letter:
         assert page.evaluate("scrollY") == scrolled
 
 
+@pytest.mark.slow
 def test_a_slider_divides_any_two_images(letter: Path, shown: Opened) -> None:
     with shown(letter) as page:
         compared = page.locator(".compare")
@@ -319,6 +326,7 @@ def test_a_slider_divides_any_two_images(letter: Path, shown: Opened) -> None:
         assert area(page) == [0, 0, 24, 24], "the maps stay where they are"
 
 
+@pytest.mark.slow
 def test_the_pointer_and_the_keyboard_read_values(letter: Path, run: Run, shown: Opened) -> None:
     assert run.truth is not None
     with shown(letter) as page:
@@ -339,6 +347,7 @@ def test_the_pointer_and_the_keyboard_read_values(letter: Path, run: Run, shown:
         assert form.locator("output").inner_text() == "outside the image"
 
 
+@pytest.mark.slow
 def test_images_are_saved_as_arrays_tables_and_pictures(letter: Path, run: Run, tmp_path: Path, shown: Opened) -> None:
     assert run.truth is not None
     with shown(letter) as page:
@@ -359,6 +368,7 @@ def test_images_are_saved_as_arrays_tables_and_pictures(letter: Path, run: Run, 
                     assert io.imread(path).shape[:2] == (24, 24)
 
 
+@pytest.mark.slow
 def test_the_pointer_identifies_sub_images(letter: Path, run: Run, shown: Opened) -> None:
     patch = sensor.mosaic(run.stack).patches[1]
     with shown(letter) as page:
@@ -375,6 +385,7 @@ def test_the_pointer_identifies_sub_images(letter: Path, run: Run, shown: Opened
         assert not page.locator('.read[data-group="packed"]').inner_text().strip()
 
 
+@pytest.mark.slow
 def test_a_lens_type_is_chosen_and_drawn(letter: Path, shown: Opened) -> None:
     with shown(letter) as page:
         first, second = canvas(page, "response-A-measured"), canvas(page, "response-B-measured")
@@ -394,6 +405,7 @@ def test_a_lens_type_is_chosen_and_drawn(letter: Path, shown: Opened) -> None:
 # --- print
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dark", [False, True])
 def test_print_is_light_and_without_tools(dark: bool, letter: Path, shown: Opened) -> None:
     with shown(letter, dark=dark) as page:
@@ -411,6 +423,7 @@ def test_print_is_light_and_without_tools(dark: bool, letter: Path, shown: Opene
 # --- other pages
 
 
+@pytest.mark.slow
 def test_a_calibrated_run_is_shown_without_errors(finished: Path, shown: Opened) -> None:
     with shown(finished / "report.html") as page:
         assert page.locator("h1").inner_text() == "Tiny"
@@ -418,6 +431,7 @@ def test_a_calibrated_run_is_shown_without_errors(finished: Path, shown: Opened)
         assert canvas(page, "response-I-difference").is_visible()
 
 
+@pytest.mark.slow
 def test_folders_without_a_run_are_shown(finished: Path, tmp_path: Path, shown: Opened) -> None:
     for name in ("stack.exr", "estimate.exr"):
         shutil.copy(finished / name, tmp_path)
@@ -429,6 +443,7 @@ def test_folders_without_a_run_are_shown(finished: Path, tmp_path: Path, shown: 
         assert canvas(page, "packed").is_visible()
 
 
+@pytest.mark.slow
 def test_a_large_frame_is_drawn(run: Run, tmp_path: Path, shown: Opened) -> None:
     path = tmp_path / "report.html"
     path.write_text(page_of(synthetic(run, (512, 512)), None, None, "0"), encoding="utf-8")
@@ -438,6 +453,7 @@ def test_a_large_frame_is_drawn(run: Run, tmp_path: Path, shown: Opened) -> None
         assert page.locator("form.pixel [name=row]").input_value() in ("510", "511")
 
 
+@pytest.mark.slow
 def test_a_batch_is_shown(finished: Path, tmp_path: Path, shown: Opened) -> None:
     for name in ("a", "b"):
         shutil.copytree(finished, tmp_path / name)

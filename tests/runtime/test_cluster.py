@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import gc
-import os
 import shutil
 import socket
 import subprocess
 import warnings
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -22,8 +21,7 @@ from distributed import LocalCluster, Security
 from ommatid.batch.batch import Batch
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import workers
-from ommatid.runtime.execution.cluster import Cluster
-from ommatid.runtime.execution.dask_cluster import SILENT, cluster_workers
+from ommatid.runtime.execution.cluster import SILENT, Cluster, cluster_workers
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.progress import no_progress
 
@@ -83,8 +81,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         openssl("req", *new, "-subj", "/CN=member", "-keyout", f"{name}-key", "-out", f"{name}.csr")
         authority = ("-CA", f"{name}-ca", "-CAkey", f"{name}-ca.key", "-CAcreateserial", "-days", "2")
         openssl("x509", "-req", "-in", f"{name}.csr", *authority, "-out", f"{name}-cert")
-    (folder / "text").write_text("no certificate\n")
-    openssl("ec", "-in", "a-key", "-aes256", "-passout", "pass:secret", "-out", "locked")
     return folder
 
 
@@ -105,95 +101,41 @@ def encrypted(files: Path) -> Generator[str]:
         yield cluster.scheduler_address
 
 
-def tls(address: str, files: Path, authority: str = "a-ca", certificate: str = "a-cert", key: str = "a-key") -> Cluster:
-    return Cluster(address, files / authority, files / certificate, files / key)
+def settings(files: Path, authority: str = "a", member: str = "a") -> Any:
+    """Dask's own configuration, with an authority and the certificate of another or the same."""
+    names = {"ca-file": f"{authority}-ca", "client.cert": f"{member}-cert", "client.key": f"{member}-key"}
+    return config.set({f"distributed.comm.tls.{key}": str(files / name) for key, name in names.items()})
 
 
 # --- TLS
 
 
-def test_tasks_are_sent_over_an_encrypted_connection(encrypted: str, files: Path) -> None:
+@pytest.mark.slow
+def test_a_scene_is_rendered_on_an_encrypted_cluster_with_the_files_of_dasks_configuration(
+    encrypted: str, files: Path, ommatid: Command
+) -> None:
     assert encrypted.startswith("tls://")
-    with worker_pool(tls(encrypted, files)) as pool:
-        assert pool.map(squared, range(4), no_progress, 4) == [0, 1, 4, 9]
-
-
-def test_a_scene_is_rendered_on_an_encrypted_cluster(encrypted: str, files: Path, ommatid: Command) -> None:
     Path("tiny.toml").write_text(TINY, encoding="utf-8")
-    names = [f"--tls-{part}={files / f'a-{part}'}" for part in ("ca", "cert", "key")]
-    ended = ommatid("render", "tiny.toml", "-o", "out", "--scheduler", encrypted, *names)
+    with settings(files):
+        ended = ommatid("render", "tiny.toml", "-o", "out", "--scheduler", encrypted)
     assert ended.code == 0, ended.err
     assert Path("out/tiny/stack.exr").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 def test_strangers_are_refused_on_both_sides(encrypted: str, files: Path) -> None:
-    plain = encrypted.replace("tls://", "tcp://")
-    for cluster, message in (
-        (tls(encrypted, files, "b-ca"), "was not signed by --tls-ca"),
-        (
-            tls(encrypted, files, "a-ca", "b-cert", "b-key"),
-            "no encrypted scheduler answers there that accepts --tls-cert",
-        ),
-        (Cluster(encrypted), "expected --tls-ca, --tls-cert, --tls-key with it, got none"),
-        (Cluster(plain), "no scheduler answers there"),
+    for address, configured, message in (
+        (encrypted, settings(files, authority="b"), "was not signed by the authority of Dask's configuration"),
+        (encrypted, settings(files, member="b"), "no encrypted scheduler answers there that accepts the certificate"),
+        (encrypted, nullcontext(), "expected certificates in Dask's configuration"),
+        (encrypted, settings(files / "none"), "Dask's configuration names files that cannot be used"),
+        (encrypted.replace("tls://", "tcp://"), nullcontext(), "no scheduler answers there"),
     ):
-        with pytest.raises(InputError, match=message) as refused, worker_pool(cluster):
+        with configured, pytest.raises(InputError, match=message) as refused, worker_pool(Cluster(address)):
             pass
-        assert str(refused.value).startswith(f"--scheduler {cluster.address}: ")
+        assert str(refused.value).startswith(f"--scheduler {address}: ")
         assert len(str(refused.value)) < 300
-
-
-@pytest.mark.usefixtures("impatient")
-def test_a_scheduler_without_encryption_is_named(files: Path) -> None:
-    with started() as cluster:
-        address = cluster.scheduler_address.replace("tcp://", "tls://")
-        with pytest.raises(InputError, match="no encrypted scheduler answers there"), worker_pool(tls(address, files)):
-            pass
-
-
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        (("gone", "a-cert", "a-key"), r"--tls-ca: .*gone cannot be read \(No such file or directory\)"),
-        (("a-ca", "", "a-key"), r"--tls-cert: .* cannot be read \(Is a directory\)"),
-        (("text", "a-cert", "a-key"), "--tls-ca: .*text: expected a certificate in PEM format"),
-        (("a-ca", "text", "a-key"), "expected a certificate and its own key"),
-        (("a-ca", "a-cert", "text"), "expected a certificate and its own key"),
-        (("a-ca", "a-cert", "b-key"), "expected a certificate and its own key"),
-        (("a-ca", "a-cert", "locked"), "expected a certificate and its own key without a password"),
-        (("a-ca", "fifo", "a-key"), "--tls-cert: .*expected a regular file, got a FIFO"),
-    ],
-)
-def test_files_that_are_no_certificates_are_named(names: tuple[str, str, str], message: str, files: Path) -> None:
-    if "fifo" in names and not (files / "fifo").exists():
-        os.mkfifo(files / "fifo")
-    with pytest.raises(InputError, match=message) as refused, worker_pool(tls("tls://127.0.0.1:1", files, *names)):
-        pass
-    assert len(str(refused.value)) < 400
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--tls-ca", "x"), "expected --scheduler tls://HOST:PORT with them, got none"),
-        (
-            ("--scheduler", "tcp://127.0.0.1:1", "--tls-key", "x"),
-            "--tls-key: expected --scheduler tls://HOST:PORT with it, got",
-        ),
-        (
-            ("--scheduler", "tls://127.0.0.1:1", "--tls-ca", "x"),
-            "--tls-cert: expected all of --tls-ca, --tls-cert, --tls-key, got only --tls-ca",
-        ),
-    ],
-)
-def test_tls_options_belong_together(options: tuple[str, ...], message: str, ommatid: Command) -> None:
-    Path("tiny.toml").write_text(TINY, encoding="utf-8")
-    for command in ("render", "run"):
-        ended = ommatid(command, "tiny.toml", "-o", "out", *options)
-        assert (ended.code, ended.err.count("\n")) == (2, 1)
-        assert message in ended.err
-        assert not Path("out").exists()
 
 
 # --- other servers
@@ -223,7 +165,9 @@ def endless(connection: socket.socket) -> None:
 
 
 @pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize("behaviour", [silent, closing, http, huge, endless], ids=lambda function: function.__name__)
+@pytest.mark.parametrize(
+    "behaviour", [http, *(pytest.param(one, marks=pytest.mark.slow) for one in (silent, closing, huge, endless))]
+)
 def test_another_server_is_refused_in_one_sentence(behaviour: Callable[[socket.socket], None]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         connections: list[socket.socket] = []
@@ -276,7 +220,7 @@ def test_a_scheduler_that_stops_answering_is_not_waited_for(monkeypatch: pytest.
         yield client
         client.end.set()
 
-    monkeypatch.setattr("ommatid.runtime.execution.dask_cluster._connected", connected)
+    monkeypatch.setattr("ommatid.runtime.execution.cluster._connected", connected)
     with cluster_workers(Cluster("tcp://h:1")) as pool:
         with pytest.raises(MachineError, match="connection to the scheduler was lost"):
             pool.map(squared, range(2), no_progress, 2)
@@ -296,6 +240,7 @@ def test_a_worker_that_joins_later_with_another_version_is_named(monkeypatch: py
             pool.map(squared, range(2), no_progress, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 def test_a_lost_scheduler_ends_a_batch_and_keeps_what_is_finished(
     monkeypatch: pytest.MonkeyPatch, ommatid: Command

@@ -20,15 +20,13 @@ OWN = {
     "ommatid.runtime.input_files": "the one that opens inputs",
     "ommatid.runtime.files": "temporary files, which it writes",
     "ommatid.cli.failures": "/dev/null",
-    "ommatid.cli.streams": "/dev/null",
+    "ommatid.cli.app": "/dev/null",
     "ommatid.runtime.outputs.occupied": "lock files, which it makes",
     "ommatid.page.document": "templates of the installation",
     "ommatid.page.cached": "modules and templates of the installation",
     "ommatid.pipeline.calibration": "a temporary file, which it writes",
-    "ommatid.batch.jobs.job_files": "a file that it creates",
     "ommatid.batch.frames": "a file that it wrote into a folder of its own",
-    "ommatid.batch.remote": "results that it wrote",
-    "ommatid.batch.world_package": "files of a world, which have been read before",
+    "ommatid.batch.remote": "results that it wrote, and files of a world, which have been read before",
     "ommatid.bench.resources": "/proc",
     "ommatid.runtime.processors": "/proc",
     "ommatid.bench.scheduler": "a journal, which it appends to",
@@ -65,29 +63,18 @@ def test_no_other_module_opens_inputs() -> None:
     assert {name: calls for name, calls in found.items() if calls and name not in OWN} == {}
 
 
-@pytest.fixture(params=["FIFO", "device", "folder", "socket", "link to a device"])
-def irregular(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A path that names no regular file."""
-    monkeypatch.chdir(tmp_path)  # addresses of sockets are short
-    path = Path("input")
-    if request.param == "FIFO":
-        os.mkfifo(path)
-    elif request.param == "folder":
-        path.mkdir()
-    elif request.param == "socket":
-        with socket.socket(socket.AF_UNIX) as server:
-            server.bind(str(path))
-    else:
-        path.symlink_to("/dev/zero")
-    return path
-
-
-def test_other_things_than_files_are_refused_without_waiting(irregular: Path) -> None:
-    for read in (read_bytes, read_text):
-        with pytest.raises((InputError, OSError)):
-            read(irregular)
-    with pytest.raises((InputError, OSError)), open_input(irregular):
-        pass
+def test_other_things_than_files_are_refused_without_waiting() -> None:
+    os.mkfifo("fifo")
+    Path("folder").mkdir()
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind("socket")
+    Path("device").symlink_to("/dev/zero")
+    for irregular in map(Path, ("fifo", "folder", "socket", "device")):
+        for read in (read_bytes, read_text):
+            with pytest.raises((InputError, OSError)):
+                read(irregular)
+        with pytest.raises((InputError, OSError)), open_input(irregular):
+            pass
 
 
 def test_large_files_are_refused_before_they_are_read(tmp_path: Path) -> None:
@@ -110,8 +97,8 @@ def test_links_in_a_circle_have_a_path(tmp_path: Path) -> None:
         read_bytes(tmp_path / "a")
 
 
-@pytest.mark.parametrize("document", ['{"a": 1, "b": {"c": 1, "d": 2, "c": 1}}', '[{"c": 1.5, "c": 1e400}]'])
-def test_a_key_that_stands_twice_is_refused(document: str) -> None:
+def test_a_key_that_stands_twice_is_refused() -> None:
+    document = '[{"c": 1}, {"b": {"c": 1.5, "d": 2, "c": 1e400}}]'
     with pytest.raises(ValueError, match="expected each key of a table once, got 'c' twice"):
         parse_json(document)
     with pytest.raises(InputError, match=r"^run\.json: expected each key of a table once, got 'c' twice; delete it"):

@@ -60,6 +60,7 @@ def run(command: Sequence[str], folder: Path, **variables: str) -> str:
     return ended.stdout
 
 
+@pytest.mark.slow
 def test_workers_in_a_hostile_folder_open_only_what_was_named(hostile: Path, tmp_path: Path) -> None:
     for name in ("a.toml", "b.toml"):
         (tmp_path / name).write_text(TINY, encoding="utf-8")
@@ -80,7 +81,9 @@ def test_the_module_ommatid_is_run_in_a_hostile_folder(hostile: Path) -> None:
     assert run([sys.executable, "-m", "ommatid", "--version"], hostile, PYTHONPATH=str(ROOT)).startswith("ommatid ")
 
 
-@pytest.mark.parametrize("python_path", ["", os.pathsep, f".{os.pathsep}x", f"{os.pathsep}/tmp{os.pathsep}"], ids=repr)
+@pytest.mark.parametrize(
+    "python_path", [f".{os.pathsep}x", *(pytest.param(one, marks=pytest.mark.slow) for one in ("", os.pathsep))]
+)
 def test_a_process_finds_the_same_modules_without_the_current_folder(
     python_path: str, hostile: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,12 +114,14 @@ def test_in_a_checkout_the_program_comes_last(monkeypatch: pytest.MonkeyPatch) -
     assert import_path() == ["/usr/lib", str(ROOT)]
 
 
+@pytest.mark.slow
 def test_settings_in_the_current_folder_are_ignored(hostile: Path) -> None:
     code = "import matplotlib, numba; print(matplotlib.rcParams['font.size'], numba.config.CACHE_DIR or '-')"
     assert run(python_command(code), hostile) == "10.0 -\n"
     assert set(SETTINGS) == CONFIGURATIONS
 
 
+@pytest.mark.slow
 def test_a_notebook_keeps_its_path_and_its_settings(hostile: Path) -> None:
     code = "import os, sys; before = [*sys.path], os.path.exists; import ommatid; from ommatid import Scene; "
     assert run([sys.executable, "-Pc", f"{code}print(before == (sys.path, os.path.exists))"], hostile) == "True\n"

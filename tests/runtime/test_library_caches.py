@@ -79,6 +79,7 @@ def test_functions_are_compiled_where_no_machine_code_can_be_kept(monkeypatch: p
     assert compiled(lambda x: 2 * x + 1)(3) == 7
 
 
+@pytest.mark.slow
 def test_a_command_without_a_home_says_nothing_of_it(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (here / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(here / "temporary"))

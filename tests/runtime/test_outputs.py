@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.files import make_folder, write_text
-from ommatid.runtime.outputs.kinds import SUFFIXES, check_folder, check_output
-from ommatid.runtime.outputs.names import LONGEST, check_name, shortened_name
+from ommatid.runtime.outputs.kinds import LONGEST, SUFFIXES, check_folder, check_name, check_output, shortened_name
 from ommatid.runtime.outputs.occupied import LOCK, occupied
 
 FIFO = stat.S_IFIFO
@@ -84,38 +83,32 @@ def test_a_link_to_a_device_is_not_replaced(tmp_path: Path) -> None:
         check_output(path)
 
 
-@pytest.mark.parametrize(
-    "path", ["/dev/null", "/dev/a.npz", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "/sys/a.npz"]
-)
-def test_nothing_is_written_among_devices(path: str) -> None:
-    with pytest.raises(InputError, match=r"expected|would"):
-        check_output(Path(path))
+def test_nothing_is_written_among_devices() -> None:
+    for path in ("/dev/null", "/dev/a.npz", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "/sys/a.npz"):
+        with pytest.raises(InputError, match=r"expected|would"):
+            check_output(Path(path))
 
 
-@pytest.mark.parametrize("suffix", sorted(SUFFIXES))
-def test_a_folder_with_a_fifo_in_place_of_a_result_is_refused(suffix: str, tmp_path: Path) -> None:
+def test_a_folder_with_a_fifo_in_place_of_a_result_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     check_folder(tmp_path)  # no result has this name
-    os.mkfifo(tmp_path / f".part{suffix}")
-    with pytest.raises(InputError, match=rf"{suffix}: expected a regular file, got a FIFO; remove it"):
-        make_folder(tmp_path)
+    for suffix in SUFFIXES:
+        fifo = tmp_path / f".part{suffix}"
+        os.mkfifo(fifo)
+        with pytest.raises(InputError, match=rf"{suffix}: expected a regular file, got a FIFO; remove it"):
+            make_folder(tmp_path)
+        fifo.unlink()
 
 
-@pytest.mark.parametrize("name", ["a" * 256, "a" * 5000, f"{'a' * 300}/b", "a\udcff", "a\udcff/b"])
-def test_names_that_no_file_can_have_are_the_users_to_correct(name: str, tmp_path: Path) -> None:
-    for check in (check_output, make_folder):
-        with pytest.raises(InputError, match=r"at most 255 bytes|in UTF-8") as refused:
-            check(tmp_path / name)
-        assert len(str(refused.value)) < 700
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["", ".", "..", "...", ".jobs", ".hidden", "a/b", "a\\b", "a\nb", "a\x1b[2J", "a\u202eb", "\udcff", "é" * 101],
-)
-def test_names_that_no_folder_of_results_has(name: str) -> None:
-    with pytest.raises(InputError, match=r"scene.toml: its results are named after it, and its name .*; rename it"):
-        check_name(name, "scene.toml")
+def test_names_that_no_file_or_folder_can_have_are_the_users_to_correct(tmp_path: Path) -> None:
+    for name in ("a" * 256, "a" * 5000, f"{'a' * 300}/b", "a\udcff", "a\udcff/b"):
+        for check in (check_output, make_folder):
+            with pytest.raises(InputError, match=r"at most 255 bytes|in UTF-8") as refused:
+                check(tmp_path / name)
+            assert len(str(refused.value)) < 700
+    for name in ("", ".", "..", "...", ".hidden", "a/b", "a\\b", "a\nb", "a\x1b[2J", "a\u202eb", "\udcff", "é" * 101):
+        with pytest.raises(InputError, match=r"scene.toml: its results are named after it, and its name .*; rename it"):
+            check_name(name, "scene.toml")
 
 
 @given(st.text(max_size=120) | st.text("./\\a é\0", max_size=8))

@@ -22,8 +22,7 @@ from distributed import LocalCluster
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import cluster as cluster_options
 from ommatid.runtime.execution import workers
-from ommatid.runtime.execution.cluster import Cluster
-from ommatid.runtime.execution.dask_cluster import SILENT
+from ommatid.runtime.execution.cluster import SILENT, Cluster
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.progress import no_progress
 
@@ -100,11 +99,15 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- results
 
 
-@pytest.mark.parametrize("options", [{}, {"threads": 3}, {"count": 2}, {"scheduler": "address"}], ids=str)
-def test_results_are_in_the_order_of_the_items(options: dict[str, Any], address: str) -> None:
+ON_A_CLUSTER = pytest.param({"cluster": "address"}, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("options", [{}, {"threads": 3}, {"count": 2}, ON_A_CLUSTER])
+def test_results_are_in_the_order_of_the_items(options: dict[str, Any], request: pytest.FixtureRequest) -> None:
     progress: list[float] = []
-    arguments: dict[str, Any] = {"cluster": Cluster(address)} if "scheduler" in options else options
-    with worker_pool(**arguments) as pool:
+    if "cluster" in options:
+        options = {"cluster": Cluster(request.getfixturevalue("address"))}
+    with worker_pool(**options) as pool:
         results = pool.map(digits_and_process, range(8), progress.append, 8)
     assert [values for values, _ in results] == [digits(seed) for seed in range(8)]
     assert progress == [(count + 1) / 8 for count in range(8)]
@@ -137,9 +140,11 @@ def test_threads_work_at_the_same_time() -> None:
 
 
 @pytest.mark.parametrize("error", [InputError, MachineError, ZeroDivisionError])
-@pytest.mark.parametrize("remote", [False, True])
-def test_a_failure_is_the_same_here_and_on_a_cluster(error: type[Exception], remote: bool, address: str) -> None:
-    with worker_pool(Cluster(address) if remote else None) as pool:
+@pytest.mark.parametrize("remote", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_failure_is_the_same_here_and_on_a_cluster(
+    error: type[Exception], remote: bool, request: pytest.FixtureRequest
+) -> None:
+    with worker_pool(Cluster(request.getfixturevalue("address")) if remote else None) as pool:
         with pytest.raises(error, match=r"^the picture is upside down; turn it$"):
             pool.map(fine_or_raises, [None, error, None], no_progress, 3)
         ended = {task.index: task for task in pool.each(fine_or_raises, [None, error, None])}
@@ -148,6 +153,7 @@ def test_a_failure_is_the_same_here_and_on_a_cluster(error: type[Exception], rem
             ended[1].result()
 
 
+@pytest.mark.slow
 def test_a_large_item_causes_no_warning(address: str) -> None:
     with worker_pool(Cluster(address)) as pool:
         assert pool.map(len, [bytes(20_000_000)], no_progress, 1) == [20_000_000]
@@ -161,6 +167,7 @@ def test_the_task_of_a_killed_process_is_repeated(tmp_path: Path) -> None:
     assert results == [digits(seed) for seed in range(8)]
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_every_process_is_given_up_and_the_others_are_done(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
@@ -220,6 +227,7 @@ def test_a_lost_connection_is_reported() -> None:
         workers.Workers(IdleExecutor(cancelled=True), lambda: 1).map(digits, range(2), no_progress, 2)
 
 
+@pytest.mark.slow
 def test_workers_with_other_versions_are_refused(address: str) -> None:
     with worker_pool(Cluster(address)) as pool:
         pool.check_versions(python_version)
@@ -230,6 +238,7 @@ def test_workers_with_other_versions_are_refused(address: str) -> None:
             pool.check_versions(OfUnknownModule())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 def test_a_scheduler_without_workers_is_refused() -> None:
     start: Any = LocalCluster
@@ -243,9 +252,8 @@ def test_a_scheduler_without_workers_is_refused() -> None:
 
 
 @pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_wrong_options_are_refused_in_one_line(here: Path, ommatid: Command) -> None:
+    for options, message in (
         (("--scheduler", "tcp://127.0.0.1:8786", "--workers", "2"), "--scheduler and --workers: expected one of them"),
         (("--scheduler", "127.0.0.1:8786"), "expected an address such as tcp://"),
         (("--scheduler", "tcp://127.0.0.1"), "expected an address such as tcp://"),
@@ -254,16 +262,12 @@ def test_a_scheduler_without_workers_is_refused() -> None:
         (("--scheduler", "tcp://127.0.0.1:1"), "--scheduler tcp://127.0.0.1:1: no scheduler answers there"),
         (("--workers", "0"), "--workers"),
         (("--workers", "many"), "--workers"),
-    ],
-)
-def test_wrong_options_are_refused_in_one_line(
-    options: tuple[str, ...], message: str, here: Path, ommatid: Command
-) -> None:
-    ended = ommatid("render", here / "tiny.toml", "-o", "out", *options)
-    assert (ended.code, ended.out) == (2, "")
-    [line] = ended.err.splitlines()
-    assert line.startswith("ommatid: ")
-    assert message in line
+    ):
+        ended = ommatid("render", here / "tiny.toml", "-o", "out", *options)
+        assert (ended.code, ended.out) == (2, "")
+        [line] = ended.err.splitlines()
+        assert line.startswith("ommatid: ")
+        assert message in line
     assert not (here / "out").exists()
 
 

@@ -47,6 +47,7 @@ def test_every_command_is_tried() -> None:
     assert {*commands()} == {*COMMANDS, *SLOW}
 
 
+@pytest.mark.slow
 def test_no_command_executes_anything_of_the_current_folder(trapped: tuple[Path, Path]) -> None:
     """All commands in one process, which the imports of a start are too long for otherwise."""
     folder, marks = trapped
@@ -72,6 +73,7 @@ def test_the_console_script_starts_without_the_current_folder(trapped: tuple[Pat
     assert (code, messages, os.listdir(marks)) == (0, "", [])  # noqa: PTH208
 
 
+@pytest.mark.slow
 def test_results_into_the_folder_itself_neither_hang_nor_replace_its_traps(trapped: tuple[Path, Path]) -> None:
     folder, marks = trapped
     code, messages, _ = ended(("render", "tiny.toml", "-o", "."), folder)
@@ -80,14 +82,17 @@ def test_results_into_the_folder_itself_neither_hang_nor_replace_its_traps(trapp
 
 
 def test_the_traps_work(tmp_path: Path) -> None:
-    """A trap that is executed leaves its mark: a module, a package, a library and a script."""
+    """A trap that is executed leaves its mark: a module, a package, a library and a script.
+
+    Some systems have a `sitecustomize` of their own, which is imported before.
+    """
     (tmp_path / "traps").mkdir()
     (tmp_path / "marks").mkdir()
     folder, marks = tmp_path / "traps", tmp_path / "marks"
     make_traps(folder, marks)
     imported = (
         "import sys; here = sys.path.pop(0); import ctypes, glob; sys.path.insert(0, here)\n"
-        "import simulate, sitecustomize\n"
+        "import simulate; sys.modules.pop('sitecustomize', None); import sitecustomize\n"
         "for file in glob.glob('plugins/*.so'): ctypes.CDLL('./' + file)"
     )
     subprocess.run([sys.executable, "-c", imported], cwd=folder, check=True)

@@ -9,62 +9,21 @@ import subprocess
 from pathlib import Path
 
 MODULES = (
-    *(
-        "json",
-        "numpy",
-        "scipy",
-        "signal",
-        "simulate",
-        "scenes",
-        "reconstruct",
-        "ommatid",
-        "mitsuba",
-        "drjit",
-        "matplotlib",
-    ),
-    *(
-        "typing",
-        "pickle",
-        "sitecustomize",
-        "usercustomize",
-        "conftest",
-        "__init__",
-        "setup",
-        "noxfile",
-        "__main__",
-        "random",
-    ),
-    *("struct", "tempfile", "socket", "psutil", "typer", "rich", "pydantic", "numba", "tifffile", "OpenEXR", "tomllib"),
-    *("evil", "threading", "_bootlocale", "readline", "zlib", "dask", "distributed", "skimage", "PIL", "defusedxml"),
-)
+    "json", "numpy", "scipy", "signal", "simulate", "scenes", "reconstruct", "ommatid", "mitsuba", "drjit",
+    "matplotlib", "typing", "pickle", "sitecustomize", "usercustomize", "conftest", "__init__", "setup", "noxfile",
+    "__main__", "random", "struct", "tempfile", "socket", "psutil", "typer", "rich", "pydantic", "numba", "tifffile",
+    "OpenEXR", "tomllib", "evil", "threading", "_bootlocale", "readline", "zlib", "dask", "distributed", "skimage",
+    "PIL", "defusedxml",
+)  # fmt: skip
 PACKAGES = ("encodings", "importlib", "multiprocessing", "plugins", "yaml")
 LIBRARIES = (
-    *(
-        "plugins/evil.so",
-        "plugins/path.so",
-        "plugins/cube.so",
-        "evil.so",
-        "libLLVM.so",
-        "libLLVM-19.so",
-        "libLLVM.so.1",
-    ),
-    *("libmitsuba.so", "libdrjit-core.so", "libcuda.so", "libm.so.6", "libopenblas.so", "_ctypes.so", "_json.so"),
+    "plugins/evil.so", "plugins/path.so", "plugins/cube.so", "evil.so", "libLLVM.so", "libLLVM-19.so", "libLLVM.so.1",
+    "libmitsuba.so", "libdrjit-core.so", "libcuda.so", "libm.so.6", "libopenblas.so", "_ctypes.so", "_json.so",
     "math.cpython-311-x86_64-linux-gnu.so",
-)
+)  # fmt: skip
 SCRIPTS = (
-    "python",
-    "python3",
-    "git",
-    "ldconfig",
-    "gcc",
-    "cc",
-    "ld",
-    "sh",
-    "nvidia-smi",
-    "llvm-config",
-    "lscpu",
-    "uname",
-)
+    "python", "python3", "git", "ldconfig", "gcc", "cc", "ld", "sh", "nvidia-smi", "llvm-config", "lscpu", "uname",
+)  # fmt: skip
 SETTINGS = {
     "matplotlibrc": "backend: module://evil\naxes.formatter.min_exponent: 9\n",
     ".numba_config.yaml": "opt: evil\ndisable_jit: evil\n",
@@ -85,30 +44,13 @@ SETTINGS = {
     "gallery.toml": "[",
 }
 FIFOS = (
-    *(
-        "report.html",
-        "index.html",
-        "run.json",
-        "bench.json",
-        "sweep.json",
-        "stack.exr",
-        "model.npz",
-        "scene.toml",
-        "LICENSE",
-    ),
-    *("tile19", ".jobs", "metadata.json"),
-)
+    "report.html", "index.html", "run.json", "bench.json", "sweep.json", "stack.exr", "model.npz", "scene.toml",
+    "LICENSE", "tile19", ".jobs", "metadata.json",
+)  # fmt: skip
 NAMES = (
-    "\x1b[31mred.toml",
-    "\x1b]0;title\x07",
-    "\udcff.toml",
-    "a\nb.toml",
-    "..toml",
-    "...toml",
-    "-o",
-    "--help",
+    "\x1b[31mred.toml", "\x1b]0;title\x07", "\udcff.toml", "a\nb.toml", "..toml", "...toml", "-o", "--help",
     "x" * 255,
-)
+)  # fmt: skip
 LIBRARY = r"""
 #define _GNU_SOURCE
 #include <dlfcn.h>

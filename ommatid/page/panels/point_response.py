@@ -19,8 +19,7 @@ from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import Model
 from ommatid.scenes.optics.boxes import overlap
 
-from .embedded import ColourScale
-from .maps import Panel, value_words
+from .maps import ColourScale, Panel, value_words
 
 IdealMatrix = Callable[[SubImager], sparse.csr_array]
 

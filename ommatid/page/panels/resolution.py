@@ -13,8 +13,7 @@ from ommatid.analysis.quality.resolution import EdgeResponse, Transfer
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.model import Model
 
-from ..data import Run
-from ..single import ShownSubImage
+from ..data import Run, ShownSubImage
 from .charts import ChartAxis, ChartSeries, chart
 
 LARGEST_SIDE = 1024  # of the part of an image whose spectrum is computed, in pixels

@@ -20,7 +20,7 @@ from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.stack import Stack
 
 from ..data import reduced
-from .embedded import ColourScale, encoded
+from .maps import ColourScale, encoded
 
 LEVELS = 65534  # codes of values on a page
 MISSING = 65535  # code of a pixel without a value

@@ -1,86 +1,58 @@
-"""A Dask cluster as the options of the command line name it, and checks of these options."""
+"""Workers of a running Dask cluster, on this machine or others, as `--scheduler` names it.
+
+Certificates of tls:// are those of Dask's own configuration.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import os
 import ssl
+import sys
+import warnings
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
+from threading import Thread
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from ..errors import InputError
-from ..input_files import read_bytes
+from ..errors import InputError, MachineError
 from ..printable import printable
+from . import workers
+from .workers import LOST, Completed, Workers
 
-LARGEST = 1_000_000  # bytes of a certificate or a key
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
 EXAMPLE = "192.168.1.5:8786"
-TLS_OPTIONS = "--tls-ca", "--tls-cert", "--tls-key"
+TLS_FILES = "distributed.comm.tls: ca-file, client.cert and client.key"
+SILENT = logging.CRITICAL + 1
+_LOGGERS = ("distributed", "distributed.client", "distributed.gc", "tornado", "tornado.application", "asyncio")
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """The scheduler of a cluster, and the PEM files with which a client of tls:// and the scheduler know one another.
-
-    authority : certificate of the authority that signed all certificates of the cluster
-    certificate, key : of this client;  all three None: those of Dask's own configuration
-    """
+    """The address of a scheduler."""
 
     address: str
-    authority: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
 
     def __str__(self) -> str:
         """Name the cluster as messages do."""
         return f"--scheduler {printable(self.address)}"
 
     def check(self) -> None:
-        """Raise InputError if the address is none, or if a file is missing, is no certificate, or fits to no other."""
+        """Raise InputError if the address is none, or if Dask is not installed."""
         if not _is_address(self.address):
             raise InputError(
                 f"--scheduler: expected an address such as tcp://{EXAMPLE}, got '{printable(self.address)}'"
             )
         if find_spec("distributed") is None:
             raise InputError("--scheduler: needs Dask, which is not installed; run: pip install 'ommatid[cluster]'")
-        given = [option for option, path in zip(TLS_OPTIONS, self._files(), strict=True) if path is not None]
-        if not given:
-            return
-        if not self.address.startswith("tls://"):
-            raise InputError(
-                f"{given[0]}: expected --scheduler tls://HOST:PORT with it, got '{printable(self.address)}'"
-            )
-        missing = [option for option in TLS_OPTIONS if option not in given]
-        if missing:
-            raise InputError(f"{missing[0]}: expected all of {', '.join(TLS_OPTIONS)}, got only {', '.join(given)}")
-        self._check_files()
-
-    def _files(self) -> tuple[Path | None, Path | None, Path | None]:
-        return self.authority, self.certificate, self.key
-
-    def _check_files(self) -> None:
-        names = dict(zip(TLS_OPTIONS, self._files(), strict=True))
-        for option, path in names.items():
-            try:
-                read_bytes(path or Path(), LARGEST)
-            except OSError as error:
-                reason = f"cannot be read ({error.strerror})"
-                raise InputError(f"{option}: {printable(path)} {reason}; expected a file in PEM format") from error
-            except InputError as error:
-                raise InputError(f"{option}: {error}") from error
-        context = ssl.create_default_context()
-        try:
-            context.load_verify_locations(str(self.authority))
-        except (ssl.SSLError, ValueError) as error:
-            raise InputError(
-                f"--tls-ca: {printable(self.authority)}: expected a certificate in PEM format, got something else"
-            ) from error
-        try:
-            context.load_cert_chain(str(self.certificate), str(self.key), password=b"")  # else OpenSSL asks for one
-        except (ssl.SSLError, ValueError) as error:
-            raise InputError(
-                f"--tls-cert, --tls-key: {printable(self.certificate, 80)}, {printable(self.key, 80)}: expected a"
-                " certificate and its own key without a password, both in PEM format"
-            ) from error
 
 
 def _is_address(text: str) -> bool:
@@ -89,3 +61,190 @@ def _is_address(text: str) -> bool:
         return parts.scheme in ("tcp", "tls") and bool(parts.hostname and parts.port) and not parts.path
     except ValueError:
         return False
+
+
+@contextmanager
+def cluster_workers(cluster: Cluster) -> Generator[Workers]:
+    """Connect to a cluster. Raises InputError if its scheduler does not answer, or if it has no workers."""
+    with _settings(), _connected(cluster) as client:
+        yield _ClusterWorkers(client, cluster)
+
+
+class _ClusterWorkers(Workers):
+    """Workers whose installations may differ from this one."""
+
+    def __init__(self, client: Any, cluster: Cluster) -> None:
+        super().__init__(client.get_executor(pure=False), self._count_threads)
+        self._client = client
+        self._cluster = cluster
+        self._requirement: _Requirement | None = None
+
+    def _count_threads(self) -> int:
+        try:
+            return sum(_answer(self._client.nthreads, workers.ANSWER).values())
+        except OSError as error:
+            raise MachineError(LOST) from error
+
+    def check_versions(self, facts: Callable[[], dict[str, str]]) -> None:
+        expected = facts()
+        try:
+            answers: dict[str, Any] = _answer(partial(self._client.run, facts, on_error="return"), workers.ANSWER)
+        except TimeoutError as error:
+            raise InputError(
+                f"{self._cluster}: not all workers answered within {workers.ANSWER:g} s; restart those that hang"
+            ) from error
+        for worker, answer in answers.items():
+            if isinstance(answer, Exception):
+                raise InputError(_unusable(self._cluster, worker, answer))
+            _check_same(str(self._cluster), worker, expected, answer)
+        self._requirement = _Requirement(str(self._cluster), facts, expected)
+
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Completed[Result]]:
+        """Apply `function` as `Workers.each`; each task is preceded by the check of its worker."""
+        checked = function if self._requirement is None else partial(self._requirement.execute, function)
+        return super().each(checked, items)
+
+
+@dataclass(frozen=True)
+class _Requirement:
+    """What has to be the same on a worker, also on one that joins the cluster later."""
+
+    cluster: str
+    facts: Callable[[], dict[str, str]]
+    expected: dict[str, str]
+
+    def execute(self, function: Callable[[Item], Result], item: Item) -> Result:
+        """Execute a task on this worker. Raises InputError if the worker differs."""
+        from distributed import get_worker
+
+        _check_same(self.cluster, get_worker().address, self.expected, self.facts())
+        return function(item)
+
+
+def _check_same(cluster: str, worker: str, expected: dict[str, str], facts: dict[str, str]) -> None:
+    """Raise InputError if the facts of a worker are not those expected."""
+    different = [
+        f"{name} {facts.get(name)}, here {value}" for name, value in expected.items() if facts.get(name) != value
+    ]
+    if different:
+        raise InputError(
+            f"{cluster}: results would differ, because the worker {printable(worker)} has"
+            f" {printable('; '.join(different), 120)}; install the same versions on all machines"
+        )
+
+
+def _unusable(cluster: Cluster, worker: str, error: Exception) -> str:
+    return (
+        f"{cluster}: the worker {printable(worker)} cannot work for this program"
+        f" ({printable(f'{type(error).__name__}: {error}', 100)}); install the same version of ommatid there"
+    )
+
+
+def _answer(question: Callable[[], Result], patience: float) -> Result:
+    """Return what a cluster answers. Raises TimeoutError if it does not: Dask itself would wait without end."""
+    answer: Future[Result] = Future()
+
+    def ask() -> None:
+        try:
+            answer.set_result(question())
+        except BaseException as error:  # is raised where the answer is expected
+            answer.set_exception(error)
+
+    Thread(target=ask, daemon=True).start()
+    return answer.result(patience)
+
+
+def scratch_folder() -> str | None:
+    """Return a Dask worker's own folder, which Dask clears even if the worker is killed; elsewhere None."""
+    if "distributed" not in sys.modules:
+        return None
+    from distributed import get_worker
+
+    try:
+        return get_worker().local_directory
+    except ValueError:
+        return None
+
+
+@contextmanager
+def _connected(cluster: Cluster) -> Generator[Any]:
+    """Connect a client to a cluster with at least one worker. Raises InputError."""
+    from distributed import Client
+
+    security = _security(cluster)
+    start = partial(Client, cluster.address, security=security, timeout=workers.PATIENCE, set_as_default=False)
+    try:
+        asyncio.run(_check_scheduler(cluster, security))
+        client: Any = _answer(start, 2 * workers.PATIENCE + 1)
+    except Exception as error:  # another server at this address may answer anything
+        raise InputError(f"{cluster}: {_reason(cluster, error)}") from error
+    with closing(client):
+        try:
+            _answer(partial(client.wait_for_workers, 1, workers.PATIENCE), workers.PATIENCE + 1)
+        except TimeoutError as error:
+            raise InputError(
+                f"{cluster}: the scheduler has no workers; start some with `dask worker {cluster.address}`"
+            ) from error
+        yield client
+
+
+def _security(cluster: Cluster) -> Any:
+    """Return the certificates of Dask's configuration. Raises InputError where they cannot be used, or are none."""
+    from distributed import Security
+
+    security: Any = Security
+    try:
+        configured = security()
+        encrypted = configured.get_connection_args("client").get("ssl_context") is not None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{cluster}: Dask's configuration names files that cannot be used ({error})") from error
+    if cluster.address.startswith("tls://") and not encrypted:
+        raise InputError(f"{cluster}: expected certificates in Dask's configuration ({TLS_FILES}), got none")
+    return configured
+
+
+def _reason(cluster: Cluster, error: BaseException) -> str:
+    """Return why there is no connection, and what to do."""
+    causes: list[BaseException] = []
+    while error not in causes:
+        causes.append(error)
+        error = error.__cause__ or error.__context__ or error
+    if any(isinstance(cause, ssl.SSLCertVerificationError) for cause in causes):
+        return "the certificate of the scheduler was not signed by the authority of Dask's configuration (ca-file)"
+    if cluster.address.startswith("tls://"):
+        return "no encrypted scheduler answers there that accepts the certificate; check both, and Dask's configuration"
+    return "no scheduler answers there; start one with `dask scheduler`, or correct the address"
+
+
+async def _check_scheduler(cluster: Cluster, security: Any) -> None:
+    """Return if a Dask scheduler answers; at another server's address the client itself would wait forever."""
+    from distributed.comm.core import connect  # pyright: ignore[reportUnknownVariableType]
+
+    options = security.get_connection_args("client")
+    connecting: Any = connect(cluster.address, timeout=workers.PATIENCE, **options)  # pyright: ignore[reportUnknownVariableType]
+    comm: Any = await asyncio.wait_for(connecting, workers.PATIENCE + 1)
+    await comm.close()
+
+
+@contextmanager
+def _settings() -> Generator[None]:
+    """Silence Dask's logs and warnings, since errors are reported by exceptions; restore everything afterwards."""
+    from dask import config
+
+    environment = dict(os.environ)  # Dask adds variables for its workers
+    no_warning = {"distributed.admin.large-graph-warning-threshold": "1 PiB"}  # tasks are sent with all their data
+    with config.set(no_warning), warnings.catch_warnings():
+        from distributed.versions import VersionMismatchWarning
+
+        warnings.simplefilter("ignore", VersionMismatchWarning)
+        loggers = [logging.getLogger(name) for name in _LOGGERS]
+        levels = [logger.level for logger in loggers]
+        for logger in loggers:
+            logger.setLevel(SILENT)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+            for name in os.environ.keys() - environment.keys():
+                del os.environ[name]

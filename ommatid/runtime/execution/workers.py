@@ -6,6 +6,8 @@ worker executes a task, nor on how many workers fail meanwhile.
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from contextlib import closing, contextmanager
@@ -15,7 +17,6 @@ from time import monotonic
 from typing import Any, Generic, TypeVar
 
 from ..errors import InputError, MachineError
-from ..interrupts import interrupts_remembered
 from ..printable import printable
 from ..progress import Progress
 
@@ -126,3 +127,33 @@ def _first_completed(pending: Iterable[Future[Result]], check_interrupt: Callabl
         check_interrupt()
         if ended or monotonic() >= until:
             return ended
+
+
+@contextmanager
+def interrupts_remembered() -> Generator[Callable[[], None]]:
+    """Yield a function that raises KeyboardInterrupt if Ctrl-C was pressed inside, even if the exception was dropped.
+
+    Python raises it in whatever code the main thread is running. In a callback of the garbage collector or in a
+    `__del__` method it is printed and dropped, and the command would continue.
+    Signals reach the main thread only; in other threads the function does nothing.
+    """
+    previous = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(previous):
+        yield lambda: None
+        return
+    interrupted = False
+
+    def remember(number: int, frame: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        previous(number, frame)  # type: ignore[arg-type]
+
+    def check() -> None:
+        if interrupted:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,4 +1,4 @@
-"""Kinds of places: results are written to regular files in folders, never to devices, FIFOs or sockets.
+"""Places of results: regular files in folders, never devices, FIFOs or sockets, and names that every system allows.
 
 A symbolic link in place of a result is replaced by the result, and what it points to stays as it is.
 """
@@ -6,6 +6,7 @@ A symbolic link in place of a result is replaced by the result, and what it poin
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import stat
 from pathlib import Path
@@ -18,6 +19,7 @@ from ..printable import printable
 SUFFIXES = frozenset(
     (".exr", ".npz", ".npy", ".png", ".svg", ".pdf", ".tiff", ".json", ".jsonl", ".csv", ".md", ".html", ".toml")
 )
+LONGEST = 200  # bytes of a name: 255, less what is added to the names of temporary files
 SHORT = 110  # characters of each of two paths in one sentence
 _SYSTEM = Path("/dev"), Path("/proc"), Path("/sys")
 _KINDS = {
@@ -87,6 +89,29 @@ def input_error(path: Path, error: OSError) -> InputError | None:
     return None
 
 
+def check_name(name: str, source: object) -> None:
+    """Raise InputError unless a name serves for a folder or a file of results.
+
+    Dots alone name the folder above, and names that begin with a dot are those of hidden files.
+
+    source : what has the name, for the message
+    """
+    wrong = _wrong(name)
+    if wrong:
+        raise InputError(
+            f"{printable(source)}: its results are named after it, and its name {wrong}; rename it, such as to scene1"
+        )
+
+
+def shortened_name(name: str) -> str:
+    """Return a name of at most LONGEST bytes: that of a longer one is cut, and ends with its hash."""
+    encoded = name.encode(errors="surrogateescape")
+    if len(encoded) <= LONGEST:
+        return name
+    ending = f"~{hashlib.sha256(encoded).hexdigest()[:12]}"
+    return encoded[: LONGEST - len(ending)].decode(errors="ignore") + ending
+
+
 def _mode(path: Path) -> int | None:
     """Return the mode of what a path names, links followed; None if there is nothing. Raises InputError or OSError."""
     if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # libraries cannot open such names
@@ -107,3 +132,17 @@ def _check_place(path: Path, folder: Path) -> None:
 
 def _kind(mode: int) -> str:
     return _KINDS.get(stat.S_IFMT(mode), "something else")
+
+
+def _wrong(name: str) -> str:
+    try:
+        size = len(name.encode())
+    except UnicodeEncodeError:
+        return "is not UTF-8"
+    if not name or name.startswith("."):
+        return "is empty or begins with a dot"
+    if size > LONGEST:
+        return f"has {size} bytes, more than {LONGEST}"
+    if any(letter in "/\\" or not letter.isprintable() for letter in name):
+        return "holds characters that do not print, or separators of folders"
+    return ""

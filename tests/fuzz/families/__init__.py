@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import ceil
 
-from ..command_family import CommandFamily
-from ..file_type import FileType
+from ..family import CommandFamily, FileType
 from ..file_types import FILE_TYPES
 from .archives import ARCHIVES
 from .documents import DOCUMENTS

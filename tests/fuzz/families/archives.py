@@ -16,7 +16,7 @@ from ommatid.scenes import model_file
 
 from .. import file_types
 from ..damage import damaged
-from ..file_type import FileType
+from ..family import FileType
 
 LARGE = 300_000_000  # bytes of zeros, deflated to a thousandth
 

@@ -1,4 +1,4 @@
-"""Files that a command finds in a folder of results: reports, tables, plans of jobs, pages and interrupted work."""
+"""Files that a command finds in a folder of results: reports, tables, pages and interrupted work."""
 
 from __future__ import annotations
 
@@ -17,32 +17,21 @@ from ommatid.scenes.scene import read
 
 from ...bench.tables import bench_table, cell
 from .. import mutations
-from ..command_family import CommandCase, CommandFamily
 from ..damage import damaged
-from ..file_type import RUN, SCENE
+from ..family import RUN, SCENE, CommandCase, CommandFamily
 from ..formats import npz_damaged
-from ..verdicts import run_command
 
 PARTIAL = f"{RUN}/.stack.exr.partial.npz"  # an interrupted rendering
-PLAN = "out/.jobs/1.plan.json"
-JOB_1 = ("render", SCENE, "-o", "out", "--job", "1/1")
 TEXTS = (
-    "\x1b[31mred\x1b[0m",
-    "\x1b]0;title\x07",
-    "\u202eleft",
-    "\x9b2J",
-    "a\x00b",
-    "\ud800",
-    "x" * 100000,
-    "=1+1",
+    "\x1b[31mred\x1b[0m", "\x1b]0;title\x07", "\u202eleft", "\x9b2J", "a\x00b", "\ud800", "x" * 100000, "=1+1",
     "<script>",
-)
+)  # fmt: skip
 NESTED = ("[", '{"a":', "[[],")
 NUMBERS = ("1" + "0" * 5000, "-" + "9" * 5000, "1e400", "-1e400", "NaN", "Infinity", "1e-400", "0.1" * 2)
 
 
 def add_documents(folder: Path) -> None:
-    """Add a sweep, a bench and the plan of two jobs to the results in a folder."""
+    """Add a sweep, a bench and a study to the results in a folder."""
     report = json.loads((folder / RUN / "run.json").read_bytes())
     row = SweepRow(scene=SCENE, folder=Path(RUN).name, values={"noise.variance": "1e-2"}, mse=1.0, predicted_mse=2.0)
     write_rows(folder / "out/sweep.json", [row, row.model_copy(update={"mse": report["error"].get("mse")})])
@@ -121,8 +110,6 @@ def beside(
 
     def case(rng: Random, folder: Path) -> CommandCase:
         path = folder / file
-        if file == PLAN:
-            run_command(JOB_1)
         original = path.read_bytes() if path.exists() else b""
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(damage(rng, original))
@@ -146,7 +133,6 @@ DOCUMENTS = (
     beside(
         "study.json", f"{RUN}/study.json", json_damaged, (*AGAIN, "--set", 'study.models=["ideal"]', "-q"), share=0.2
     ),
-    beside("plan of jobs", PLAN, json_damaged, JOB_1, share=0.2),
     beside("report.html", f"{RUN}/report.html", text_damaged, REPORT, share=0.2),
     beside("scene.toml", f"{RUN}/scene.toml", text_damaged, REPORT, AGAIN, share=0.2),
     beside("interrupted rendering", PARTIAL, archive_damaged, ("render", SCENE, "-o", "out", "--force"), share=0.2),

@@ -7,58 +7,15 @@ import shutil
 from pathlib import Path
 from random import Random
 
-from ..command_family import CommandCase, CommandFamily
-from ..file_type import SCENE
+from ..family import SCENE, CommandCase, CommandFamily
 
 STEMS = (
-    *(
-        ".",
-        "..",
-        "...",
-        " ",
-        "  .",
-        "-",
-        "--help",
-        "-o",
-        "a b",
-        "a\tb",
-        "a\nb",
-        "\r",
-        "\x1b[31mred\x1b[0m",
-        "\x1b]0;x\x07",
-    ),
-    *(
-        "\u202egnp",
-        "\u200b",
-        "é",
-        "e\u0301",
-        "😀",
-        "日本語",
-        "\udcff\udcfe",
-        "\udcc3(",
-        "x" * 250,
-        "é" * 124,
-        "x" * 195,
-        "x" * 201,
-    ),
-    *("~", "$HOME", "$(touch pwned)", "`touch pwned`", ";touch pwned", "%s%n", "{0}", "[red]", "*", "?", "con", "nul"),
-    *(
-        "<script>",
-        "\"'&",
-        "=cmd",
-        "@x",
-        "run",
-        "index",
-        "new",
-        "sweep",
-        ".jobs",
-        ".hidden",
-        "a.part.b",
-        "C:x",
-        "a:b",
-        "a\\b",
-    ),
-)
+    ".", "..", "...", " ", "  .", "-", "--help", "-o", "a b", "a\tb", "a\nb", "\r", "\x1b[31mred\x1b[0m",
+    "\x1b]0;x\x07", "\u202egnp", "\u200b", "é", "e\u0301", "😀", "日本語", "\udcff\udcfe", "\udcc3(", "x" * 250,
+    "é" * 124, "x" * 195, "x" * 201, "~", "$HOME", "$(touch pwned)", "`touch pwned`", ";touch pwned", "%s%n", "{0}",
+    "[red]", "*", "?", "con", "nul", "<script>", "\"'&", "=cmd", "@x", "run", "index", "new", "sweep", ".jobs",
+    ".hidden", "a.part.b", "C:x", "a:b", "a\\b",
+)  # fmt: skip
 SCENE_COMMANDS = (
     *(
         ("show", "{}"),

@@ -9,8 +9,7 @@ from random import Random
 from typing import Any
 
 from .. import mutations
-from ..command_family import CommandCase, CommandFamily
-from ..file_type import RUN, SCENE
+from ..family import RUN, SCENE, CommandCase, CommandFamily
 
 HARMLESS: dict[str, tuple[str, ...]] = {
     "show": (SCENE,),
@@ -37,29 +36,13 @@ NUMBERS = (
     *("٣", "½", "+1", " 1", "1 ", "1e", "", "--", "-", "x", "1,1", "1;1"),
 )
 TEXTS = (
-    *(
-        "",
-        " ",
-        ",",
-        ",,,,",
-        "a,",
-        "=",
-        "x" * 300,
-        "x" * 100000,
-        "\x1b[31mred",
-        "\x9b2J",
-        "\u202eabc",
-        "é",
-        "\udcff",
-        "😀",
-        "%s",
-    ),
-    *("0,0", "-1,-1", "1,1,1,1", "0,0,999,999", "99999999999999999999,0", "1e9,1", "0,0,-1,-1", "nan,nan"),
-    *("1/2,1/3,...,1/1000000000", "1/0", "1/2,...,1/3", "...", "1/" + "9" * 5000, "0/1", "1/1e9"),
-    *("1/2", "0/0", "1/0", "9/1", "/1", "auto", "1/99999999999999999999", "2/1" + "0" * 5000),
-    *("svg,pdf,exe", "npy,npy", "tiff64", "1 s", "-1 s", "0 s", "1e999 s", "1e30 years", "1 parsec", "I", "I,I", "II"),
-    *("x", "tcp://", "tcp://x y:1", "file:///etc/passwd", "http://", "tcp://localhost:99999999"),
-)
+    "", " ", ",", ",,,,", "a,", "=", "x" * 300, "x" * 100000, "\x1b[31mred", "\x9b2J", "\u202eabc", "é", "\udcff",
+    "😀", "%s", "0,0", "-1,-1", "1,1,1,1", "0,0,999,999", "99999999999999999999,0", "1e9,1", "0,0,-1,-1", "nan,nan",
+    "1/2,1/3,...,1/1000000000", "1/0", "1/2,...,1/3", "...", "1/" + "9" * 5000, "0/1", "1/1e9", "1/2", "0/0", "1/0",
+    "9/1", "/1", "auto", "1/99999999999999999999", "2/1" + "0" * 5000, "svg,pdf,exe", "npy,npy", "tiff64", "1 s",
+    "-1 s", "0 s", "1e999 s", "1e30 years", "1 parsec", "I", "I,I", "II", "x", "tcp://", "tcp://x y:1",
+    "file:///etc/passwd", "http://", "tcp://localhost:99999999",
+)  # fmt: skip
 FILES = (
     "",
     " ",
@@ -84,17 +67,8 @@ SWEEPS = (
     *("noise.variance=" + ",".join(map(str, range(100))), "render.samples=1,2,...,1e9", "title=.,.."),
 )
 NOT_A_SCENE = (
-    "nope.toml",
-    "sound.exr",
-    "out",
-    "",
-    "\udcff.toml",
-    "x" * 300,
-    "/",
-    "..toml",
-    "photo:camera",
-    "\x1b[31m.toml",
-)
+    "nope.toml", "sound.exr", "out", "", "\udcff.toml", "x" * 300, "/", "..toml", "photo:camera", "\x1b[31m.toml",
+)  # fmt: skip
 
 
 @cache
@@ -123,8 +97,7 @@ def option_case(rng: Random, folder: Path) -> CommandCase:
         if not option.is_flag:
             words.append(_value(rng, option))
     named = _outputs(["-o", *words[1:2], *words]) if name == "init" else _outputs(words)
-    recorded = named if "--job" in words else ()  # the record of a share that failed
-    return CommandCase(tuple(words), outputs=named, finished=recorded)
+    return CommandCase(tuple(words), outputs=named)
 
 
 def _outputs(words: list[str]) -> tuple[str, ...]:

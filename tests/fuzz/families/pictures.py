@@ -23,7 +23,7 @@ from ommatid.scenes.formats import picture
 from ommatid.scenes.hardware import frames
 
 from ..damage import damaged, damaged_near
-from ..file_type import SCENE, FileType
+from ..family import SCENE, FileType
 
 LUMINANCE = np.array((0.2125, 0.7154, 0.0721))  # docs/pictures.md
 CLOSE = 2e-3  # of 255: half a step of 16 bits

@@ -12,8 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
-from ..command_family import CommandCase, CommandFamily
-from ..file_type import RUN, SCENE
+from ..family import RUN, SCENE, CommandCase, CommandFamily
 
 SLOW = ("paper", "bench", "stability")
 LARGE = 10 << 30  # bytes of a sparse file
@@ -55,19 +54,12 @@ FOUND = {  # what a command finds in its folder of results
     **{
         f"{RUN}/{name}": (("report", RUN), ("report", "out"), ("run", SCENE, "-o", "out"))
         for name in (
-            "run.json",
-            "report.html",
-            "bench.json",
-            "scene.toml",
-            "stack.exr",
-            "model.npz",
-            "truth.exr",
-            "estimate.exr",
+            *("run.json", "report.html", "bench.json", "scene.toml"),
+            *("stack.exr", "model.npz", "truth.exr", "estimate.exr"),
         )
     },
     "out/sweep.json": (("report", "out"),),
     "out/index.html": (("report", "out"), ("run", SCENE, "-o", "out")),
-    "out/.jobs": (("render", SCENE, "-o", "out", "--job", "1/2"),),
     f"{RUN}/.stack.exr.partial.npz": (("render", SCENE, "-o", "out", "--force"),),
 }
 OUTPUTS = {
@@ -97,20 +89,17 @@ def fifo(path: Path) -> None:
     os.mkfifo(path)
 
 
-def device(path: Path) -> None:
+def device(path: Path, number: int = 5) -> None:
     """Make a node of /dev/zero, or where that is not allowed a FIFO."""
     try:
-        os.mknod(path, 0o666 | stat.S_IFCHR, os.makedev(1, 5))
+        os.mknod(path, 0o666 | stat.S_IFCHR, os.makedev(1, number))
     except PermissionError:
         os.mkfifo(path)
 
 
 def null_device(path: Path) -> None:
     """Make a node of /dev/null, or where that is not allowed a FIFO."""
-    try:
-        os.mknod(path, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
-    except PermissionError:
-        os.mkfifo(path)
+    device(path, 3)
 
 
 def socket_file(path: Path) -> None:

@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 from random import Random
 
-from ..command_family import CommandCase, CommandFamily
-from ..file_type import SCENE
+from ..family import SCENE, CommandCase, CommandFamily
 
 PARTS = (
     *(

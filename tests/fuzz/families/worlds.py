@@ -9,9 +9,8 @@ from random import Random
 
 import numpy as np
 
-from ..command_family import CommandCase, CommandFamily
 from ..damage import damaged
-from ..file_type import SCENE, FileType, fingerprint
+from ..family import SCENE, CommandCase, CommandFamily, FileType, fingerprint
 
 HEAD = '<scene version="3.0.0">'
 LIGHT = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
@@ -19,65 +18,18 @@ WHERE = '<transform name="to_world"><translate z="1000"/></transform>'
 BLOCK = f'<shape type="cube">{WHERE}<bsdf type="diffuse"/></shape>'
 PLAIN = f"{HEAD}{LIGHT}{BLOCK}</scene>"
 OUTSIDE = (
-    *(
-        "/etc/passwd",
-        "../../etc/passwd",
-        "/dev/zero",
-        "/dev/stdin",
-        "/proc/self/mem",
-        "~/x",
-        "file:///etc/passwd",
-        "",
-        ".",
-    ),
-    *("nope.png", "x\x1b[31m.png", "é" * 300, "a" * 5000, "world.xml", "mesh.ply", "tiny.toml", "sound.exr", "lenses"),
-)
+    "/etc/passwd", "../../etc/passwd", "/dev/zero", "/dev/stdin", "/proc/self/mem", "~/x", "file:///etc/passwd", "",
+    ".", "nope.png", "x\x1b[31m.png", "é" * 300, "a" * 5000, "world.xml", "mesh.ply", "tiny.toml", "sound.exr",
+    "lenses",
+)  # fmt: skip
 PLUGINS = (
-    *(
-        "../x/evil",
-        "./evil",
-        "/elsewhere/evil",
-        "evil",
-        "plugins/evil",
-        "evil.so",
-        "",
-        "CUBE",
-        "cube\0",
-        "sphere ",
-        "ommatid_camera",
-    ),
-    *(
-        "path",
-        "aov",
-        "moment",
-        "ptracer",
-        "prb",
-        "stokes",
-        "volpath",
-        "depth",
-        "direct",
-        "perspective",
-        "hdrfilm",
-        "merge",
-    ),
-)
+    "../x/evil", "./evil", "/elsewhere/evil", "evil", "plugins/evil", "evil.so", "", "CUBE", "cube\0", "sphere ",
+    "ommatid_camera", "path", "aov", "moment", "ptracer", "prb", "stokes", "volpath", "depth", "direct",
+    "perspective", "hdrfilm", "merge",
+)  # fmt: skip
 NUMBERS = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "-1",
-    "0",
-    "1e308",
-    "1e-320",
-    "x",
-    "",
-    "1 2 3",
-    "9" * 5000,
-    "-0.0",
-    "0x10",
-    "1e38",
-)
+    "nan", "inf", "-inf", "1e400", "-1", "0", "1e308", "1e-320", "x", "", "1 2 3", "9" * 5000, "-0.0", "0x10", "1e38",
+)  # fmt: skip
 LAUGHS = (
     "<!DOCTYPE x [<!ENTITY a 'aaaaaaaaaa'>"
     + "".join(f"<!ENTITY {chr(98 + index)} '{('&' + chr(97 + index) + ';') * 10}'>" for index in range(9))

@@ -1,4 +1,4 @@
-"""A type of file that is read: its valid originals, how these are damaged, and what is read from them."""
+"""Families of hostile inputs: a type of file that is read, with its valid originals and their damage; command lines."""
 
 from __future__ import annotations
 
@@ -48,6 +48,38 @@ class FileType:
         rng = Random(f"{self.name} {seed} {number}")
         index = rng.randrange(len(originals))
         return index, self.damaged(rng, originals[index])
+
+
+@dataclass(frozen=True)
+class CommandCase:
+    """A command line, run in the folder of the campaign.
+
+    refused : True if it must be refused, False if it must work, None if either is right
+    outputs : beginnings of the names of files that it may write if it is not refused
+    finished : beginnings of the names of files that may have changed before it is refused: what is finished stays
+    kept : name of a file that is not to be replaced by a command that is refused
+    """
+
+    words: tuple[str, ...]
+    refused: bool | None = None
+    outputs: tuple[str, ...] = ("new",)
+    finished: tuple[str, ...] = ()
+    kept: str = ""
+
+
+@dataclass(frozen=True)
+class CommandFamily:
+    """Hostile command lines.
+
+    case : makes one, and the files that it needs in a folder
+    harmless : command lines that work and import what the hostile ones need
+    share : number of inputs relative to other families
+    """
+
+    name: str
+    case: Callable[[Random, Path], CommandCase]
+    harmless: tuple[tuple[str, ...], ...] = ()
+    share: float = 1.0
 
 
 def fingerprint(*parts: Any) -> str:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import exp, inf, log
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ommatid.analysis.pareto import pareto_front
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.shrinkage import shrink_variances
 
@@ -190,3 +189,18 @@ def _more_samples(cells: Sequence[Cell], cell: Cell, floor: float) -> str:
     rate = log(last[0][1] / last[1][1]) / log(last[1][0] / last[0][0])
     samples = cell.samples * exp(log(present / share) / (2 * rate))
     return f"{cell.stage}, {cell.way}, would need about {float(f'{samples:.1g}'):.0f} samples"
+
+
+Item = TypeVar("Item")
+
+
+def pareto_front(items: Iterable[Item], cost: Callable[[Item], float], error: Callable[[Item], float]) -> list[Item]:
+    """Return the items than which no other has both less cost and less error, the cheapest first.
+
+    Of equal items the first one stays.
+    """
+    front: list[Item] = []
+    for item in sorted(items, key=lambda item: (cost(item), error(item))):
+        if not front or error(item) < error(front[-1]):
+            front.append(item)
+    return front

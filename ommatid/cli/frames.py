@@ -77,7 +77,7 @@ class DescribedFrame:
 
 def _print(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
     from ommatid.analysis import run_table
-    from ommatid.pipeline.summary_lines import verdict_line
+    from ommatid.pipeline.sections import verdict_line
 
     if detail is None:
         output.print_json([frame.document for frame in frames])

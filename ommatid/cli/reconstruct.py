@@ -164,12 +164,12 @@ def check(
 
     Names those that disagree: their H is wrong, or their pixels. Needs no truth.
     """
-    from ommatid.analysis.held_out import table
-    from ommatid.pipeline.held_out import check_files
+    from ommatid.analysis import held_out
+    from ommatid.pipeline.reconstruction import ReconstructionRequest, check_held_out_files
 
-    asked = options.changes(sets), options.lens_names(lens)
+    request = ReconstructionRequest(stack, model, options.changes(sets), options.lens_names(lens))
     with output.progress_bar("check") as progress:
-        report = check_files(stack, model, *asked, fitted=not scene_prior, progress=progress)
-    output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", table.rows(report))], as_json)
+        report = check_held_out_files(request, fitted=not scene_prior, progress=progress)
+    output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", held_out.rows(report))], as_json)
     if strict and report.verdict.trusted is False:
         raise failures.BatchError(failures.NOT_TRUSTED)

@@ -27,8 +27,7 @@ from ommatid.scenes.tables import toml
 from ommatid.scenes.tables.units import duration
 
 from . import stages
-from .bench_curves import bench_error_curves
-from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, error_curve
+from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, bench_error_curves, error_curve
 
 FEW, MORE = 256, 1024  # samples per pixel of the two measuring runs
 MOST = 2**20  # samples per pixel of either stage

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ommatid.analysis.pareto import pareto_front
+from ommatid.bench.slopes import pareto_front
 
 
 @given(st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-9, 1e6)), max_size=12))

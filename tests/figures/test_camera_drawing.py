@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ommatid.figures.camera_drawing import camera_drawing
-from ommatid.figures.lengths import length_words
 from ommatid.figures.saving import FigureFiles, figure_formats, save_figure, svg_text
+from ommatid.figures.sensor_drawing import length_words
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import read

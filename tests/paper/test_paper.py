@@ -13,10 +13,8 @@ import pytest
 from scipy import stats
 
 from ommatid.paper import claims, paper
-from ommatid.paper.claims import NO, QUALIFIED, YES
-from ommatid.paper.photograph_claims import photograph_claims
+from ommatid.paper.claims import NO, QUALIFIED, YES, photograph_claims, tile_claims
 from ommatid.paper.photographs import Photograph, TileCrops, crop_tiles, load, measure, seeds, simulate_trials
-from ommatid.paper.tile_claims import tile_claims
 from ommatid.paper.tile_errors import THREE, TWICE, TWO, PaperTile, TileError, Tiles, tile, tiles
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError

@@ -15,8 +15,14 @@ from hypothesis import strategies as st
 
 from ommatid.batch.remote import RunObserver
 from ommatid.bench import table
-from ommatid.pipeline.bench_curves import bench_error_curves
-from ommatid.pipeline.time_allocation import NEGLIGIBLE, STEPS, ErrorCurve, allocate_time, error_curve
+from ommatid.pipeline.time_allocation import (
+    NEGLIGIBLE,
+    STEPS,
+    ErrorCurve,
+    allocate_time,
+    bench_error_curves,
+    error_curve,
+)
 from ommatid.pipeline.time_budget import FEW, KEYS, MORE, run_within, shared_time
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.output.time_spent import time_spent

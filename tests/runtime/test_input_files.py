@@ -24,7 +24,7 @@ OWN = {
     "ommatid.runtime.outputs.occupied": "lock files, which it makes",
     "ommatid.page.document": "templates of the installation",
     "ommatid.page.cached": "modules and templates of the installation",
-    "ommatid.pipeline.calibration": "a temporary file, which it writes",
+    "ommatid.pipeline.camera_files": "a temporary file, which it writes",
     "ommatid.batch.jobs.job_files": "a file that it creates",
     "ommatid.batch.frames": "a file that it wrote into a folder of its own",
     "ommatid.batch.remote": "results that it wrote",

@@ -76,7 +76,6 @@ REFUSED: dict[str, tuple[Callable[[Path], None], str]] = {
     "index that is a FIFO": (fifo("out/index.html"), "run tiny.toml -o out"),
     "sweep that is a FIFO": (fifo("out/sweep.json"), "run tiny.toml -o out"),
     "plan of jobs that is a FIFO": (fifo("out/.jobs/1.plan.json"), "run tiny.toml -o out --job 1/2"),
-    "journal that is a FIFO": (fifo("new/.bench.partial.jsonl"), "bench tiny.toml -o new"),
     "plan beside a FIFO": (fifo("out/tiny/run.json"), "run tiny.toml -o out --dry-run"),
     "model that is a FIFO": (fifo("model.npz"), "calibrate tiny.toml -o model.npz"),
     "drawing that is a FIFO": (fifo("camera.png"), "show tiny.toml --figure camera.png"),

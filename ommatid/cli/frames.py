@@ -13,27 +13,13 @@ from ommatid.runtime.printable import printable_sentence
 from . import failures, output
 
 if TYPE_CHECKING:
-    from ommatid.batch.frames import Frame
-    from ommatid.reconstruct.output.estimate_formats import Format
-    from ommatid.reconstruct.output.result_files import Region
+    from ommatid.batch.frames import Frame, FrameOptions
     from ommatid.reconstruct.output.run_json import RunReport
 
 
-@dataclass(frozen=True)
-class FrameRequest:
-    """Stacks and their model, with the options that they share."""
-
-    stacks: Sequence[Path]
-    model: Path
-    changes: tuple[str, ...]
-    lenses: tuple[str, ...]
-    regions: tuple[Region, ...]
-    formats: tuple[Format, ...]
-    force: bool
-
-
 def reconstruct(
-    request: FrameRequest,
+    stacks: Sequence[Path],
+    shared: FrameOptions,
     folder: Path,
     scheduler: str,
     workers: int | None,
@@ -45,19 +31,15 @@ def reconstruct(
     Raises InputError before anything is written if a stack is not of the model's camera, and BatchError at the end if a
     frame failed or, if `strict`, if one is not to be trusted.
     """
-    from ommatid.batch.frames import FrameOptions, reconstruct_frames
+    from ommatid.batch.frames import reconstruct_frames
 
-    stacks, model = request.stacks, request.model
     if not stacks:
-        raise InputError(f"{model}: expected stacks and then their model, got one file; name a stack before it")
+        raise InputError(f"{shared.model}: expected stacks and then their model, got one file; name a stack before it")
     if scheduler:
         raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
     described: dict[Path, DescribedFrame] = {}
     with output.progress_bar("reconstruct") as progress:
-        asked = FrameOptions(
-            model, request.changes, request.lenses, request.regions, request.formats, force=request.force
-        )
-        for frame, work in reconstruct_frames(stacks, folder, asked, workers, progress):
+        for frame, work in reconstruct_frames(stacks, folder, shared, workers, progress):
             described[frame.stack] = _described(frame, work, strict, quiet=detail == "verdict")
     _print(folder, [described[stack] for stack in stacks], detail)
     worst = max(frame.code for frame in described.values())

@@ -92,6 +92,7 @@ def reconstruct(
     as_json: Json = False,
 ) -> None:
     """Reconstruct from files: one frame, or several of one camera."""
+    from ommatid.batch.frames import FrameOptions
     from ommatid.pipeline import reconstruction
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
@@ -99,8 +100,8 @@ def reconstruct(
     *stacks, model = files
     asked = options.changes(sets), options.lens_names(lens), options.regions(region)
     if len(stacks) != 1:
-        request = frames.FrameRequest(stacks, model, *asked, others, force)
-        frames.reconstruct(request, file, scheduler, workers, strict, None if as_json else detail)
+        shared = FrameOptions(model, *asked, others, force)
+        frames.reconstruct(stacks, shared, file, scheduler, workers, strict, None if as_json else detail)
         return
     request = reconstruction.ReconstructionRequest(stacks[0], model, *asked, force)
     pool = options.cluster(scheduler, tls_ca, tls_cert, tls_key), workers

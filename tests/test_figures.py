@@ -37,7 +37,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("README.md", "Two commands"): "the version of Python",
     ("docs/install.md", "Install"): "the version of Python",
     ("docs/speed.md", None): "times and ratios of `make bench`",
-    ("docs/batches.md", "Many frames of one camera"): "ratios of times, `python -m tests.benchmarks film`",
+    ("docs/batches.md", "Many frames of one camera"): "ratios of times, measured once",
     ("docs/frames.md", "Time and memory"): "times and memory, `python -m tests.benchmarks frames`",
     ("docs/frames.md", "Whole frames"): "defaults and limits of the program",
     ("docs/frames.md", "Error bars"): "experiments against exact solutions, which no command prints",

@@ -1,10 +1,9 @@
 """Benchmarks of rendering and estimation against other methods: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `frames`, and `film`, which takes ten
-minutes. No speed is asserted, and other load slows both sides of a ratio alike, so compare ratios rather than times.
-Run by themselves: `chain`, the time, memory and files of every stage of a run from 239 x 239 pixels on, and the
-campaigns, which continue where they were interrupted: `nasty`, half an hour, and `coverage`, which measures error bars
-for hours (`coverage --help`).
+`python -m tests.benchmarks frames` runs one part; the parts are `rendering` and `frames`. No speed is asserted, and
+other load slows both sides of a ratio alike, so compare ratios rather than times. Run by themselves: `chain`, the time,
+memory and files of every stage of a run from 239 x 239 pixels on, and the campaigns, which continue where they were
+interrupted: `nasty`, half an hour, and `coverage`, which measures error bars for hours (`coverage --help`).
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from .alternation import VARIANTS, Row
 from .camera import SAMPLES, camera_rows
 from .chain import command as chain
 from .coverage.command import command as coverage
-from .film import film_table
 from .frames import frames_table
 from .nasty import command as nasty
 
@@ -80,14 +78,9 @@ def _frames() -> Iterator[Table]:
     yield frames_table()
 
 
-def _film() -> Iterator[Table]:
-    yield film_table()
-
-
 PARTS: dict[str, Callable[[], Iterator[Table]]] = {
     "rendering": _rendering,
     "frames": _frames,
-    "film": _film,
 }
 ALONE: dict[str, Callable[[list[str]], None]] = {"chain": chain, "coverage": coverage, "nasty": nasty}
 

@@ -20,6 +20,7 @@ from ommatid.pipeline import stages
 from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.held_out_report import HeldOutReport
 from ommatid.reconstruct.prediction import Prediction
+from ommatid.result import Reconstructor
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError, MachineError, naming_source
 from ommatid.runtime.outputs.occupied import occupied
@@ -33,7 +34,6 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 
 from . import notebook
-from .reconstructor import Reconstructor
 from .result import Result, check_type, flat_truth, result_of
 
 __all__ = ["InputError", "MachineError", "Model", "Reconstructor", "Result", "Scene", "Stack"]

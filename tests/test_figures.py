@@ -27,7 +27,7 @@ from .benchmarks import f_numbers
 from .conftest import Command, shell
 from .documentation import DOCS, PAGES, Block, blocks, page_name, text_of
 from .examples import GALLERY
-from .printed_figures import check_figures, is_printed, rounds_to, stated_figures, unchecked_decimals
+from .printed_figures import check_figures, is_printed, stated_figures, unchecked_decimals
 
 STARTER = str(GALLERY / "starter.toml")
 needs_fast_backend = pytest.mark.skipif(bool(unusable_reason("llvm_ad_mono")), reason="needs the fast backend")
@@ -37,7 +37,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("README.md", "Two commands"): "the version of Python",
     ("docs/install.md", "Install"): "the version of Python",
     ("docs/speed.md", None): "times and ratios of `make bench`",
-    ("docs/batches.md", "Many frames of one camera"): "ratios of times, `python -m tests.benchmarks film`",
+    ("docs/batches.md", "Many frames of one camera"): "ratios of times, measured once",
     ("docs/frames.md", "Time and memory"): "times and memory, `python -m tests.benchmarks frames`",
     ("docs/frames.md", "Whole frames"): "defaults and limits of the program",
     ("docs/frames.md", "Error bars"): "experiments against exact solutions, which no command prints",
@@ -130,14 +130,13 @@ def test_a_camera_of_small_pixels(tmp_path: Path) -> None:
     assert ommatid.predict(scene, rays=False).null_space == 0
 
 
-@pytest.mark.parametrize(("lens", "count"), [("I", 0), ("II", 1), ("III", 2)])
-def test_electrons_of_white_pixels(lens: str, count: int) -> None:
+def test_electrons_of_white_pixels() -> None:
     scene = ommatid.read_scene("sensor")
     camera = derive(scene)
     types = np.concatenate([np.full(np.prod(sub.type.pixels), sub.type.name) for sub in camera.sub_imagers])
-    collected = 255 * electrons(scene, camera)[types == lens].mean()
+    collected = [255 * electrons(scene, camera)[types == lens].mean() for lens in ("I", "II", "III")]
     sentence = "a white pixel collects {} electrons behind lens type I, {} behind II and {} behind III"
-    assert rounds_to(collected, stated_figures("noise.md", sentence)[count])
+    check_figures("noise.md", sentence, *collected)
 
 
 def test_light_that_surfaces_reflect() -> None:
@@ -371,43 +370,32 @@ def test_outputs_in_a_page_are_those_of_its_commands(page: Path, tmp_path: Path)
             )
 
 
-@pytest.mark.parametrize("page", PAGES, ids=page_name)
-def test_every_output_follows_its_command(page: Path) -> None:
-    everything = blocks(page)
-    for block in outputs(page):
-        before = [other.language for other in everything[: everything.index(block)] if other.language != "text"]
-        assert before[-1:] == ["sh"], f"{page.name}: which command prints this?\n{block.text}"
+def test_every_output_follows_its_command() -> None:
+    for page in PAGES:
+        everything = blocks(page)
+        for block in outputs(page):
+            before = [other.language for other in everything[: everything.index(block)] if other.language != "text"]
+            assert before[-1:] == ["sh"], f"{page.name}: which command prints this?\n{block.text}"
 
 
 # --- no others
 
 
-@pytest.mark.parametrize("page", PAGES, ids=page_name)
-def test_every_decimal_number_of_a_page_is_checked(page: Path) -> None:
+def test_every_decimal_number_of_a_page_is_checked() -> None:
     """A decimal number is checked by the test of its command, excepted above, or a constant of the text."""
-    name = page_name(page)
-    left = [
-        f"{heading}: {number}"
-        for heading, number in unchecked_decimals(page)
-        if (name, None) not in NOT_PRINTED and (name, heading) not in NOT_PRINTED
-    ]
-    assert not left, f"{name}: {left}: check them with check_figures in the test of the command that prints them"
+    found = {(page_name(page), heading): number for page in PAGES for heading, number in unchecked_decimals(page)}
+    whole = {name for name, heading in NOT_PRINTED if heading is None}
+    left = {place: number for place, number in found.items() if place[0] not in whole and place not in NOT_PRINTED}
+    assert not left, "check them with check_figures in the test of the command that prints them"
+    superfluous = {place for place in NOT_PRINTED if place[1] is not None and place not in found}
+    assert (superfluous, whole - {name for name, _ in found}) == (set(), set()), "exceptions for no decimal number"
 
 
-def test_exceptions_exist() -> None:
-    for name, heading in NOT_PRINTED:
-        page = next(page for page in PAGES if page_name(page) == name)
-        found = {each for each, _ in unchecked_decimals(page)}
-        assert found if heading is None else heading in found, f"{name}: no decimal number in '{heading}'"
-
-
-@pytest.mark.parametrize(("value", "passes"), [(279.78, True), (279.4, False), (281.0, False)])
-def test_a_wrong_figure_is_reported(value: float, passes: bool) -> None:
+def test_a_wrong_figure_is_reported() -> None:
     sentence = "it is {} for `tile19`"
     assert stated_figures("noise.md", sentence) == ("280",)
-    if passes:
-        check_figures("noise.md", sentence, value)
-    else:
+    check_figures("noise.md", sentence, 279.78)
+    for value in (279.4, 281.0):
         with pytest.raises(AssertionError, match="states 280"):
             check_figures("noise.md", sentence, value)
 

@@ -267,20 +267,18 @@ def test_a_title_is_text_and_a_picture_that_is_gone_is_said(tmp_path: Path) -> N
 # --- errors
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
+def test_what_is_wrong_is_said() -> None:
+    wrong: list[tuple[Callable[[], object], str]] = [
         (lambda: ommatid.read_scene("tile9"), "did you mean 'tile19'"),
         (lambda: ommatid.read_scene("tile19", set=["noise.varience=1"]), "'noise.variance'"),
         (lambda: ommatid.read_scene("tile19", lens=["X"]), "no lens type is called 'X'"),
         (lambda: ommatid.read_stack("none.exr"), "no such file"),
         (lambda: ommatid.read_model("none.npz"), "no such file"),
         (lambda: ommatid.read_result("none"), "none"),
-    ],
-)
-def test_what_is_wrong_is_said(wrong: Callable[[], object], words: str) -> None:
-    with pytest.raises(ommatid.InputError, match=words):
-        wrong()
+    ]
+    for call, words in wrong:
+        with pytest.raises(ommatid.InputError, match=words):
+            call()
 
 
 def test_what_does_not_belong_together_is_said(stack: ommatid.Stack) -> None:
@@ -297,18 +295,16 @@ def test_what_does_not_belong_together_is_said(stack: ommatid.Stack) -> None:
         ommatid.reconstruct(stack, wrong)
 
 
-@pytest.mark.parametrize(
-    ("truth", "words"),
-    [
+def test_a_truth_that_is_none_is_said(stack: ommatid.Stack, model: ommatid.Model) -> None:
+    wrong: list[tuple[Any, str]] = [
         (np.zeros((3, 3)), "expected 19 x 19 pixels"),
         (np.zeros((1, 361)), "expected 19 x 19 pixels"),
         (np.full((19, 19), np.nan), "expected finite values"),
         ("truth.exr", "expected an array of numbers"),
-    ],
-)
-def test_a_truth_that_is_none_is_said(stack: ommatid.Stack, model: ommatid.Model, truth: Any, words: str) -> None:
-    with pytest.raises(ommatid.InputError, match=f"truth: {words}"):
-        ommatid.reconstruct(stack, model, truth)
+    ]
+    for truth, words in wrong:
+        with pytest.raises(ommatid.InputError, match=f"truth: {words}"):
+            ommatid.reconstruct(stack, model, truth)
 
 
 def test_a_run_with_another_estimate_is_said(tmp_path: Path) -> None:

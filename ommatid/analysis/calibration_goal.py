@@ -12,6 +12,7 @@ from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance
 from ommatid.reconstruct.noise import SHARED, Noise, known_noise, uniform, usable_pixels
 from ommatid.reconstruct.restore import restore
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
 from ommatid.scenes.constants import WHITE
@@ -20,8 +21,6 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibration.stopping_rule import StoppingRule
-
-from .prediction.sensor_noise import expected_noise
 
 SEED = 20260408  # of an image of white noise, different from those of data, calibration and the other analyses
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
@@ -136,3 +135,14 @@ def _added(noise: Noise, expected: ExpectedError, mse_without: Callable[[], floa
 
 def _tables(scene: Scene) -> dict[str, object]:
     return {name: value for name, value in scene.plain().items() if name in TABLES}
+
+
+def expected_noise(setup: Setup) -> float | FloatArray:
+    """Return the variance of all measurements, or of each, (M,): with a [sensor] that of light of the prior's mean."""
+    scene = setup.scene
+    if scene.sensor is not None:
+        from ommatid.scenes.optics.radiometry import predicted_noise
+        from ommatid.simulate.sensor.response import response
+
+        return predicted_noise(scene, setup.camera, response(setup))
+    return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0

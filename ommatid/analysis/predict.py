@@ -20,8 +20,8 @@ from ommatid.scenes.skipped import assumptions
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.validation import check_lenses, check_scene_memory
 
-from .prediction.run_prediction import predict_run
-from .prediction.sensor_noise import expected_noise
+from .calibration_goal import expected_noise
+from .run_prediction import predict_run
 
 LEFT_OUT = "a perfect H and a perfect rendering: their uncertainty is left out"
 PRIOR_LIGHT = "light of the prior's mean, and no pixel saturated"

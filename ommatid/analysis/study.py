@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from ommatid.reconstruct.method_choice import choose_method
@@ -19,7 +20,11 @@ from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.simulate.cache import cached_model
+from ommatid.simulate.calibration.stopping_rule import StoppingRule
+from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
 NUMBERS, TABLE = "study.json", "study.csv"
 MISALIGNMENT = {"robust": "robust", "fitted": "fit"}  # estimator.misalignment by model; "trust" for all others
@@ -126,3 +131,23 @@ def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:
             words += f"; for this picture {case.expected:.4g}, {position} {case.low:.4g} to {case.high:.4g}"
         lines.append((LABELS[case.model], words))
     return lines
+
+
+def study_models(
+    setup: Setup, folder: Path, progress: Progress, stopping_rule: StoppingRule | None = None
+) -> dict[str, Callable[[], Model]]:
+    """Return by name the functions that make the models of a scene's study; calibrated ones are cached in `folder`."""
+
+    scene, camera = setup.scene, setup.calibrated.camera
+
+    def make(name: str) -> Model:
+        if name == "true":
+            return exact_model(setup.resolved, camera, true_matrix(camera), "true")
+        if name not in ("points", "transport"):
+            return ideal_model(setup.resolved, camera)
+        calibration = scene.calibration.model_copy(update={"method": name})
+        path = folder / ("model.npz" if name == scene.calibration.method else f"model.{name}.npz")
+        changed = replace(setup, scene=scene.model_copy(update={"calibration": calibration}))
+        return cached_model(path, changed, progress, stopping_rule)[0]
+
+    return {name: partial(make, name) for name in (() if scene.study is None else scene.study.models)}

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import inf
 from pathlib import Path
 from time import perf_counter
-from typing import cast
-
-import numpy as np
 
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.files import digest, fingerprint
@@ -18,34 +14,26 @@ from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import WHITE
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sampling import Sampler
-from ommatid.simulate.sampling.passes import FEWEST_PASSES
-from ommatid.simulate.sampling.samplers import corners, law
 from ommatid.simulate.validation import check_scene
 
 from . import table as bench_file
+from .cells import Job, Subject, jobs, name_of
 from .figure import write_figures
-from .jobs import Subject, jobs
-from .reference import REFERENCE, reference
-from .scheduler import Journal, measure, name_of
-from .slopes import recommend, slope
-from .table import AUTO, JSON, STAGES, BenchTable, Cell, ConvergenceCurve, SkippedJob, Stage
+from .reference import reference
+from .slopes import curves, recommend
+from .table import AUTO, JSON, STAGES, BenchTable, Cell, SkippedJob
 
-PARTIAL = ".bench.partial.jsonl"
 LOCK = ".ommatid-bench.lock"  # runs into folders of this folder do not wait for it
-ROUNDING: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below these are float32 rounding
 FLOOR_SHARE = 0.1  # of the time limit, for the noise floor
-SETUP_SHARE = 0.02  # of the progress, for the reference and the noise floor
 
 
 def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
     """Return the bench table of a scene, and True if anything had to be measured for it.
 
-    Cells that are already in `folder` are not measured again; those that do not fit into `seconds` are left out.
+    The table is written after every cell, so that an interrupted bench goes on with the cells that it lacks. Those that
+    do not fit into `seconds` are left out.
     Raises InputError for a scene that cannot be measured, and if `folder` holds the table of another scene.
     """
     _check_flat(setup.scene)
@@ -64,40 +52,78 @@ def _bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tu
     previous = _previous(folder, subject_print)
     if previous is not None and previous.fingerprint != made_from:
         previous = None
-    if previous is not None and (previous.budget >= seconds or not any(job.late for job in previous.left_out)):
-        return previous, False
-    journal = _open_journal(folder, made_from, previous)
-    seconds_before = journal.seconds
+    if previous is not None and previous.budget > 0:  # one that was not interrupted
+        late = any(job.late for job in previous.left_out)
+        if previous.budget >= seconds or not late:
+            return previous, False
+    spent_before = 0.0 if previous is None else previous.seconds
+    start -= spent_before
     with naming_source(scene.source):
-        right = reference(setup, folder, lambda share: progress(SETUP_SHARE * share))
+        right = reference(setup)
         subject = Subject(setup, right, FLOOR_SHARE * seconds)
-        listed, left_out = jobs(subject)
-
-    def measured(share: float) -> None:
-        progress(SETUP_SHARE + (1 - SETUP_SHARE) * share)
-
-    late = measure(listed, seconds, journal, measured, perf_counter() - start)
-    left_out += [SkippedJob(what=name, why=why) for name, why in journal.refused.items()]
-    cells = tuple(journal.cells[job.name] for job in listed if job.name in journal.cells)
+        listed, never = jobs(subject)
     system = os.uname().sysname, os.uname().release, os.uname().machine  # `platform` runs the command uname
-    table = BenchTable(
-        title=scene.title or scene.source.stem,
-        scene=subject_print,
-        fingerprint=made_from,
-        camera=camera.describe(),
-        machine={"cores": os.cpu_count(), "system": " ".join(system), "load": os.getloadavg()[0]},
-        versions=versions("mitsuba", "drjit", "scipy"),
-        against=right.description,
-        noise_deviation=_noise_deviation(subject),
-        budget=seconds,
-        seconds=seconds_before + perf_counter() - start,
-        cells=cells,
-        curves=tuple(curves(cells, camera)),
-        recommended=recommend(cells, subject.noise_floor),
-        left_out=(*left_out, *late),
-    )
-    _finish(folder, table, journal)
-    return table, True
+
+    def table(cells: Sequence[Cell], left_out: Sequence[SkippedJob], budget: float) -> BenchTable:
+        return BenchTable(
+            title=scene.title or scene.source.stem,
+            scene=subject_print,
+            fingerprint=made_from,
+            camera=camera.describe(),
+            machine={"cores": os.cpu_count(), "system": " ".join(system), "load": os.getloadavg()[0]},
+            versions=versions("mitsuba", "drjit", "scipy"),
+            against=right.description,
+            noise_deviation=subject.noise_deviation,
+            budget=budget,
+            seconds=perf_counter() - start,
+            cells=tuple(cells),
+            curves=tuple(curves(cells, camera)),
+            recommended=recommend(cells, subject.noise_floor),
+            left_out=(*never, *left_out),
+        )
+
+    def save(cells: Sequence[Cell]) -> None:
+        bench_file.write(folder, table(cells, (), 0.0))
+        progress(min(1.0, (perf_counter() - start) / seconds))
+
+    known = {} if previous is None else {name_of(cell): cell for cell in previous.cells}
+    cells, left_out = measure(listed, known, start + seconds, save)
+    complete = table(cells, left_out, seconds)
+    write_figures(folder, complete)
+    bench_file.write(folder, complete)
+    progress(1.0)
+    return complete, True
+
+
+def measure(
+    listed: Sequence[Job], known: dict[str, Cell], deadline: float, save: Callable[[Sequence[Cell]], None]
+) -> tuple[list[Cell], list[SkippedJob]]:
+    """Measure the cells that are not known, in their order, and return all, and those that were left out.
+
+    deadline : on the clock of `perf_counter`;  save : called with all cells after each that is measured
+    A cell is left out whose time does not suffice, if its time is proportional to its samples in the cells before it.
+    """
+    left_out: list[SkippedJob] = []
+    seconds: dict[tuple[str, str, str | None], tuple[int, float]] = {}  # samples and seconds of the last cell of a way
+    for job in listed:
+        way, samples, start = (job.stage, job.way, job.variant), job.samples or 1, perf_counter()
+        last_samples, last_seconds = seconds.get(way, (samples, 0.0))
+        cell = known.get(job.name)
+        if cell is None:
+            late = start + last_seconds * samples / last_samples > deadline
+            try:
+                cell = None if late else job.measure(deadline)
+            except InputError as error:
+                left_out.append(SkippedJob(what=job.name, why=str(error)))
+                continue
+            if cell is None:
+                left_out.append(SkippedJob(what=job.name, why="it did not fit into the time limit", late=True))
+                continue
+            known = {**known, job.name: cell}
+            save([known[one.name] for one in listed if one.name in known])
+        if job.samples is not None:
+            seconds[way] = samples, cell.seconds.median * cell.repeats
+    return [known[job.name] for job in listed if job.name in known], left_out
 
 
 def _check_flat(scene: Scene) -> None:
@@ -110,24 +136,6 @@ def _check_flat(scene: Scene) -> None:
         raise InputError(
             f"{scene.source}: bench measures flat targets, got a [world]; remove it, or choose another scene"
         )
-
-
-def _open_journal(folder: Path, made_from: str, previous: BenchTable | None) -> Journal:
-    """Open the journal of an interrupted bench, or begin one with the cells of a table that needs more time."""
-    journal = Journal(folder / PARTIAL, made_from)
-    if previous is not None:
-        for cell in previous.cells:
-            journal.cells.setdefault(name_of(cell), cell)
-        journal.seconds = max(journal.seconds, previous.seconds)
-    return journal
-
-
-def _finish(folder: Path, table: BenchTable, journal: Journal) -> None:
-    """Write the figures and the table, and remove the files of the unfinished bench."""
-    write_figures(folder, table)
-    bench_file.write(folder, table)
-    journal.remove()
-    (folder / REFERENCE).unlink(missing_ok=True)
 
 
 def _with_exact_assumptions(scene: Scene) -> Scene:
@@ -160,50 +168,6 @@ def _previous(folder: Path, subject_print: str) -> BenchTable | None:
             " with -o"
         )
     return previous
-
-
-def _noise_deviation(subject: Subject) -> float:
-    """Return the root mean square of the sensor's noise on exact light, in pixel values of f."""
-    noise = subject.stack(0).values - subject.reference.light
-    return float(np.sqrt(np.nanmean(np.square(noise))))
-
-
-def curves(cells: Sequence[Cell], camera: Camera) -> list[ConvergenceCurve]:
-    """Return the slope of each method of rendering and calibration, and its theoretical slope."""
-    fitted: list[ConvergenceCurve] = []
-    for stage, limit in ROUNDING.items():
-        counted = [cell for cell in cells if cell.stage == stage and cell.counted]
-        for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in counted):
-            used = [cell for cell in counted if (cell.way, cell.variant) == (way, variant)]
-            fitted.append(_curve([cell for cell in used if cell.error.median > limit], camera, stage, way, variant))
-    return fitted
-
-
-def _curve(cells: Sequence[Cell], camera: Camera, stage: Stage, way: str, variant: str | None) -> ConvergenceCurve:
-    theory = law(cast(Sampler, way.split(", ")[-1]), camera)
-    asymptotic = theory.least > 1
-    used = [cell for cell in cells if not asymptotic or (cell.samples or 0) >= theory.least * FEWEST_PASSES]
-    fit, why, agrees = slope(used), theory.why, None
-    if fit is None:
-        why += "; fewer than three cells to fit, or errors at the level of rounding"
-    elif asymptotic:
-        why += f"; fitted from {theory.least * FEWEST_PASSES} samples on"
-    if fit is not None and theory.slope is not None:
-        counts = [(cell.samples or 1) // FEWEST_PASSES for cell in used]
-        margin = corners(camera, min(counts), max(counts)) if asymptotic else 0.0
-        if 0 < margin < inf:
-            why += f", where strata that contain corners may change it by {margin:.2g}"
-        agrees = None if margin == inf else fit.agrees(theory.slope, margin)
-    return ConvergenceCurve(
-        stage=stage,
-        way=way,
-        variant=variant,
-        slope=None if fit is None else fit.value,
-        slope_deviation=None if fit is None else fit.deviation,
-        theory=theory.slope,
-        why=why,
-        agrees=agrees,
-    )
 
 
 def rows(table: BenchTable) -> list[tuple[str, str]]:

@@ -6,47 +6,28 @@ Points are medians over seeds, error bars their 10 % and 90 % quantiles.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ommatid.analysis.pareto import pareto_front
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.runtime.printable import printable_label
 
-from .labels import Label, label_points
-from .slopes import TOLERANCE, median_error, median_seconds
+from .slopes import TOLERANCE, median_error, median_seconds, pareto_front
 from .table import ALONE, AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quantiles, Stage
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 FRONT: dict[str, Any] = {"color": "0.75", "linewidth": 7, "alpha": 0.6, "solid_capstyle": "round"}
-ADAPTIVE: dict[str, Any] = {"markersize": 10, "markeredgecolor": "black", "linestyle": "none"}
-BOX: dict[str, Any] = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+NAMES: dict[Stage, str] = {"render": "Rendering", "calibrate": "Calibration", "reconstruct": "Reconstruction"}
+ERRORS: dict[Stage, str] = {
+    "render": "error of the rendering: RMS over sensor pixels (grey levels)",
+    "calibrate": "error of the calibration: RMS over entries of H",
+    "reconstruct": "numerical error: RMS over pixels (posterior standard deviations)",
+}
+IMAGES: dict[Stage, str] = {"render": "exact H", "calibrate": "exact light", "reconstruct": "exact light and H"}
 IMAGE_ERROR = "mean squared error of the image (grey levels squared)"
 
-
-@dataclass(frozen=True)
-class Style:
-    """Colour and marker of a curve; slow backends and unrefined forms are hollow and dashed."""
-
-    colour: str
-    marker: str
-    hollow: bool
-
-    def line(self) -> dict[str, Any]:
-        """Return the options of matplotlib's `plot`."""
-        return {
-            "color": self.colour,
-            "marker": self.marker,
-            "markersize": 5,
-            "markerfacecolor": "white" if self.hollow else self.colour,
-            "linewidth": 1.1,
-            "linestyle": "--" if self.hollow else "-",
-        }
-
-
-Key = tuple[str, str | None]  # way, and variant or setting
+Key = tuple[str, str | None]  # way and variant
 Abscissa = Callable[[Cell], float | None]
 Ordinate = Callable[[Cell], Quantiles | None]
 
@@ -58,81 +39,42 @@ def write_figures(folder: Path, table: BenchTable, files: FigureFiles = SCREEN_P
     from matplotlib.figure import Figure
 
     for stage in STAGES:
-        if not table.of(stage):
-            continue
-        figure: Any = Figure(figsize=(19, 7.4), layout="constrained")
-        FigureCanvasAgg(figure)
-        if stage == "reconstruct":
-            _draw_reconstruction(figure, table)
-        else:
-            _draw_sampling(figure, table, stage)
-        files.replace(figure, folder / f"{stage}.png")
+        if table.of(stage):
+            figure: Any = Figure(figsize=(19, 7.4), layout="constrained")
+            FigureCanvasAgg(figure)
+            _draw(figure, table, stage)
+            files.replace(figure, folder / f"{stage}.png")
 
 
-def _draw_sampling(figure: Any, table: BenchTable, stage: Stage) -> None:
-    """Draw error against samples with slopes, error against seconds, and the image's error against seconds."""
-    unit = "RMS over sensor pixels (grey levels)" if stage == "render" else "RMS over entries of H"
-    name = "Rendering" if stage == "render" else "Calibration"
-    figure.suptitle(f"{name}: {printable_label(table.title)}")
-    panels = figure.subplots(1, 3, width_ratios=(1.35, 1, 1))
+def _draw(figure: Any, table: BenchTable, stage: Stage) -> None:
+    """Draw error against samples where a stage takes them, error against seconds, and the image's against seconds."""
+    figure.suptitle(f"{NAMES[stage]}: {printable_label(table.title)}")
     cells = table.of(stage)
-    groups, styles = _groups([cell for cell in cells if cell.counted]), _styles(cells)
-    axes: tuple[tuple[Abscissa, Ordinate], ...] = ((_samples, _error), (median_seconds, _error), (median_seconds, _mse))
+    axes: list[tuple[Abscissa, Ordinate]] = [(median_seconds, _error), (median_seconds, _mse)]
+    if stage != "reconstruct":
+        axes.insert(0, (_samples, _error))
+    panels = figure.subplots(1, len(axes))
     for panel, (x_of, y_of) in zip(panels, axes, strict=True):
         _prepare(panel)
-        _draw_curves(panel, groups, styles, x_of, y_of)
+        for key, style in _styles(cells).items():
+            _draw_cells(panel, [cell for cell in cells if (cell.way, cell.variant) == key], style, x_of, y_of)
+        panel.set_xlabel("samples per pixel" if x_of is _samples else "time (s)")
+        panel.set_ylabel(ERRORS[stage] if y_of is _error else IMAGE_ERROR)
+    *first, cost, image = panels
+    for panel in first:
+        panel.set_title(f"Convergence: slope ± standard error\nReference: {table.against}", fontsize=10)
+    cost.set_title("Cost", fontsize=10)
+    image.set_title(f"Error of the image with {IMAGES[stage]}", fontsize=10)
+    front = pareto_front(cells, median_seconds, median_error)
+    cost.plot([median_seconds(cell) for cell in front], [median_error(cell) for cell in front], zorder=1, **FRONT)
     if stage == "render" and table.noise_deviation > 0:
-        for panel in panels[:2]:
+        for panel in (*first, cost):
             _draw_level(panel, table.noise_deviation, f"noise of the sensor, {table.noise_deviation:.2g}")
-    _draw_floor(panels[2], table)
-    for panel, (x_of, y_of) in zip(panels, axes, strict=True):
-        _draw_adaptive(panel, cells, styles, x_of, y_of)
-    _label_slopes(panels[0], groups, styles, table.curves, stage)
-    _draw_front(panels[1], cells)
-    for panel in panels[1:]:
-        panel.set_xlabel("time (s)")
-    for panel in panels[:2]:
-        panel.set_ylabel(f"error of the {name.lower()}: {unit}")
-    panels[0].set_xlabel("samples per pixel (4: one pass, others: at least 16 passes; auto: the maximum over pixels)")
-    panels[0].set_title(f"Convergence: slope ± standard error\nReference: {table.against}", fontsize=10)
-    panels[1].set_title("Cost\n", fontsize=10)
-    panels[2].set_ylabel(IMAGE_ERROR)
-    panels[2].set_title(f"Error of the image\nwith exact {'H' if stage == 'render' else 'light'}", fontsize=10)
-    _mark_recommended(panels[2], table, stage)
-    _draw_legend(figure, groups, styles)
-
-
-def _draw_reconstruction(figure: Any, table: BenchTable) -> None:
-    """Draw numerical error, and the image's error, against seconds: one labelled mark per setting."""
-    figure.suptitle(f"Reconstruction: {printable_label(table.title)}")
-    panels = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    cells = table.of("reconstruct")
-    groups: dict[Key, list[Cell]] = {(cell.way, cell.setting): [cell] for cell in cells}
-    ways = list(dict.fromkeys(cell.way for cell in cells))
-    styles: dict[Key, Style] = {(way, setting): _style(ways.index(way), setting == ALONE) for way, setting in groups}
-    for panel, y_of in zip(panels, (_error, _mse), strict=True):
-        _prepare(panel)
-        panel.set_xlabel("time (s)")
-        _draw_curves(panel, groups, styles, median_seconds, y_of)
-    _draw_front(panels[0], cells)
-    panels[0].legend(loc="lower left", fontsize=9)
-    _draw_level(panels[0], 0.1, "0.1 posterior standard deviations: 1 % of the mean squared error")
-    panels[0].set_ylabel("numerical error: RMS over pixels (posterior standard deviations)")
-    panels[0].set_title("Distance from the exact estimate; hollow: a dense form without refinement", fontsize=10)
-    labels: list[Label] = []
-    for key, (cell,) in groups.items():
-        text = f"{cell.way}, {cell.setting.split(',')[0]}"
-        labels.append(Label(cell.seconds.median, cell.error.median, text, styles[key].colour))
-    label_points(panels[0], labels, 1.7)
-    panels[1].set_ylabel(IMAGE_ERROR)
-    panels[1].set_title("Error of the image with exact light and H", fontsize=10)
-    _draw_floor(panels[1], table)
-    for key, (cell,) in groups.items():
-        if cell.mse is not None and cell.mse.median > table.recommended.noise_floor * (1 + TOLERANCE / 2):
-            text = {"xytext": (-8, 0), "textcoords": "offset points", "ha": "right", "va": "center", "fontsize": 8.5}
-            point = cell.seconds.median, cell.mse.median
-            panels[1].annotate(f"{cell.way}, {cell.setting}", point, color=styles[key].colour, **text)
-    _mark_recommended(panels[1], table, "reconstruct")
+    if stage == "reconstruct":
+        _draw_level(cost, 0.1, "0.1 posterior standard deviations: 1 % of the mean squared error")
+    _draw_floor(image, table)
+    _mark_recommended(image, table, stage)
+    _draw_legend(figure, table, stage)
 
 
 def _samples(cell: Cell) -> float | None:
@@ -147,21 +89,22 @@ def _mse(cell: Cell) -> Quantiles | None:
     return cell.mse
 
 
-def _groups(cells: Sequence[Cell]) -> dict[Key, list[Cell]]:
-    groups: dict[Key, list[Cell]] = {}
-    for cell in sorted(cells, key=lambda cell: cell.samples or 0):
-        groups.setdefault((cell.way, cell.variant), []).append(cell)
-    return {key: groups[key] for key in dict.fromkeys((cell.way, cell.variant) for cell in cells)}
-
-
-def _styles(cells: Sequence[Cell]) -> dict[Key, Style]:
+def _styles(cells: Sequence[Cell]) -> dict[Key, dict[str, Any]]:
+    """Return the options of matplotlib's `plot` for each way: a colour and a marker, hollow for slow backends."""
     ways = list(dict.fromkeys(cell.way for cell in cells))
-    keys = dict.fromkeys((cell.way, cell.variant) for cell in cells)
-    return {(way, variant): _style(ways.index(way), (variant or "").startswith("scalar")) for way, variant in keys}
-
-
-def _style(index: int, hollow: bool) -> Style:
-    return Style(COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)], hollow)
+    styles: dict[Key, dict[str, Any]] = {}
+    for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in cells):
+        index, hollow = ways.index(way), (variant or "").startswith("scalar")
+        colour = COLOURS[index % len(COLOURS)]
+        styles[way, variant] = {
+            "color": colour,
+            "marker": MARKERS[index % len(MARKERS)],
+            "markersize": 5,
+            "markerfacecolor": "white" if hollow else colour,
+            "linewidth": 1.1,
+            "linestyle": "--" if hollow else "-",
+        }
+    return styles
 
 
 def _prepare(panel: Any) -> None:
@@ -176,52 +119,25 @@ def _prepare(panel: Any) -> None:
     panel.set_axisbelow(True)
 
 
-def _draw_curves(
-    panel: Any, groups: dict[Key, list[Cell]], styles: dict[Key, Style], x_of: Abscissa, y_of: Ordinate
-) -> None:
-    for key, cells in groups.items():
-        points = [(x_of(cell), y_of(cell)) for cell in cells]
-        known = [(x, y) for x, y in points if x is not None and y is not None and y.median > 0]
-        if not known:
-            continue
-        below = [max(y.median - y.low, 0.0) for _, y in known]
-        above = [y.high - y.median for _, y in known]
-        panel.errorbar(
-            [x for x, _ in known], [y.median for _, y in known], yerr=[below, above],
-            elinewidth=0.8, capsize=1.5, zorder=3, **styles[key].line(),
-        )  # fmt: skip
-    values = {x for cells in groups.values() for x in map(x_of, cells) if x is not None}
-    if len(values) == 1:  # around a single value, Matplotlib's limits of a logarithmic axis may coincide
-        panel.update_datalim([(factor * value, 1.0) for value in values for factor in (0.5, 2.0)], updatey=False)
-
-
-def _draw_adaptive(panel: Any, cells: Sequence[Cell], styles: dict[Key, Style], x_of: Abscissa, y_of: Ordinate) -> None:
-    """Mark cells with samples "auto", which are on no curve, with a large marker and a label.
-
-    Where their error is below the panel, because only rounding is left, the marker is on the lower edge and the label
-    gives the error.
-    """
-    low, high = panel.get_ylim()
-    cells = [cell for cell in cells if not cell.counted]
-    known = [(x_of(cell), y_of(cell), styles[cell.way, cell.variant]) for cell in cells]
-    points = [(x, y.median, style) for x, y, style in known if x is not None and y is not None]
-    for x, y, style in points:
-        panel.plot(x, max(y, low), zorder=5, clip_on=False, **{**style.line(), **ADAPTIVE})
-    left, right = panel.get_xlim()
-    middle = (left * right) ** 0.5
-    for index, (x, y, style) in enumerate(points):
-        label = f"{AUTO}, below: {y:.1g}" if y < low else AUTO
-        offset = {"xytext": (-14 if x > middle else 14, 28 + 14 * index), "ha": "right" if x > middle else "left"}
-        line = {"arrowstyle": "-", "color": style.colour, "linewidth": 0.8}
-        text = {"textcoords": "offset points", "fontsize": 9, "fontweight": "bold", "bbox": BOX, "zorder": 6}
-        panel.annotate(label, (x, max(y, low)), color=style.colour, arrowprops=line, **offset, **text)
-    panel.set_ylim(low, high)
-
-
-def _draw_front(panel: Any, cells: Sequence[Cell]) -> None:
-    front = pareto_front(cells, median_seconds, median_error)
-    panel.plot([median_seconds(cell) for cell in front], [median_error(cell) for cell in front], zorder=1,
-               label="Pareto front", **FRONT)  # fmt: skip
+def _draw_cells(panel: Any, cells: Sequence[Cell], style: dict[str, Any], x_of: Abscissa, y_of: Ordinate) -> None:
+    """Draw the cells of a way as a curve, those with a setting of their own as single points with its name."""
+    known: list[tuple[float, Quantiles, Cell]] = []
+    for cell in sorted(cells, key=lambda cell: cell.samples or 0):
+        x, y = x_of(cell), y_of(cell)
+        if x is not None and y is not None and y.median > 0:
+            known.append((x, y, cell))
+    curve = [(x, y) for x, y, cell in known if cell.counted and cell.samples is not None]
+    for points, options in ((curve, style), ([(x, y) for x, y, _ in known], {**style, "linestyle": "none"})):
+        below = [max(y.median - y.low, 0.0) for _, y in points]
+        above = [y.high - y.median for _, y in points]
+        medians = [y.median for _, y in points]
+        panel.errorbar([x for x, _ in points], medians, yerr=[below, above], elinewidth=0.8, capsize=1.5, **options)
+    for x, y, cell in known:
+        if cell.samples is None or not cell.counted:
+            offset = {"xytext": (6, 4), "textcoords": "offset points", "fontsize": 8}
+            panel.annotate(cell.setting.split(",")[0], (x, y.median), color=style["color"], **offset)
+    if len({x for x, _, _ in known}) == 1:  # around a single value, limits of a logarithmic axis may coincide
+        panel.update_datalim([(factor * known[0][0], 1.0) for factor in (0.5, 2.0)], updatey=False)
 
 
 def _draw_level(panel: Any, value: float, label: str) -> None:
@@ -233,14 +149,7 @@ def _draw_floor(panel: Any, table: BenchTable) -> None:
     floor = table.recommended.noise_floor
     if floor > 0:
         panel.axhspan(floor, floor * (1 + TOLERANCE), color="#009E73", alpha=0.15, linewidth=0, zorder=0)
-        _draw_level(panel, floor, "")
-        panel.annotate(
-            f"noise floor {floor:.3g}, and {100 * TOLERANCE:g} % above it", (0.01, floor),
-            xycoords=panel.get_yaxis_transform(), xytext=(0, -4), textcoords="offset points",
-            va="top", fontsize=8, color="0.3",
-        )  # fmt: skip
-        low, high = panel.get_ylim()
-        panel.set_ylim(min(low, floor / (high / floor) ** 0.08), high)
+        _draw_level(panel, floor, f"noise floor {floor:.3g}, and {100 * TOLERANCE:g} % above it")
 
 
 def _mark_recommended(panel: Any, table: BenchTable, stage: Stage) -> None:
@@ -250,46 +159,24 @@ def _mark_recommended(panel: Any, table: BenchTable, stage: Stage) -> None:
             point = cell.seconds.median, cell.mse.median
             panel.plot(*point, marker="o", markersize=15, markerfacecolor="none", color="black", zorder=5)
             label = "recommended" if table.recommended.reached else "nearest"
-            text = {"textcoords": "offset points", "ha": "center", "fontsize": 9, "bbox": BOX, "zorder": 6}
-            panel.annotate(label, point, xytext=(0, 12), **text)
+            panel.annotate(label, point, xytext=(0, 12), textcoords="offset points", ha="center", fontsize=9)
 
 
-def _label_slopes(
-    panel: Any,
-    groups: dict[Key, list[Cell]],
-    styles: dict[Key, Style],
-    curves: Sequence[ConvergenceCurve],
-    stage: Stage,
-) -> None:
-    """Write each method's slope in its colour, for the first backend only: errors do not depend on the backend."""
-    known = {(curve.way, curve.variant): curve for curve in curves if curve.stage == stage}
-    first: dict[str, Key] = {}
-    for way, variant in groups:
-        first.setdefault(way, (way, variant))
-    labels: list[Label] = []
-    for key in first.values():
-        last = groups[key][-1]
-        text = _slope_words(key[0], known.get(key))
-        labels.append(Label(float(last.samples or 1), last.error.median, text, styles[key].colour))
-    most = max((cell.samples or 0 for cells in groups.values() for cell in cells), default=0)
-    panel.set_xticks([4**power for power in range(1, 12) if 4**power <= most])
-    panel.minorticks_off()
-    panel.xaxis.set_major_formatter("{x:.0f}")
-    label_points(panel, labels, 1.75)
-
-
-def _slope_words(way: str, curve: ConvergenceCurve | None) -> str:
-    if curve is None or curve.slope is None or curve.slope_deviation is None:
-        return f"{way}: too few cells for a slope"
-    theory = "" if curve.theory is None else f" (theory {curve.theory:g})"
-    return f"{way}\n{curve.slope:.3f} ± {curve.slope_deviation:.3f}{theory}"
-
-
-def _draw_legend(figure: Any, groups: dict[Key, list[Cell]], styles: dict[Key, Style]) -> None:
+def _draw_legend(figure: Any, table: BenchTable, stage: Stage) -> None:
+    """Name the ways with their slopes, below all panels."""
     from matplotlib.lines import Line2D
 
-    lines: list[Any] = [Line2D([], [], **styles[key].line()) for key in groups]
-    names = [way if variant is None else f"{way}, {variant}" for way, variant in groups]
-    lines += [Line2D([], [], **FRONT), Line2D([], [], marker="o", markerfacecolor="0.7", color="0.7", **ADAPTIVE)]
-    names += ["Pareto front", "auto: adaptive number of samples"]
-    figure.legend(lines, names, loc="outside lower center", ncols=4, fontsize=9)
+    slopes = {(curve.way, curve.variant): _slope_words(curve) for curve in table.curves if curve.stage == stage}
+    styles = _styles(table.of(stage))
+    lines: list[Any] = [*(Line2D([], [], **style) for style in styles.values()), Line2D([], [], **FRONT)]
+    names = [", ".join(word for word in (*key, slopes.get(key)) if word) for key in styles]
+    note = f"Pareto front; {AUTO}: adaptive number of samples" if stage != "reconstruct" else "Pareto front"
+    note += f"; {ALONE}: a dense form without refinement" if stage == "reconstruct" else ""
+    figure.legend(lines, [*names, note], loc="outside lower center", ncols=3, fontsize=9)
+
+
+def _slope_words(curve: ConvergenceCurve) -> str:
+    if curve.slope is None or curve.slope_deviation is None:
+        return "too few cells for a slope"
+    theory = "" if curve.theory is None else f" (theory {curve.theory:g})"
+    return f"{curve.slope:.3f} ± {curve.slope_deviation:.3f}{theory}"

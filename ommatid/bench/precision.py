@@ -32,19 +32,14 @@ from .table import ALONE
 TILE_SIZES = ((11, 2), (15, 3), (19, 4), (27, 6), (35, 8), (51, 12))  # sides, and widths of the border that is dropped
 ACCURACIES = (1.0, 0.1, 0.01, 1e-3, 1e-4)  # estimator.accuracy of a frame
 EXACT_ACCURACY = 1e-6  # of the exact solution for a frame, in posterior standard deviations
-SECONDS_PER_WORK = 4e-12  # order of magnitude; the work of a form is the 3/2 power of the numbers it stores
 
 
 @dataclass(frozen=True)
 class SolverSetting:
-    """One setting of a solver.
-
-    guess : expected duration in seconds;  image : computes the estimate, (N,)
-    """
+    """One setting of a solver; `image` computes the estimate, (N,)."""
 
     method: str
     setting: str
-    guess: float
     image: Callable[[EstimationTask], FloatArray]
 
 
@@ -91,7 +86,7 @@ def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tup
             return [], [("reconstruct", why)]
     measurable += [_tile_setting(size, overlap) for size, overlap in TILE_SIZES if size < min(task.shape)]
     if has_frame:
-        measurable += [_frame_setting(task, accuracy) for accuracy in ACCURACIES]
+        measurable += [_frame_setting(accuracy) for accuracy in ACCURACIES]
     else:
         left_out.append(("frame", "it needs noise in every measurement, and lens types with the same view everywhere"))
     return measurable, left_out
@@ -102,13 +97,10 @@ def _form_settings(task: EstimationTask) -> list[SolverSetting]:
     if not is_dense(task):
         return []
     settings: list[SolverSetting] = []
-    correlated = task.prior.kind != "independent"
     for name in FORMS:
-        needed = needed_memory(name, task.model.measurements, task.model.unknowns, correlated=correlated)
-        guess = SECONDS_PER_WORK * (needed / 8) ** 1.5
         refined = f"refined, tolerance {task.settings.tolerance:g}"
-        settings.append(SolverSetting(name, ALONE, guess, partial(_unrefined_image, name=name)))
-        settings.append(SolverSetting(name, refined, 2 * guess, partial(_refined_image, name=name)))
+        settings.append(SolverSetting(name, ALONE, partial(_unrefined_image, name=name)))
+        settings.append(SolverSetting(name, refined, partial(_refined_image, name=name)))
     return settings
 
 
@@ -142,12 +134,12 @@ def _tile_setting(size: int, overlap: int) -> SolverSetting:
     def image(task: EstimationTask) -> FloatArray:
         return TileMethod(replace(task, tiles=tiles), Execution()).image
 
-    return SolverSetting("tiles", f"{size} less {overlap}", 1.0 + 4 * (size / 51) ** 4, image)
+    return SolverSetting("tiles", f"{size} less {overlap}", image)
 
 
-def _frame_setting(task: EstimationTask, accuracy: float) -> SolverSetting:
+def _frame_setting(accuracy: float) -> SolverSetting:
     def image(task: EstimationTask) -> FloatArray:
         settings = task.settings.model_copy(update={"accuracy": accuracy})
         return FrameMethod(replace(task, settings=settings), Execution()).image
 
-    return SolverSetting("frame", f"accuracy {accuracy:g}", 0.1 + 1e-5 * task.model.unknowns, image)
+    return SolverSetting("frame", f"accuracy {accuracy:g}", image)

@@ -6,32 +6,28 @@ Every repeat has its own seed, and none of these random streams is one of the sc
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sampling import Sampler
-from ommatid.simulate.adaptive_render import AIM, EXPONENTS, LEAST, MOST, STRATIFIED, AdaptiveRendering, render_until
-from ommatid.simulate.cache import cached_model
+from ommatid.simulate.adaptive_render import AdaptiveRendering, render_until
+from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
-from ommatid.simulate.noise_target import allowed_variance
 from ommatid.simulate.render import Rendering, exposed, light
-from ommatid.simulate.sampling.passes import FEWEST_PASSES, JITTERED, Plan, cells_of, on_grid, plan
+from ommatid.simulate.sampling.passes import FEWEST_PASSES, Plan, plan
 from ommatid.simulate.sampling.samplers import fitting
 from ommatid.simulate.sampling.seeds import repeat_seed
 
 Samples = int | Literal["auto"]
 
 SAMPLE_RATIO = 64  # reference samples per measured sample: the reference adds less than a hundredth of the error
-REFERENCE = ".bench.reference.npz"
 MOST_SAMPLES = 2**14  # per pixel, of a measured cell
 MOST_RAYS = 2**27  # of a reference: about ten seconds where rays are traced through surfaces
 
@@ -50,10 +46,10 @@ class Reference:
     description: str
 
 
-def reference(setup: Setup, folder: Path, progress: Progress = no_progress) -> Reference:
+def reference(setup: Setup) -> Reference:
     """Return the closed form where there is one, else H from 64 times the rays, or as many as MOST_RAYS permits.
 
-    Such an estimate is cached in `folder`. Raises InputError if its backend does not work on this machine.
+    Raises InputError if its backend does not work on this machine.
     """
     scene, camera, image = setup.scene, setup.camera, setup.image.ravel()
     if setup.has_closed_form:
@@ -65,7 +61,7 @@ def reference(setup: Setup, folder: Path, progress: Progress = no_progress) -> R
     samples = min(SAMPLE_RATIO * MOST_SAMPLES, MOST_RAYS // camera.measurements)
     seed = repeat_seed(scene.render.seed, "right", 0)
     many = with_calibration(scene, "transport", "multijitter", "auto", samples, seed)
-    model, _ = cached_model(folder / REFERENCE, replace(setup, scene=many), progress)
+    model = calibrate(replace(setup, scene=many))
     description = f"a reference of {model.record['samples']} samples"
     return Reference(model, model.forward(image), model.variance_from_model(image), description)
 
@@ -90,21 +86,6 @@ def _changed(scene: Scene, table: str, **update: Any) -> Scene:
 def sample_plan(samples: int, sampler: Sampler) -> Plan:
     """Return passes and samples as renderings use them; too few samples for several passes make a single pass."""
     return plan(samples, sampler) if samples >= FEWEST_PASSES else Plan(1, fitting(sampler, samples))
-
-
-def expected_samples(setup: Setup, right: Reference) -> int:
-    """Estimate the samples per pixel that samples = "auto" will take.
-
-    Where a grid of strata fits the edges of the pixels of f this is a first round. Elsewhere it is the number that
-    leaves a quarter of the allowed variance if the rays of a pixel vary as the image does.
-    Raises InputError without noise, to which the variance could be compared.
-    """
-    camera, sampler = setup.camera, setup.scene.render.sampler
-    allowed = float(np.nanmean(allowed_variance(setup)(right.light, slice(0, right.light.size))))
-    if camera.has_box_footprints and sampler in JITTERED:
-        return max(on_grid(LEAST, sampler, cells_of(lens_type.ratio)).total for lens_type in camera.types)
-    ratio = float(setup.image.var()) / (FEWEST_PASSES * AIM * allowed)
-    return int(min(max(FEWEST_PASSES * ratio ** (1 / EXPONENTS.get(sampler, STRATIFIED)), LEAST), MOST))
 
 
 def render_light(setup: Setup) -> Rendering | AdaptiveRendering:

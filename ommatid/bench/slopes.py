@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from math import exp, inf, log
-from typing import Any
+from math import inf
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ommatid.analysis.pareto import pareto_front
 from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.shrinkage import shrink_variances
+from ommatid.scenes.tables.sampling import Sampler
+from ommatid.simulate.sampling.passes import FEWEST_PASSES
+from ommatid.simulate.sampling.samplers import corners, law
 
-from .table import ALONE, AUTO, STAGES, Cell, Recommendation, RecommendedSetting
+from .table import ALONE, AUTO, STAGES, Cell, ConvergenceCurve, Recommendation, RecommendedSetting, Stage
 
+Item = TypeVar("Item")
+
+ROUNDING: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below these are float32 rounding
 CRITICAL_SCORE = 3.0  # standard errors within which a slope agrees with theory
 FEWEST_POINTS = 3  # of a fitted slope
 TOLERANCE = 0.1  # relative excess over the noise floor that recommended settings may add in total
@@ -53,6 +60,44 @@ def slope(cells: Sequence[Cell]) -> Slope | None:
     center = float(weight @ x / weight.sum())
     moment = float(weight @ np.square(x - center))
     return Slope(float(weight @ ((x - center) * y)) / moment, moment**-0.5)
+
+
+def curves(cells: Sequence[Cell], camera: Camera) -> list[ConvergenceCurve]:
+    """Return the slope of each method of rendering and calibration, and its theoretical slope."""
+    fitted: list[ConvergenceCurve] = []
+    for stage, limit in ROUNDING.items():
+        counted = [cell for cell in cells if cell.stage == stage and cell.counted]
+        for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in counted):
+            used = [cell for cell in counted if (cell.way, cell.variant) == (way, variant)]
+            fitted.append(_curve([cell for cell in used if cell.error.median > limit], camera, stage, way, variant))
+    return fitted
+
+
+def _curve(cells: Sequence[Cell], camera: Camera, stage: Stage, way: str, variant: str | None) -> ConvergenceCurve:
+    theory = law(cast(Sampler, way.split(", ")[-1]), camera)
+    asymptotic = theory.least > 1
+    used = [cell for cell in cells if not asymptotic or (cell.samples or 0) >= theory.least * FEWEST_PASSES]
+    fit, why, agrees = slope(used), theory.why, None
+    if fit is None:
+        why += "; fewer than three cells to fit, or errors at the level of rounding"
+    elif asymptotic:
+        why += f"; fitted from {theory.least * FEWEST_PASSES} samples on"
+    if fit is not None and theory.slope is not None:
+        counts = [(cell.samples or 1) // FEWEST_PASSES for cell in used]
+        margin = corners(camera, min(counts), max(counts)) if asymptotic else 0.0
+        if 0 < margin < inf:
+            why += f", where strata that contain corners may change it by {margin:.2g}"
+        agrees = None if margin == inf else fit.agrees(theory.slope, margin)
+    return ConvergenceCurve(
+        stage=stage,
+        way=way,
+        variant=variant,
+        slope=None if fit is None else fit.value,
+        slope_deviation=None if fit is None else fit.deviation,
+        theory=theory.slope,
+        why=why,
+        agrees=agrees,
+    )
 
 
 def variance_of_median(repeats: NDArray[Any]) -> FloatArray:
@@ -109,7 +154,6 @@ def recommend(cells: Sequence[Cell], floor: float) -> Recommendation:
         reasons = [f"the cheapest {limit}: {round(100 * total, 4):.2g} % above it"]
     else:
         reasons = [f"no measured setting is {limit}; these are the nearest, {100 * total:.0f} % above it"]
-        reasons += [words for words in (_more_samples(cells, cell, floor) for cell in best) if words]
     reasons += [
         f'{SAMPLES_KEYS[cell.stage]} = "{AUTO}" took up to {cell.samples} samples per pixel'
         for cell in best
@@ -169,24 +213,13 @@ def _recommended(cell: Cell) -> RecommendedSetting:
     )
 
 
-def _more_samples(cells: Sequence[Cell], cell: Cell, floor: float) -> str:
-    """Return in words how many samples a stage needs, extrapolated from its last two cells, or an empty string.
+def pareto_front(items: Iterable[Item], cost: Callable[[Item], float], error: Callable[[Item], float]) -> list[Item]:
+    """Return the items than which no other has both less cost and less error, the cheapest first.
 
-    The excess decreases with the square of the error; rendering and calibration each get half of the tolerance.
+    Of equal items the first one stays.
     """
-    if cell.samples is None or not cell.counted:
-        return ""
-    share, present = TOLERANCE / 2, excess(cell, floor)
-    curve = [
-        (other.samples, other.error.median)
-        for other in cells
-        if (other.stage, other.way, other.variant) == (cell.stage, cell.way, cell.variant)
-        and other.samples
-        and other.counted
-    ]
-    last = sorted(curve)[-2:]
-    if present <= share or len(last) < 2 or last[0][1] <= last[1][1]:
-        return ""
-    rate = log(last[0][1] / last[1][1]) / log(last[1][0] / last[0][0])
-    samples = cell.samples * exp(log(present / share) / (2 * rate))
-    return f"{cell.stage}, {cell.way}, would need about {float(f'{samples:.1g}'):.0f} samples"
+    front: list[Item] = []
+    for item in sorted(items, key=lambda item: (cost(item), error(item))):
+        if not front or error(item) < error(front[-1]):
+            front.append(item)
+    return front

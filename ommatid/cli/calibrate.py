@@ -58,7 +58,7 @@ def calibrate(
 
     It is rendered or computed as the scene says, or with --points taken from recorded frames of a real camera.
     """
-    from ommatid.pipeline.calibration import calibrate_file, point_recording
+    from ommatid.pipeline.camera_files import calibrate_file, point_recording
 
     settings = options.acquisition(dark, flat, flat_value, origin, upright)
     value = options.positive("--point-value", point_value)
@@ -77,7 +77,7 @@ def export_model(
     as_json: Json = False,
 ) -> None:
     """Write the observation matrix H of a model as a matrix for scipy.sparse.load_npz."""
-    from ommatid.pipeline.calibration import export_matrix
+    from ommatid.pipeline.camera_files import export_matrix
 
     description = export_matrix(model, file)
     output.say_done("export-model", True, file)
@@ -101,7 +101,7 @@ def import_frames(
 
     A mosaic is the sensor seen from behind the camera, rows downwards; its numbers are taken as they are.
     """
-    from ommatid.pipeline.imports import import_file
+    from ommatid.pipeline.camera_files import import_file
 
     settings = options.acquisition(dark, flat, flat_value, origin, upright)
     outcome = import_file(scene, images, file, settings, options.changes(sets), options.lens_names(lens))

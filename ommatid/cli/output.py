@@ -123,7 +123,7 @@ def print_report(name: str, page: Path | None, report: RunReport, sections: Iter
 
     name : of the scene;  page : its report.html, None without one;  sections : its tables
     """
-    from ommatid.pipeline.summary_lines import summary_lines, verdict_line
+    from ommatid.pipeline.sections import summary_lines, verdict_line
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
     if detail == "table":

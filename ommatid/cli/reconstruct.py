@@ -106,7 +106,7 @@ def reconstruct(
     if len(stacks) != 1:
         if scheduler:
             raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
-        common = FrameOptions(model, *asked, others, force=force)
+        common = FrameOptions(model, *asked, others, force)
         _reconstruct_many(stacks, common, file, workers, strict, None if as_json else detail)
         return
     request = reconstruction.ReconstructionRequest(stacks[0], model, *asked, force)
@@ -185,7 +185,7 @@ class DescribedFrame:
 
 def _print_frames(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
     from ommatid.analysis import run_table
-    from ommatid.pipeline.summary_lines import verdict_line
+    from ommatid.pipeline.sections import verdict_line
 
     if detail is None:
         output.print_json([frame.document for frame in frames])
@@ -241,12 +241,12 @@ def check(
 
     Names those that disagree: their H is wrong, or their pixels. Needs no truth.
     """
-    from ommatid.analysis.held_out import table
-    from ommatid.pipeline.held_out import check_files
+    from ommatid.analysis import held_out
+    from ommatid.pipeline.reconstruction import ReconstructionRequest, check_held_out_files
 
-    asked = options.changes(sets), options.lens_names(lens)
+    request = ReconstructionRequest(stack, model, options.changes(sets), options.lens_names(lens))
     with output.progress_bar("check") as progress:
-        report = check_files(stack, model, *asked, fitted=not scene_prior, progress=progress)
-    output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", table.rows(report))], as_json)
+        report = check_held_out_files(request, fitted=not scene_prior, progress=progress)
+    output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", held_out.rows(report))], as_json)
     if strict and report.verdict.trusted is False:
         raise failures.BatchError(failures.NOT_TRUSTED)

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ommatid.analysis.held_out import maps as held_out_maps
-from ommatid.analysis.held_out import table
-from ommatid.analysis.quality.another_type import best_other_type
-from ommatid.analysis.quality.averaging_kernel import ErrorWindow, error_window
-from ommatid.analysis.quality.next_steps import next_steps
+from ommatid.analysis import held_out
+from ommatid.analysis.averaging_kernel import ErrorWindow, error_window
+from ommatid.analysis.next_steps import best_other_type, next_steps
 from ommatid.bench.table import BenchTable
 from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.reconstruct.output import verdict_words
@@ -147,12 +145,12 @@ def _held_out(run: Run) -> dict[str, Any]:
     report = run.report.held_out
     if report is None:
         return {"held_out": None}
-    rows = table.rows(report)
+    rows = held_out.rows(report)
     return {
         "held_out": report,
         "held_out_words": f"{rows[0][1][:1].upper()}{rows[0][1][1:]}",
-        "held_out_prior": table.prior_words(report.prior),
-        "held_out_maps": held_out_maps.lens_type_maps(report),
+        "held_out_prior": held_out.prior_words(report.prior),
+        "held_out_maps": held_out.lens_type_maps(report),
         "held_out_table": tables.held_out(rows),
     }
 

@@ -1,21 +1,29 @@
-"""The claims of the paper (Wood, Rajan and Christensen) on expected errors, and our formulas of null spaces, checked.
+"""The claims of the paper (Wood, Rajan and Christensen), and our formulas of null spaces, checked.
 
 Errors are expected squared errors per pixel (Eq. 5) in squared units of f; noise means its variance. Unless stated
-otherwise the estimator expects the actual noise.
+otherwise the estimator expects the actual noise. Claims on photographs are checked by simulated reconstructions.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import combinations
 from math import inf, isfinite
 
+import numpy as np
+
 from ommatid.reconstruct.measured_error import TRIM
+from ommatid.reconstruct.methods.tile_merging import Posterior, disjoint_tiles, merge_posteriors, tile_posterior
 from ommatid.reconstruct.prediction import observability
+from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.arrays import FloatArray
 from ommatid.simulate.ideal import ideal_matrix
 
+from .photographs import WHOLE_BITS, Photograph, Trials
 from .tile_errors import (
     ACTUAL,
+    COMBINATIONS,
     COMPLETE_SIDES,
     EXPECTED,
     LEAST,
@@ -27,6 +35,7 @@ from .tile_errors import (
     Tiles,
     gallery,
     inner,
+    tile,
 )
 
 YES, NO, QUALIFIED = "yes", "no", "with qualifications"
@@ -248,3 +257,148 @@ def _two_ranks() -> Claim:
     }
     numbers |= {f"{side} {'+'.join(THREE)}: null space": count for side, count in all_three.items()}
     return Claim("two coprime types leave 2ab dimensions, three leave none", verdict(holds), numbers, source=OWN)
+
+
+EQUAL = 1e-9  # relative difference of errors that two methods compute in float64
+JOINED_SIDE, PARTS = 35, 2  # of the tile that is cut into parts, and parts along either axis
+
+
+def tile_claims(tiles: Tiles) -> list[Claim]:
+    """Check the claims that compare tiles and combinations of lens types."""
+    trimming = [_relative_trimming(tiles, side) for side in COMPLETE_SIDES]
+    return [*trimming, _larger_tile_and_null_space(tiles), _second_set(tiles), _joined(tiles)]
+
+
+def _relative_trimming(tiles: Tiles, side: int) -> Claim:
+    errors = {lenses: tiles[side, lenses].matched(LEAST) for lenses in (TWO, THREE)}
+    removed = {lenses: 1 - inner(error, side) / float(error.mean()) for lenses, error in errors.items()}
+    holds = verdict(removed[THREE] < removed[TWO])
+    remark = f"does not hold: it removes {removed[THREE]:.1%} with three types and {removed[TWO]:.1%} with two"
+    return Claim(
+        f"three types: trimming the {side} x {side} tile brings relatively less than with two",
+        holds,
+        {f"{'+'.join(lenses)}: share of the error that it removes": share for lenses, share in removed.items()},
+        remark if holds == NO else "",
+    )
+
+
+def _larger_tile_and_null_space(tiles: Tiles) -> Claim:
+    small, large = COMPLETE_SIDES
+    ratios = {lenses: tiles[small, lenses].mse(LEAST) / tiles[large, lenses].mse(LEAST) for lenses in COMBINATIONS}
+    limited = {lenses: all(tiles[side, lenses].floor > 0 for side in COMPLETE_SIDES) for lenses in COMBINATIONS}
+    most_open = min(ratio for lenses, ratio in ratios.items() if limited[lenses])
+    most_complete = max(ratio for lenses, ratio in ratios.items() if not limited[lenses])
+    return Claim(
+        f"the {large} x {large} tile helps most where a null space limits the error",
+        verdict(most_open > most_complete),
+        {f"{'+'.join(lenses)}: error of {small} over error of {large}": ratio for lenses, ratio in ratios.items()},
+    )
+
+
+def _second_set(tiles: Tiles) -> Claim:
+    """Compare two sets of every lens type with one set at half the noise, which averaging them would leave."""
+    numbers: dict[str, float] = {}
+    holds = True
+    for (side, lenses), two in tiles.items():
+        if len(set(lenses)) == 1:
+            one = tile(side, lenses[:1])
+            halved = [abs(two.mse(noise) / one.mse(noise / 2) - 1) for noise in map(float, ACTUAL)]
+            holds &= max(halved) < EQUAL and one.form.rank == two.form.rank
+            numbers[f"{side}: largest relative difference from one set at half the noise"] = max(halved)
+            numbers[f"{side}: null space of one set"] = two.camera.unknowns - one.form.rank
+            numbers[f"{side}: null space of two"] = two.camera.unknowns - two.form.rank
+            numbers[f"{side}: error of two over error of one, noise {LEAST:g}"] = two.mse(LEAST) / one.mse(LEAST)
+    return Claim("a second equal set of lenses only averages noise", verdict(holds), numbers)
+
+
+def _joined(tiles: Tiles) -> Claim:
+    """Compare a tile that Eq. 7 joins from four with the whole, and with the four before they are joined."""
+    numbers: dict[str, float] = {}
+    holds = True
+    for lenses in (TWO, THREE):
+        whole = tiles[JOINED_SIDE, lenses]
+        parts = _parts(whole)
+        apart = float(np.concatenate([part.variance for part in parts]).mean())
+        joined = _join(whole, parts).variance
+        difference = float(np.abs(joined / whole.matched(LEAST) - 1).max())
+        holds &= difference < EQUAL and apart > whole.mse(LEAST)
+        numbers[f"{whole.name}: error of four parts of the {whole.side} x {whole.side} tile"] = apart
+        numbers[f"{whole.name}: joined"] = float(joined.mean())
+        numbers[f"{whole.name}: error of the whole tile"] = whole.mse(LEAST)
+        numbers[f"{whole.name}: largest relative difference of a pixel"] = difference
+    return Claim("joining tiles by Eq. 7 brings what a larger tile brings", verdict(holds), numbers)
+
+
+def _parts(whole: PaperTile) -> list[Posterior]:
+    half = -(-whole.side // PARTS)
+    problem = _quiet(whole)
+    return [
+        tile_posterior(problem, np.zeros(problem.measurements), pixels)
+        for pixels in disjoint_tiles(whole.camera.shape, (half, half))
+    ]
+
+
+def _join(whole: PaperTile, parts: list[Posterior]) -> Posterior:
+    problem = _quiet(whole)
+    return reduce(lambda one, other: merge_posteriors(one, other, problem, np.zeros(problem.measurements)), parts)
+
+
+def _quiet(whole: PaperTile) -> Problem:
+    """Return the problem of a tile at the least noise."""
+    problem = whole.form.problem
+    return replace(problem, noise_variance=LEAST * problem.noise_variance)
+
+
+SIGMAS = 4.0  # standard errors that a ratio may be off, so that one of twenty ratios hardly ever is by chance
+
+
+def photograph_claims(photograph: Photograph) -> list[Claim]:
+    """Check the claims on quantisation and on photographs."""
+    return [_quantisation(photograph), _photographs(photograph)]
+
+
+def _quantisation(photograph: Photograph) -> Claim:
+    trials = photograph.quantised
+    bits = [noise.bits or 0 for noise in trials.noises]
+    ratios, errors = _noise_ratios(trials)
+    off = np.flatnonzero(np.abs(ratios - 1) > SIGMAS * errors)
+    first = bits[int(off[-1])] + 1 if off.size else bits[0]
+    numbers = {
+        f"error it causes over predicted at {count} bits": float(ratio)
+        for count, ratio in zip(bits, ratios, strict=True)
+    }
+    whole = float(_noise_ratios(photograph.whole)[0].mean())
+    numbers |= {"standard error at most": float(errors.max()), f"whole numbers, from {WHOLE_BITS} bits on": whole}
+    holds = first <= WHOLE_BITS
+    remark = (
+        f"from {first} bits on: where a smooth image changes by less than a step, neighbours are rounded alike; pixels"
+        f" that are whole numbers err {1 - whole:.0%} less from {WHOLE_BITS} bits on"
+    )
+    return Claim(
+        "quantisation acts as added noise of variance step^2 / 12",
+        verdict(holds, qualified=True),
+        numbers,
+        remark if holds else "",
+    )
+
+
+def _noise_ratios(trials: Trials) -> tuple[FloatArray, FloatArray]:
+    """Return the error that the noise causes over what Eq. 5 predicts, (Q,), and its standard error."""
+    ratios = trials.from_noise.mean(axis=1) / trials.noise_part
+    return ratios, trials.spread / np.sqrt(trials.from_noise.shape[1])
+
+
+def _photographs(photograph: Photograph) -> Claim:
+    trials = photograph.noisy
+    ratios = trials.mean / trials.predicted
+    noise = np.array([table.variance for table in trials.noises])
+    quiet, loud = noise <= QUIET, noise >= LOUD
+    error = float(np.sqrt(np.mean(trials.spread[quiet] ** 2) / (quiet.sum() * trials.measured.shape[1])))
+    holds = bool((ratios[loud] < 1).all()) and ratios[quiet].mean() < 1 + SIGMAS * error
+    numbers = {
+        f"measured over predicted at noise {noise[index]:g}": float(ratios[index]) for index in np.flatnonzero(loud)
+    }
+    numbers[f"mean up to noise {QUIET:g}"] = float(ratios[quiet].mean())
+    numbers["its standard error"] = error
+    remark = "a photograph is smoother than the prior, which helps where the prior decides; at low noise it is no help"
+    return Claim("real photographs do somewhat better than predicted", verdict(holds), numbers, remark if holds else "")

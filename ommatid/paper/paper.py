@@ -17,10 +17,8 @@ from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
 
 from . import figures
-from .claims import PAPER, Claim, error_claims, rank_claims
-from .photograph_claims import photograph_claims
+from .claims import PAPER, Claim, error_claims, photograph_claims, rank_claims, tile_claims
 from .photographs import PHOTOGRAPH, Photograph, TileCrops, Trials, crop_tiles, load, seeds, simulate_trials
-from .tile_claims import tile_claims
 from .tile_errors import ACTUAL, COMBINATIONS, SIDES, THREE, PaperTile, Tiles, distortion, sweep, tiles
 
 SIDE = 35  # of the photograph's tiles

@@ -15,6 +15,7 @@ from ommatid.page.batch_index import INDEX, cached_index
 from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import figures, result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import Format, check_formats, check_picture, clear_formats
+from ommatid.reconstruct.output.held_out_report import HeldOutReport, held_out_report
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
@@ -141,6 +142,19 @@ def reconstruct_folder(
             _copy(request.model, folder / MODEL)
         with _tile_workers(cluster, workers) as pool:
             return finish_folder(folder, progress, request.regions, pool, request.force)
+
+
+def check_held_out_files(request: ReconstructionRequest, *, fitted: bool, progress: Progress) -> HeldOutReport:
+    """Predict every sub-imager of a stack from all others.
+
+    fitted : True replaces an independent prior by one fitted to the stack
+    Raises InputError for wrong files and options, and for a scene without noise.
+    """
+    from ommatid.reconstruct.held_out.check import check_held_out
+
+    recorded, calibrated = request.read()
+    check_match(recorded, calibrated, (request.stack, request.model))
+    return held_out_report(check_held_out(recorded, calibrated, fitted=fitted, progress=progress))
 
 
 def finish_folder(

@@ -240,8 +240,7 @@ def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> tuple[Stack,
 def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> tuple[tuple[StudyCase, ...], bool]:
     """Reconstruct the stack with every model of H that the scene's study names; True if that had to be done."""
     from ommatid.analysis.calibration_goal import for_stack
-    from ommatid.analysis.models import study_models
-    from ommatid.analysis.study import cached_study
+    from ommatid.analysis.study import cached_study, study_models
     from ommatid.reconstruct.output.result_files import truth_beside
 
     with observer.progress("study") as progress:

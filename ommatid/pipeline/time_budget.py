@@ -6,7 +6,7 @@ All of them are ordinary runs in the scene's own folder, so that it holds comple
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -27,8 +27,7 @@ from ommatid.scenes.tables import toml
 from ommatid.scenes.tables.units import duration
 
 from . import stages
-from .bench_curves import bench_error_curves
-from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, error_curve
+from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, bench_error_curves, error_curve
 
 FEW, MORE = 256, 1024  # samples per pixel of the two measuring runs
 MOST = 2**20  # samples per pixel of either stage
@@ -70,14 +69,6 @@ def check_within(setup: Setup, folder: Path) -> None:
     stages.check_run(_with_samples(setup, FEW, FEW), folder)
 
 
-@dataclass(frozen=True)
-class TimeRequest:
-    """Seconds for a number of scenes together."""
-
-    seconds: float
-    scenes: int = 1
-
-
 def shared_time(
     seconds: float, folders: Sequence[Path], started: float, say: Callable[[str], None], clock: Clock = perf_counter
 ) -> Stages:
@@ -86,7 +77,7 @@ def shared_time(
     folders : of the scenes, in the order in which they are run
     Each scene has an equal share of the time that is left, so that a scene that fails leaves its share to the others.
     """
-    request = TimeRequest(seconds, len(folders))
+    request = RequestedTime(seconds=seconds, scenes=len(folders))
 
     def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
         begun = started if request.scenes == 1 else clock()
@@ -104,7 +95,7 @@ def run_within(
     say: Callable[[str], None],
     clock: Clock = perf_counter,
     begun: float | None = None,
-    request: TimeRequest | None = None,
+    request: RequestedTime | None = None,
 ) -> dict[str, Any]:
     """Run a scene with the samples that give the least expected error within `seconds`, and return its description.
 
@@ -113,7 +104,7 @@ def run_within(
     request : the request that `seconds` are a share of; it identifies a repeated run, as shares vary
     """
     begun = clock() if begun is None else begun
-    requested = asdict(TimeRequest(seconds) if request is None else request)
+    requested = RequestedTime(seconds=seconds, scenes=1) if request is None else request
     earlier = _earlier_run(folder, setup, requested)
     if earlier is not None:
         report = stages.results(_with_samples(setup, *_samples_of(earlier.chosen)), folder, observer)
@@ -252,7 +243,7 @@ def _fitted_curves(setup: Setup, few: MeasuredRun, more: MeasuredRun) -> Curves:
     return curves[0], curves[1]
 
 
-def _earlier_run(folder: Path, setup: Setup, requested: dict[str, Any]) -> TimeReport | None:
+def _earlier_run(folder: Path, setup: Setup, requested: RequestedTime) -> TimeReport | None:
     """Return the times of the run in `folder` if it was of the same scene with the same request."""
     try:
         earlier = run_json.read(folder).spent
@@ -260,7 +251,7 @@ def _earlier_run(folder: Path, setup: Setup, requested: dict[str, Any]) -> TimeR
         same_scene = toml.loads(read_text(folder / "scene.toml")) == scene
     except (InputError, OSError, ValueError, KeyError):
         return None
-    return earlier if same_scene and earlier.asked == RequestedTime(**requested) else None
+    return earlier if same_scene and earlier.asked == requested else None
 
 
 def _finish(

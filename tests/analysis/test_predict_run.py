@@ -42,16 +42,19 @@ DISTORTION = tuple(f"camera.lens.{name}.distortion=[0.05,0.02]" for name in ("I"
 @pytest.mark.parametrize(
     ("changes", "lenses"),
     [
-        ((), ()),
-        ((), ("I", "II")),
-        (("camera.lens.II.array=[3,4]", "camera.lens.II.pixels=fit"), ()),
-        (DIFFRACTION, ()),
-        (DISTORTION, ()),
-        (('camera.tolerance.position="1 um"',), ()),
-        (("render.samples=auto", "calibration.samples=auto"), ()),
-        (("calibration.method=ideal",), ()),
+        pytest.param((), (), id="three types"),
+        pytest.param(("calibration.method=ideal",), ("I", "II"), id="two types, ideal"),
+        *(
+            pytest.param(changes, (), id=name, marks=pytest.mark.slow)
+            for name, changes in (
+                ("odd array", ("camera.lens.II.array=[3,4]", "camera.lens.II.pixels=fit")),
+                ("diffraction", DIFFRACTION),
+                ("distortion", DISTORTION),
+                ("misaligned", ('camera.tolerance.position="1 um"',)),
+                ("auto", ("render.samples=auto", "calibration.samples=auto")),
+            )
+        ),
     ],
-    ids=["three types", "two types", "odd array", "diffraction", "distortion", "misaligned", "auto", "ideal"],
 )
 def test_a_prediction_lies_in_the_interval_of_the_run(changes: tuple[str, ...], lenses: tuple[str, ...]) -> None:
     needs("llvm_ad_mono")
@@ -68,6 +71,7 @@ def test_a_prediction_lies_in_the_interval_of_the_run(changes: tuple[str, ...], 
     assert sum(predicted.budget.values()) == pytest.approx(predicted.mse, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_diffraction_with_distortion_has_no_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
     needs("llvm_ad_mono")
     monkeypatch.setattr(pilot, "MOST_RAYS", 2**21)
@@ -78,6 +82,7 @@ def test_diffraction_with_distortion_has_no_closed_form(monkeypatch: pytest.Monk
     assert predict_scene(read(TILE, (*FEW, *DIFFRACTION)), rays=False).mse < 0.5 * alone.mse
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [(), DIFFRACTION], ids=["pinholes", "light beside the target"])
 def test_a_pilot_knows_the_variance_of_a_rendering(changes: tuple[str, ...]) -> None:
     """Against the scatter of eight renderings: 7 x 706 degrees of freedom, but neighbours go together."""
@@ -91,6 +96,7 @@ def test_a_pilot_knows_the_variance_of_a_rendering(changes: tuple[str, ...]) -> 
     assert stated.mean() == pytest.approx(np.var(values, axis=0, ddof=1).mean(), rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_h_around_the_true_one_deviates_as_a_calibration_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """With half the passes, and with fewer samples in each of them."""
     needs("llvm_ad_mono")
@@ -128,6 +134,7 @@ def test_an_estimator_with_the_wrong_h() -> None:
     np.testing.assert_allclose(np.square(known) + of_image, np.square(error), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_uncalibrated_tolerances_cost_a_picture_the_mean_over_assemblies() -> None:
     """Against 300 assemblies; the form is that of the design, and nothing but H scatters."""
     lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
@@ -150,6 +157,7 @@ def test_uncalibrated_tolerances_cost_a_picture_the_mean_over_assemblies() -> No
     assert predicted > float(np.square(start).mean()) + 20 * deviation, "misalignment raises the error"
 
 
+@pytest.mark.slow
 def test_a_tolerance_as_designed_and_calibrated_side_by_side(ommatid: Command) -> None:
     needs("llvm_ad_mono")
     loose = ("--set", 'camera.tolerance.position="41 nm"', "--set", "calibration.samples=1024")
@@ -180,6 +188,7 @@ def test_it_says_where_nothing_is_recovered(ommatid: Command) -> None:
     assert "nothing is recovered" not in ommatid("predict", TILE, "--no-rays").out
 
 
+@pytest.mark.slow
 def test_a_scene_without_a_picture(tmp_path: Path) -> None:
     needs("llvm_ad_mono")
     scene = tmp_path / "scene.toml"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,7 @@ def recorded(described: Scene) -> tuple[Stack, Model, FloatArray]:
     return Stack(described, camera, values, np.zeros_like(values), record), model, truth
 
 
+@cache
 def restored(how: str) -> Reconstruction:
     return restore(*recorded(misaligned(how)))
 
@@ -151,10 +153,10 @@ def test_a_study_is_cached_and_printed(tmp_path: Path) -> None:
     assert study.cached_study(tmp_path, other, models, truth)[1]
 
 
-def test_a_study_from_the_command_line(tmp_path: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_a_study_from_the_command_line(tmp_path: Path, ommatid: Command) -> None:
     """Real lenses: point sources and transport give the same error."""
     needs("llvm_ad_mono")
-    monkeypatch.chdir(tmp_path)
     lens = {"aperture": "0.4 mm", "focus": "600 mm"}
     data = scene((12, 12), (("1/3", [2, 2], [3, 3]),), noise={"variance": 1e-2}).plain()
     data["camera"]["lens"][0] |= lens

@@ -1,31 +1,38 @@
-"""`ommatid bench`: slopes, recommendations, the scheduler and its journal, and the files it writes."""
+"""`ommatid bench`: slopes, recommendations, its time limit and the files that it writes."""
 
 from __future__ import annotations
 
 import csv
 import json
-import os
-from collections.abc import Callable
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
+from scipy import special, stats
 
-from ommatid.bench.bench import curves, rows
+from ommatid.bench.bench import measure, rows
+from ommatid.bench.cells import (
+    CLEAR_REFS,
+    SAMPLERS,
+    Cost,
+    Job,
+    Repeat,
+    Subject,
+    cell_from_repeats,
+    jobs,
+    measure_cost,
+    name_of,
+)
 from ommatid.bench.figure import write_figures
-from ommatid.bench.jobs import SAMPLERS, Subject, jobs
 from ommatid.bench.reference import reference, sample_plan
-from ommatid.bench.resources import CLEAR_REFS, Cost, measure_cost
-from ommatid.bench.scheduler import Job, Journal, Repeat, cell_from_repeats, measure, name_of
-from ommatid.bench.slopes import Slope, excess, recommend, slope
+from ommatid.bench.slopes import Slope, curves, excess, pareto_front, recommend, slope
 from ommatid.bench.table import AUTO, CSV, JSON, BenchTable, Cell, Quantiles, Stage, read, row_of, write
 from ommatid.pipeline.stages import open_scene
 from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import derive
 
 from ..conftest import Command
@@ -35,6 +42,22 @@ from .tables import bench_table, cell, exactly
 FIGURES = ("render.png", "calibrate.png", "reconstruct.png")
 
 
+def test_the_slope_of_a_power_law_is_found_with_its_standard_error() -> None:
+    """Medians of 5 with a scatter of 5 % each: s^2 pi / (2 n + pi - 2) over the spread of ln(samples).
+
+    Variances are shrunk by their logarithms, whose mean for 4 degrees of freedom is digamma(2) - ln 2 too low.
+    """
+    samples = 4.0 ** np.arange(2, 8)
+    cells = [cell(samples=int(count), error=exactly(7.0 * count**-0.75), scatter=0.05) for count in samples]
+    fit = slope(cells)
+    assert fit is not None
+    assert fit.value == pytest.approx(-0.75)
+    unbiased = 2 * np.exp(-special.digamma(2))
+    spread = np.log(samples).var() * samples.size
+    assert fit.deviation == pytest.approx(0.05 * (unbiased * np.pi / (8 + np.pi) / spread) ** 0.5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [-0.5, -0.75, -1.0])
 def test_slopes_are_right_within_their_standard_error(power: float) -> None:
     """400 fits to errors of 5 seeds with a scatter of 5 %: the scores follow Student's t with about 24 degrees.
@@ -96,7 +119,7 @@ def test_the_cheapest_settings_that_reach_the_floor_are_recommended() -> None:
 
 
 def test_adaptive_samples_are_recommended_as_a_scene_asks_for_them() -> None:
-    """They share their sampler with cells of given numbers; neither slopes nor forecasts of samples use them."""
+    """They share their sampler with cells of given numbers; no slope uses them."""
     ways: list[tuple[Stage, str]] = [("render", "multijitter"), ("calibrate", "transport, multijitter")]
     counted = [
         cell(stage, way=way, seconds=exactly(0.1 * count), mse=exactly(2 + 100 / count), samples=count,
@@ -116,93 +139,50 @@ def test_adaptive_samples_are_recommended_as_a_scene_asks_for_them() -> None:
         assert (setting.samples, setting.sampler) == (AUTO, "multijitter")
     assert 'render.samples = "auto" took up to 576' in best.why
     assert not recommend([*counted, estimate], 2.0).reached
-    half = recommend([*counted, adaptive[0], estimate], 2.0)
-    assert [setting.samples for setting in (half.render, half.calibrate) if setting] == [AUTO, 256]
-    assert "calibrate, transport, multijitter, would need about 1000 samples" in half.why
     tile = open_scene(GALLERY / "tile19.toml").camera
     assert curves([*counted, *adaptive], tile) == curves(counted, tile)
 
 
-class Counter:
-    """Jobs that count their repeats; each reports its guess as its duration, and takes no time."""
+def job(samples: int, ran: list[tuple[int, int]], seconds: float = 0.0) -> Job:
+    """A job that notes its repeats in `ran` and takes no time; one of 13 samples cannot be measured."""
 
-    def __init__(self) -> None:
-        self.ran: list[tuple[int, int]] = []
+    def work(repeat: int) -> Repeat:
+        ran.append((samples, repeat))
+        if samples == 13:
+            raise InputError("thirteen cannot be done")
+        return Repeat(1 / samples + 1e-3 * repeat, Cost(seconds, 2**20), 2.0)
 
-    def job(self, samples: int, guess: float = 1e-3) -> Job:
-        def work(repeat: int) -> Repeat:
-            self.ran.append((samples, repeat))
-            if samples == 13:
-                raise InputError("thirteen cannot be done")
-            return Repeat(1 / samples + 1e-3 * repeat, Cost(guess, 2**20), 2.0)
-
-        return Job("render", "independent", None, samples, "", guess, work)
+    return Job("render", "independent", None, samples, "", work)
 
 
-@pytest.mark.parametrize("link", [os.symlink, os.link])
-def test_a_link_in_place_of_the_journal_is_replaced(link: Callable[[Path, Path], None], tmp_path: Path) -> None:
-    other, path = tmp_path / "other", tmp_path / "partial"
-    other.write_text("of another program", encoding="utf-8")
-    link(other, path)
-    Journal(path, "a").add("render", "no time", 1.0)
-    assert other.read_text(encoding="utf-8") == "of another program"
-    assert Journal(path, "a").refused == {"render": "no time"}
+def test_known_cells_are_not_repeated_and_each_new_one_is_saved() -> None:
+    ran, saved = list[tuple[int, int]](), list[list[Cell]]()
+    first, refused = measure([job(4, ran), job(13, ran)], {}, perf_counter() + 60, lambda cells: saved.append([*cells]))
+    assert ran == [*((4, repeat) for repeat in range(5)), (13, 0)]
+    assert [(skipped.why, skipped.late) for skipped in refused] == [("thirteen cannot be done", False)]
+    known = {name_of(cell): cell for cell in first}
+    again, _ = measure([job(4, ran), job(16, ran)], known, perf_counter() + 60, lambda cells: saved.append([*cells]))
+    assert ran[6:] == [(16, repeat) for repeat in range(5)]
+    assert [cell.samples for cell in again] == [4, 16]
+    assert saved == [first, again]
 
 
-def test_finished_jobs_are_not_repeated_after_an_interruption(tmp_path: Path) -> None:
-    path, counter = tmp_path / "partial", Counter()
-    first = Journal(path, "a")
-    assert measure([counter.job(4), counter.job(13)], 60, first, no_progress) == []
-    assert (len(counter.ran), set(first.refused.values())) == (6, {"thirteen cannot be done"})
-    with path.open("a", encoding="utf-8") as stream:
-        stream.write('{"fingerprint": "a", "name": "render ind')  # killed in the middle of a line
-    again = Journal(path, "a")
-    measure([counter.job(4), counter.job(13), counter.job(16)], 60, again, no_progress)
-    assert counter.ran[6:] == [(16, repeat) for repeat in range(5)]
-    assert again.cells == Journal(path, "a").cells
-    assert len(again.cells) == 2
-    assert Journal(path, "another").cells == {}
-    again.remove()
-    assert not path.exists()
-
-
-def test_the_cheapest_come_first_and_what_does_not_fit_is_named(tmp_path: Path) -> None:
-    counter, shares = Counter(), list[float]()
-    listed = [counter.job(64, 1e6), counter.job(16, 0.02), counter.job(4, 0.01)]
-    left_out = measure(listed, 60, Journal(tmp_path / "partial", "a"), shares.append)
-    assert [samples for samples, repeat in counter.ran if repeat == 0] == [4, 16]
-    assert len(left_out) == 1
-    assert "64 samples" in left_out[0].what
-    assert left_out[0].late
-    assert shares[-1] == 1.0
-
-
-def test_short_adaptive_jobs_come_first_and_are_found_again(tmp_path: Path) -> None:
-    """A long one waits for its turn. The cell has the most samples of any repeat, and the name of its job."""
-    ran: list[str] = []
-
-    def job(way: str, guess: float) -> Job:
-        def work(repeat: int) -> Repeat:
-            ran.append(way)
-            return Repeat(1e-15, Cost(guess, None), 2.0, 576 * (1 + repeat % 2))
-
-        return Job("render", way, None, None, AUTO, guess, work)
-
-    listed, path = [Counter().job(4), job("short", 1.0), job("long", 3.0)], tmp_path / "partial"
-    measure(listed, 60, Journal(path, "a"), no_progress)
-    assert list(dict.fromkeys(ran)) == ["short", "long"]
-    again = Journal(path, "a")
-    assert list(again.cells) == ["render short, auto", listed[0].name, "render long, auto"]
-    assert all(name_of(one) == name for name, one in again.cells.items())
-    assert again.cells["render short, auto"].samples == 1152
-    assert not again.cells["render short, auto"].counted
-    assert measure(listed, 60, again, no_progress) == []
-    assert len(ran) == 5 + 5, "five repeats of each, since neither takes as long as its guess, and no more"
+def test_what_does_not_fit_is_left_out() -> None:
+    """Time is proportional to samples: of a cell of 5 s in 60 s one with 4 times as many fits, one with 16 does not."""
+    ran: list[tuple[int, int]] = []
+    listed = [job(4, ran, 1.0), job(16, ran, 1.0), job(64, ran, 1.0)]
+    cells, left_out = measure(listed, {name_of(listed[0]): listed[0].measure()}, perf_counter() + 60, lambda _: None)
+    assert [cell.samples for cell in cells] == [4, 16, 64], "each as long as the one before"
+    known = {name_of(cell): cell for cell in cells[:1]}
+    cells, left_out = measure([listed[0], job(64, ran)], known, perf_counter() + 60, lambda _: None)
+    assert [cell.samples for cell in cells] == [4]
+    assert [(skipped.late, "64 samples" in skipped.what) for skipped in left_out] == [(True, True)]
+    assert job(4, ran).measure(deadline=0.0) is None, "one repeat is no cell"
 
 
 def test_a_cell_is_median_and_quantiles_of_its_repeats() -> None:
     repeats = [Repeat(error, Cost(1.0, memory), None) for error, memory in ((1.0, 5), (3.0, 7), (2.0, 6))]
-    made = cell_from_repeats(Counter().job(4), repeats)
+    made = cell_from_repeats(job(4, []), repeats)
     assert made.error.median == 2.0
     assert (made.error.low, made.error.high) == (pytest.approx(1.2), pytest.approx(2.8))
     assert (made.memory, made.mse, made.repeats) == (7, None, 3)
@@ -240,10 +220,9 @@ def test_a_table_that_is_read_is_the_one_that_was_written(
     assert row["mse_high"] == ("" if measured.mse is None else str(measured.mse.high))
 
 
-@pytest.mark.parametrize("seconds", [0.01, 0.023146497000197996, 1.0])
-def test_a_single_cell_is_drawn_whatever_its_time(tmp_path: Path, seconds: float) -> None:
-    """Matplotlib's limits of a logarithmic axis coincide around some single values."""
-    single = cell("reconstruct", way="covariance", error=exactly(1e-10), seconds=exactly(seconds))
+def test_a_single_cell_is_drawn(tmp_path: Path) -> None:
+    """Matplotlib's limits of a logarithmic axis coincide around some single values, such as this one."""
+    single = cell("reconstruct", way="covariance", error=exactly(1e-10), seconds=exactly(0.023146497000197996))
     write_figures(tmp_path, bench_table(derive(scene()), [single]))
     assert (tmp_path / "reconstruct.png").is_file()
 
@@ -252,9 +231,10 @@ def test_a_single_cell_is_drawn_whatever_its_time(tmp_path: Path, seconds: float
 def subject(here: Path) -> Subject:
     """The tiny scene, to be measured."""
     setup = open_scene(here / "tiny.toml")
-    return Subject(setup, reference(setup, here))
+    return Subject(setup, reference(setup))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_errors_of_real_renderings_fall_as_theory_says(subject: Subject, variant: str) -> None:
     """Within 4 standard errors with 16 degrees of freedom: one seed in a thousand would fail."""
@@ -290,6 +270,7 @@ def test_every_sampler_method_and_solver_is_measured(subject: Subject) -> None:
     assert sample_plan(4, "orthogonal").passes == 1
 
 
+@pytest.mark.slow
 def test_adaptive_samples_leave_the_noise_alone(subject: Subject) -> None:
     """Rendering may add a tenth of the noise, H a tenth of all the rest, for any backend."""
     adaptive = [job for job in jobs(subject)[0] if job.setting == AUTO]
@@ -304,7 +285,7 @@ def test_adaptive_samples_leave_the_noise_alone(subject: Subject) -> None:
 
 def test_without_noise_no_cell_has_adaptive_samples(here: Path) -> None:
     setup = open_scene(here / "tiny.toml", ["noise="])
-    listed, left_out = jobs(Subject(setup, reference(setup, here)))
+    listed, left_out = jobs(Subject(setup, reference(setup)))
     assert all(job.setting != AUTO for job in listed)
     assert ["noise.variance above 0" in skipped.why for skipped in left_out if "auto" in skipped.what] == [True]
 
@@ -313,11 +294,6 @@ def test_seeds_differ_between_cells_and_repeats_and_from_the_scenes_own(subject:
     seeds = {subject.seed(name, repeat) for name in ("a", "b") for repeat in range(5)}
     assert len(seeds) == 10
     assert subject.scene.render.seed not in seeds
-
-
-@pytest.mark.parametrize(("name", "closed"), [("tile19", True), ("planoconvex", True), ("misaligned", True)])
-def test_which_cameras_have_a_closed_form(name: str, closed: bool) -> None:
-    assert open_scene(GALLERY / f"{name}.toml").has_closed_form == closed
 
 
 def check(table: BenchTable, document: dict[str, object]) -> None:
@@ -333,11 +309,12 @@ def check(table: BenchTable, document: dict[str, object]) -> None:
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two samplers with few samples and one form: seconds on any machine."""
-    monkeypatch.setattr("ommatid.bench.jobs.SAMPLES", (4, 16, 64))
-    monkeypatch.setattr("ommatid.bench.jobs.SAMPLERS", ("independent", "ldsampler"))
+    monkeypatch.setattr("ommatid.bench.cells.SAMPLES", (4, 16, 64))
+    monkeypatch.setattr("ommatid.bench.cells.SAMPLERS", ("independent", "ldsampler"))
     monkeypatch.setattr("ommatid.bench.precision.FORMS", {"information": FORMS["information"]})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few")
 def test_the_command_writes_its_table_and_repeats_nothing(ommatid: Command, here: Path) -> None:
     ended = ommatid("bench", "tiny.toml", "-o", "out", "--seconds", "3600", "--json")
@@ -380,3 +357,15 @@ def test_a_damaged_table_is_reported_in_one_sentence(tmp_path_factory: pytest.Te
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"run `ommatid bench` again$"):
         read(path)
+
+
+@given(st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-9, 1e6)), max_size=12))
+def test_no_point_beats_the_front_and_none_of_it_is_beaten(points: list[tuple[float, float]]) -> None:
+    front = pareto_front(points, lambda point: point[0], lambda point: point[1])
+    for cost, error in points:
+        assert any(best_cost <= cost and best_error <= error for best_cost, best_error in front)
+    for cost, error in front:
+        assert not any(other[0] < cost and other[1] <= error for other in points)
+    assert front == sorted(front)
+    errors = [error for _, error in front]
+    assert errors == sorted(set(errors), reverse=True), "each costs more for a smaller error"

@@ -1,10 +1,9 @@
-"""Benchmarks of rendering, calibration and estimation against other methods: `python -m tests.benchmarks`.
+"""Benchmarks of rendering and estimation against other methods: `python -m tests.benchmarks`.
 
-`python -m tests.benchmarks frames` runs one part; the parts are `rendering`, `lenses`, `leaving-out`, `forms`,
-`frames`, `film`, which takes ten minutes, and `nasty`, which takes half an hour. No speed is asserted. `coverage`,
-which measures error bars for hours, and `chain`, the time, memory and files of every stage of a run from 239 x 239
-pixels on, are run by themselves (`coverage --help`). Other load slows both sides of a ratio alike, so compare ratios
-rather than times.
+`python -m tests.benchmarks frames` runs one part; the parts are `rendering` and `frames`. No speed is asserted, and
+other load slows both sides of a ratio alike, so compare ratios rather than times. Run by themselves: `chain`, the time,
+memory and files of every stage of a run from 239 x 239 pixels on, and the campaigns, which continue where they were
+interrupted: `nasty`, half an hour, and `coverage`, which measures error bars for hours (`coverage --help`).
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
-from math import isnan
 from pathlib import Path
 from time import perf_counter
 
@@ -25,41 +23,27 @@ from ommatid.runtime.versions import versions
 from ommatid.simulate.renderer.variant import unusable_reason
 
 from .alternation import VARIANTS, Row
-from .calibration import PASS, calibration_rows
 from .camera import SAMPLES, camera_rows
 from .chain import command as chain
 from .coverage.command import command as coverage
-from .film import film_table
-from .forms import NOISE, form_rows
-from .frame_tables import bandwidth_table, frames_table, growth_table
-from .leaving_out import SAMPLES as LEAVING_OUT_SAMPLES
-from .leaving_out import SIDE as LEAVING_OUT_SIDE
-from .leaving_out import leaving_out_rows
-from .lenses import SAMPLES as LENS_SAMPLES
-from .lenses import SIDE as LENS_SIDE
-from .lenses import VARIANT as LENS_VARIANT
-from .lenses import lens_rows, transport_rows
-from .nasty import nasty_table
+from .frames import frames_table
+from .nasty import command as nasty
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NARROWEST = 160
-CHAIN, COVERAGE = "chain", "coverage"
 
 
 def main() -> None:
     """Run the parts that are named on the command line, or all, and print each table as soon as it is complete."""
-    if sys.argv[1:2] == [COVERAGE]:
-        coverage(sys.argv[2:])
-        return
-    if sys.argv[1:2] == [CHAIN]:
-        chain(sys.argv[2:])
+    if sys.argv[1:2] and sys.argv[1] in ALONE:
+        ALONE[sys.argv[1]](sys.argv[2:])
         return
     names = sys.argv[1:] or list(PARTS)
     unknown = [name for name in names if name not in PARTS]
     if unknown:
         raise SystemExit(
-            f"{unknown[0]!r} is not a part of the benchmarks; expected {CHAIN}, {COVERAGE},"
-            f" or some of: {', '.join(PARTS)}"
+            f"{unknown[0]!r} is not a part of the benchmarks; expected one of {', '.join(ALONE)},"
+            f" or some of {', '.join(PARTS)}"
         )
     console = Console()
     console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell
@@ -69,19 +53,16 @@ def main() -> None:
 
 
 def _rendering() -> Iterator[Table]:
-    """Rendering and calibration, on every variant that works here."""
+    """Rendering, on every variant that works here."""
     start = perf_counter()
     releases = ", ".join(f"{name} {version}" for name, version in versions("mitsuba", "drjit").items())
-    table = _ratio_table(f"Speed against stock Mitsuba, on {os.cpu_count()} cores with {releases}")
+    table = _ratio_table(f"Rendering speed against stock Mitsuba, on {os.cpu_count()} cores with {releases}")
     reasons = {variant: unusable_reason(variant) for variant in VARIANTS}
     working = [variant for variant in VARIANTS if not reasons[variant]]
     for variant in working:
         for samples in SAMPLES:
             for row in camera_rows(SCENES / "tile19.toml", variant, samples):
-                _add(table, f"camera: tile19\n{samples} samples per pixel", row)
-    for variant in working:
-        for row in calibration_rows(SCENES / "photo.toml", variant):
-            _add(table, f"calibration: 119 x 119\none pass of {PASS.samples} samples", row)
+                _add(table, f"tile19\n{samples} samples per pixel", row)
     skipped = [f"{variant} was left out: {reason}." for variant, reason in reasons.items() if reason]
     table.caption = " ".join(
         [
@@ -93,75 +74,15 @@ def _rendering() -> Iterator[Table]:
     yield table
 
 
-def _forms() -> Iterator[Table]:
-    table = Table(title=f"Time and precision of the estimator's forms, noise variance {NOISE:g}", show_lines=False)
-    for name in ("unknowns", "measurements", "lens types", "form", "factorise", "solve", "solve, refine and bound"):
-        table.add_column(name, justify="right" if name not in ("lens types", "form") else "left")
-    for name in ("digits, unrefined", "digits, refined", "digits of the worst variance"):
-        table.add_column(name, justify="right")
-    previous = None
-    for row in form_rows(SCENES):
-        if previous is not None and (row.unknowns, row.lenses) != previous:
-            table.add_section()
-        previous = row.unknowns, row.lenses
-        case = [str(row.unknowns), str(row.measurements), row.lenses, row.form]
-        if row.seconds is None or row.digits is None:
-            table.add_row(*case, row.failed)
-            continue
-        seconds = [f"{value:.2g} s" if value >= 1 else f"{value * 1e3:.3g} ms" for value in row.seconds]
-        table.add_row(*case, *seconds, *("reference" if isnan(value) else f"{value:.1f}" for value in row.digits))
-    yield table
-
-
 def _frames() -> Iterator[Table]:
-    for table in (frames_table, growth_table, bandwidth_table):
-        yield table()
-
-
-def _film() -> Iterator[Table]:
-    yield film_table()
-
-
-def _nasty() -> Iterator[Table]:
-    yield nasty_table()
-
-
-def _lenses() -> Iterator[Table]:
-    def rows() -> Iterator[tuple[str, Row]]:
-        for row in lens_rows():
-            yield f"{LENS_SIDE} x {LENS_SIDE} pixels\n{LENS_SAMPLES} samples per pixel", row
-        for row in transport_rows(SCENES / "tile19.toml"):
-            yield "calibration: tile19\n1024 samples", row
-
-    yield _compared("Lenses with surfaces, and calibration by transport", rows())
-
-
-def _leaving_out() -> Iterator[Table]:
-    case = f"{LEAVING_OUT_SIDE} x {LEAVING_OUT_SIDE}, three types\n{LEAVING_OUT_SAMPLES} samples per pixel"
-    yield _compared("Time saved by skipping negligible effects", ((case, row) for row in leaving_out_rows()))
-
-
-def _compared(title: str, rows: Iterator[tuple[str, Row]]) -> Table:
-    """Return a table of ratios on the fast backend, from cases and their rows."""
-    table = _ratio_table(title)
-    reason = unusable_reason(LENS_VARIANT)
-    if reason:
-        table.caption = f"Nothing was measured: {reason}."
-        return table
-    for case, row in rows:
-        _add(table, case, row)
-    return table
+    yield frames_table()
 
 
 PARTS: dict[str, Callable[[], Iterator[Table]]] = {
     "rendering": _rendering,
-    "lenses": _lenses,
-    "leaving-out": _leaving_out,
-    "forms": _forms,
     "frames": _frames,
-    "film": _film,
-    "nasty": _nasty,
 }
+ALONE: dict[str, Callable[[list[str]], None]] = {"chain": chain, "coverage": coverage, "nasty": nasty}
 
 
 def _ratio_table(title: str) -> Table:

@@ -1,18 +1,24 @@
 """Random problems that leave float64 few digits, each against Eq. 4 and 5 in rational numbers.
 
-`python -m tests.benchmarks nasty` solves 100,000 of them. An answer is silently wrong if its error exceeds ten times
-its stated bound and 1e-9; anything else is right or refused with a reason.
+`python -m tests.benchmarks nasty FOLDER` solves 100,000 of them. It continues where it was interrupted; a folder is for
+one version of the program. An answer is silently wrong if its error exceeds ten times its stated bound and 1e-9;
+anything else is right or refused with a reason.
 """
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 from scipy import sparse
 
@@ -304,17 +310,42 @@ def campaign(seeds: range, families: list[str] | None = None) -> tuple[dict[str,
     return counts, losses
 
 
-def nasty_table(start: int = 0, each: int = EACH) -> Table:
-    """Return the counts of a campaign by family, with the silent losses in the caption; `start` is its first seed."""
-    begin = perf_counter()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        counts, losses = campaign(range(start, start + each))
+def nasty_table(folder: Path, start: int = 0, each: int = EACH) -> Table:
+    """Return the counts of a campaign by family, with the silent losses in the caption; `start` is its first seed.
+
+    Every hundred seeds of a family are one line of `folder`/nasty.jsonl, which are not repeated.
+    """
+    begin, path = perf_counter(), folder / "nasty.jsonl"
+    folder.mkdir(parents=True, exist_ok=True)
+    done: dict[tuple[str, int, int], dict[str, Any]] = {}
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        with suppress(ValueError):  # interrupted while it was written
+            entry = json.loads(line)
+            done[entry["family"], entry["start"], entry["stop"]] = entry
+    counts: dict[str, Counter[str]] = {name: Counter() for name in FAMILIES}
+    losses: list[str] = []
+    for name in FAMILIES:
+        for first in range(start, start + each, 100):
+            key = name, first, min(first + 100, start + each)
+            if key not in done:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    counted, lost = campaign(range(*key[1:]), [name])
+                words = [f"{one.family}, seed {one.seed}: {one.error:.1e}, stated {one.bound:.1e}" for one in lost]
+                done[key] = {"family": name, "start": key[1], "stop": key[2], "counts": counted[name], "losses": words}
+                with path.open("a", encoding="utf-8") as stream:
+                    stream.write(f"\n{json.dumps(done[key])}\n")
+            counts[name] += Counter(done[key]["counts"])
+            losses += done[key]["losses"]
     table = Table(title=f"{each * len(counts)} problems that leave float64 few digits, against rational numbers")
     for name in ("family", RIGHT, REFUSED, SILENT):
         table.add_column(name, justify="left" if name == "family" else "right")
     for name, count in [*counts.items(), ("all", sum(counts.values(), Counter[str]()))]:
         table.add_row(name, *(str(count[outcome]) for outcome in (RIGHT, REFUSED, SILENT)))
-    lines = [f"{loss.family}, seed {loss.seed}: {loss.error:.1e}, stated {loss.bound:.1e}" for loss in losses[:20]]
-    table.caption = "\n".join([*lines, f"Total time: {perf_counter() - begin:.0f} s."])
+    table.caption = "\n".join([*losses[:20], f"Time of this call: {perf_counter() - begin:.0f} s."])
     return table
+
+
+def command(words: list[str]) -> None:
+    """Run or continue the campaign in the folder that is named, and print its table."""
+    Console().print(nasty_table(Path(*words[:1] or ("nasty",))))

@@ -23,7 +23,6 @@ from ommatid.simulate.ideal import ideal_matrix
 WIDTHS = (3, 5, 4)
 MEAN, VARIANCE, NOISE = 127.5, 5461.25, 1e-2
 SMALL = 59  # like 539 one less than a multiple of 60, so that all types see the whole frame and borders are alike
-WAVES = 1024  # of a grid of frequencies along one axis, over which the interior's variance is averaged
 
 
 @dataclass(frozen=True)
@@ -100,18 +99,6 @@ def deviations(size: int) -> FloatArray:
     index, middle = np.arange(size), SMALL // 2
     folded = np.where(index < size // 2, np.minimum(index, middle), np.maximum(index - size + SMALL, middle))
     return small[np.ix_(folded, folded)]
-
-
-@cache
-def predicted() -> tuple[float, float]:
-    """Return the posterior variance far from the border, and the standard error of a mean squared error x sqrt(pixels).
-
-    There K is a convolution; its transfer function is the sum over types of that of a mean over m x m pixels, squared.
-    """
-    angle = np.pi * (np.arange(WAVES) + 0.5) / WAVES
-    squared = [np.square(np.sin(width * angle / 2) / (width * np.sin(angle / 2))) for width in WIDTHS]
-    covariance = 1 / (sum(np.outer(part, part) for part in squared) / NOISE + 1 / VARIANCE)
-    return float(covariance.mean()), float((2 * np.square(covariance).mean()) ** 0.5)
 
 
 def stored(camera: Camera) -> sparse.csr_array:

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ommatid.pipeline.calibration import calibrate_file
+from ommatid.pipeline.camera_files import calibrate_file
 from ommatid.pipeline.stages import export_scene
 from ommatid.reconstruct.output.single_sub_image import best_single_sub_image
 from ommatid.runtime.errors import InputError

@@ -66,7 +66,6 @@ REFUSED: dict[str, tuple[Callable[[Path], None], str]] = {
     "folder inside a scene": (nothing, "run tiny.toml -o tiny.toml/new"),
     "folder that is a FIFO": (fifo("new"), "run tiny.toml -o new"),
     "page that is a FIFO": (fifo("out/tiny/report.html"), "run tiny.toml -o out"),
-    "journal that is a FIFO": (fifo("new/.bench.partial.jsonl"), "bench tiny.toml -o new"),
     "plan beside a FIFO": (fifo("out/tiny/run.json"), "run tiny.toml -o out --dry-run"),
     "model that is a FIFO": (fifo("model.npz"), "calibrate tiny.toml -o model.npz"),
     "export that is a FIFO": (fifo("export.xml"), "export tiny.toml -o export.xml"),

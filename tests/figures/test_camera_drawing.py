@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from ommatid.figures.camera_drawing import camera_drawing
-from ommatid.figures.lengths import length_words
 from ommatid.figures.saving import FigureFiles, figure_formats, save_figure, svg_text
+from ommatid.figures.sensor_drawing import length_words
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import read
 
 from ..modules import ROOT
 
-CASES = ("tile19", "sensor", "single", "corridor")
+CASES = ("tile19", "sensor", *(pytest.param(name, marks=pytest.mark.slow) for name in ("single", "corridor")))
 BLACK_TARGET = 4  # line width of the target
 
 
@@ -98,8 +98,10 @@ def test_the_outline_of_the_sensor_is_drawn_around_the_sub_images() -> None:
     assert any(f"4.55 mm x 6.17 mm, {used:.2g} % used" in text.get_text() for text in face.texts)
 
 
-def test_svg_for_a_page_takes_the_page_s_colour(drawn: tuple[Camera, Any]) -> None:
-    text = svg_text(drawn[1])
+def test_svg_for_a_page_takes_the_page_s_colour() -> None:
+    scene = read(Path("single"))
+    figure = camera_drawing(scene, derive(scene))
+    text = svg_text(figure)
     root = ElementTree.fromstring(text)
     assert root.tag.endswith("svg")
     assert not {"width", "height"} & set(root.attrib)
@@ -107,7 +109,7 @@ def test_svg_for_a_page_takes_the_page_s_colour(drawn: tuple[Camera, Any]) -> No
     assert "#ffffff" not in text
     assert "currentColor" in text
     assert any("break" in (element.text or "") for element in root.iter())
-    assert text == svg_text(drawn[1])
+    assert text == svg_text(figure)
 
 
 def test_figures_are_written_in_every_format_and_the_same_again(tmp_path: Path) -> None:
@@ -140,19 +142,15 @@ def test_unknown_formats_are_refused() -> None:
         figure_formats("png,gif")
 
 
-@pytest.mark.parametrize(
-    ("length", "words"), [(0.006, "6 µm"), (1000.0, "1 m"), (19.0, "19 mm"), (4.1e-5, "41 nm"), (1.0, "1 mm")]
-)
-def test_lengths_have_the_unit_that_suits_them(length: float, words: str) -> None:
-    assert length_words(length) == words
+def test_lengths_have_the_unit_that_suits_them() -> None:
+    lengths = [length_words(length) for length in (0.006, 1000.0, 19.0, 4.1e-5, 1.0)]
+    assert lengths == ["6 µm", "1 m", "19 mm", "41 nm", "1 mm"]
 
 
-def test_the_drawing_in_the_documentation_is_that_of_the_program(drawn: tuple[Camera, Any], tmp_path: Path) -> None:
+def test_the_drawing_in_the_documentation_is_that_of_the_program(tmp_path: Path) -> None:
     """All words and numbers of docs/camera.svg are those of a new drawing of the scene that the page names."""
-    camera, figure = drawn
-    if camera != derive(read(Path("sensor"))):
-        return
-    save_figure(figure, tmp_path / "camera.svg", ["svg"])
+    scene = read(Path("sensor"))
+    save_figure(camera_drawing(scene, derive(scene)), tmp_path / "camera.svg", ["svg"])
     assert words_of(ROOT / "docs" / "camera.svg") == words_of(tmp_path / "camera.svg")
 
 

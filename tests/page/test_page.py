@@ -25,7 +25,7 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 from scipy import stats
 
-from ommatid.analysis.quality.averaging_kernel import ErrorWindow
+from ommatid.analysis.averaging_kernel import ErrorWindow
 from ommatid.bench.table import BenchTable, bench_tables, write
 from ommatid.page import batch_index, data, tables, words
 from ommatid.page.cached import cached_page

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ommatid as interface
-from ommatid.analysis.held_out import maps, table
+from ommatid.analysis import held_out
 from ommatid.page.data import read_run
 from ommatid.page.document import page
 from ommatid.reconstruct.output import run_json
@@ -89,7 +89,7 @@ def test_a_run_stores_its_check_and_the_page_shows_it(altered: Path, ommatid: Co
 def test_the_map_of_a_lens_type_has_its_sub_imagers_in_order(kept: Path) -> None:
     report = run_json.read(kept).held_out
     assert report is not None
-    [shown] = maps.lens_type_maps(report)
+    [shown] = held_out.lens_type_maps(report)
     assert [[cell.words.split(":")[0] for cell in row] for row in shown.rows] == [
         [f"I.{k:02d}.{l:02d}" for l in range(3)]  # noqa: E741
         for k in range(3)
@@ -102,7 +102,7 @@ def test_without_others_the_table_says_that_nothing_was_checked(kept: Path) -> N
     values[:9] = stack.values[:9]
     report = interface.check(replace(stack, values=values), model)
     assert report.verdict.trusted is None
-    assert table.rows(report)[0][1].startswith("not checked: fewer than two sub-imagers")
+    assert held_out.rows(report)[0][1].startswith("not checked: fewer than two sub-imagers")
     assert json.loads(report.model_dump_json())["p_value"] is None
 
 

@@ -15,8 +15,14 @@ from hypothesis import strategies as st
 
 from ommatid.batch.remote import RunObserver
 from ommatid.bench import table
-from ommatid.pipeline.bench_curves import bench_error_curves
-from ommatid.pipeline.time_allocation import NEGLIGIBLE, STEPS, ErrorCurve, allocate_time, error_curve
+from ommatid.pipeline.time_allocation import (
+    NEGLIGIBLE,
+    STEPS,
+    ErrorCurve,
+    allocate_time,
+    bench_error_curves,
+    error_curve,
+)
 from ommatid.pipeline.time_budget import FEW, KEYS, MORE, run_within, shared_time
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.output.time_spent import time_spent
@@ -170,6 +176,7 @@ def test_samples_are_adaptive_where_grids_fit_the_pixels(tmp_path: Path) -> None
     assert budget["rendering"] + budget["calibration"] < 0.1 * description["error"]["predicted_mse"]
 
 
+@pytest.mark.slow
 def test_samples_of_a_world_are_not_adaptive(tmp_path: Path) -> None:
     """A world has edges inside pixels, where 'auto', which has no time limit, would take too long."""
     shape = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><scale value="2.3"/>'
@@ -265,14 +272,9 @@ def test_every_run_reports_the_gain_from_more_time(here: Path, ommatid: Command)
     assert alone.model_copy(update={"start_up": spent.start_up}) == spent
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("30s", 30.0), ("2 min", 120.0), ("0.5 h", 1800.0)])
-def test_durations(text: str, seconds: float) -> None:
-    assert duration(text) == pytest.approx(seconds)
-
-
-@pytest.mark.parametrize("options", [["--within", "30"], ["--within", "soon"], ["--within", "3 s", "--workers", "2"]])
-def test_wrong_times_are_refused(here: Path, ommatid: Command, options: list[str]) -> None:
-    ended = ommatid("run", "tiny.toml", "-o", "out", *options)
-    assert ended.code == 2
-    assert "--within" in ended.err
+def test_times_are_read_and_wrong_ones_refused(here: Path, ommatid: Command) -> None:
+    assert [duration(text) for text in ("30s", "2 min", "0.5 h")] == pytest.approx([30.0, 120.0, 1800.0])
+    for options in (["--within", "30"], ["--within", "soon"], ["--within", "3 s", "--workers", "2"]):
+        ended = ommatid("run", "tiny.toml", "-o", "out", *options)
+        assert (ended.code, "--within" in ended.err) == (2, True)
     assert not (here / "out").exists()

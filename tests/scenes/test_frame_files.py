@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from ommatid.pipeline.imports import import_file
+from ommatid.pipeline.camera_files import import_file
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks
 from ommatid.scenes.formats.picture import LUMINANCE, grey

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import constants, integrate
 
-from ommatid.analysis.light_table import rows
+from ommatid.analysis.summary import light_rows
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.prediction import predict, predict_frame
 from ommatid.reconstruct.prior import independent
@@ -156,17 +156,17 @@ def test_the_summary_has_the_light_of_each_type() -> None:
             (lens_type["mean"] + 4 + 1 / 12) ** 0.5 / lens_type["mean"] * 127.5
         )  # at half of 255; frames add less than 1/64
         assert shot < lens_type["noise"] < 1.03 * shot
-    assert rows(result)[0] == ("light", "679.6 lm/W")
-    assert [line[0] for line in rows(result)[1:]] == ["lens type A", "lens type B", "lens type C"]
+    assert light_rows(result)[0] == ("light", "679.6 lm/W")
+    assert [line[0] for line in light_rows(result)[1:]] == ["lens type A", "lens type B", "lens type C"]
     assert described.sensor is not None
     changes = {"exposure": 1.0, "black_level": 0.0, "dark_current": 1.0}
     long = described.model_copy(update={"sensor": described.sensor.model_copy(update=changes)})
     result = summary(long, camera, electrons(long, camera))
     assert all(lens_type["saturates"] and lens_type["saturation"] < 255 for lens_type in result["lens_types"])
     assert result["cut_off"]
-    assert {"without light", "warning"} <= {line[0] for line in rows(result)}
+    assert {"without light", "warning"} <= {line[0] for line in light_rows(result)}
     dark = summary(described, camera, np.zeros_like(response))
-    assert "too little light" in rows(dark)[1][1]
+    assert "too little light" in light_rows(dark)[1][1]
 
 
 def test_a_prediction_with_unequal_noise() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy import special
 
-from ommatid.analysis.quality.averaging_kernel import ErrorWindow, why_none
+from ommatid.analysis.averaging_kernel import ErrorWindow, why_none
 from ommatid.runtime.arrays import FloatArray
 
 from ..data import Run

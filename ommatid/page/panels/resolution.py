@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ommatid.analysis.quality import resolution, spectra
-from ommatid.analysis.quality.averaging_kernel import ErrorWindow, why_none
-from ommatid.analysis.quality.resolution import EdgeResponse, Transfer
+from ommatid.analysis import resolution
+from ommatid.analysis.averaging_kernel import ErrorWindow, why_none
+from ommatid.analysis.resolution import EdgeResponse, Transfer
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.model import Model
 
@@ -87,14 +87,14 @@ def edge_words(estimate: EdgeResponse, sub: tuple[Transfer, EdgeResponse] | None
 
 def _spectrum(truth: Image, estimate: Image, single: Image) -> tuple[Markup, str]:
     truth = _central(truth)
-    signal, error = spectra.radial_spectrum(truth), spectra.radial_spectrum(_central(estimate) - truth)
+    signal, error = resolution.radial_spectrum(truth), resolution.radial_spectrum(_central(estimate) - truth)
     series = [
         ChartSeries("truth", list(signal.frequencies), list(signal.powers), "dashed", 0),
         ChartSeries("error of the estimate", list(error.frequencies), list(error.powers), "line", 1),
     ]
-    other = spectra.radial_spectrum(_central(single) - truth)
+    other = resolution.radial_spectrum(_central(single) - truth)
     series.append(ChartSeries("error of the single sub-image", list(other.frequencies), list(other.powers), "line", 2))
-    limit = spectra.crossing(signal, error)
+    limit = resolution.crossing(signal, error)
     words = "The error is weaker than the image at all frequencies."
     if limit is not None:
         words = f"The error is as strong as the image from {limit:.2g} cycles per pixel on."

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from ommatid.analysis.pareto import pareto_front
+from ommatid.bench.slopes import pareto_front
 from ommatid.bench.table import BenchTable, Cell
 
 from ..data import Run

@@ -31,7 +31,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.skipped import assumptions
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .recording import PredictedRecording, predicted_recording
+from .predicted_recording import PredictedRecording, predicted_recording
 
 MODEL = "model"  # in the budget: H as designed is not that of the lenses
 

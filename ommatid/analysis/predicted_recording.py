@@ -31,7 +31,7 @@ from ommatid.simulate.render import exposed
 from ommatid.simulate.sampling.passes import rounding_variance
 from ommatid.simulate.sampling.seeds import repeat_seed
 
-from ..calibration_goal import for_stack
+from .calibration_goal import for_stack
 
 ERRORS = 1  # stream of the errors of H
 Assumptions = tuple[str, ...]

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.analysis.quality.averaging_kernel import ErrorWindow, error_window
-from ommatid.analysis.quality.resolution import edge_response, of_sub_image, of_window
-from ommatid.analysis.quality.spectra import crossing, radial_spectrum
+from ommatid.analysis.averaging_kernel import ErrorWindow, error_window
+from ommatid.analysis.resolution import crossing, edge_response, of_sub_image, of_window, radial_spectrum
 from ommatid.reconstruct.output.result_files import reconstruct
 from ommatid.reconstruct.prior import exponential
 from ommatid.runtime.arrays import FloatArray
 from ommatid.simulate.ideal import ideal_matrix
 
-from ...examples import Lenses, scene
-from ...page.runs import record
+from ..examples import Lenses, scene
+from ..page.runs import record
 
 PRIOR = 100.0  # variance
 

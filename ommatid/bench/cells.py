@@ -1,13 +1,15 @@
-"""The cells that `bench` measures for a scene: every sampler, calibration method and solver."""
+"""The cells that `bench` measures for a scene: every sampler, calibration method and solver, with their cost."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import ctypes
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
+from pathlib import Path
 from time import perf_counter
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sampling import Sampler
 from ommatid.simulate.adaptive_render import AdaptiveRendering
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.calibration.point_sources import RENDERINGS
+from ommatid.simulate.noise_target import check_noise_target
 from ommatid.simulate.render import Rendering
 from ommatid.simulate.renderer.variant import PREFERENCE, release, unusable_reason
 from ommatid.simulate.sampling.seeds import repeat_seed
@@ -33,21 +35,95 @@ from ommatid.simulate.sampling.seeds import repeat_seed
 from . import reference
 from .precision import ExactSolution, SolverSetting, exact_solution, solver_settings
 from .reference import Reference, Samples
-from .resources import Cost, measure_cost
-from .scheduler import FEWER_REPEATS, REPEATS, Job, Repeat
-from .table import AUTO, SkippedJob
+from .table import AUTO, Cell, Quantiles, SkippedJob, Stage
 
 Method = Literal["points", "transport"]
 Result = TypeVar("Result")
 
 SAMPLES = tuple(4**power for power in range(1, 8))  # per pixel, 4 to 16384
 SAMPLERS: tuple[Sampler, ...] = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
-# Orders of magnitude, for a first guess of durations:
-RAYS_PER_SECOND = {"scalar_rgb": 5e6, "llvm_ad_mono": 3e7, "cuda_ad_mono": 3e8}
-STARTUP = {"scalar_rgb": 0.02, "llvm_ad_mono": 0.03, "cuda_ad_mono": 0.05}  # seconds before the first ray
-SUB_IMAGER_STARTUP = 0.005  # seconds per sub-imager that is rendered separately
-ESTIMATES = 2  # per calibrated H: the first shows how much noise the uncertainty of H adds
-STOPPING_ESTIMATES = 2  # in addition, where the calibration stops at a goal for that noise
+REPEATS, FEWER_REPEATS = 5, 3  # with independent seeds; odd, so that the median is one of the values
+LONG = 1.0  # seconds of a repeat, from which on FEWER_REPEATS are made
+STATUS, CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+class Cost(NamedTuple):
+    """Wall-clock seconds, and peak resident memory of the whole process in bytes, None where it is not reported."""
+
+    seconds: float
+    memory: int | None
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """Result of one repeat.
+
+    mse : mean squared error of the resulting image, None if not computed
+    samples : per pixel, of a job with an adaptive number
+    """
+
+    error: float
+    cost: Cost
+    mse: float | None
+    samples: int | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell to be measured; `work` runs the repeat of an index."""
+
+    stage: Stage
+    way: str
+    variant: str | None
+    samples: int | None
+    setting: str
+    work: Callable[[int], Repeat]
+
+    @property
+    def name(self) -> str:
+        """Readable name."""
+        return name_of(self)
+
+    def measure(self, deadline: float = inf) -> Cell | None:
+        """Return the cell, None if the time on the clock of `perf_counter` passes `deadline` before it is complete.
+
+        Raises InputError where the cell cannot be measured.
+        """
+        repeats: list[Repeat] = []
+        start = perf_counter()
+        while len(repeats) < FEWER_REPEATS or (len(repeats) < REPEATS and perf_counter() - start < LONG * len(repeats)):
+            if repeats and perf_counter() > deadline:
+                return None
+            repeats.append(self.work(len(repeats)))
+        return cell_from_repeats(self, repeats)
+
+
+def name_of(item: Job | Cell) -> str:
+    """Return the readable name of a job or its cell, by which a cell that was measured before is found."""
+    known = item.samples is not None and item.setting != AUTO  # adaptive: known only after the measurement
+    samples = f"{item.samples} samples" if known else None
+    return ", ".join(part for part in (f"{item.stage} {item.way}", item.variant, samples, item.setting) if part)
+
+
+def cell_from_repeats(job: Job, repeats: Sequence[Repeat]) -> Cell:
+    """Return the cell of a job: quantiles over its repeats, and the largest memory and number of samples."""
+    errors = [repeat.error for repeat in repeats]
+    mses = [repeat.mse for repeat in repeats if repeat.mse is not None]
+    samples = [repeat.samples for repeat in repeats if repeat.samples is not None]
+    memory = [repeat.cost.memory for repeat in repeats if repeat.cost.memory is not None]
+    return Cell(
+        stage=job.stage,
+        way=job.way,
+        variant=job.variant,
+        samples=max(samples, default=None) if job.samples is None else job.samples,
+        setting=job.setting,
+        repeats=len(repeats),
+        error=Quantiles.of(errors),
+        seconds=Quantiles.of([repeat.cost.seconds for repeat in repeats]),
+        memory=max(memory, default=None),
+        mse=Quantiles.of(mses) if mses else None,
+        scatter=float(np.std(np.log(errors), ddof=1)) if len(errors) > 1 and min(errors) > 0 else None,
+    )
 
 
 @dataclass(frozen=True)
@@ -87,6 +163,11 @@ class Subject:
     def stack(self, repeat: int) -> Stack:
         """Return exact light, recorded with the noise of a repeat."""
         return reference.record_light(self.noise(repeat), self.reference.light, self.reference)
+
+    @property
+    def noise_deviation(self) -> float:
+        """Root mean square of the sensor's noise on exact light, in pixel values of f."""
+        return float(np.sqrt(np.nanmean(np.square(self.stack(0).values - self.reference.light))))
 
     def mean_squared_error(self, image: FloatArray) -> float:
         """Return the mean squared error of an estimate, (N,)."""
@@ -140,82 +221,68 @@ class Subject:
         return {}
 
     @cached_property
-    def _floor_and_duration(self) -> tuple[float, float]:
+    def noise_floor(self) -> float:
+        """Median of the mean squared error with exact light and exact H over repeats of the noise."""
         start, errors = perf_counter(), list[float]()
         while not errors or (len(errors) < REPEATS and perf_counter() - start < self.time_limit):
             errors.append(self._exact_mse(len(errors)))
-        return float(np.median(errors)), (perf_counter() - start) / len(errors)
-
-    @property
-    def noise_floor(self) -> float:
-        """Median of the mean squared error with exact light and exact H over repeats of the noise."""
-        return self._floor_and_duration[0]
-
-    @property
-    def estimate_seconds(self) -> float:
-        """Mean duration of an estimate with exact light and exact H."""
-        return self._floor_and_duration[1]
+        return float(np.median(errors))
 
 
 def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
-    """Return all cells, and those that cannot be measured on this machine or for this scene, with the reason."""
+    """Return all cells, and those that cannot be measured on this machine or for this scene, with the reason.
+
+    Few samples come before many, so that the curves of all ways grow together; an adaptive number of samples comes
+    where the curves are half finished.
+    """
     reasons = {variant: unusable_reason(variant) for variant in PREFERENCE}
     working = [variant for variant in PREFERENCE if not reasons[variant]]
     left_out = [SkippedJob(what=variant, why=reason) for variant, reason in reasons.items() if reason]
     if not subject.camera.is_ideal_pinhole and "scalar_rgb" in working:
         working.remove("scalar_rgb")
         left_out.append(SkippedJob(what="scalar_rgb", why="lenses other than pinholes need a fast backend"))
-    measurable = [*_renderings(subject, working), *_calibrations(subject, working)]
+    counts: list[Samples] = [*SAMPLES]
     try:
-        measurable += _adaptive_jobs(subject, working)
+        check_noise_target(subject.scene)
+        counts.insert(len(counts) // 2, AUTO)
     except InputError as error:
         left_out.append(SkippedJob(what="samples 'auto'", why=str(error)))
     estimates, unsolvable = _estimates(subject)
-    return [*measurable, *estimates], [*left_out, *unsolvable]
+    by_name = {job.name: job for job in estimates}
+    for job in (job for samples in counts for job in _sampling(subject, working, samples)):
+        by_name.setdefault(job.name, job)  # several numbers may be rounded up to the same
+    return list(by_name.values()), [*left_out, *unsolvable]
 
 
-@dataclass(frozen=True)
-class JobSettings:
-    """Samples per pixel of a cell: the number, None if it is adaptive, and its expectation.
+def _sampling(subject: Subject, variants: Sequence[str], samples: Samples) -> list[Job]:
+    """Return the renderings and calibrations with a number of samples; an adaptive one has the scene's own sampler.
 
-    setting : the same as text
+    A calibration refuses fewer samples than it has passes.
     """
+    own, listed = subject.scene.render.sampler, list[Job]()
+    samplers = (own,) if samples == AUTO else SAMPLERS
+    for variant in variants:
+        slow = variant.startswith("scalar")
+        listed += [_rendering(subject, variant, sampler, samples) for sampler in samplers]
+        if samples == SAMPLES[0] or (slow and samples == AUTO):
+            continue
+        listed.append(_calibration(subject, variant, "points", own, samples))
+        if not slow:
+            listed += [_calibration(subject, variant, "transport", sampler, samples) for sampler in samplers]
+    return listed
 
-    samples: int | None
-    expected: int
-    setting: str
 
-
-def _fixed_samples(samples: int, sampler: Sampler) -> JobSettings:
+def _planned(samples: Samples, sampler: Sampler) -> tuple[int | None, str]:
+    """Return the samples per pixel as the sampler takes them, None if they are adaptive, and the setting in words."""
+    if samples == AUTO:
+        return None, AUTO
     work = reference.sample_plan(samples, sampler)
-    return JobSettings(work.total, work.total, f"{work.passes} pass{'es' if work.passes > 1 else ''} of {work.samples}")
+    return work.total, f"{work.passes} pass{'es' if work.passes > 1 else ''} of {work.samples}"
 
 
-def _adaptive_jobs(subject: Subject, variants: list[str]) -> list[Job]:
-    """Return cells with samples "auto" and the scene's own sampler. Raises InputError for a scene without noise."""
-    scene = subject.scene
-    expected = reference.expected_samples(subject.setup, subject.reference)
-    work = JobSettings(None, expected, AUTO)
-    adaptive: list[Job] = []
-    for variant in variants:
-        adaptive.append(_rendering(subject, variant, scene.render.sampler, AUTO, work))
-        methods: tuple[Method, ...] = () if variant.startswith("scalar") else ("points", "transport")
-        adaptive += [_calibration(subject, variant, method, scene.render.sampler, AUTO, work) for method in methods]
-    return adaptive
-
-
-def _renderings(subject: Subject, variants: list[str]) -> list[Job]:
-    by_name: dict[str, Job] = {}
-    for variant in variants:
-        for sampler in SAMPLERS:
-            for samples in SAMPLES:
-                job = _rendering(subject, variant, sampler, samples, _fixed_samples(samples, sampler))
-                by_name.setdefault(job.name, job)  # several numbers may be rounded up to the same
-    return list(by_name.values())
-
-
-def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Samples, work: JobSettings) -> Job:
-    name = f"render {sampler} {variant} {work.samples or AUTO}"
+def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Samples) -> Job:
+    total, setting = _planned(samples, sampler)
+    name = f"render {sampler} {variant} {total or AUTO}"
 
     def repeated(repeat: int) -> Repeat:
         scene = reference.with_rendering(subject.scene, sampler, variant, samples, subject.seed(name, repeat))
@@ -224,34 +291,13 @@ def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Sample
         mse = subject.rendering_mse(rendering, repeat) if repeat < FEWER_REPEATS else None
         return Repeat(error, cost, mse, int(rendering.record()["samples"]))
 
-    startup = STARTUP[variant]
-    if samples == AUTO:
-        startup += SUB_IMAGER_STARTUP * len(subject.camera.sub_imagers)
-    rays = work.expected * subject.camera.measurements
-    guess = startup + rays / RAYS_PER_SECOND[variant] + subject.estimate_seconds
-    return Job("render", sampler, variant, work.samples, work.setting, guess, repeated)
+    return Job("render", sampler, variant, total, setting, repeated)
 
 
-def _calibrations(subject: Subject, variants: list[str]) -> list[Job]:
-    own_sampler, by_name = subject.scene.render.sampler, dict[str, Job]()
-    for variant in variants:
-        transport: tuple[Sampler, ...] = () if variant.startswith("scalar") else SAMPLERS
-        methods: list[tuple[Method, Sampler]] = [
-            ("points", own_sampler),
-            *(("transport", sampler) for sampler in transport),
-        ]
-        for method, sampler in methods:
-            for samples in SAMPLES[1:]:  # the first is less than the number of passes, which a calibration refuses
-                job = _calibration(subject, variant, method, sampler, samples, _fixed_samples(samples, sampler))
-                by_name.setdefault(job.name, job)
-    return list(by_name.values())
-
-
-def _calibration(
-    subject: Subject, variant: str, method: Method, sampler: Sampler, samples: Samples, work: JobSettings
-) -> Job:
+def _calibration(subject: Subject, variant: str, method: Method, sampler: Sampler, samples: Samples) -> Job:
+    total, setting = _planned(samples, sampler)
     way = f"{method}, {sampler}"
-    name = f"calibrate {way} {variant} {work.samples or AUTO}"
+    name = f"calibrate {way} {variant} {total or AUTO}"
 
     def repeated(repeat: int) -> Repeat:
         seed = subject.seed(name, repeat)
@@ -262,10 +308,7 @@ def _calibration(
         mse = subject.model_mse(model, repeat) if repeat < FEWER_REPEATS else None
         return Repeat(error, cost, mse, int(model.record["samples"]))
 
-    rendering = work.expected * subject.camera.measurements / RAYS_PER_SECOND[variant]
-    solving = subject.estimate_seconds * (ESTIMATES + (STOPPING_ESTIMATES if samples == AUTO else 0))
-    guess = 2 * STARTUP[variant] + rendering * (RENDERINGS if method == "points" else 1.0) + solving
-    return Job("calibrate", way, variant, work.samples, work.setting, guess, repeated)
+    return Job("calibrate", way, variant, total, setting, repeated)
 
 
 def _estimates(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
@@ -284,7 +327,7 @@ def _estimates(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
             image, cost = _measured(lambda: setting.image(task))
             return Repeat(exact.error(image), cost, subject.normalised(subject.mean_squared_error(image), repeat))
 
-        return Job("reconstruct", setting.method, None, None, setting.setting, setting.guess, repeated)
+        return Job("reconstruct", setting.method, None, None, setting.setting, repeated)
 
     settings, unsolvable = solver_settings(solution(0)[0])
     return [job(setting) for setting in settings], [SkippedJob(what=what, why=why) for what, why in unsolvable]
@@ -293,3 +336,34 @@ def _estimates(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
 def _measured(work: Callable[[], Result]) -> tuple[Result, Cost]:
     release()
     return measure_cost(work)
+
+
+def measure_cost(work: Callable[[], Result]) -> tuple[Result, Cost]:
+    """Return the result of `work` and its cost."""
+    is_reset = reset_peak_memory()
+    start = perf_counter()
+    result = work()
+    return result, Cost(perf_counter() - start, resident_memory("VmHWM") if is_reset else None)
+
+
+def reset_peak_memory() -> bool:
+    """Reset the peak of the resident memory to its present value; return False where the system cannot.
+
+    The peak comes from /proc and not from getrusage, whose ru_maxrss is inherited from the parent process and cannot
+    be reset.
+    """
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # return freed memory, which would hide as much of the work's memory
+        CLEAR_REFS.write_text("5", encoding="ascii")
+    except (OSError, AttributeError, TypeError):
+        return False
+    return True
+
+
+def resident_memory(field: str) -> int | None:
+    """Return a field of /proc/self/status in bytes: VmRSS, resident memory, or VmHWM, its peak; None without /proc."""
+    try:
+        lines = STATUS.read_text(encoding="ascii").splitlines()
+        return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), None)
+    except OSError:
+        return None

@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ommatid.analysis.averaging_kernel import error_window
 from ommatid.analysis.design import with_lens
+from ommatid.analysis.next_steps import NextStep, best_other_type, next_steps
 from ommatid.analysis.predict import predict_ideal
-from ommatid.analysis.quality.another_type import best_other_type
-from ommatid.analysis.quality.averaging_kernel import error_window
-from ommatid.analysis.quality.next_steps import NextStep, next_steps
 from ommatid.reconstruct.output.result_files import reconstruct
 from ommatid.reconstruct.output.run_json import MoreTime, RunReport, TimeReport, VerdictReport
 from ommatid.reconstruct.output.verdict_words import limit
 from ommatid.scenes.recording import expected_recording
 from ommatid.scenes.scene import Scene, parse
 
-from ...examples import THREE, Lenses, scene
-from ...page.runs import record
+from ..examples import THREE, Lenses, scene
+from ..page.runs import record
 
 IMAGE = np.add.outer(np.linspace(60, 180, 19), np.linspace(0, 40, 19))
 LENSES: Lenses = tuple((magnification, array, "fit") for magnification, array, _ in THREE)

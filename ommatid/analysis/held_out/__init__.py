@@ -1,1 +1,0 @@
-"""The held-out check in words and tables."""

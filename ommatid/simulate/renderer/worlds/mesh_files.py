@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import zlib
 from math import isfinite
 from pathlib import Path
@@ -19,103 +18,53 @@ LONGEST_LINE = 10_000
 MOST_MESHES = 100_000  # of a serialized file
 DENSEST = 1100  # bytes that a byte of zlib becomes at most, rounded up
 SERIALIZED, VERSIONS = 0x041C, (3, 4)
-BLOCK = 2**18  # bytes of an OBJ mesh that are checked at once
-_END = rb"[ \t]*+\r?+\n"
-_NUMBER = rb"[ \t]{1,8}+[-+]?+[0-9]{1,40}+(?:\.[0-9]{0,40}+)?+(?:[eE][-+]?+[0-9]{1,2}+)?+"
-_NUMBERS = {  # lines of one kind in their usual form, one after another
-    kind: re.compile(rb"(?:%b(?:%b){%d,8}+%b)++" % (kind, _NUMBER, least, _END))
-    for kind, least in ((b"v", 3), (b"vt", 2), (b"vn", 3))
-}
-_FACES = {
-    kinds: re.compile(rb"(?:f(?:[ \t]{1,8}+%b){3,100}+%b)++" % (indices, _END))
-    for kinds, indices in (
-        ((b"v",), rb"[0-9]{1,11}+(?!/)"),
-        ((b"v", b"vt"), rb"[0-9]{1,11}+/[0-9]{1,11}+(?!/)"),
-        ((b"v", b"vn"), rb"[0-9]{1,11}+//[0-9]{1,11}+(?!/)"),
-        ((b"v", b"vt", b"vn"), rb"[0-9]{1,11}+/[0-9]{1,11}+/[0-9]{1,11}+(?!/)"),
-    )
-}
 NORMALS, TEXTURED, COLOURED, DOUBLE = 0x1, 0x2, 0x8, 0x2000  # flags
 
 
 def check_obj(path: Path) -> None:
     """Check an OBJ mesh. Raises InputError that names the file, OSError if it cannot be read."""
-    shown, counts = printable(path), {b"v": 0, b"vt": 0, b"vn": 0}
-    number = faces = 0
+    shown, counts, faces, number = printable(path), {b"v": 0, b"vt": 0, b"vn": 0}, 0, 0
     with open_input(path) as stream:
         check_memory(8 * path.stat().st_size, f"{shown}: a mesh", "make it smaller")
-        while block := stream.read(BLOCK):
-            block += stream.readline(LONGEST_LINE + 1)
-            start = by_line = 0
-            while start < len(block):
-                kind, end, lines = b"", start, 0
-                if start >= by_line:
-                    kind, end, lines = _checked_run(block, start, counts)
-                if not lines:
-                    by_line = max(by_line, end)
-                    kind, lines = _checked_line(block, start, counts, f"{shown} (line {number + 1})"), 1
-                    end = block.find(b"\n", start) + 1 or len(block)
-                number, start, faces = number + lines, end, faces + lines * (kind == b"f")
-                if kind in counts:
-                    counts[kind] += lines
+        while line := stream.readline(LONGEST_LINE + 1):
+            number += 1
+            kind, *words = line.split() or [b""]
+            reason = ""
+            if len(line) > LONGEST_LINE or b"\0" in line:
+                reason = f"expected text of at most {LONGEST_LINE} characters a line, got more"
+            elif kind in counts:
+                reason = _wrong_numbers(words[:3], 2 if kind == b"vt" else 3)
+                counts[kind] += 1
+            elif kind == b"f":
+                reason = _wrong_face(words, counts)
+                faces += 1
+            if reason:
+                raise InputError(f"{shown} (line {number}): {reason}")
     if not faces:
         raise InputError(f"{shown}: expected an OBJ mesh with vertices and faces, got no face")
 
 
-def _checked_run(block: bytes, start: int, counts: dict[bytes, int]) -> tuple[bytes, int, int]:
-    """Return the kind, the end and the number of lines of one kind in their usual form, if all are correct.
-
-    The number is 0 if there are none, or if one of those up to the end is wrong.
-    """
-    for kind, pattern in _NUMBERS.items():
-        if run := pattern.match(block, start):
-            return kind, run.end(), run.group().count(b"\n")
-    for kinds, pattern in _FACES.items():
-        if run := pattern.match(block, start):
-            text = run.group()
-            indices = np.array(text.replace(b"f", b" ").replace(b"/", b" ").split(), dtype=np.int64)
-            columns = indices.reshape(-1, len(kinds))
-            if columns.min() >= 1 and (columns.max(axis=0) <= [counts[kind] for kind in kinds]).all():
-                return b"f", run.end(), text.count(b"\n")
-            return b"f", run.end(), 0
-    return b"", start, 0
-
-
-def _checked_line(block: bytes, start: int, counts: dict[bytes, int], place: str) -> bytes:
-    """Return the first word of a line. Raises InputError that begins with `place`."""
-    line = block[start : block.find(b"\n", start) + 1 or len(block)]
-    if len(line) > LONGEST_LINE or b"\0" in line:
-        raise InputError(f"{place}: expected text of at most {LONGEST_LINE} characters a line, got more")
-    words = line.split()
-    if not words:
-        return b""
-    if words[0] in counts:
-        _check_numbers(words[1:4], 2 if words[0] == b"vt" else 3, place)
-    elif words[0] == b"f":
-        _check_face(words[1:], counts, place)
-    return words[0]
-
-
-def _check_numbers(words: list[bytes], least: int, place: str) -> None:
+def _wrong_numbers(words: list[bytes], least: int) -> str:
+    """Return what is wrong about the numbers of a vertex, a place in a texture or a normal, "" if nothing is."""
     try:
-        correct = len(words) >= least and all(isfinite(float(word)) for word in words[:least])
+        correct = len(words) >= least and isfinite(sum(map(float, words[:least])))
     except ValueError:
         correct = False
-    if not correct:
-        raise InputError(f"{place}: expected {least} finite numbers, got '{printable(b' '.join(words), 80)[2:-1]}'")
+    return "" if correct else f"expected {least} finite numbers, got '{printable(b' '.join(words), 80)[2:-1]}'"
 
 
-def _check_face(words: list[bytes], counts: dict[bytes, int], place: str) -> None:
+def _wrong_face(words: list[bytes], counts: dict[bytes, int]) -> str:
+    """Return what is wrong about the indices of a face, "" if nothing is."""
     if len(words) < 3:
-        raise InputError(f"{place}: expected a face of three or more vertices, got {len(words)}")
+        return f"expected a face of three or more vertices, got {len(words)}"
     for word in words:
-        for index, kind in zip(word.split(b"/"), counts, strict=False):
-            if index and not (index.isdigit() and len(index) < 12 and 1 <= int(index) <= counts[kind]):
-                got = printable(index.decode("latin-1"), 40)
-                raise InputError(
-                    f"{place}: expected indices from 1 to {counts[kind]} of the lines '{kind.decode()}' before it,"
-                    f" got {got}; correct the mesh"
+        for index, (kind, count) in zip(word.split(b"/"), counts.items(), strict=False):
+            if index and not (index.isdigit() and len(index) < 12 and 1 <= int(index) <= count):
+                return (
+                    f"expected indices from 1 to {count} of the lines '{kind.decode()}' before it,"
+                    f" got {printable(index.decode('latin-1'), 40)}; correct the mesh"
                 )
+    return ""
 
 
 def check_serialized(path: Path) -> None:

@@ -1,7 +1,8 @@
 """Mitsuba's variants: which of them work on this machine, and the choice of one.
 
 LLVM 15 and 16 load, and then kill the process at the first rendering, so the version is checked before the backend is
-used. A variant is global to the process.
+used. A variant is global to the process. Where Dr.Jit finds no LLVM it prints so as it is loaded: those lines are left
+out, since the reason of `unusable_reason` says it where it matters.
 """
 
 # pyright: basic
@@ -12,6 +13,9 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -26,6 +30,7 @@ if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
 
 OLDEST_LLVM = (17, 0, 0)
+COMPLAINTS = (b"jitc_llvm_init():", b"jit_find_library():")  # of Dr.Jit, about LLVM
 PATIENCE = 120  # seconds that a trial rendering may take
 PREFERENCE = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 
@@ -71,7 +76,8 @@ def unusable_reason(variant: str) -> str:
     Raises MachineError if Mitsuba cannot be loaded at all.
     """
     try:
-        import drjit as dr
+        with _without_complaints():
+            import drjit as dr
     except (ImportError, NameError) as error:  # NameError: Dr.Jit's, of a system library that it does not find
         reason = printable(str(error.__context__ or error))
         raise MachineError(f"Mitsuba could not be loaded ({reason}); install what is missing") from error
@@ -80,7 +86,9 @@ def unusable_reason(variant: str) -> str:
         return "" if dr.has_backend(dr.JitBackend.CUDA) else "no CUDA device was found"
     if variant.startswith("llvm"):
         if not dr.has_backend(dr.JitBackend.LLVM):
-            return "no usable LLVM library (libLLVM.so) was found"
+            named = os.environ.get("DRJIT_LIBLLVM_PATH")
+            where = f" at {printable(named)}, which DRJIT_LIBLLVM_PATH names" if named else ""
+            return f"no usable LLVM library (libLLVM.so) was found{where}"
         try:
             version = tuple(dr.detail.llvm_version())
         except AttributeError:  # not part of Dr.Jit's public interface
@@ -90,6 +98,27 @@ def unusable_reason(variant: str) -> str:
                 f"LLVM {version[0]} was found, which fails at the first rendering; {OLDEST_LLVM[0]} or newer is needed"
             )
     return ""
+
+
+@contextmanager
+def _without_complaints() -> Generator[None]:
+    """Leave out what Dr.Jit prints to the error stream about LLVM while it is loaded, and pass on all other lines."""
+    if "drjit" in sys.modules:
+        yield
+        return
+    sys.stderr.flush()
+    stream = os.dup(2)
+    with tempfile.TemporaryFile() as printed:
+        os.dup2(printed.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stream, 2)
+            os.close(stream)
+            printed.seek(0)
+            for line in printed:
+                if not line.startswith(COMPLAINTS):
+                    os.write(2, line)
 
 
 def choose(requested: str) -> str:
@@ -116,7 +145,8 @@ def check_transport_variant(variant: str, key: str = "calibration.method") -> No
 
 def activate(variant: str) -> None:
     """Make a variant Mitsuba's current one, and pass its warnings to Python's log."""
-    import mitsuba as mi
+    with _without_complaints():
+        import mitsuba as mi
 
     fix_plugin_folder()
     if mi.variant() != variant:

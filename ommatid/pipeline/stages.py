@@ -207,7 +207,7 @@ def export_scene(path: Path, output: Path, changes: Sequence[str] = (), lenses: 
     Raises InputError for a scene with a world or with lenses that are more than pinholes.
     """
     from ommatid.runtime.outputs.kinds import check_output
-    from ommatid.simulate.renderer.export import export
+    from ommatid.simulate.renderer.plugins import export
 
     check_output(output, find_scene(path))
     setup = open_scene(path, changes, lenses)

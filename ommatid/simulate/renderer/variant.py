@@ -1,15 +1,18 @@
-"""Mitsuba's variants: which of them work on this machine, and the choice of one.
+"""Mitsuba in this process: which of its variants work on this machine, the choice of one, and its log.
 
 LLVM 15 and 16 load, and then kill the process at the first rendering, so the version is checked before the backend is
 used. A variant is global to the process. Where Dr.Jit finds no LLVM it prints so as it is loaded: those lines are left
-out, since the reason of `unusable_reason` says it where it matters.
+out, since the reason of `unusable_reason` says it where it matters. Of Mitsuba's log, every kind of message becomes one
+warning of Python's; samples that are no radiances are counted.
 """
 
 # pyright: basic
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -17,14 +20,14 @@ import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
 from ommatid.runtime.printable import printable
-
-from .messages import redirect_log
-from .worlds.plugin_names import mitsuba_folder
 
 if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
@@ -59,6 +62,13 @@ if not reason:
     speed = 128 * 128 * 64 / (time.perf_counter() - start)
 print(json.dumps({"reason": reason, "speed": speed}))
 """
+INTERRUPTED = "Received interrupt signal"  # suppressed: the command line reports Ctrl-C itself
+INVALID = "Invalid sample value"  # negative or not finite, one message per sample, which is then ignored
+_HEADING = re.compile(r"\A[-\d]+ [:\d]+ \w+ +(\S+ +)?\[[^\]]*\] *")  # date, level, thread and line of a log message
+_NUMBERS_AND_NAMES = re.compile(r"\d+|\"[^\"]*\"")
+_APPENDERS: dict[str, Any] = {}
+_seen: set[str] = set()
+_invalid = {"samples": 0}
 
 
 @dataclass(frozen=True)
@@ -154,6 +164,15 @@ def activate(variant: str) -> None:
     redirect_log()
 
 
+@cache
+def mitsuba_folder() -> Path:
+    """Return the folder of the installed Mitsuba. Raises ModuleNotFoundError if there is none."""
+    spec = find_spec("mitsuba")
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError("No module named 'mitsuba'", name="mitsuba")
+    return Path(spec.origin).parent
+
+
 def fix_plugin_folder() -> None:
     """Make Mitsuba find its plugins and data in its own folder alone, and not in the current one."""
     import mitsuba as mi
@@ -210,3 +229,48 @@ def remedy() -> str:
     if shutil.which("brew"):
         return "run: brew install llvm@19, and set DRJIT_LIBLLVM_PATH to its libLLVM.dylib"
     return "install LLVM 17 or newer, and set DRJIT_LIBLLVM_PATH to its libLLVM.so"
+
+
+def redirect_log() -> None:
+    """Hand Mitsuba's warnings to the log of Python."""
+    import mitsuba as mi
+
+    logger = cast(Any, mi).logger()
+    if logger is not None and not isinstance(logger.appender(0), _log_appender()):
+        logger.clear_appenders()
+        appender: Any = _log_appender()
+        logger.add_appender(appender())
+        logger.set_log_level(mi.LogLevel.Warn)
+
+
+def ignored_samples() -> int:
+    """Return the number of samples that Mitsuba ignored since the last call, since they were no radiances."""
+    count, _invalid["samples"] = _invalid["samples"], 0
+    return count
+
+
+def _append(text: str) -> None:
+    message = _HEADING.sub("", text)
+    kind = _NUMBERS_AND_NAMES.sub("", message)
+    if INVALID in text:
+        _invalid["samples"] += 1
+    elif INTERRUPTED not in text and kind not in _seen:
+        _seen.add(kind)
+        logging.getLogger("mitsuba").warning("%s", message)
+
+
+def _log_appender() -> Any:
+    import mitsuba as mi
+
+    if "log" not in _APPENDERS:
+
+        class LogAppender(mi.Appender):
+            def append(self, level: object, text: str) -> None:
+                del level
+                _append(text)
+
+            def log_progress(self, *arguments: object) -> None:
+                del arguments
+
+        _APPENDERS["log"] = LogAppender
+    return _APPENDERS["log"]

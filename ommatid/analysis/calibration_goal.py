@@ -19,7 +19,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
-from ommatid.simulate.calibration.stopping_rule import StoppingRule
+from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 
 from .prediction.sensor_noise import expected_noise
 

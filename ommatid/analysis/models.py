@@ -10,8 +10,8 @@ from pathlib import Path
 from ommatid.runtime.progress import Progress
 from ommatid.scenes.model import Model
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.cache import cached_model
-from ommatid.simulate.calibration.stopping_rule import StoppingRule
+from ommatid.simulate.calibrate import cached_model
+from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
 

@@ -19,13 +19,12 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sampling import Sampler
-from ommatid.simulate.adaptive_render import AIM, EXPONENTS, LEAST, MOST, STRATIFIED, AdaptiveRendering, render_until
-from ommatid.simulate.cache import cached_model
+from ommatid.simulate.adaptive_render import AIM, LEAST, MOST, AdaptiveRendering, allowed_variance, render_until
+from ommatid.simulate.calibrate import cached_model
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
-from ommatid.simulate.noise_target import allowed_variance
 from ommatid.simulate.render import Rendering, exposed, light
 from ommatid.simulate.sampling.passes import FEWEST_PASSES, JITTERED, Plan, cells_of, on_grid, plan
-from ommatid.simulate.sampling.samplers import fitting
+from ommatid.simulate.sampling.samplers import expected_exponent, fitting
 from ommatid.simulate.sampling.seeds import repeat_seed
 
 Samples = int | Literal["auto"]
@@ -104,7 +103,7 @@ def expected_samples(setup: Setup, right: Reference) -> int:
     if camera.has_box_footprints and sampler in JITTERED:
         return max(on_grid(LEAST, sampler, cells_of(lens_type.ratio)).total for lens_type in camera.types)
     ratio = float(setup.image.var()) / (FEWEST_PASSES * AIM * allowed)
-    return int(min(max(FEWEST_PASSES * ratio ** (1 / EXPONENTS.get(sampler, STRATIFIED)), LEAST), MOST))
+    return int(min(max(FEWEST_PASSES * ratio ** (1 / expected_exponent(sampler)), LEAST), MOST))
 
 
 def render_light(setup: Setup) -> Rendering | AdaptiveRendering:

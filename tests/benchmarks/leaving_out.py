@@ -16,7 +16,7 @@ from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.sampling.passes import plan
-from ommatid.simulate.sensor.emva1288 import record
+from ommatid.simulate.sensors import record
 
 from .alternation import Row, alternate
 

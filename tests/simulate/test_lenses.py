@@ -22,7 +22,7 @@ from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses import sharpness
 from ommatid.simulate.render import render
 from ommatid.simulate.renderer.plugins import export
-from ommatid.simulate.sensor.response import response
+from ommatid.simulate.sensors import response
 
 from ..conftest import Command
 from ..examples import THREE, Lenses, mean_weights, needs, scene

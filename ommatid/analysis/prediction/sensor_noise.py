@@ -11,7 +11,7 @@ def expected_noise(setup: Setup) -> float | FloatArray:
     scene = setup.scene
     if scene.sensor is not None:
         from ommatid.scenes.optics.radiometry import predicted_noise
-        from ommatid.simulate.sensor.response import response
+        from ommatid.simulate.sensors import response
 
         return predicted_noise(scene, setup.camera, response(setup))
     return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0

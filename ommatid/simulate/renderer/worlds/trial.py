@@ -32,6 +32,7 @@ from .checked_world import CheckedWorld, reason_of
 LONGEST = 600.0  # seconds that a world may take
 RESERVE = 100_000_000  # bytes that a world may take even if less are free
 SHOWN = 100
+MODULE = __name__  # of the `main` that a process runs
 IDLE = 20  # seconds without a world after which the process ends
 MESHES = ("ply", "obj", "serialized")
 
@@ -48,7 +49,7 @@ class WorldTrials:
         if self.process is None or self.process.poll() is not None:
             self.stop()
             self.process = subprocess.Popen(
-                python_command(f"from {__name__} import main; main()"),
+                python_command(f"from {MODULE} import main; main()"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

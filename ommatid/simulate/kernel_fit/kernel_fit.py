@@ -13,23 +13,20 @@ typical picture, whose values are correlated over a few pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernels import KernelFootprints, basis
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.blur import blurs_of, entries
 
 from ..calibration.point_sources import Responses
-from ..ideal import ideal_matrix
 from .chart import Chart, chart_of
-from .regression import Sums, chance, residual, sums_of
-from .selection import SIGNIFICANCE, Candidate, Components, choose, components, residual_sums, seen, term_sums
+from .regression import Sums
+from .selection import Candidate, Components, choose, components, seen
 
 DRAWS = 64
 SHARE = 0.99  # of the expected variance of H f that the directions describe; they are scaled to all of it
@@ -37,8 +34,6 @@ KERNELS = 0.999  # of that variance that the common kernels of the directions de
 MOST_DIRECTIONS, MOST_KERNELS = 16, 32
 MOST_UNEXPLAINED = 0.1  # of the entries' variance, with which kernels are still far better than entries
 MOST_WIDTH = 48  # pixels of f: wider kernels have as many numbers as entries, and take minutes to learn
-MOST_DESIGNED = 2**24  # entries of the H as designed that is compared
-DESIGNED_DEGREE = 2  # of polynomials that are looked for in the difference from the design
 
 
 def error_directions(chart: Chart, candidate: Candidate, parts: Components) -> tuple[FloatArray, FloatArray]:
@@ -96,22 +91,16 @@ def _needed(values: FloatArray, share: float, most: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class KernelFit:
-    """Kernels of a lens type, if they explain the entries; `reason` names what they do not explain.
-
-    designed : True if the entries do not differ from H as designed, None where they were not compared
-    """
+    """Kernels of a lens type, if they explain the entries; `reason` names what they do not explain."""
 
     accepted: bool
     reason: str
     footprints: KernelFootprints | None = None
-    designed: bool | None = None
     details: dict[str, Any] = field(default_factory=dict[str, Any])
 
     def record(self) -> dict[str, Any]:
         """Return the entry of a model's record, in JSON's types."""
-        return {"kind": "kernels", "accepted": self.accepted, "reason": self.reason, "designed": self.designed} | (
-            self.details
-        )
+        return {"kind": "kernels", "accepted": self.accepted, "reason": self.reason, **self.details}
 
 
 def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixels: IntArray | None = None) -> KernelFit:
@@ -140,10 +129,7 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
         "count": len(parts.strengths),
         "strengths": [float(each) for each in parts.strengths],
     }
-    designed, chances = _as_designed(chart, camera, lens_type)
-    if chances:
-        details["designed_chances"] = chances
-    return KernelFit(True, reason, _footprints(chart, candidate, parts), designed, details)
+    return KernelFit(True, reason, _footprints(chart, candidate, parts), details)
 
 
 def refusal(camera: Camera, lens_type: LensType) -> str:
@@ -194,42 +180,3 @@ def _footprints(chart: Chart, candidate: Candidate, parts: Components) -> Kernel
         error_kernels.reshape(-1, size, size),
         error_coefficients,
     )
-
-
-def _as_designed(chart: Chart, camera: Camera, lens_type: LensType) -> tuple[bool | None, dict[str, float]]:
-    """Return whether the entries agree with H as designed, and the chances of the tests; None if it is too large."""
-    values = designed_values(chart, camera, lens_type)
-    if values is None:
-        return None, {}
-    difference = replace(chart, values=chart.values - values)
-    degree = DESIGNED_DEGREE if len(chart.pixels) > 20 else 0
-    sums = sums_of(difference, degree)
-    nothing = np.zeros((1 + len(chart.batches), values.shape[1], 1))
-    left = residual(sums, nothing)
-    tests = term_sums(difference, left) | residual_sums(difference, nothing, 0)
-    chances = {name: chance(products) for name, products in tests.items()}
-    single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
-    return bool(min(chances.values()) >= single), chances
-
-
-def designed_values(chart: Chart, camera: Camera, lens_type: LensType) -> FloatArray | None:
-    """Return H as designed of the chart's pixels, (n, C), None if it cannot be computed or is too large."""
-    places, alone = chart.places, replace(camera, types=(lens_type,))
-    if lens_type.measurements * places.width**2 > MOST_DESIGNED:
-        return None
-    if lens_type.optics.surfaces is None:
-        reach = max(blur.reach for blur, _ in blurs_of(camera, lens_type))
-        if entries(alone, lens_type, reach) > MOST_DESIGNED:
-            return None
-    try:
-        matrix = ideal_matrix(alone)[chart.pixels]
-    except InputError:
-        return None
-    row = np.repeat(np.arange(chart.pixels.size), np.diff(matrix.indptr))
-    down, across = np.divmod(matrix.indices.astype(np.int64), camera.columns)
-    first = [start[line][row] for start, line in zip(places.starts, places.lines(chart.pixels), strict=True)]
-    down, across = down - first[0], across - first[1]
-    reached = (down >= 0) & (down < places.width) & (across >= 0) & (across < places.width)
-    values = np.zeros(chart.values.shape)
-    values[row[reached], (down * places.width + across)[reached]] = matrix.data[reached]
-    return values

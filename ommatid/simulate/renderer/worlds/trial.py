@@ -28,13 +28,14 @@ from ommatid.runtime.memory import free_memory
 from ommatid.runtime.printable import printable
 
 from .checked_world import CheckedWorld, reason_of
+from .file_checks import MESHES
 
 LONGEST = 600.0  # seconds that a world may take
 RESERVE = 100_000_000  # bytes that a world may take even if less are free
 SHOWN = 100
 MODULE = __name__  # of the `main` that a process runs
 IDLE = 20  # seconds without a world after which the process ends
-MESHES = ("ply", "obj", "serialized")
+PICTURES = ("bitmap", "envmap", "projector")
 
 
 @dataclass
@@ -188,7 +189,7 @@ def _try_world(world: dict[str, Any], answer: Any) -> None:
         answer(at=path)
         if plugin in MESHES:
             mi.load_dict({"type": plugin, "filename": os.path.realpath(path)})
-        elif plugin == "bitmap":
+        elif plugin in PICTURES:
             mi.Bitmap(os.path.realpath(path))
     answer(at="")
     built = parse_world(world["text"], world["variant"]).build()

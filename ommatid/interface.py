@@ -108,7 +108,7 @@ def render(scene: Scene | str | Path) -> Stack:
 
     Raises InputError for a scene that cannot be rendered here.
     """
-    from ommatid.simulate.cache import cached_stack
+    from ommatid.simulate.render import cached_stack
     from ommatid.simulate.validation import check_scene
 
     setup = _setup(scene)
@@ -125,7 +125,7 @@ def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
     Raises InputError for a scene that cannot be calibrated here.
     """
     from ommatid.analysis.calibration_goal import for_stack
-    from ommatid.simulate.cache import cached_model
+    from ommatid.simulate.calibrate import cached_model
     from ommatid.simulate.validation import check_scene
 
     setup = _setup(scene)

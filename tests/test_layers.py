@@ -6,6 +6,7 @@ import ast
 import importlib
 import subprocess
 import sys
+import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -88,6 +89,36 @@ def test_no_class_name_is_defined_twice() -> None:
 def test_no_folder_has_many_modules() -> None:
     inside = Counter(path.parent for path in modules().values() if path.stem != "__init__")
     assert {folder: count for folder, count in inside.items() if count > LARGEST} == {}
+
+
+def test_no_regular_expression_needs_a_newer_python_than_3_11() -> None:
+    """`re` before Python 3.11.5 leaves a possessive repetition or an atomic group half-way when it fails."""
+    parser = importlib.import_module("re._parser")
+    found = dict[str, list[str | bytes]]()
+    for module, path in modules().items():
+        for text in _texts(path) if "re" in imports(module) else []:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    parsed = repr(parser.parse(text))
+                except (parser.error, OverflowError):  # no regular expression
+                    continue
+            if "POSSESSIVE_REPEAT" in parsed or "ATOMIC_GROUP" in parsed:
+                found.setdefault(module, []).append(text)
+    assert found == {}
+
+
+def _texts(path: Path) -> list[str | bytes]:
+    """All literals of a module but docstrings; of f-strings with a letter for what they format."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts = list[str | bytes]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            texts.append("".join(str(part.value) if isinstance(part, ast.Constant) else "x" for part in node.values))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str | bytes) and id(node) not in docstrings:
+            texts.append(node.value)
+    return texts
 
 
 def test_names_of_modules_that_do_not_exist_are_errors() -> None:

@@ -20,7 +20,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
-from ommatid.simulate.calibration.stopping_rule import StoppingRule
+from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 
 SEED = 20260408  # of an image of white noise, different from those of data, calibration and the other analyses
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
@@ -142,7 +142,7 @@ def expected_noise(setup: Setup) -> float | FloatArray:
     scene = setup.scene
     if scene.sensor is not None:
         from ommatid.scenes.optics.radiometry import predicted_noise
-        from ommatid.simulate.sensor.response import response
+        from ommatid.simulate.sensors import response
 
         return predicted_noise(scene, setup.camera, response(setup))
     return scene.noise.variance + scene.noise.quantisation_variance if scene.noise else 0.0

@@ -88,7 +88,7 @@ def electrons(setup: Setup) -> dict[str, Any] | None:
     if setup.scene.sensor is None:
         return None
     from ommatid.scenes.optics.radiometry import summary
-    from ommatid.simulate.sensor.response import response
+    from ommatid.simulate.sensors import response
 
     light = summary(setup.scene, setup.camera, response(setup))
     if all(lens_type.optics.surfaces is None for lens_type in setup.camera.types):

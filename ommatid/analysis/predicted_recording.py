@@ -21,12 +21,12 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.adaptive_render import AIM as RENDERING_AIM
 from ommatid.simulate.adaptive_render import DONE as RENDERING_DONE
+from ommatid.simulate.adaptive_render import SHARE, allowed_variance, check_noise_target
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.calibration import pilot
 from ommatid.simulate.calibration.adaptive_rounds import AIM, DONE
 from ommatid.simulate.calibration.entries import explains
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
-from ommatid.simulate.noise_target import SHARE, allowed_variance, check_noise_target
 from ommatid.simulate.render import exposed
 from ommatid.simulate.sampling.passes import rounding_variance
 from ommatid.simulate.sampling.seeds import repeat_seed

@@ -22,8 +22,8 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
-from ommatid.simulate.cache import cached_model
-from ommatid.simulate.calibration.stopping_rule import StoppingRule
+from ommatid.simulate.calibrate import cached_model
+from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
 NUMBERS, TABLE = "study.json", "study.csv"

@@ -27,7 +27,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sampling import Sampler
 from ommatid.simulate.adaptive_render import AdaptiveRendering
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.noise_target import check_noise_target
+from ommatid.simulate.adaptive_render import check_noise_target
 from ommatid.simulate.render import Rendering
 from ommatid.simulate.renderer.variant import PREFERENCE, release, unusable_reason
 from ommatid.simulate.sampling.seeds import repeat_seed

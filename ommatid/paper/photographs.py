@@ -20,7 +20,7 @@ from ommatid.scenes import scene
 from ommatid.scenes.formats import picture
 from ommatid.scenes.tables.gallery import GALLERY
 from ommatid.scenes.tables.sensor import NoiseTable
-from ommatid.simulate.sensor.gaussian import expose, generators
+from ommatid.simulate.sensors import expose, generators
 
 from .tile_errors import PaperTile
 

@@ -24,8 +24,8 @@ from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.gallery import find_scene
-from ommatid.simulate.cache import cached_model, cached_stack
-from ommatid.simulate.calibrate import is_adaptive
+from ommatid.simulate.calibrate import cached_model, is_adaptive
+from ommatid.simulate.render import cached_stack
 from ommatid.simulate.renderer.variant import check_transport_variant
 from ommatid.simulate.renderer.variant import choose as choose_variant
 from ommatid.simulate.validation import check_scene, check_scene_memory
@@ -207,7 +207,7 @@ def export_scene(path: Path, output: Path, changes: Sequence[str] = (), lenses: 
     Raises InputError for a scene with a world or with lenses that are more than pinholes.
     """
     from ommatid.runtime.outputs.kinds import check_output
-    from ommatid.simulate.renderer.export import export
+    from ommatid.simulate.renderer.plugins import export
 
     check_output(output, find_scene(path))
     setup = open_scene(path, changes, lenses)

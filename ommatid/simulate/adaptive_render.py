@@ -6,9 +6,9 @@ its own: earlier rounds only determine how many samples it takes. A pixel is don
 passes or more, is half of the allowed one, and rounds are planned for a quarter: so a variance that is underestimated
 by chance lets no bad pixel pass, and few rounds need another. Through pinholes, stratified samples make the variance
 fall like 1 / samples^1.5, since only those at the edges of pixels of f err. Where a grid of samples fits these edges
-none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.exact_grid`), and are
+none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.passes`), and are
 done where these agree. Behind lenses, where a ray
-has four numbers and more, points are Sobol's (`sampling.sobol`) unless another sampler than the default is asked for:
+has four numbers and more, points are Sobol's (`renderer.draws`) unless another sampler than the default is asked for:
 measured, their variance is 1.5 to 1.8 times lower than multijitter's at 256 samples in a pass, 1.9 to 2.3 times at
 1024 and 3.1 to 3.3 times at 4096, in the same time. The seeds of a sub-imager do not depend on the other ones.
 """
@@ -16,8 +16,8 @@ measured, their variance is 1.5 to 1.8 times lower than multijitter's at 256 sam
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby
 from math import inf
 from time import perf_counter
@@ -26,29 +26,32 @@ from typing import Any
 import numpy as np
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.recording import expected_recording_of, flat_values
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import posterior_variances
 
-from .exact_exposure import expose_exactly
-from .noise_target import AllowedVariance, allowed_variance
 from .renderer.renderer import Renderer
 from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint, State
-from .sampling.exact_grid import exact_plan
 from .sampling.passes import (
+    FEWEST_PASSES,
     MOST_SAMPLES,
     Plan,
     Tally,
     cells_of,
+    exact_plan,
+    margin,
     on_grid,
+    power_of_two_plan,
     rounding_variance,
     samples_within,
 )
+from .sampling.samplers import LEAPS, expected_exponent, measured_exponent, next_samples
 from .sampling.seeds import sampler_seeds
-from .sampling.sobol import power_of_two_plan
-from .sampling.sub_imager_progress import LEAPS, SubImagerProgress, mean_of_known
 from .world_view import rendered_world
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
@@ -56,12 +59,12 @@ LEAST = 256  # samples per pixel of a first round, at least
 MOST = 2**20  # samples per pixel of a round, at most
 MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
 MOST_PASSES = 1024  # of all rounds of a sub-imager: they number its seeds
-EXPONENTS = {"independent": 1.0}  # of the fall of the variance with the samples of a pass, before it is measured
-STRATIFIED = 1.5  # the same for all other samplers
 
 SOBOL = "sobol"  # in records, Sobol's points of pixel and pupil
 REACHED = "reached"  # how a sub-imager ends; otherwise the reason why it could not:
 TIME, SAMPLES, FLOAT32 = "render.time is over", "no more samples are taken", "float32 rounds as much"
+AllowedVariance = Callable[[FloatArray, slice], FloatArray]  # of light on some measurements, and their slice
+SHARE = 0.1  # of the sensor's variance
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ class AdaptiveRounds:
         self._slices = setup.camera.slices()
         self.mean, self.variance = np.zeros(setup.camera.measurements), np.zeros(setup.camera.measurements)
         self._open = np.ones(setup.camera.measurements, dtype=np.bool_)  # pixels that are not done
-        exponent = EXPONENTS.get(setup.scene.render.sampler, STRATIFIED)
+        exponent = expected_exponent(setup.scene.render.sampler)
         self._world, flat, sampler = setup.world.simulated, setup.scene.world is None, setup.scene.render.sampler
         numbers = range(len(self._slices))
         self._exact = [exact_plan(self._world, index, sampler) if flat else None for index in numbers]
@@ -296,3 +299,113 @@ class AdaptiveRounds:
             "passes": max(sub.seeds for sub in self.sub_imagers),
             "first_seed": sampler_seeds(self._scene.render.seed, "data", 0, MOST_PASSES)(0),
         }
+
+
+@dataclass
+class SubImagerProgress:
+    """Progress of one sub-imager.
+
+    next, last : plans of the next round and of the last one
+    spent : samples of all rounds per pixel that was in each of them;  fewest : the same for the first pixel to be done
+    rays : of all rounds;  seeds : number of passes so far
+    scatter : variance of one pass of the last round, mean over the unfinished pixels
+    exponent : of its fall with the samples of a pass;  ended : why the sub-imager ended, "" before that
+    """
+
+    next: Plan
+    exponent: float
+    last: Plan = field(default_factory=lambda: Plan(0, 0))
+    rounds: int = 0
+    spent: int = 0
+    fewest: int = 0
+    rays: int = 0
+    seeds: int = 0
+    scatter: float = 0.0
+    ended: str = ""
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> SubImagerProgress:
+        """Create the progress from its fields in JSON's types."""
+        fields: dict[str, Any] = {**values, **{name: Plan(**values[name]) for name in ("next", "last")}}
+        return SubImagerProgress(**fields)
+
+    def add_round(self, work: Plan, variance: FloatArray) -> None:
+        """Account for a round, from its plan and the variances of its pixels' means."""
+        scatter = mean_of_known(variance) * work.passes
+        if self.scatter > 0 and scatter > 0 and work.samples > self.last.samples:
+            self.exponent = measured_exponent(self.scatter / scatter, work.samples / self.last.samples)
+        self.last, self.rounds = work, self.rounds + 1
+        self.spent, self.seeds, self.rays = (
+            self.spent + work.total,
+            self.seeds + work.passes,
+            self.rays + work.total * variance.size,
+        )
+
+    def predicted_samples(self, factor: float, most: int) -> int:
+        """Predict the samples per pixel that divide the variance by `factor`, in passes of at most `most`."""
+        each = self.last.samples * (factor * self.last.passes / FEWEST_PASSES) ** (1 / self.exponent)
+        total = FEWEST_PASSES * each
+        if each > most:
+            total = most * self.last.passes * factor * (self.last.samples / most) ** self.exponent
+        return next_samples(total, self.last.total)
+
+
+def mean_of_known(variance: FloatArray) -> float:
+    """Return the mean of the variances of pixels that receive light."""
+    known = variance[np.isfinite(variance)]
+    return float(known.mean()) if known.size else 0.0
+
+
+def expose_exactly(
+    renderer: Renderer, camera: Camera, indices: Sequence[int], work: Plan, seeds: Sequence[Callable[[int], int]]
+) -> Iterator[tuple[slice, FloatArray]]:
+    """Yield the readings of adjacent sub-imagers by parts: measurements, and (passes, pixels).
+
+    work : from `exact_plan`;  seeds : of each pass, by the index of a sub-imager. The values of a sub-imager depend on
+        no other one: on the fast backends all start together, on scalar they are rendered one by one.
+    """
+    slices = camera.slices()
+    if renderer.is_fast:
+        keys = np.array([[seed(index) for seed in seeds] for index in range(len(slices))], dtype=np.int64)
+        rows = slice(slices[indices[0]].start, slices[indices[-1]].stop)
+        yield from renderer.expose_grid(rows, work, margin(camera, camera.sub_imagers[indices[0]].type), keys)
+        return
+    for index in indices:
+        rows, columns = camera.sub_imagers[index].type.pixels
+        pixels: IntArray = np.arange(rows * columns)
+        values = renderer.expose_alone(index, pixels, work, lambda number, index=index: seeds[number](index))
+        yield slices[index], values
+
+
+def check_noise_target(scene: Scene) -> None:
+    """Raise InputError if the sensor adds no noise that a rendering could be compared with."""
+    noise = scene.noise
+    silent = noise is None or noise.variance + noise.quantisation_variance == 0
+    if scene.sensor is None and silent:
+        raise InputError(
+            "render.samples 'auto' renders until its own variance is a tenth of the sensor's, and this scene's sensor"
+            " adds none; set noise.variance above 0, add a [sensor], or give render.samples a number"
+        )
+
+
+def allowed_variance(setup: Setup) -> AllowedVariance:
+    """Return the function from light on some measurements, and their slice, to the allowed variance of its rendering.
+
+    NaN where a pixel receives no light. Raises InputError if the sensor adds no noise.
+    """
+    check_noise_target(setup.scene)
+    sensor, noise = setup.scene.sensor, setup.scene.noise
+    if sensor is None:
+        known = 0.0 if noise is None else noise.variance + noise.quantisation_variance
+        return lambda light, _: np.full(light.shape, SHARE * known)
+    from .sensors import response
+
+    electrons = response(setup)
+    level = flat_values(sensor, setup.camera, electrons)
+
+    def of_sensor(light: FloatArray, rows: slice) -> FloatArray:
+        values = np.maximum(np.nan_to_num(light), 0.0)
+        expected = expected_recording_of(sensor, level[rows], electrons[rows], values)
+        return SHARE * expected.noise_variance(values)
+
+    return of_sensor

@@ -1,22 +1,25 @@
-"""H with the variance of each of its entries, from point sources, from rays or in closed form."""
+"""H with the variance of each of its entries, from point sources, from rays or in closed form; reused from its file."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from ommatid.runtime.files import fingerprint
+from ommatid.runtime.files import cached, fingerprint
+from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
+from ommatid.scenes import model_file
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
+from .calibration.adaptive_rounds import StoppingRule
 from .calibration.entries import rendered_model
-from .calibration.stopping_rule import StoppingRule
 from .ideal import ideal_model
-from .sampling.checkpoint import Checkpoint
+from .sampling.checkpoint import Checkpoint, open_checkpoint
 
 
 def made_from(setup: Setup, stopping_rule: StoppingRule | None = None) -> str:
@@ -64,3 +67,28 @@ def calibrate(
 def is_adaptive(scene: Scene) -> bool:
     """Return True if the scene leaves the number of samples of its calibration open."""
     return scene.calibration.samples == "auto" and scene.calibration.method != "ideal"
+
+
+@one_thread()
+def cached_model(
+    path: Path, setup: Setup, progress: Progress, stopping_rule: StoppingRule | None = None
+) -> tuple[Model, bool]:
+    """Return the model at `path` as it is on disk, and True if it had to be calibrated.
+
+    stopping_rule : needed where the scene leaves the number of samples open
+    Raises what `calibrate` raises.
+    """
+    wanted = made_from(setup, stopping_rule)
+    with open_checkpoint(path, wanted) as checkpoint:
+        return cached(
+            path,
+            wanted,
+            _read_model,
+            lambda: calibrate(setup, progress, checkpoint, stopping_rule),
+            model_file.write,
+        )
+
+
+def _read_model(path: Path) -> tuple[Model, str | None]:
+    model = model_file.read(path)
+    return model, model.record.get("fingerprint")

@@ -1,8 +1,13 @@
-"""Rendering of all sub-images: the mean of passes with seeds of their own, its variance, and the sensor's recording."""
+"""Rendering of all sub-images: the mean of passes with seeds of their own, its variance, and the sensor's recording.
+
+A film is rendered in bands: all passes of some sensor pixels before those of the next, so that memory holds few. A
+stack is reused from its file while its fingerprint matches the scene.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -10,24 +15,30 @@ import numpy as np
 from scipy import ndimage
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
+from ommatid.scenes import stack
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.recording import Recording
+from ommatid.scenes.scene import TRUTH
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import posterior_variances_among
 from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
+from .renderer.renderer import Renderer
 from .renderer.variant import choose
-from .sampling.checkpoint import Checkpoint
-from .sampling.passes import OverPasses, Plan, plan, rounding_variance
+from .sampling.checkpoint import Checkpoint, State, open_checkpoint
+from .sampling.passes import OverPasses, Plan, Tally, plan, rounding_variance
 from .sampling.seeds import sampler_seeds
 from .world_view import rendered_world
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
+BAND = 2**22  # sensor pixels, at most, unless rays that start together are of more
+
+Part = tuple[str, slice]  # group, and pixels of it
 
 
 @dataclass(frozen=True)
@@ -93,7 +104,6 @@ def light(
     work : passes and their samples; None: as the scene's `render.samples` asks
     Raises InputError if the requested variant does not work here, ValueError if the samples are "auto".
     """
-    from .film_bands import render_bands
     from .renderer.renderer import Renderer
 
     scene = setup.scene
@@ -154,17 +164,87 @@ def exposed(setup: Setup, light: FloatArray, variance: FloatArray, record: dict[
         recording = _recording(setup, scene.sensor, light)
         return stack_from_recording(setup.resolved, camera, recording, variance, record)
     if scene.noise is not None:
-        from .sensor.gaussian import expose, generators
+        from .sensors import expose, generators
 
         values = expose(values, scene.noise, generators(camera, scene.render.seed), camera.slices())
     return Stack(setup.resolved, camera, values, variance, record)
 
 
 def _recording(setup: Setup, sensor: SensorTable, light: FloatArray) -> Recording:
-    from .sensor.emva1288 import record
-    from .sensor.response import response
+    from .sensors import record, response
 
     dark = np.isnan(light)  # no light can reach these pixels, so their flat frame marks them as dead
     electrons = np.where(dark, 0.0, response(setup))
     shot = negligible_shot_noise(setup.scene, setup.camera) is None
     return record(np.where(dark, 0.0, light), electrons, sensor, setup.camera, setup.scene.render.seed, shot)
+
+
+def render_bands(
+    renderer: Renderer, seed: int, work: Plan, progress: Progress, checkpoint: Checkpoint | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean over all passes on every sensor pixel and its variance, (M,) each, which bands do not change."""
+    bands = bands_of(renderer, work.samples)
+    mean, variance, first = np.zeros(renderer.camera.measurements), np.zeros(renderer.camera.measurements), 0
+    state = State() if checkpoint is None else checkpoint.state()
+    if state:
+        mean, variance, first = state["mean"], state["variance"], int(state["band"])
+    for number, band in list(enumerate(bands))[first:]:
+        tally = Tally(sum(pixels.stop - pixels.start for _, pixels in band))
+        tally.resume("light", state)
+        state = State()  # the other bands have not begun
+        for index in range(tally.count, work.passes):
+            seeds = sampler_seeds(seed, "data", index, work.passes)
+            parts = [renderer.expose(group, work.samples, seeds, block=part)[0] for group, part in band]
+            tally.add(np.concatenate(parts))
+            if checkpoint is not None:
+                done = {"mean": mean, "variance": variance, "band": np.array(number)}
+                checkpoint.offer(lambda done=done, tally=tally: {**done, **tally.state("light")})
+            progress((number + (index + 1) / work.passes) / len(bands))
+        start = renderer.rows(band[0][0]).start + band[0][1].start
+        rows = slice(start, start + tally.mean.size)
+        mean[rows], variance[rows] = tally.mean, tally.variance
+    return mean, variance
+
+
+def bands_of(renderer: Renderer, samples: int) -> list[list[Part]]:
+    """Join the adjacent blocks of pixels whose rays start together to bands."""
+    bands, pixels = list[list[Part]](), 0
+    for group in renderer.groups:
+        rows = renderer.rows(group)
+        whole = [slice(0, rows.stop - rows.start)]
+        for block in renderer.blocks(group, samples) if renderer.is_fast else whole:
+            size = block.stop - block.start
+            if not bands or pixels + size > BAND:
+                bands.append([])
+                pixels = 0
+            bands[-1].append((group, block))
+            pixels += size
+    return bands
+
+
+def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:
+    """Return the stack at `path` as it is on disk, and True if it had to be rendered.
+
+    The truth of a world is stored beside the stack. Raises what `render` raises.
+    """
+    truth = setup.image
+    if setup.scene.world is not None:
+        from .ground_truth import cached_truth
+
+        truth = cached_truth(path.with_name(TRUTH), setup)
+    wanted = made_from(setup)
+    with open_checkpoint(path, wanted) as checkpoint:
+        result, made = cached(
+            path, wanted, _read_stack, lambda: render(setup, progress, checkpoint, truth), stack.write
+        )
+    record = {**result.record, "truth": digest(truth.astype(np.float32))}
+    if result.scene.plain() != setup.resolved.plain() or result.record != record:
+        # The estimator's tables or the truth may have changed; the values have not.
+        stack.write(path, replace(result, scene=setup.resolved, record=record))
+        result = stack.read(path)
+    return result, made
+
+
+def _read_stack(path: Path) -> tuple[Stack, str | None]:
+    result = stack.read(path)
+    return result, result.record.get("fingerprint")

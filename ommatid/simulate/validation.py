@@ -10,7 +10,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.setup import Setup
 
-from .noise_target import check_noise_target
+from .adaptive_render import check_noise_target
 from .renderer.variant import check_fast_variant, check_transport_variant, choose
 from .world_view import check_world
 

@@ -95,7 +95,7 @@ def world_view(setup: Setup) -> WorldView:
     """Look at the world of a scene; computed once per process. Raises InputError for one that cannot be built."""
     from .renderer.renderer import Renderer
     from .renderer.world import describe, world_of
-    from .renderer.worlds.surfaces import box_of, depths_met, has_surroundings
+    from .renderer.worlds.building import box_of, depths_met, has_surroundings
 
     scene, camera, table = setup.scene, setup.camera, world_of(setup.scene)
     variant = choose(scene.render.variant)
@@ -195,7 +195,7 @@ def _remedy(view: WorldView, table: WorldTable) -> str:
 
 def _fitting_unit(world: Any, camera: Camera, table: WorldTable) -> str | None:
     """Return the unit in which the camera sees the world with surfaces closest to the target's plane, if any."""
-    from .renderer.worlds.surfaces import depths_met
+    from .renderer.worlds.building import depths_met
 
     found = dict[str, float]()
     for unit, millimetres in MILLIMETRES.items():

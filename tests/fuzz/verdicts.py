@@ -22,7 +22,7 @@ LONGEST_MESSAGE = 500  # characters of an error of the library
 LONGEST_SENTENCE = 1000  # characters of a line that a command writes to stderr
 MEMORY = 1 << 30  # bytes that the process may need beyond those at the start
 ROOT = Path(__file__).parent.parent.parent
-KEPT_PROCESSES = ("resource_tracker", "trial_process")  # that end when this one ends
+KEPT_PROCESSES = ("resource_tracker", "worlds.trial")  # that end when this one ends
 NOT_PRINTABLE = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # general categories of Unicode
 LIBRARY_NOISE = re.compile(r"\w*Warning: |^\d{4}-\d\d-\d\d .* (WARN|ERROR) |Traceback|Exception ignored|^  File ", re.M)
 

@@ -25,7 +25,7 @@ from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.ideal import ideal_matrix, ideal_model, true_matrix
 from ommatid.simulate.render import exposed
 
-from ..examples import Lenses, familywise, scene
+from ..examples import Lenses, familywise, needs, scene
 
 ACTUAL, NOISE = 5461.25, 4.0
 SEEDS = 20
@@ -86,6 +86,7 @@ def test_the_prediction_and_the_error_map_are_those_of_equation_5(assumed: float
 @pytest.mark.parametrize("assumed", [50.0, 1e6])
 def test_the_prediction_of_a_run_holds_the_actual_prior(assumed: float) -> None:
     """With an assumed noise the rendering's noise changes no gain, and is a part of its own."""
+    needs("llvm_ad_mono")
     scene = described(assumed, estimator={"noise_variance": NOISE})
     budget = predict_run(Setup.from_scene(scene)).budget
     assert budget is not None

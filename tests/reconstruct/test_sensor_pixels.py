@@ -27,7 +27,7 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sensor import NoiseTable
 from ommatid.simulate.ideal import ideal_model
-from ommatid.simulate.sensor.gaussian import expose, generators
+from ommatid.simulate.sensors import expose, generators
 
 from ..conftest import Command
 from ..examples import THREE, scene

@@ -29,7 +29,7 @@ from ommatid.scenes.skipped import skipped_effects
 from ommatid.scenes.stack import stack_from_recording
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light
-from ommatid.simulate.sensor.emva1288 import record
+from ommatid.simulate.sensors import record
 
 from ..examples import THREE, TWO, familywise, needs, scene, with_optics
 from ..modules import ROOT, existing
@@ -204,9 +204,7 @@ def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
         "renderer.crosstalk",
         "renderer.real_lens",
         "renderer.world",
-        "sensor.emva1288",
         "calibration.ray_transport",
-        "calibration.transport_kernels",
     )
     absent = existing(
         *(f"ommatid.scenes.optics.{name}" for name in optics), *(f"ommatid.simulate.{name}" for name in simulated)

@@ -201,15 +201,6 @@ def paths_in_other_keys(rng: random.Random, folder: Path) -> str:
     return scene(f'<shape type="sphere"><bsdf type="conductor"><string name="{name}" value="{value}"/></bsdf></shape>')
 
 
-def pictures(rng: random.Random, folder: Path) -> str:
-    size = rng.choice([2**31 - 1, 10**6])
-    png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", size, size) + b"\x08\0\0\0\0"
-    bad = [png, b"BM" + b"\0" * 16 + struct.pack("<ii", size, size), f"P5\n{size} {size}\n255\n".encode(), b"egg", b""]
-    (folder / "p.png").write_bytes(rng.choice(bad))
-    picture = '<texture type="bitmap" name="reflectance"><string name="filename" value="p.png"/></texture>'
-    return scene(f'<shape type="sphere"><bsdf type="diffuse">{picture}</bsdf></shape>')
-
-
 def damaged(rng: random.Random, folder: Path) -> str:
     del folder
     text = scene('<shape type="sphere"/>')
@@ -235,7 +226,6 @@ FAMILIES: dict[str, Callable[[random.Random, Path], str]] = {
         plugins,
         outside,
         paths_in_other_keys,
-        pictures,
         damaged,
     )
 }

@@ -23,20 +23,17 @@ from ommatid.simulate.adaptive_render import (
     LEAST,
     MOST,
     SAMPLES,
+    SHARE,
     TIME,
     AdaptiveRendering,
+    SubImagerProgress,
     render_until,
 )
-from ommatid.simulate.cache import cached_model, cached_stack
-from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.calibration.adaptive_rounds import GOAL
-from ommatid.simulate.calibration.stopping_rule import StoppingRule
+from ommatid.simulate.calibrate import cached_model, calibrate
+from ommatid.simulate.calibration.adaptive_rounds import GOAL, StoppingRule
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.noise_target import SHARE
-from ommatid.simulate.render import render
-from ommatid.simulate.sampling.exact_grid import PASSES
-from ommatid.simulate.sampling.passes import Plan, cells_of, on_grid, rounding_variance, samples_within
-from ommatid.simulate.sampling.sub_imager_progress import SubImagerProgress
+from ommatid.simulate.render import cached_stack, render
+from ommatid.simulate.sampling.passes import EXACT_PASSES, Plan, cells_of, on_grid, rounding_variance, samples_within
 
 from ..conftest import Command
 from ..examples import THREE, VARIANTS, needs, scene
@@ -327,7 +324,7 @@ def test_a_whole_run(here: Path, ommatid: Command) -> None:
     assert "samples per pixel" in " ".join(ended.out.replace("│", " ").split())
     run = json.loads((here / "out/tiny/run.json").read_text("utf-8"))
     assert run["stages"]["render"]["reached"]
-    assert run["stages"]["render"]["fewest_samples"] == PASSES * 9, "one sample per pixel of f and pass at 1/3"
+    assert run["stages"]["render"]["fewest_samples"] == EXACT_PASSES * 9, "one sample per pixel of f and pass at 1/3"
     assert run["stages"]["calibrate"]["auto"]["reached"]
     budget = run["error"]["budget"]
     assert budget["calibration"] <= GOAL * (run["error"]["predicted_mse"] - budget["calibration"])

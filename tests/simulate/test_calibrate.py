@@ -18,7 +18,7 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate import calibrate
 from ommatid.simulate.calibration import entries, point_sources
-from ommatid.simulate.calibration.visible_pixels import VisiblePixels, of_pinholes
+from ommatid.simulate.calibration.point_sources import VisiblePixels, of_pinholes
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 from ..examples import scene

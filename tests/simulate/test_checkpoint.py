@@ -15,7 +15,8 @@ from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.setup import Setup
 from ommatid.simulate import render
-from ommatid.simulate.cache import cached_model, cached_stack
+from ommatid.simulate.calibrate import cached_model
+from ommatid.simulate.render import cached_stack
 from ommatid.simulate.sampling import checkpoint
 from ommatid.simulate.sampling.checkpoint import Checkpoint, open_checkpoint
 
@@ -72,7 +73,7 @@ def test_bands_change_no_bit_and_a_rendering_continues_within_one(
     render = tiny().scene.render.model_copy(update={"variant": variant})
     setup = replace(tiny(), scene=tiny().scene.model_copy(update={"render": render}))
     whole, _ = cached_stack(tmp_path / "whole.exr", setup, no_progress)
-    monkeypatch.setattr("ommatid.simulate.film_bands.BAND", 300)
+    monkeypatch.setattr("ommatid.simulate.render.BAND", 300)
     monkeypatch.setattr("ommatid.simulate.renderer.rays.MOST_RAYS", 2**10)
     with pytest.raises(KeyboardInterrupt):
         cached_stack(tmp_path / "stack.exr", setup, after(0.7))
@@ -80,7 +81,7 @@ def test_bands_change_no_bit_and_a_rendering_continues_within_one(
     continued, _ = cached_stack(tmp_path / "stack.exr", setup, fractions.append)
     assert min(fractions) > 0.7
     assert fractions == sorted(fractions)
-    monkeypatch.setattr("ommatid.simulate.film_bands.BAND", 10**6)
+    monkeypatch.setattr("ommatid.simulate.render.BAND", 10**6)
     at_once, _ = cached_stack(tmp_path / "once.exr", setup, no_progress)
     np.testing.assert_array_equal(continued.values, at_once.values)
     np.testing.assert_array_equal(continued.variance, at_once.variance)

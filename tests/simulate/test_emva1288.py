@@ -24,9 +24,9 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack, stack_from_recording
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.scenes.tables.sensor import SensorTable
+from ommatid.simulate import sensors
 from ommatid.simulate.ideal import ideal_model
-from ommatid.simulate.sensor import emva1288
-from ommatid.simulate.sensor.emva1288 import record
+from ommatid.simulate.sensors import record
 
 from ..examples import THREE, Lenses, familywise, scene
 
@@ -158,7 +158,7 @@ def test_means_of_frames_are_distributed_like_frames_drawn_one_by_one(monkeypatc
     camera, told = field(60), sensor(dsnu=0.0, prnu=0.0, frames=9, **coarse)
     found: list[Recording] = []
     for most in (10**9, 0):
-        monkeypatch.setattr(emva1288, "MOST_READINGS", most)
+        monkeypatch.setattr(sensors, "MOST_READINGS", most)
         found.append(exposed(told, camera, 50.0, most % 7))
     pixels = camera.measurements
     for name in ("dark", "flat"):
@@ -205,8 +205,8 @@ def test_the_fixed_pattern_belongs_to_the_camera_and_the_rest_to_the_exposure() 
 
 def test_all_streams_differ() -> None:
     subs = field(4, 2).sub_imagers
-    purposes: list[emva1288.Purpose] = ["dark signal", "response", "exposure", "dark frames", "flat frames"]
-    drawn = {emva1288.generator(seed, what, sub).random() for seed in (0, 1) for what in purposes for sub in subs}
+    purposes: list[sensors.Purpose] = ["dark signal", "response", "exposure", "dark frames", "flat frames"]
+    drawn = {sensors.generator(seed, what, sub).random() for seed in (0, 1) for what in purposes for sub in subs}
     assert len(drawn) == 2 * 5 * 2
     plain = exposed(
         sensor(dsnu=0.0, frames=2), field(60), 100.0, 0, electrons=0.0

@@ -11,14 +11,12 @@ import pytest
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.adaptive_render import render_until
-from ommatid.simulate.exact_exposure import expose_exactly
+from ommatid.simulate.adaptive_render import expose_exactly, render_until
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose
-from ommatid.simulate.sampling import exact_grid
-from ommatid.simulate.sampling.exact_grid import exact_plan
-from ommatid.simulate.sampling.passes import Plan, rounding_variance
+from ommatid.simulate.sampling import passes
+from ommatid.simulate.sampling.passes import Plan, exact_plan, rounding_variance
 
 from ..examples import VARIANTS, needs, scene, with_optics
 
@@ -75,7 +73,7 @@ def test_samples_keep_away_from_edges_by_what_float32_rounds(monkeypatch: pytest
 
     assert wrong() == 0
     assert render_until(setup).details["rounds"] == 1
-    monkeypatch.setattr(exact_grid, "ROUNDINGS", 0)
+    monkeypatch.setattr(passes, "ROUNDINGS", 0)
     assert wrong() > 0, "at the edge of this target, rays are rounded into the next pixel"
 
 

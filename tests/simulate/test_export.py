@@ -15,7 +15,7 @@ from ommatid.scenes.formats.exr import read_channels
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.renderer.export import export
+from ommatid.simulate.renderer.plugins import export
 
 from ..examples import THREE, scene
 

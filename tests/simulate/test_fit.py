@@ -24,7 +24,7 @@ from ommatid.simulate.calibration.point_sources import Responses, Subsets
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.sampling.passes import BATCHES, FEWEST_PASSES
 
-from ..examples import THREE, camera, with_optics
+from ..examples import THREE, camera, needs, with_optics
 
 FEW = (("1/3", [2, 2], [5, 5]), ("1/4", [2, 1], [4, 4]))
 WRONG = {"tolerance": {"position": "1 um", "rotation": "1 deg", "focal_length": 0.01}}
@@ -135,6 +135,7 @@ def test_what_no_view_explains_is_measured_entry_by_entry() -> None:
 @pytest.mark.parametrize("method", ["points", "transport"])
 def test_traced_rays_of_a_misaligned_camera(method: str, tmp_path: Path) -> None:
     """By rays through wrongly placed lenses, against exact areas; the file holds the numbers alone."""
+    needs("llvm_ad_mono")
     calibration = {"samples": 256, "method": method, "fit": "auto"}
     described, cam = with_optics({}, MOVED, FEW, calibration=calibration)
     setup = Setup(described, cam)
@@ -156,6 +157,7 @@ def test_traced_rays_of_a_misaligned_camera(method: str, tmp_path: Path) -> None
 
 
 def test_a_file_of_other_numbers_is_refused(tmp_path: Path) -> None:
+    needs("llvm_ad_mono")
     calibration = {"samples": 64, "method": "transport", "fit": "auto"}
     described, cam = with_optics({}, MOVED, FEW, calibration=calibration)
     path = tmp_path / "model.npz"
@@ -184,6 +186,7 @@ def test_null_spaces_are_not_filled() -> None:
     """Two lens types leave a null space, which the noise of entries would fill: expected error by H as calibrated."""
     from ommatid.analysis.predict import predict_scene
 
+    needs("llvm_ad_mono")
     calibration = {"samples": 256, "method": "transport", "fit": "auto"}
     described, cam = with_optics({}, {}, THREE[:2], calibration=calibration, noise={"variance": 1e-4})
     model = calibrate(Setup(described, cam))

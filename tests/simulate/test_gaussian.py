@@ -8,7 +8,7 @@ from scipy import stats
 
 from ommatid.scenes.tables.sensor import NoiseTable
 from ommatid.simulate.sampling.seeds import Purpose, noise_generator, sampler_seeds
-from ommatid.simulate.sensor.gaussian import expose, generators, quantise
+from ommatid.simulate.sensors import expose, generators, quantise
 
 from ..examples import THREE, camera
 

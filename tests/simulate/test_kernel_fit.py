@@ -77,12 +77,11 @@ def test_h_of_a_defocused_lens_is_ten_times_better_known_than_its_entries() -> N
     truth, rng = ideal_matrix(camera), np.random.default_rng(0)
     responses = drawn(truth, rng)
     fit = fit_kernels(responses, camera, camera.types[0])
-    assert fit.designed
     learnt = accepted(fit).to_sparse()
     assert rms(learnt - truth, truth.nnz) < 0.1 * rms(responses.matrix - truth, truth.nnz)
-    assert not fit_kernels(drawn(varying(camera).to_sparse(), rng), camera, camera.types[0]).designed
 
 
+@pytest.mark.slow
 def test_errors_of_h_f_are_as_large_as_promised() -> None:
     camera, rng = defocused(), np.random.default_rng(1)
     truth, image = ideal_matrix(camera), np.random.default_rng(2).normal(127, 74, camera.unknowns)
@@ -103,7 +102,6 @@ def test_components_of_a_varying_blur_are_learnt() -> None:
     record = json.loads(json.dumps(fit.record()))
     assert record["degree"] == 2
     assert record["components"]["count"] >= 3
-    assert not fit.designed
     learnt = accepted(fit).to_sparse()
     mean = replace(varying(camera), kernels=varying(camera).kernels[:1], coefficients=np.eye(1, 6)).to_sparse()
     assert rms(learnt - truth, truth.nnz) < 0.1 * rms(mean - truth, truth.nnz)

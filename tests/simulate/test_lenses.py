@@ -21,8 +21,8 @@ from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses import sharpness
 from ommatid.simulate.render import render
-from ommatid.simulate.renderer.export import export
-from ommatid.simulate.sensor.response import response
+from ommatid.simulate.renderer.plugins import export
+from ommatid.simulate.sensors import response
 
 from ..conftest import Command
 from ..examples import THREE, Lenses, mean_weights, needs, scene

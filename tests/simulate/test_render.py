@@ -16,7 +16,6 @@ from ommatid.scenes.stack import Stack
 from ommatid.simulate.render import made_from, mean_of_neighbours, render
 
 from ..examples import THREE, VARIANTS, needs, scene
-from ..modules import existing
 
 
 def recorded(described: Scene) -> Stack:
@@ -63,15 +62,6 @@ def test_variances_are_stored_and_never_zero() -> None:
     stack = recorded(scene((19, 19), THREE, render={"variant": "scalar_rgb", "samples": 256}))
     assert (stack.variance > 0).all()
     assert stack.variance.astype(np.float32).min() > 0, "in the file's precision too"
-
-
-def test_a_scene_without_noise_imports_no_noise_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    [noise] = existing("ommatid.simulate.sensor.gaussian")
-    monkeypatch.delitem(sys.modules, noise, raising=False)
-    recorded(scene(render={"variant": "scalar_rgb", "samples": 16}))
-    assert noise not in sys.modules
 
 
 def test_the_fingerprint_changes_with_the_inputs_of_the_values_only() -> None:

@@ -34,7 +34,7 @@ def shares(sampler: Sampler, reseeded: bool) -> FloatArray:
     import drjit as dr
     import mitsuba as mi
 
-    from ommatid.simulate.renderer.reseeded_sampler import ReseededSampler
+    from ommatid.simulate.renderer.draws import ReseededSampler
 
     samples = fitting(sampler, SAMPLES)
     mitsuba: Any = mi.load_dict({"type": sampler, "sample_count": samples})
@@ -83,7 +83,7 @@ def test_errors_of_pixels_are_independent(sampler: Sampler) -> None:
     activate(FAST)
     import mitsuba as mi
 
-    from ommatid.simulate.renderer.reseeded_sampler import ReseededSampler
+    from ommatid.simulate.renderer.draws import ReseededSampler
 
     samples = fitting(sampler, SAMPLES)
     mitsuba: Any = mi.load_dict({"type": sampler, "sample_count": samples})

@@ -13,11 +13,11 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.sampling import Sampler
 from ommatid.simulate.adaptive_render import render_until
 from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.renderer.draws import DIMENSIONS, SobolDraws, sobol_points
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
-from ommatid.simulate.sampling.passes import Plan
+from ommatid.simulate.sampling.passes import Plan, power_of_two_plan
 from ommatid.simulate.sampling.seeds import sampler_seeds
-from ommatid.simulate.sampling.sobol import DIMENSIONS, power_of_two_plan, sobol_points
 
 from ..examples import needs, with_optics
 
@@ -40,8 +40,6 @@ def out_of_focus(seed: int = 0, noise: float = 1.0, **render: Any) -> Setup:
 
 def draws(seed: int = 3) -> FloatArray:
     """Return numbers of all dimensions and of one more, (dimensions + 1, streams, samples)."""
-    from ommatid.simulate.renderer.points.sobol import SobolDraws
-
     drawn = SobolDraws(seed, LANES, SAMPLES)
     return np.stack([np.array(drawn.next_1d()) for _ in range(DIMENSIONS + 1)]).reshape(-1, LANES // SAMPLES, SAMPLES)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ommatid.scenes.camera import derive
 from ommatid.scenes.pose import corner_offset, pose_of
 from ommatid.scenes.scene import parse
-from ommatid.simulate.lenses import thin_lens
+from ommatid.simulate.renderer import lens as thin_lens
 from ommatid.simulate.renderer.variant import activate
 
 from ..examples import camera, mean_weights, needs, scene

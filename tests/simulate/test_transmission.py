@@ -15,7 +15,7 @@ from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.lenses.etendue import transmission, transmissions
 from ommatid.simulate.lenses.prescription import Prescription, prescription_of
-from ommatid.simulate.sensor.response import response
+from ommatid.simulate.sensors import response
 
 from ..conftest import Command
 from ..examples import GALLERY

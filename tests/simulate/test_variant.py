@@ -14,6 +14,8 @@ from ommatid.runtime.errors import InputError, MachineError
 from ommatid.simulate.renderer import variant
 from ommatid.simulate.renderer.variant import BackendStatus, choose, diagnosis, probe, unusable_reason
 
+from ..conftest import shell
+
 BROKEN = [path for version in (15, 16) for path in Path("/usr/lib").glob(f"*/libLLVM-{version}.so*")]
 
 
@@ -67,6 +69,20 @@ def test_a_real_broken_llvm_does_not_kill_the_process() -> None:
     assert chosen == "scalar_rgb"
     assert "LLVM 15" in why or "LLVM 16" in why
     assert probed == why
+
+
+def test_without_llvm_nothing_foreign_is_on_the_error_stream(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(here / "none"))
+    predicted = shell("predict", "tiny.toml", "--no-rays", cwd=here)
+    assert (predicted.code, predicted.err) == (0, "")
+    script = "import os; from ommatid.simulate.renderer.variant import unusable_reason as reason\n"
+    script += "print(reason('llvm_ad_mono')); os.write(2, b'kept')"
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert (str(here / "none") in ended.stdout, ended.stderr) == (True, "kept")
+    foreign = "import os, sys; os.write(2, b'jitc_llvm_init(): none\\nanother line\\n')"
+    (here / "drjit.py").write_text(foreign, encoding="utf-8")
+    ended = subprocess.run([sys.executable, "-c", script.replace("llvm_ad", "scalar")], capture_output=True, text=True)
+    assert ended.stderr == "another line\nkept"
 
 
 def test_a_failed_probe_is_reported_as_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,10 +15,9 @@ from ommatid.scenes.formats.exr import read
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import TRUTH, parse
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.cache import cached_stack
 from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.render import Rendering, light
+from ommatid.simulate.render import Rendering, cached_stack, light
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.renderer.world import files, has_interreflections, stage
 

@@ -10,7 +10,7 @@ import pytest
 from ommatid.interface import read_scene
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.renderer.worlds.checked_world import check_world_files
-from ommatid.simulate.renderer.worlds.mesh_files import check_obj
+from ommatid.simulate.renderer.worlds.file_checks import check_named_file
 
 from ..conftest import TINY, Command
 from ..examples import GALLERY
@@ -141,8 +141,8 @@ def test_a_wrong_line_among_many_is_named(face: str, tmp_path: Path) -> None:
         ["v 0 0 1", "v 1 0 1", "v 0 1.5 -1e-2", "vt 0 0", "vn 0 0 1", *[f"f {face}"] * 300],
     )
     path.write_text("\n".join(lines), encoding="utf-8")
-    check_obj(path)
+    check_named_file(path, "obj")
     for at, wrong in ((200, f"f {face.replace('3', '4')}"), (100, f"f {face.replace('1', '0', 1)}"), (2, "v 1 2 nan")):
         path.write_text("\n".join([*lines[:at], wrong, *lines[at:]]), encoding="utf-8")
-        with pytest.raises(InputError, match=rf"\(line {at + 1}\): expected"):
-            check_obj(path)
+        with pytest.raises(InputError, match=rf"\(line {at + 1}: expected"):
+            check_named_file(path, "obj")

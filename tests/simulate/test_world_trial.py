@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 import subprocess
 from contextlib import nullcontext
 from pathlib import Path
@@ -72,6 +73,25 @@ def test_a_world_is_tried_once_and_its_process_serves_the_next(tmp_path: Path, a
         InputError, match=r'w is no scene that Mitsuba can build: in world.xml \(line 1\): could not .* "x"'
     ):
         trial.try_world(checked(tmp_path, '<float name="a" value="x"/>'), "scalar_rgb", "w")
+    alone.stop()
+
+
+@pytest.mark.slow
+def test_pictures_and_volumes_that_are_none_or_too_large_are_refused_in_one_sentence(
+    tmp_path: Path, alone: trial.WorldTrials
+) -> None:
+    """Mitsuba reads them in the process that may die: nothing walks through their headers before."""
+    png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 2**31 - 1, 10**6) + b"\x08\0\0\0\0"
+    pictures = [png, b"BM" + b"\0" * 16 + struct.pack("<ii", 10**6, 10**6), b"P5\n1000000 1000000\n255\n", b"egg", b""]
+    volumes = [b"VOL\3" + struct.pack("<5i", 1, 2**20, 2**20, 2**20, 1) + b"\0" * 24, b"egg"]
+    named = '<string name="filename" value="f"/>'
+    kinds = [f'<texture type="bitmap">{named}</texture>'] * 5 + [f'<volume type="gridvolume">{named}</volume>'] * 2
+    for content, kind in zip((*pictures, *volumes), kinds, strict=True):
+        (tmp_path / "f").write_bytes(content)
+        with pytest.raises(InputError, match=r"^w[: ].*") as refused:
+            trial.try_world(checked(tmp_path, kind), "scalar_rgb", "w")
+        assert str(refused.value).isprintable()
+        assert len(str(refused.value)) <= 300
     alone.stop()
 
 

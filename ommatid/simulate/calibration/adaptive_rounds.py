@@ -9,8 +9,8 @@ are independent of each other. Grids of samples fit the edges of pixels of f whe
 from __future__ import annotations
 
 import json
-from dataclasses import replace
-from math import ceil, log
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,21 +20,31 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
-from ..adaptive_render import EXPONENTS, STRATIFIED
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import MOST_SAMPLES, cells_of, on_grid
-from ..sampling.sub_imager_progress import STEEPEST
+from ..sampling.samplers import expected_exponent, measured_exponent, next_samples
 from .entries import rendered_model
 from .point_sources import Plans
-from .stopping_rule import StoppingRule
 
 GOAL = 0.1  # of all the rest of the expected error: what the uncertainty of H may add
 DONE, AIM = 0.025, 0.0125  # addition at which a round is accepted, and the one it is planned for
 LEAST, MOST, MOST_FLOAT32 = 256, 2**19, 40960  # samples per pixel of a round; the last if sums are float32
 MOST_EXACT = 2**16  # samples per pixel of a pass if sums are float64
-LEAPS = (2.0, 64.0)  # least and largest growth of the samples from one round to the next
 FLAT = 0.01  # relative fall of the addition over two growths, below which more samples are of no use
+
+
+@dataclass(frozen=True)
+class StoppingRule:
+    """Decides whether H is known precisely enough for the reconstruction that will use it.
+
+    added_error : maps a model to the expected error due to the uncertainty of its H, relative to all other error
+    fingerprint : of the reconstruction;  description : of the same for people
+    """
+
+    added_error: Callable[[Model], float]
+    fingerprint: str
+    description: str
 
 
 def calibrate_until(
@@ -56,7 +66,7 @@ def calibrate_until(
     state = {} if checkpoint is None else checkpoint.state()
     tried: list[dict[str, Any]] = json.loads(str(state["tried"])) if "tried" in state else []
     while True:
-        samples = _next(tried, EXPONENTS.get(scene.render.sampler, STRATIFIED), most)
+        samples = _next(tried, expected_exponent(scene.render.sampler), most)
         plans = plans_of(setup, samples, float64)
         model = rendered_model(
             replace(setup, scene=_with_samples(scene, samples)), progress, plans=plans, float64=float64
@@ -95,9 +105,8 @@ def _next(tried: list[dict[str, Any]], exponent: float, most: int) -> int:
     asked, adds = tried[-1]["asked"], tried[-1]["adds"]
     if len(tried) > 1:
         before = tried[-2]
-        exponent = min(max(log(before["adds"] / adds) / log(asked / before["asked"]), 1.0), STEEPEST)
-    fewest, largest = (leap * asked for leap in LEAPS)
-    return min(ceil(min(max(asked * (adds / AIM) ** (1 / exponent), fewest), largest)), most)
+        exponent = measured_exponent(before["adds"] / adds, asked / before["asked"])
+    return min(next_samples(asked * (adds / AIM) ** (1 / exponent), asked), most)
 
 
 def _is_flat(tried: list[dict[str, Any]]) -> bool:

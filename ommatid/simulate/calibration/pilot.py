@@ -22,10 +22,9 @@ from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
-from ..adaptive_render import EXPONENTS, STRATIFIED
 from ..renderer.variant import choose, unusable_reason
 from ..sampling.passes import BATCHES, MOST_SAMPLES, Plan, cells_of, on_grid, plan
-from ..sampling.samplers import fitting
+from ..sampling.samplers import expected_exponent, fitting
 from ..sampling.seeds import repeat_seed
 from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model
@@ -152,7 +151,7 @@ def pilot(setup: Setup, plans: Plans) -> Pilot:
     changed = setup_of_pilot(setup, samples=max(work.total for work in traced.values()), fit="none")
     model = rendered_model(changed, plans=traced, float64=scene.calibration.samples == "auto")
     pinholes = all(lens.optics.aperture is None and lens.optics.surfaces is None for lens in setup.simulated.types)
-    exponent = EXPONENTS.get(scene.render.sampler, STRATIFIED) if pinholes else 1.0
+    exponent = expected_exponent(scene.render.sampler) if pinholes else 1.0
     rows = np.empty(setup.camera.measurements)
     for lens_type, pixels in zip(setup.camera.types, setup.camera.type_slices(), strict=True):
         few, all_ = traced[lens_type.name], plans[lens_type.name]

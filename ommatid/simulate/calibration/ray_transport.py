@@ -14,6 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.library_caches import compiled
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.setup import Setup
 
@@ -24,6 +25,44 @@ from .point_sources import Part, Plans, Responses, Subsets, joined_parts, on_all
 
 if TYPE_CHECKING:
     from ..renderer.renderer import Renderer
+
+
+@compiled
+def sums_by_texel(texels: IntArray, weights: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Sum the weights, (P, S), by texel for every pixel, without texels below 0: counts (P,), texels and sums.
+
+    Texels rise within a pixel. A pixel sees few of them again and again, so each ray is looked up by bisection among
+    the previous ones.
+    """
+    pixels, samples = texels.shape
+    counts = np.zeros(pixels, dtype=np.int64)
+    known = np.empty(texels.size, dtype=np.int64)
+    sums = np.empty(texels.size, dtype=np.float64)
+    start = 0
+    for pixel in range(pixels):
+        stop = start
+        for sample in range(samples):
+            texel = texels[pixel, sample]
+            if texel < 0 or weights[pixel, sample] == 0.0:
+                continue
+            low, high = start, stop
+            while low < high:
+                middle = (low + high) // 2
+                if known[middle] < texel:
+                    low = middle + 1
+                else:
+                    high = middle
+            if low == stop or known[low] != texel:
+                for index in range(stop, low, -1):
+                    known[index] = known[index - 1]
+                    sums[index] = sums[index - 1]
+                known[low] = texel
+                sums[low] = 0.0
+                stop += 1
+            sums[low] += weights[pixel, sample]
+        counts[pixel] = stop - start
+        start = stop
+    return counts, known[:start].copy(), sums[:start].copy()
 
 
 class TracedEntries(NamedTuple):
@@ -74,7 +113,6 @@ def one_pass(
     renderer: Renderer, group: str, block: slice, work: Plan, number: int, seed: int, subset: IntArray | None = None
 ) -> TracedEntries:
     """Trace one pass of the pixels of a block, of all or of a subset."""
-    from .transport_kernels import sums_by_texel  # pyright: ignore[reportUnknownVariableType]
 
     seeds = sampler_seeds(seed, "calibration", number, work.passes)
     texels, weights = renderer.hits(group, work.samples, seeds, block, subset)

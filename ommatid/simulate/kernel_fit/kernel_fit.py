@@ -4,53 +4,103 @@ The entries of a chart of sensor pixels determine the kernels of `ommatid.scenes
 a polynomial of the field, whose degree F tests choose, and the variation over the field is reduced to its principal
 components. The explanation is rejected if the residuals scatter more than the batches say: in any way that shows in a
 picture, or by more than a tenth of the entries' own variance.
+
+The directions in which the kernels are uncertain follow from fits to errors drawn from the scatter of the batches. A
+draw gives every pixel of the chart a random combination of its batches' deviations, which has the covariance of the
+pixel's errors; the fit to it is a draw of the kernels' error. Kept are the directions that change images most, of a
+typical picture, whose values are correlated over a few pixels.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.fitted.kernels import KernelFootprints
+from ommatid.scenes.fitted.kernels import KernelFootprints, basis
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.blur import blurs_of, entries
 
 from ..calibration.point_sources import Responses
-from ..ideal import ideal_matrix
 from .chart import Chart, chart_of
-from .regression import chance, residual, sums_of
-from .selection import SIGNIFICANCE, Candidate, Components, choose, components, residual_sums, term_sums
-from .uncertainty import error_directions
+from .regression import Sums
+from .selection import Candidate, Components, choose, components, seen
 
+DRAWS = 64
+SHARE = 0.99  # of the expected variance of H f that the directions describe; they are scaled to all of it
+KERNELS = 0.999  # of that variance that the common kernels of the directions describe
+MOST_DIRECTIONS, MOST_KERNELS = 16, 32
 MOST_UNEXPLAINED = 0.1  # of the entries' variance, with which kernels are still far better than entries
 MOST_WIDTH = 48  # pixels of f: wider kernels have as many numbers as entries, and take minutes to learn
-MOST_DESIGNED = 2**24  # entries of the H as designed that is compared
-DESIGNED_DEGREE = 2  # of polynomials that are looked for in the difference from the design
+
+
+def error_directions(chart: Chart, candidate: Candidate, parts: Components) -> tuple[FloatArray, FloatArray]:
+    """Return the kernels, (E, C), and the coefficients, (q, E, P), of errors of variance 1 each."""
+    errors = _projected(chart, _draws(chart, candidate) @ parts.triangle, parts)
+    draws, cells, count = errors.shape
+    shown = seen(errors.swapaxes(1, 2) * chart.share**0.5).reshape(draws, -1)
+    values, vectors = np.linalg.eigh(shown @ shown.T)
+    total = float(values.sum())
+    if total <= 0:
+        return np.zeros((0, cells)), np.zeros((0, 0, count))
+    kept = _needed(values, SHARE, MOST_DIRECTIONS)
+    scale = (total / values[-kept:].sum() / draws) ** 0.5
+    directions = np.asarray(np.tensordot(vectors[:, -kept:].T * scale, errors, axes=1), dtype=np.float64)
+    terms = directions.swapaxes(1, 2).reshape(-1, cells)
+    shown = seen(terms * chart.share**0.5)
+    values, vectors = np.linalg.eigh(shown @ shown.T)
+    vectors = vectors[:, -_needed(values, KERNELS, MOST_KERNELS) :]
+    shares = vectors.reshape(kept, count, -1).swapaxes(1, 2)
+    kernels: FloatArray = np.asarray(vectors.T @ terms, dtype=np.float64)
+    return kernels, np.asarray(shares @ np.linalg.inv(parts.triangle), dtype=np.float64)
+
+
+def _draws(chart: Chart, candidate: Candidate) -> FloatArray:
+    """Return coefficients of the kernels' errors: (draws, C, P)."""
+    rng, count = np.random.default_rng(0), len(chart.batches)
+    x = basis(chart.field, candidate.degree)
+    entries = np.zeros((DRAWS, chart.inside.shape[1], x.shape[1]))
+    for batch in chart.batches:
+        for draw in entries:
+            weights = rng.normal(size=len(x))[:, None] / (count * (count - 1)) ** 0.5
+            draw += ((x * weights).T @ batch).T
+    own = Sums(candidate.sums.products, entries, candidate.sums.whole, candidate.degree)
+    if not candidate.symmetric:
+        return own.fitted()
+    symmetric = Sums(candidate.sums.products, entries, candidate.sums.whole, candidate.degree).symmetric
+    return Sums(own.products, symmetric.entries, own.whole, own.degree).fitted()
+
+
+def _projected(chart: Chart, errors: FloatArray, parts: Components) -> FloatArray:
+    """Return the part of errors, (draws, C, P) of orthonormal terms, that changes the mean or the components."""
+    root = np.sqrt(chart.weights * chart.share)
+    varying = errors[..., 1:].swapaxes(1, 2) * root
+    rest = varying - parts.field @ (parts.field.T @ varying)
+    rest = rest - (rest @ parts.cells.T) @ parts.cells
+    changed = np.divide(varying - rest, root, out=np.zeros_like(varying), where=root > 0)
+    return np.concatenate([errors[..., :1], changed.swapaxes(1, 2)], axis=2)
+
+
+def _needed(values: FloatArray, share: float, most: int) -> int:
+    """Return how many of the largest of rising values add up to a share of their sum."""
+    left: FloatArray = np.cumsum(values[::-1], dtype=np.float64)
+    return min(int(np.searchsorted(left, share * float(left[-1]))) + 1, most)
 
 
 @dataclass(frozen=True, eq=False)
 class KernelFit:
-    """Kernels of a lens type, if they explain the entries; `reason` names what they do not explain.
-
-    designed : True if the entries do not differ from H as designed, None where they were not compared
-    """
+    """Kernels of a lens type, if they explain the entries; `reason` names what they do not explain."""
 
     accepted: bool
     reason: str
     footprints: KernelFootprints | None = None
-    designed: bool | None = None
     details: dict[str, Any] = field(default_factory=dict[str, Any])
 
     def record(self) -> dict[str, Any]:
         """Return the entry of a model's record, in JSON's types."""
-        return {"kind": "kernels", "accepted": self.accepted, "reason": self.reason, "designed": self.designed} | (
-            self.details
-        )
+        return {"kind": "kernels", "accepted": self.accepted, "reason": self.reason, **self.details}
 
 
 def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixels: IntArray | None = None) -> KernelFit:
@@ -79,10 +129,7 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
         "count": len(parts.strengths),
         "strengths": [float(each) for each in parts.strengths],
     }
-    designed, chances = _as_designed(chart, camera, lens_type)
-    if chances:
-        details["designed_chances"] = chances
-    return KernelFit(True, reason, _footprints(chart, candidate, parts), designed, details)
+    return KernelFit(True, reason, _footprints(chart, candidate, parts), details)
 
 
 def refusal(camera: Camera, lens_type: LensType) -> str:
@@ -133,42 +180,3 @@ def _footprints(chart: Chart, candidate: Candidate, parts: Components) -> Kernel
         error_kernels.reshape(-1, size, size),
         error_coefficients,
     )
-
-
-def _as_designed(chart: Chart, camera: Camera, lens_type: LensType) -> tuple[bool | None, dict[str, float]]:
-    """Return whether the entries agree with H as designed, and the chances of the tests; None if it is too large."""
-    values = designed_values(chart, camera, lens_type)
-    if values is None:
-        return None, {}
-    difference = replace(chart, values=chart.values - values)
-    degree = DESIGNED_DEGREE if len(chart.pixels) > 20 else 0
-    sums = sums_of(difference, degree)
-    nothing = np.zeros((1 + len(chart.batches), values.shape[1], 1))
-    left = residual(sums, nothing)
-    tests = term_sums(difference, left) | residual_sums(difference, nothing, 0)
-    chances = {name: chance(products) for name, products in tests.items()}
-    single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(chances))
-    return bool(min(chances.values()) >= single), chances
-
-
-def designed_values(chart: Chart, camera: Camera, lens_type: LensType) -> FloatArray | None:
-    """Return H as designed of the chart's pixels, (n, C), None if it cannot be computed or is too large."""
-    places, alone = chart.places, replace(camera, types=(lens_type,))
-    if lens_type.measurements * places.width**2 > MOST_DESIGNED:
-        return None
-    if lens_type.optics.surfaces is None:
-        reach = max(blur.reach for blur, _ in blurs_of(camera, lens_type))
-        if entries(alone, lens_type, reach) > MOST_DESIGNED:
-            return None
-    try:
-        matrix = ideal_matrix(alone)[chart.pixels]
-    except InputError:
-        return None
-    row = np.repeat(np.arange(chart.pixels.size), np.diff(matrix.indptr))
-    down, across = np.divmod(matrix.indices.astype(np.int64), camera.columns)
-    first = [start[line][row] for start, line in zip(places.starts, places.lines(chart.pixels), strict=True)]
-    down, across = down - first[0], across - first[1]
-    reached = (down >= 0) & (down < places.width) & (across >= 0) & (across < places.width)
-    values = np.zeros(chart.values.shape)
-    values[row[reached], (down * places.width + across)[reached]] = matrix.data[reached]
-    return values

@@ -24,9 +24,8 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.blur import blurs_of
 from ommatid.scenes.optics.diffraction import QUANTILES, pattern
 
-from ..lenses import thin_lens
 from ..lenses.ray_trace import reach
-from .lens import Distance, Emission, LensModel, Point
+from .lens import Distance, Emission, LensModel, Point, falloff, through_thin_lens
 
 FEW_QUANTILES = 2**12  # where the defocus varies
 STEP, GROWTH, LINEAR = 0.05, 1.02, 3.0  # between tabulated defoci, in waves: up to LINEAR, and as a factor beyond
@@ -87,19 +86,19 @@ class DiffractingLens(LensModel):
         sine, cosine = dr.sincos(2 * pi * sample.y)
         chief = self.chief(x, y, depth)
         beam = Beam(sample.x, cosine, sine, 2 * (x * cosine + y * sine) * (self._aperture / 2) / (depth * depth))
-        falloff = thin_lens.falloff(x, y, 0.0, 0.0, depth)
+        light = falloff(x, y, 0.0, 0.0, depth)
         shift = 1 / depth - 1 / self._depth
         if self.distance is None:
             slopes, slant = self._displaced(chief, 1 / self._camera.distance + shift, beam, band)
-            return (0, 0, 0), (*slopes, 1), falloff * slant
+            return (0, 0, 0), (*slopes, 1), light * slant
         rim = dr.sqrt(beam.share / (1 + self._weight * (1 - beam.share))) * self._aperture / 2
         start = rim * cosine, rim * sine
         focal = 1 / (1 / self._depth + 1 / self._focus)
-        direction = [thin_lens.through_thin_lens(c, a, depth, focal) for c, a in zip(chief, start, strict=True)]
+        direction = [through_thin_lens(c, a, depth, focal) for c, a in zip(chief, start, strict=True)]
         vergence = 1 / self.distance((lens[0] + start[0], lens[1] + start[1], 0), (*direction, 1))
         slopes, slant = self._displaced(chief, vergence + shift, beam, band)
         direction = [slope - a * vergence for slope, a in zip(slopes, start, strict=True)]
-        return (*start, 0), (*direction, 1), falloff * slant
+        return (*start, 0), (*direction, 1), light * slant
 
     def _band(self, sampler: Any) -> list[Any]:
         """Draw the band of each ray: a mask for each band."""

@@ -2,6 +2,10 @@
 
 A lens type has one `LensModel`, composed of its properties: a pinhole, a thin lens with its distortion, one that
 diffracts (`diffracting_lens`), or the surfaces of a real one (`real_lens`). Absent effects cost nothing.
+
+Lengths are millimetres from the centre of the lens: the sensor at z = -depth, the target at z > 0. The image on the
+sensor is upside down, sub-images are upright: pixel (0, 0) of a sub-image looks at the top left of its window and has
+the smallest x and y.
 """
 
 # pyright: basic
@@ -14,11 +18,33 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.pose import poses
 
-from ..lenses import thin_lens
-
 Point = tuple[Any, Any]
 Distance = Callable[[Any, Any], Any]  # along z to the first surface that rays meet, by their origins and directions
 Emission = tuple[tuple[Any, Any, Any], tuple[Any, Any, Any], Any]
+
+
+def through_centre(x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
+    """Return the slopes dx/dz and dy/dz of the ray from (x, y, -depth) through the lens's centre."""
+    return -x / depth, -y / depth
+
+
+def through_thin_lens(slope: Any, position: Any, depth: Any, focal_length: Any) -> Any:
+    """Return the slope, along one axis, behind a thin lens of a ray that crosses it at `position`.
+
+    `slope` is that of the ray through the lens's centre. All rays of one sensor point meet where that one has gone
+    1/(1/focal_length - 1/depth) from the lens (the thin-lens equation).
+    """
+    return slope + position / depth - position / focal_length
+
+
+def falloff(x: Any, y: Any, lens_x: Any, lens_y: Any, depth: Any) -> Any:
+    """Return cos^4 of the angle, at the sensor, of the ray from (x, y, -depth) to the point (lens_x, lens_y, 0).
+
+    The irradiance that an element of the lens contributes, relative to the axis: cos at the lens, cos at the sensor,
+    and cos^2 for the distance.
+    """
+    square = ((x - lens_x) * (x - lens_x) + (y - lens_y) * (y - lens_y)) / (depth * depth)
+    return 1 / ((1 + square) * (1 + square))
 
 
 class LensModel:
@@ -52,7 +78,7 @@ class LensModel:
 
     def chief(self, x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
         """Return the slopes, behind the lens, of the ray through its centre."""
-        slopes = thin_lens.through_centre(x, y, depth)
+        slopes = through_centre(x, y, depth)
         if self._distortion is None:
             return slopes
         from ommatid.scenes.optics.distortion import undistort
@@ -80,10 +106,10 @@ class ThinLens(LensModel):
 
         del lens
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * self._radius
-        weight = thin_lens.falloff(x, y, on_disk.x, on_disk.y, depth)
+        weight = falloff(x, y, on_disk.x, on_disk.y, depth)
         slopes = self.chief(x, y, depth)
         direction = [
-            thin_lens.through_thin_lens(slope, position, depth, self._focal)
+            through_thin_lens(slope, position, depth, self._focal)
             for slope, position in zip(slopes, (on_disk.x, on_disk.y), strict=True)
         ]
         return (on_disk.x, on_disk.y, 0), (*direction, 1), weight

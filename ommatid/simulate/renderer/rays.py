@@ -22,10 +22,8 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.tables.sampling import Sampler
 
 from ..sampling.samplers import RELATED_DRAWS, fitting
+from .draws import Grid, ReseededSampler, SobolDraws
 from .lens import Distance, LensModel, ThinLens
-from .points.grid import Grid
-from .points.sobol import SobolDraws
-from .reseeded_sampler import ReseededSampler
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each

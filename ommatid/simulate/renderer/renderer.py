@@ -27,8 +27,8 @@ from ommatid.scenes.tables.sampling import Sampler
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting
 from ..sampling.seeds import seed_of
+from .draws import Grid
 from .plugins import black, depths, scene_of, stock_sensors, target_of
-from .points.grid import Grid
 from .variant import activate, check_fast_variant
 from .worlds.placement import MILLIMETRES_AT_ORIGIN
 

@@ -1,31 +1,39 @@
-"""Mitsuba's variants: which of them work on this machine, and the choice of one.
+"""Mitsuba in this process: which of its variants work on this machine, the choice of one, and its log.
 
 LLVM 15 and 16 load, and then kill the process at the first rendering, so the version is checked before the backend is
-used. A variant is global to the process.
+used. A variant is global to the process. Where Dr.Jit finds no LLVM it prints so as it is loaded: those lines are left
+out, since the reason of `unusable_reason` says it where it matters. Of Mitsuba's log, every kind of message becomes one
+warning of Python's; samples that are no radiances are counted.
 """
 
 # pyright: basic
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
 from ommatid.runtime.printable import printable
 
-from .messages import redirect_log
-from .worlds.plugin_names import mitsuba_folder
-
 if TYPE_CHECKING:
     from ommatid.scenes.camera import Camera
 
 OLDEST_LLVM = (17, 0, 0)
+COMPLAINTS = (b"jitc_llvm_init():", b"jit_find_library():")  # of Dr.Jit, about LLVM
 PATIENCE = 120  # seconds that a trial rendering may take
 PREFERENCE = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 
@@ -54,6 +62,13 @@ if not reason:
     speed = 128 * 128 * 64 / (time.perf_counter() - start)
 print(json.dumps({"reason": reason, "speed": speed}))
 """
+INTERRUPTED = "Received interrupt signal"  # suppressed: the command line reports Ctrl-C itself
+INVALID = "Invalid sample value"  # negative or not finite, one message per sample, which is then ignored
+_HEADING = re.compile(r"\A[-\d]+ [:\d]+ \w+ +(\S+ +)?\[[^\]]*\] *")  # date, level, thread and line of a log message
+_NUMBERS_AND_NAMES = re.compile(r"\d+|\"[^\"]*\"")
+_APPENDERS: dict[str, Any] = {}
+_seen: set[str] = set()
+_invalid = {"samples": 0}
 
 
 @dataclass(frozen=True)
@@ -71,7 +86,8 @@ def unusable_reason(variant: str) -> str:
     Raises MachineError if Mitsuba cannot be loaded at all.
     """
     try:
-        import drjit as dr
+        with _without_complaints():
+            import drjit as dr
     except (ImportError, NameError) as error:  # NameError: Dr.Jit's, of a system library that it does not find
         reason = printable(str(error.__context__ or error))
         raise MachineError(f"Mitsuba could not be loaded ({reason}); install what is missing") from error
@@ -80,7 +96,9 @@ def unusable_reason(variant: str) -> str:
         return "" if dr.has_backend(dr.JitBackend.CUDA) else "no CUDA device was found"
     if variant.startswith("llvm"):
         if not dr.has_backend(dr.JitBackend.LLVM):
-            return "no usable LLVM library (libLLVM.so) was found"
+            named = os.environ.get("DRJIT_LIBLLVM_PATH")
+            where = f" at {printable(named)}, which DRJIT_LIBLLVM_PATH names" if named else ""
+            return f"no usable LLVM library (libLLVM.so) was found{where}"
         try:
             version = tuple(dr.detail.llvm_version())
         except AttributeError:  # not part of Dr.Jit's public interface
@@ -90,6 +108,27 @@ def unusable_reason(variant: str) -> str:
                 f"LLVM {version[0]} was found, which fails at the first rendering; {OLDEST_LLVM[0]} or newer is needed"
             )
     return ""
+
+
+@contextmanager
+def _without_complaints() -> Generator[None]:
+    """Leave out what Dr.Jit prints to the error stream about LLVM while it is loaded, and pass on all other lines."""
+    if "drjit" in sys.modules:
+        yield
+        return
+    sys.stderr.flush()
+    stream = os.dup(2)
+    with tempfile.TemporaryFile() as printed:
+        os.dup2(printed.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stream, 2)
+            os.close(stream)
+            printed.seek(0)
+            for line in printed:
+                if not line.startswith(COMPLAINTS):
+                    os.write(2, line)
 
 
 def choose(requested: str) -> str:
@@ -116,12 +155,22 @@ def check_transport_variant(variant: str, key: str = "calibration.method") -> No
 
 def activate(variant: str) -> None:
     """Make a variant Mitsuba's current one, and pass its warnings to Python's log."""
-    import mitsuba as mi
+    with _without_complaints():
+        import mitsuba as mi
 
     fix_plugin_folder()
     if mi.variant() != variant:
         mi.set_variant(variant)
     redirect_log()
+
+
+@cache
+def mitsuba_folder() -> Path:
+    """Return the folder of the installed Mitsuba. Raises ModuleNotFoundError if there is none."""
+    spec = find_spec("mitsuba")
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError("No module named 'mitsuba'", name="mitsuba")
+    return Path(spec.origin).parent
 
 
 def fix_plugin_folder() -> None:
@@ -180,3 +229,48 @@ def remedy() -> str:
     if shutil.which("brew"):
         return "run: brew install llvm@19, and set DRJIT_LIBLLVM_PATH to its libLLVM.dylib"
     return "install LLVM 17 or newer, and set DRJIT_LIBLLVM_PATH to its libLLVM.so"
+
+
+def redirect_log() -> None:
+    """Hand Mitsuba's warnings to the log of Python."""
+    import mitsuba as mi
+
+    logger = cast(Any, mi).logger()
+    if logger is not None and not isinstance(logger.appender(0), _log_appender()):
+        logger.clear_appenders()
+        appender: Any = _log_appender()
+        logger.add_appender(appender())
+        logger.set_log_level(mi.LogLevel.Warn)
+
+
+def ignored_samples() -> int:
+    """Return the number of samples that Mitsuba ignored since the last call, since they were no radiances."""
+    count, _invalid["samples"] = _invalid["samples"], 0
+    return count
+
+
+def _append(text: str) -> None:
+    message = _HEADING.sub("", text)
+    kind = _NUMBERS_AND_NAMES.sub("", message)
+    if INVALID in text:
+        _invalid["samples"] += 1
+    elif INTERRUPTED not in text and kind not in _seen:
+        _seen.add(kind)
+        logging.getLogger("mitsuba").warning("%s", message)
+
+
+def _log_appender() -> Any:
+    import mitsuba as mi
+
+    if "log" not in _APPENDERS:
+
+        class LogAppender(mi.Appender):
+            def append(self, level: object, text: str) -> None:
+                del level
+                _append(text)
+
+            def log_progress(self, *arguments: object) -> None:
+                del arguments
+
+        _APPENDERS["log"] = LogAppender
+    return _APPENDERS["log"]

@@ -23,12 +23,10 @@ from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.world import FROM_FILE, WorldTable
 
-from .messages import ignored_samples
-from .variant import activate
-from .worlds.building import BLOCK, parse_world
+from .variant import activate, ignored_samples
+from .worlds.building import BLOCK, check_positions, parse_world
 from .worlds.checked_world import CheckedWorld, check_world_files, reason_of
 from .worlds.placement import FINEST, Placement
-from .worlds.surfaces import check_positions
 from .worlds.trial import try_world
 
 TARGET = "ommatid_target"  # the rectangle's name in the world, unlikely to be used in its file

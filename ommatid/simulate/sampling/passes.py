@@ -1,4 +1,9 @@
-"""Rendering in passes with independent seeds, so that every mean has an estimated variance."""
+"""Rendering in passes with independent seeds, so that every mean has an estimated variance.
+
+Passes are divided over grids that the sampler fills, over a power of two of Sobol's points, or over a grid that leaves
+no error: behind an ideal pinhole a pixel averages a constant over each cell that lies within one pixel of f, wherever
+in it the sample is. Two passes suffice then: that they agree shows that nothing but the rounding of float32 is left.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,8 @@ from math import ceil, isqrt
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.tables.sampling import Sampler
 
 from .checkpoint import State
@@ -21,6 +28,9 @@ MOST_SAMPLES = 4096  # in one pass: the renderer's sums are float32
 JITTERED: tuple[Sampler, ...] = ("multijitter", "stratified")  # one sample in every cell of a grid
 MOST_CELLS = 16  # along a side of a grid that fits the edges of pixels of f
 ROUNDING = 2.0**-24  # relative, of float32
+EXACT_PASSES = 2  # of such a grid
+ROUNDINGS = 16  # of float32, from the sensor to the target: more than add up on a ray's way
+WIDEST_MARGIN = 0.125  # of a cell, beyond which float32 does not resolve the cells
 
 
 @dataclass(frozen=True)
@@ -139,3 +149,31 @@ def samples_within(values: FloatArray, variance: FloatArray) -> int:
     """Return the largest number of samples, at least 1, whose `rounding_variance` does not exceed `variance`."""
     sums = (np.sqrt(variance) / ROUNDING - 1) / np.maximum(np.abs(values), ROUNDING)
     return max(int(8 * (float(sums.min()) - 1)), 1)
+
+
+def power_of_two_plan(samples: int, most: int) -> Plan:
+    """Divide at least `samples` per pixel over passes of a power of two, and of at most `most`."""
+    each = 1 << (ceil(samples / FEWEST_PASSES) - 1).bit_length()
+    if each <= most:
+        return Plan(FEWEST_PASSES, each)
+    each = 1 << (most.bit_length() - 1)
+    return Plan(max(FEWEST_PASSES, BATCHES * ceil(samples / each / BATCHES)), each)
+
+
+def exact_plan(camera: Camera, index: int, sampler: Sampler) -> Plan | None:
+    """Return the passes that show a flat target to sub-imager `index` without error; None if no grid does."""
+    sub = camera.sub_imagers[index]
+    ratio = sub.type.ratio
+    ends = [float(start * ratio.denominator) for start in sub.window]
+    fits = ratio.numerator <= MOST_CELLS and all(end.is_integer() for end in ends)
+    is_ideal = camera.walls and camera.tolerance is None and sub.type.optics.is_pinhole and not sub.rotation
+    if sampler not in JITTERED or not fits or not is_ideal or margin(camera, sub.type) > WIDEST_MARGIN:
+        return None
+    return Plan(EXACT_PASSES, ratio.numerator**2)
+
+
+def margin(camera: Camera, lens_type: LensType) -> float:
+    """Return by how much of a cell rounding may move the point of the target that a ray of a lens type meets."""
+    away = max(abs(place) for sub in camera.sub_imagers for place in sub.lens)
+    extent = max(camera.shape) + away / camera.target_pitch  # pixels of f
+    return ROUNDINGS * ROUNDING * extent * lens_type.ratio.denominator

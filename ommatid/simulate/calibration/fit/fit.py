@@ -1,7 +1,10 @@
 """Calibration by few numbers: a chart of sensor pixels is measured, and H follows from what explains its rows.
 
-Sub-imagers with sharp footprints are explained by their views, lens types with blur by kernels. What F tests leave
-unexplained is measured entry by entry, pixel by pixel, and named in the record.
+Sub-imagers with sharp footprints are explained by their views, lens types with blur by kernels. An F test says whether
+the numbers of a view explain the measured rows of a sub-imager: the weighted sum of squares of the residuals of all
+entries, those that are zero included, is compared with that of the batches, whose rays scatter as those of the mean do.
+The weights are those of independent rays, but where cells hold few of them. What the tests leave unexplained is
+measured entry by entry, pixel by pixel, and named in the record.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse, stats
 
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
@@ -22,17 +25,62 @@ from ommatid.scenes.fitted.view import COUNT, UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 
 from ..point_sources import Responses, Subsets
-from .chart import chart_of, chart_rows
-from .explanation import Explanation, explanation
-from .view_fit import SIGNIFICANCE, ViewFit, fit_views
-from .view_model import predicted
+from .chart import ChartRows, chart_of, chart_rows
+from .view_fit import SIGNIFICANCE, ViewFit, fit_views, predicted
 
 if TYPE_CHECKING:
     from ...kernel_fit.kernel_fit import KernelFit
 
+FEW = 8  # rays of a cell, below which its weight hardly grows: single rays there would decide
+STRAY = 0.5  # rays that each cell may miss or have in excess, by rounding of positions to float32
 Measure = Callable[[Subsets], Responses]
 Variances = Callable[[Responses], FloatArray]
 Rays = dict[str, int]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Weighted sum of squared residuals, its expectation from the batches, and the degrees of freedom of the sums."""
+
+    left: float
+    expected: float
+    freedom: float
+    batches: int
+
+    @property
+    def chance(self) -> float:
+        """Probability of a sum of squares at least as large if the model is correct."""
+        return float(stats.f.sf(self.left / self.expected, self.freedom, self.freedom * (self.batches - 1)))
+
+
+def explanation(chart: ChartRows, model: FloatArray, rays: int) -> Explanation:
+    """Compare measured rows with those of a model, (pixels, W, V). rays : per pixel, of all passes."""
+    weights = (rays / (model + FEW / rays)).ravel()
+    residual = (chart.values - model).ravel()
+    batches = chart.batches.reshape(len(chart.batches), -1)
+    gram = np.asarray((batches * weights) @ batches.T, dtype=np.float64)
+    count = len(gram)
+    touched = ((model > 0) | (chart.values > 0)).ravel()
+    floor = float(weights[touched].sum()) * (STRAY / rays) ** 2
+    return Explanation(
+        left=float(weights @ np.square(residual)),
+        expected=float(np.trace(gram)) / (count * (count - 1)) + floor,
+        freedom=min(_freedom(gram), float(residual.size)),
+        batches=count,
+    )
+
+
+def _freedom(gram: FloatArray) -> float:
+    """Return the effective degrees of freedom (tr S)^2 / tr S^2 of the covariance S, from the Gram matrix of draws.
+
+    tr S^2 without bias from few draws: Bai and Saranadasa 1996, Statistica Sinica 6, 311.
+    """
+    free = len(gram) - 1
+    trace, square = float(np.trace(gram)) / free, float(np.square(gram).sum()) / free**2
+    squares = free**2 / ((free - 1) * (free + 2)) * (square - trace**2 / free)
+    if trace == 0:
+        return 1.0
+    return max(1.0, trace**2 / max(squares, trace**2 * 1e-9))
 
 
 @dataclass(frozen=True)

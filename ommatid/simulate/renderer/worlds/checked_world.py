@@ -1,27 +1,35 @@
 """Mitsuba scene files, checked without Mitsuba: their XML, plugins, and the files that they name.
 
-`check_world_files` writes one text out of a file and those that it includes: variables are replaced, paths are
-absolute, and no element is left that names further XML. This text, and nothing else, is what Mitsuba parses.
+XML is read with limits; document types and entities are refused, so that a file cannot grow or name other files while
+it is parsed. `check_world_files` writes one text out of a file and those that it includes: variables are replaced,
+paths are absolute, and no element is left that names further XML. This text, and nothing else, is what Mitsuba parses.
 """
 
 from __future__ import annotations
 
+import io
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import Any
+from xml.sax import SAXParseException, handler
 from xml.sax.saxutils import quoteattr
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.input_files import LARGEST_TEXT, check_regular
+from ommatid.runtime.input_files import LARGEST_TEXT, check_regular, read_bytes
 from ommatid.runtime.printable import printable
 
-from .file_checks import check_named_file
-from .plugin_names import metals, plugin_names
-from .world_xml import DEEPEST, MOST_ELEMENTS, SHOWN, WorldElement, read_xml
+from ..variant import mitsuba_folder
+from .file_checks import SHOWN, check_named_file
 
 DEEPEST_INCLUDE, MOST_INCLUDES = 15, 1000  # the former as in Mitsuba
 LONGEST_REASON = 180  # characters
 VERSION_OF_NAMES = 2  # from which Mitsuba's properties have today's names
+DEEPEST = 64  # levels of nested elements; Mitsuba and its plugins recurse into them
+MOST_ELEMENTS = 300_000  # of a world, those of included files counted as often as they are included
+LIBRARIES = (".so", ".dylib", ".dll")
+METAL = ".eta.spd"
 
 
 @dataclass(frozen=True)
@@ -269,3 +277,84 @@ def _check_type(attributes: dict[str, str], place: str) -> None:
 def _words(attributes: dict[str, str]) -> str:
     escaped = {key: value.replace("$", "\\$") for key, value in attributes.items()}
     return "".join(f" {key}={quoteattr(value)}" for key, value in escaped.items())
+
+
+@dataclass
+class WorldElement:
+    """An element of a Mitsuba file and the line of its start."""
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    children: list[WorldElement] = field(default_factory=lambda: list[WorldElement]())
+
+
+class _TreeBuilder(handler.ContentHandler):
+    """Builds the elements of a file and stops at its limits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.root: WorldElement | None = None
+        self._open: list[WorldElement] = []
+        self._count = 0
+        self._where: Any = None
+
+    @property
+    def line(self) -> int:
+        return int(self._where.getLineNumber() or 0)
+
+    def setDocumentLocator(self, locator: Any) -> None:
+        self._where = locator
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        element = WorldElement(name, dict(attrs.items()), self.line)
+        self._count += 1
+        if len(self._open) >= DEEPEST:
+            raise InputError(f"elements are nested in more than {DEEPEST} levels; expected at most {DEEPEST}")
+        if self._count > MOST_ELEMENTS:
+            raise InputError(f"there are more than {MOST_ELEMENTS} elements; expected fewer")
+        if self._open:
+            self._open[-1].children.append(element)
+        else:
+            self.root = element
+        self._open.append(element)
+
+    def endElement(self, name: str) -> None:
+        del name
+        self._open.pop()
+
+
+def read_xml(path: Path) -> WorldElement:
+    """Read the elements of a Mitsuba file. Raises InputError that does not name the file, OSError if it is missing."""
+    from defusedxml.common import DefusedXmlException
+    from defusedxml.sax import parse
+
+    content = io.BytesIO(read_bytes(path, LARGEST_TEXT))
+    tree = _TreeBuilder()
+    try:
+        parse(content, tree, handler.ErrorHandler(), forbid_dtd=True)
+    except DefusedXmlException as error:
+        raise InputError("has a document type or entities (<!DOCTYPE>); remove them") from error
+    except SAXParseException as error:
+        line, reason = error.getLineNumber(), printable(error.getMessage(), SHOWN)
+        raise InputError(f"is not valid XML (line {line}): {reason}; correct it there") from error
+    except (ValueError, LookupError) as error:
+        if isinstance(error, InputError):
+            raise InputError(f"line {tree.line}: {error}") from error
+        raise InputError(f"is not valid XML: {printable(error, SHOWN)}; correct it there") from error
+    if tree.root is None:
+        raise InputError("is not valid XML: no element found; correct it there")
+    return tree.root
+
+
+@cache
+def plugin_names() -> frozenset[str]:
+    """Return the names of Mitsuba's plugins."""
+    return frozenset(path.stem for path in (mitsuba_folder() / "plugins").iterdir() if path.suffix in LIBRARIES)
+
+
+@cache
+def metals() -> frozenset[str]:
+    """Return the materials whose optical constants Mitsuba ships."""
+    found = (mitsuba_folder() / "data" / "ior").glob(f"*{METAL}")
+    return frozenset({"none", *(path.name.removesuffix(METAL) for path in found)})

@@ -1,14 +1,18 @@
 """Worlds are built once in a process of their own, which may die; only then in this one.
 
 Mitsuba trusts its files: a damaged one may end the process, take all memory, or never end. The process stays for a
-while, so that further worlds do not wait for the start of Mitsuba, which takes most of the time.
+while, so that further worlds do not wait for the start of Mitsuba, which takes most of the time. It reads a line from
+stdin for every world, a JSON object {variant, text, files, memory}; the answers are JSON lines too: {"at": FILE} before
+each file, and {"built": true} or {"reason": TEXT} at the end. It ends with its stdin, or when nothing came for a while.
 """
 
+# pyright: basic
 from __future__ import annotations
 
 import atexit
 import json
 import os
+import resource
 import select
 import signal
 import subprocess
@@ -24,11 +28,14 @@ from ommatid.runtime.memory import free_memory
 from ommatid.runtime.printable import printable
 
 from .checked_world import CheckedWorld, reason_of
+from .file_checks import MESHES
 
 LONGEST = 600.0  # seconds that a world may take
 RESERVE = 100_000_000  # bytes that a world may take even if less are free
 SHOWN = 100
-MODULE = "ommatid.simulate.renderer.worlds.trial_process"
+MODULE = __name__  # of the `main` that a process runs
+IDLE = 20  # seconds without a world after which the process ends
+PICTURES = ("bitmap", "envmap", "projector")
 
 
 @dataclass
@@ -137,3 +144,65 @@ def _plugins(world: CheckedWorld) -> list[list[str]]:
 def _version(path: Path) -> list[int]:
     status = path.stat()
     return [status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino]
+
+
+def main() -> None:
+    """Answer until stdin ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # libraries print there
+
+    def answer(**words: object) -> None:
+        print(json.dumps(words), file=answers, flush=True)
+
+    with os.fdopen(0, "rb", buffering=0, closefd=False) as stdin:
+        while select.select([stdin], [], [], IDLE)[0]:
+            line = _line(stdin)
+            if not line:
+                break
+            try:
+                _try_world(json.loads(line), answer)
+                answer(built=True)
+            except (RuntimeError, TypeError, ValueError, MemoryError) as error:
+                answer(reason=str(error) or type(error).__name__)
+
+
+def _line(stdin: Any) -> bytes:
+    parts = list[bytes]()
+    while not parts or not parts[-1].endswith(b"\n"):
+        part = stdin.read(2**20)
+        if not part:
+            return b""
+        parts.append(part)
+    return b"".join(parts)
+
+
+def _try_world(world: dict[str, Any], answer: Any) -> None:
+    from ..variant import activate
+    from .building import parse_world
+
+    activate(world["variant"])
+    import mitsuba as mi
+
+    _limit_memory(world["memory"])
+    for path, plugin in world["files"]:
+        answer(at=path)
+        if plugin in MESHES:
+            mi.load_dict({"type": plugin, "filename": os.path.realpath(path)})
+        elif plugin in PICTURES:
+            mi.Bitmap(os.path.realpath(path))
+    answer(at="")
+    built = parse_world(world["text"], world["variant"]).build()
+    built.bbox()
+
+
+def _limit_memory(more: int | None) -> None:
+    """Let this process take so many more bytes, and no more."""
+    if more is None:
+        return
+    import psutil
+
+    size = psutil.Process().memory_info().data
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = size + more if hard == resource.RLIM_INFINITY else min(size + more, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))

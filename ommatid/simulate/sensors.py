@@ -1,7 +1,8 @@
-"""The physical sensor: digital numbers from light, with the dark and flat frames that calibrate it.
+"""Sensors: the ideal one with normal noise, and the physical one, with the dark and flat frames that calibrate it.
 
-The model of EMVA Standard 1288, release 4: photons are Poisson distributed, each pixel has its own dark signal and
-response, reading adds normal noise, wells and numbers are limited. Electrons and digital numbers (DN) are counts. Every
+The ideal sensor adds normal noise, quantises and saturates in the units of the target's pixel values. The physical one
+follows EMVA Standard 1288, release 4: photons are Poisson distributed, each pixel has its own dark signal and response,
+reading adds normal noise, wells and numbers are limited. Electrons and digital numbers (DN) are counts. Every
 sub-imager draws from its own streams, one per purpose, so that its values depend neither on other lens types nor on
 another exposure.
 """
@@ -18,8 +19,12 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
+from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.recording import ROUNDING, Recording, dark_electrons, flat_values
-from ommatid.scenes.tables.sensor import SensorTable
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.sensor import NoiseTable, SensorTable
+
+from .sampling.seeds import noise_generator
 
 Purpose = Literal["dark signal", "response", "exposure", "dark frames", "flat frames"]
 
@@ -124,3 +129,40 @@ def _check_light(light: FloatArray) -> None:
             f"a [sensor] counts the electrons of light, got light below 0 (least {least:.4g}) or NaN on {count}"
             " of its pixels; take a target.image without negative values, or an ideal sensor's [noise]"
         )
+
+
+def quantise(values: FloatArray, level: float) -> FloatArray:
+    """Round to the nearest multiple of `level`."""
+    return level * np.round(values / level)
+
+
+def expose(light: FloatArray, noise: NoiseTable, rngs: list[np.random.Generator], slices: list[slice]) -> FloatArray:
+    """Return the recorded values of `light`, (M,): noise from each sub-image's generator, quantised, saturated."""
+    recorded = light.copy()
+    if noise.variance > 0:
+        for measurements, rng in zip(slices, rngs, strict=True):
+            recorded[measurements] += rng.normal(0.0, noise.variance**0.5, recorded[measurements].shape)
+    if noise.bits is not None:
+        recorded = quantise(recorded, noise.level)
+    # Last, so that a saturated pixel is recognised by its value whatever the levels are.
+    return recorded if noise.saturation is None else np.minimum(recorded, noise.saturation)
+
+
+def generators(camera: Camera, seed: int) -> list[np.random.Generator]:
+    """Return one generator per sub-imager, independent of the other lens types of the camera."""
+    return [noise_generator(seed, sub.type.name, sub.k, sub.l) for sub in camera.sub_imagers]
+
+
+def response(setup: Setup) -> FloatArray:
+    """Return the electrons per unit of f, (M,).
+
+    Raises ValueError without a [sensor], InputError for a lens whose surfaces form no image.
+    """
+    scene, camera = setup.scene, setup.camera
+    if all(lens_type.optics.surfaces is None for lens_type in camera.types):
+        return electrons(scene, camera)
+    from .lenses.etendue import relative_illumination, solid_angles, transmissions
+
+    passed = transmissions(camera)
+    transmitted = {name: angle * passed[name] for name, angle in solid_angles(camera).items()}
+    return electrons(scene, camera, transmitted, relative_illumination(camera))

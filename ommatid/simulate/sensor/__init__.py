@@ -1,1 +1,0 @@
-"""Sensors: recorded values from light."""

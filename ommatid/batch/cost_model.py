@@ -10,7 +10,7 @@ from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, ch
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sampling import IN_PLACE_OF_AUTO
+from ommatid.scenes.tables.estimation import IN_PLACE_OF_AUTO
 from ommatid.simulate.calibration.point_sources import RENDERINGS
 
 from .batch import Member

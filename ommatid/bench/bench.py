@@ -22,7 +22,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
 from ommatid.simulate.sampling.samplers import corners, law
 from ommatid.simulate.validation import check_scene

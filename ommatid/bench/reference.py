@@ -18,7 +18,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.adaptive_render import AIM, EXPONENTS, LEAST, MOST, STRATIFIED, AdaptiveRendering, render_until
 from ommatid.simulate.cache import cached_model
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix

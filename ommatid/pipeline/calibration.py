@@ -13,8 +13,7 @@ from ommatid.runtime.files import write_whole
 from ommatid.runtime.outputs.kinds import check_output
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file
-from ommatid.scenes.hardware.frame_files import files_in
-from ommatid.scenes.hardware.frames import AcquisitionSettings
+from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in
 from ommatid.scenes.hardware.point_sources import from_recorded_points
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read

@@ -11,9 +11,7 @@ from ommatid.analysis.recording_warnings import import_warnings
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.outputs.kinds import check_output
 from ommatid.scenes import stack
-from ommatid.scenes.hardware.frame_files import files_in
-from ommatid.scenes.hardware.frames import AcquisitionSettings
-from ommatid.scenes.hardware.stack_import import import_stack
+from ommatid.scenes.hardware.frames import AcquisitionSettings, files_in, import_stack
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack

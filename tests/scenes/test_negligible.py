@@ -20,12 +20,12 @@ from ommatid.scenes.optics.negligible import (
     light_kept_in_focus,
     negligible_shot_noise,
     noise_variance,
+    skipped_effects,
     without_negligible_effects,
 )
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.skipped import skipped_effects
 from ommatid.scenes.stack import stack_from_recording
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.hardware.source_positions import read_positions
+from ommatid.scenes.hardware.point_sources import read_positions
 
 from ..examples import camera
 

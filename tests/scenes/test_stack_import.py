@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.hardware.frame_files import pictures_of
-from ommatid.scenes.hardware.frames import AcquisitionSettings, patches, read_frames
+from ommatid.scenes.hardware.frames import AcquisitionSettings, patches, pictures_of, read_frames
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_model

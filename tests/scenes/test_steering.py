@@ -13,7 +13,7 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.hardware.assignment import unrecorded
+from ommatid.scenes.hardware.point_sources import unrecorded
 from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.scenes.setup import Setup

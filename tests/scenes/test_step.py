@@ -12,7 +12,7 @@ import pytest
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.hardware.assignment import unrecorded
+from ommatid.scenes.hardware.point_sources import unrecorded
 from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.scenes.setup import Setup

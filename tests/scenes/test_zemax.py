@@ -9,11 +9,11 @@ import pytest
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.lens_file import read_lens
+from ommatid.scenes.formats.zemax import read_catalogue
+from ommatid.scenes.optics.dispersion import Dispersion
 from ommatid.scenes.scene import read, with_changes, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface
-from ommatid.scenes.zemax.agf import read_catalogue
-from ommatid.scenes.zemax.dispersion import Dispersion
 from ommatid.simulate.lenses.prescription import prescription_of
 
 from ..examples import GALLERY

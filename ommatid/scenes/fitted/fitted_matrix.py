@@ -20,8 +20,7 @@ from ..camera import Camera
 from ..lens_type import LensType, SubImager
 from ..tables.table import LARGEST
 from .kernels import KernelFootprints
-from .real_boxes import RealBoxes, real_box
-from .view import COUNT, K1, LEAST, MOST, ROTATION, designed, displacements, entries
+from .view import COUNT, K1, LEAST, MOST, ROTATION, RealBoxes, designed, displacements, entries, real_box
 
 STRUCTURES = {"own", "shared", "designed"}
 ALIKE = 0.05  # pixels of f that views may be displaced by where error maps take H as designed

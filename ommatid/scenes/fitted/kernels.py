@@ -187,13 +187,13 @@ class KernelFootprints:
         """
         wide = self.places.width
         rows, columns = (fft.next_fast_len(size + wide - 1, real=True) for size in self.places.camera.shape)
-        seen: NDArray[np.complex128] = fft.rfft2(image, (rows, columns), workers=processors())
+        seen = _spectrum(image, (rows, columns))
         top, left = self.places.starts
         places = np.ix_(top % rows, left % columns)
         out: FloatArray = np.zeros((top.size, left.size))
         for kernel, weight in zip(kernels, weights, strict=True):
-            spectrum: NDArray[np.complex128] = np.conj(fft.rfft2(kernel, (rows, columns), workers=processors()))
-            every: FloatArray = fft.irfft2(seen * spectrum, (rows, columns), workers=processors(), overwrite_x=True)
+            product = seen * np.conj(_spectrum(kernel, (rows, columns)))
+            every = fft.irfft2(product, (rows, columns), workers=processors(), overwrite_x=True)
             out += every[places] * ((down @ weight) @ across.T)
         return out
 
@@ -246,6 +246,10 @@ class KernelFootprints:
             "error_kernels": self.error_kernels,
             "error_coefficients": self.error_coefficients,
         }
+
+
+def _spectrum(image: FloatArray, padded: tuple[int, int]) -> NDArray[np.complex128]:
+    return fft.rfft2(image, padded, workers=processors())
 
 
 def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, FloatArray]) -> KernelFootprints:

@@ -11,7 +11,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType, SubImager
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.samplers import fitting
 from .worlds.building import BLOCK

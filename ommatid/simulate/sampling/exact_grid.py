@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 
 from .passes import JITTERED, MOST_CELLS, ROUNDING, Plan
 

@@ -10,7 +10,7 @@ from math import ceil, isqrt
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 
 from .checkpoint import State
 from .samplers import filling, fitting

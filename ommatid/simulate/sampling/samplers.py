@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import inf, isqrt, log
 
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 
 RELATED_DRAWS: tuple[Sampler, ...] = ("stratified", "ldsampler")  # successive draws of a ray are far from independent
 IN_THE_LIMIT = 64  # samples in a pass: with fewer, strata that hold a corner are not few beside those along an edge

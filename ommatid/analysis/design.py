@@ -16,8 +16,8 @@ from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
+from ommatid.scenes.optics.negligible import ignores_detail
 from ommatid.scenes.scene import Scene, parse
-from ommatid.scenes.skipped import ignores_detail
 
 from .prediction_table import DIGITS, json_of
 

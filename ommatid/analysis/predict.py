@@ -14,9 +14,9 @@ from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.optics.negligible import assumptions
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.skipped import assumptions
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.validation import check_lenses, check_scene_memory
 

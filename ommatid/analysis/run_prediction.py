@@ -26,9 +26,9 @@ from ommatid.reconstruct.restore import BUDGET, truth_for
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import averaged
+from ommatid.scenes.optics.negligible import assumptions
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.skipped import assumptions
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .predicted_recording import PredictedRecording, predicted_recording

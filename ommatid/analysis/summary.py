@@ -8,8 +8,7 @@ import numpy as np
 
 from ommatid.reconstruct.method_choice import MethodChoice
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.geometry.camera_warnings import camera_warnings
-from ommatid.scenes.geometry.optical_terms import optical_terms
+from ommatid.scenes.geometry.optical_terms import camera_warnings, optical_terms
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup

@@ -22,7 +22,7 @@ from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sampling import IN_PLACE_OF_AUTO
+from ommatid.scenes.tables.estimation import IN_PLACE_OF_AUTO
 from ommatid.simulate import calibrate, render
 from ommatid.simulate.calibration.point_sources import RENDERINGS
 from ommatid.simulate.renderer import variant

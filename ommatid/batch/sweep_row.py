@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import check_unique_keys, read_bytes
-from ommatid.scenes.tables.overrides import value_of
+from ommatid.scenes.tables.toml import value_of
 
 NUMBERS = "sweep.json"
 GROUPS = ("budget", "seconds")  # in the files a key per part, such as `budget.rendering`

@@ -24,7 +24,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.adaptive_render import AdaptiveRendering
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.adaptive_render import check_noise_target

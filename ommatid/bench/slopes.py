@@ -15,7 +15,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.shrinkage import shrink_variances
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
 from ommatid.simulate.sampling.samplers import corners, law
 

@@ -21,8 +21,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
 from .formats.picture import target_shape
-from .layout.sensor_extent import check_sensor
-from .layout.windows import check_overlap, whole_pixels, with_steering
+from .layout import check_overlap, check_sensor, whole_pixels, with_steering
 from .lens_type import LensOptics, LensType, SubImager, adjacent_slices, check_counts
 from .optics.spectrum import wavelengths_of
 from .scene import Scene

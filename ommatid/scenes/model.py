@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from math import ceil
 from typing import Any
 
@@ -21,8 +22,7 @@ from ommatid.runtime.errors import InputError
 
 from .camera import Camera
 from .fitted.fitted_matrix import FittedMatrix, gradient
-from .layout import stored_rows
-from .optics.boxes import BoxFootprints
+from .optics.boxes import MOST_STORED, BoxFootprints
 from .scene import Scene
 from .shrinkage import shrunk_by_contrast
 
@@ -135,14 +135,14 @@ class Model:
         """Indices of the measurements that see nothing outside a window of f: (m,)."""
         if self.has_boxes:
             return self.boxes.measurements_inside(rows, columns)
-        return stored_rows.inside(self._extents, rows, columns)
+        return rows_inside(self._extents, rows, columns)
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """H from a window of f to the measurements that see nothing outside it: (m, pixels of the window)."""
         if self.has_boxes:
             return self.boxes.submatrix(rows, columns)
         inside = self.matrix[self.measurements_inside(rows, columns)]
-        return stored_rows.on_window(inside, self.camera.columns, rows, columns)
+        return on_window(inside, self.camera.columns, rows, columns)
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """A key that is equal for two windows only if their submatrices are equal."""
@@ -157,8 +157,8 @@ class Model:
         return int(max((bottom - top).max(), (right - left).max())) + 1
 
     @cached_property
-    def _extents(self) -> stored_rows.Extents:
-        return stored_rows.extents(self.matrix, self.camera.columns)
+    def _extents(self) -> Extents:
+        return row_extents(self.matrix, self.camera.columns)
 
     def restrict(self, names: tuple[str, ...]) -> Model:
         """The model of only the named lens types, in its own order. Raises InputError for an unknown name."""
@@ -298,3 +298,79 @@ class Model:
 
     def _row_sums(self, entries: FloatArray) -> FloatArray:
         return np.bincount(self._rows, weights=entries, minlength=self.measurements).astype(np.float64)
+
+
+EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
+Extents = tuple[IntArray, IntArray, IntArray, IntArray]
+
+
+def row_extents(matrix: sparse.csr_array, columns: int) -> Extents:
+    """Return the first and last row, first and last column of f that each row of H sees, (M,) each; EMPTY if none."""
+    row, column = np.divmod(matrix.indices.astype(np.int64), columns)
+    nonempty = np.diff(matrix.indptr) > 0
+    starts = matrix.indptr[:-1][nonempty]
+    found = [np.full(nonempty.size, EMPTY) for _ in range(4)]
+    for extent, (values, extreme) in zip(found, product((row, column), (np.minimum, np.maximum)), strict=True):
+        extent[nonempty] = extreme.reduceat(values, starts)
+    top, bottom, left, right = found
+    return top, bottom, left, right
+
+
+def rows_inside(seen: Extents, rows: slice, columns: slice) -> IntArray:
+    """Return the indices of the rows of H that see nothing outside a window of f: (m,)."""
+    top, bottom, left, right = seen
+    return np.flatnonzero((top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop))
+
+
+def on_window(matrix: sparse.csr_array, width: int, rows: slice, columns: slice) -> sparse.csr_array:
+    """Return rows of H that see nothing outside a window, (m, N), on the window: (m, pixels of the window).
+
+    width : columns of f
+    """
+    row, column = np.divmod(matrix.indices, width)
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    indices = (row - rows.start) * shape[1] + column - columns.start
+    return sparse.csr_array((matrix.data, indices, matrix.indptr), shape=(matrix.shape[0], shape[0] * shape[1]))
+
+
+@dataclass(frozen=True)
+class MeasuredRows:
+    """Rows of H of sub-imagers that no few numbers explain, (M, N) with all other rows empty; see `Model`."""
+
+    matrix: sparse.csr_array
+    variance: FloatArray
+    batches: Float32Array
+
+
+def fitted_model(
+    scene: Scene, camera: Camera, fitted: FittedMatrix, rest: MeasuredRows | None, record: dict[str, Any]
+) -> Model:
+    """Return the model; H with box footprints is stored only while it is small."""
+    if rest is None:
+        entries = None
+        if not fitted.is_boxes or fitted.boxes.entries <= MOST_STORED:
+            entries = fitted.to_sparse()
+        count = 0 if entries is None else int(entries.nnz)
+        return Model(scene, camera, entries, np.zeros(count), np.zeros((0, count), np.float32), record, fitted=fitted)
+    explained = fitted.to_sparse()
+    matrix = sparse.csr_array(explained + rest.matrix)
+    rows = np.repeat(np.diff(rest.matrix.indptr) > 0, np.diff(matrix.indptr))  # stored in rows that were measured
+    variance, batches = np.zeros(matrix.nnz), np.zeros((len(rest.batches), matrix.nnz), np.float32)
+    variance[rows], batches[:, rows] = rest.variance, rest.batches
+    return Model(scene, camera, matrix, variance, batches, record, fitted=fitted)
+
+
+def measured_rows(model: Model) -> MeasuredRows | None:
+    """Return the rows of a model that were measured entry by entry, None where there are none."""
+    fitted = model.fitted
+    if fitted is None or model.stored is None or all(views.explained.all() for views in fitted.views.values()):
+        return None
+    named = [views.explained for views in (fitted.views[lens.name] for lens in model.camera.types)]
+    explained = np.concatenate(named)
+    sizes = [place.stop - place.start for place in model.camera.slices()]
+    counts = np.diff(model.stored.indptr)
+    kept = np.repeat(np.repeat(~explained, sizes), counts)
+    indptr = np.concatenate([[0], np.cumsum(counts * np.repeat(~explained, sizes))])
+    arrays = (model.stored.data[kept], model.stored.indices[kept], indptr)
+    matrix = sparse.csr_array(arrays, shape=model.stored.shape)
+    return MeasuredRows(matrix, model.variance[kept], model.batches[:, kept])

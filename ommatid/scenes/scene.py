@@ -21,13 +21,20 @@ from ommatid.runtime.printable import printable
 from .geometry.solution import complete
 from .tables import toml
 from .tables.camera import CameraTable
-from .tables.estimation import EstimatorTable, PriorTable, StudyTable, TilesTable
+from .tables.estimation import (
+    CalibrationTable,
+    EstimatorTable,
+    PriorTable,
+    RenderTable,
+    StudyTable,
+    TilesTable,
+    with_samples_without_noise,
+)
 from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
-from .tables.overrides import apply_overrides, keep_lenses
-from .tables.sampling import CalibrationTable, RenderTable, with_samples_without_noise
 from .tables.sensor import LightTable, NoiseTable, SensorTable
 from .tables.table import Table, allow_absent
+from .tables.toml import apply_overrides, keep_lenses
 from .tables.units import Corner, FileName, Length, Pair
 from .tables.world import WorldTable
 

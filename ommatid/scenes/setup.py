@@ -9,9 +9,8 @@ from ommatid.runtime.arrays import FloatArray
 
 from .camera import Camera, derive
 from .formats import picture
-from .optics.negligible import SkippedEffect, without_negligible_effects
+from .optics.negligible import SkippedEffect, skipped_effects, without_negligible_effects
 from .scene import Scene, resolved
-from .skipped import skipped_effects
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from ommatid.batch.sweep_row import SweepRow, read_rows, summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import read
-from ommatid.scenes.tables.overrides import value_of
+from ommatid.scenes.tables.toml import value_of
 
 from ..conftest import TINY, Command
 from ..kept_figures import KeptFigures

@@ -14,8 +14,8 @@ from scipy import stats
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.scenes.camera import derive
 from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.scenes.tables.gallery import gallery_names
-from ommatid.scenes.tables.sampling import Sampler
 from ommatid.simulate.validation import check_scene
 
 from ..examples import GALLERY, needs

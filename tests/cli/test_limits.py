@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -163,6 +164,13 @@ def test_an_array_smaller_than_its_header_states_is_refused(tmp_path: Path) -> N
 def test_headers_of_old_versions_are_read_without_a_warning(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(npy_of("(2L, 4L)"))  # as Python 2 wrote them
     assert picture_file.decode(tmp_path / "a.npy", "here").shape == (2, 4)
+    (tmp_path / "a.npy").write_bytes(npy_of("(8,)", "|a8"))  # NumPy 2.5 reads it no more, and says so by itself
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            assert npz.array(tmp_path / "a.npy").shape == (8,)
+        except ValueError:
+            assert np.lib.NumpyVersion(np.__version__) >= "2.5.0"
 
 
 def png_of(rows: int, columns: int) -> bytes:

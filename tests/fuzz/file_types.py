@@ -12,8 +12,8 @@ import numpy as np
 
 from ommatid.scenes import camera, model_file, scene, stack
 from ommatid.scenes.formats import curve, lens_file, picture
-from ommatid.scenes.hardware import frames, source_positions
-from ommatid.scenes.zemax.agf import read_catalogue
+from ommatid.scenes.formats.zemax import read_catalogue
+from ommatid.scenes.hardware import frames, point_sources
 
 from ..conftest import TINY
 from . import mutations
@@ -189,7 +189,7 @@ def positions_csv(_: Path) -> list[bytes]:
 
 def read_positions(path: Path) -> str:
     derived = camera.derive(scene.read(path.with_name(SCENE)))
-    return fingerprint(*source_positions.read_positions(path, derived, [Path(f"{index}.png") for index in range(3)]))
+    return fingerprint(*point_sources.read_positions(path, derived, [Path(f"{index}.png") for index in range(3)]))
 
 
 def read_world(path: Path) -> str:

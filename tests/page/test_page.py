@@ -45,7 +45,7 @@ from ommatid.reconstruct.output.single_sub_image import best_single_sub_image
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats import exr
-from ommatid.scenes.hardware import stack_import
+from ommatid.scenes.hardware import frames
 from ommatid.scenes.hardware.frames import AcquisitionSettings
 from ommatid.scenes.recording import Recording
 from ommatid.scenes.scene import parse
@@ -228,11 +228,11 @@ def test_a_letter_is_upright_in_the_maps_and_inverted_on_the_sensor(run: data.Ru
     mosaic, origin, step = mosaic_of(group_of(text, "sensor"), sensor.mosaic(run.stack))
     np.save(tmp_path / "mosaic.npy", mosaic)
     acquisition, setup = AcquisitionSettings(origin=origin), Setup(run.stack.scene, run.stack.camera)
-    recovered, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], acquisition)
+    recovered, _ = frames.import_stack(setup, [tmp_path / "mosaic.npy"], acquisition)
     # Half a step of the codes, and float32 rounding of values up to 255.
     np.testing.assert_allclose(recovered.values, run.stack.values, rtol=0, atol=0.5 * step + 2**-15)
     upright = replace(acquisition, upright=True)
-    wrong, _ = stack_import.import_stack(setup, [tmp_path / "mosaic.npy"], upright)
+    wrong, _ = frames.import_stack(setup, [tmp_path / "mosaic.npy"], upright)
     assert np.abs(wrong.values - run.stack.values).max() > 50, "the wrong orientation is recognised"
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from ommatid.scenes.camera import derive
-from ommatid.scenes.geometry.camera_warnings import FULL_WELL, camera_warnings
-from ommatid.scenes.geometry.optical_terms import optical_terms
+from ommatid.scenes.geometry.optical_terms import FULL_WELL, camera_warnings, optical_terms
 from ommatid.scenes.scene import read
 from ommatid.scenes.tables.gallery import gallery_names
 from ommatid.scenes.tables.sensor import SensorTable

@@ -83,6 +83,7 @@ def test_encircled_energy_follows_from_the_transfer_function(waves: float) -> No
         assert psf.spread.integral(np.array([v]))[0] == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_many_waves_are_a_disk_of_rays() -> None:
     psf, rim = pattern(100.0), 4 * np.pi * 100.0
     shares = np.array([0.2, 0.5, 0.8])

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import derive
-from ommatid.scenes.scene import Scene, with_changes
+from ommatid.scenes.scene import with_changes
 from ommatid.scenes.tables import toml
-from ommatid.scenes.tables.messages import known_keys
 
 from ..conftest import TINY
 
@@ -27,55 +24,6 @@ REAL = TINY.replace("[noise]\nvariance = 1e-2\n", SENSOR).replace(
     "pixels = [3, 3]", 'pixels = [3, 3]\naperture = "1 um"'
 )
 BASES = {name: toml.loads(text) for name, text in (("noise", TINY), ("sensor", REAL))}
-LONGEST = 300  # characters of a refusal
-EXTREME = {
-    "zero": "0",
-    "negative": "-1",
-    "largest float": "1e308",
-    "beyond floats": "1e400",
-    "infinite": "inf",
-    "not a number": "nan",
-    "63 bits": str(2**63),
-    "negative 64 bits": str(-(2**64)),
-    "most digits": str(2**63 - 1),
-    "5000 digits": "9" * 5000,
-    "text of nothing": '""',
-    "NUL": r'"\u0000"',
-    "escape": r'"\u001b[2J"',
-    "long text": "x" * 10_000,
-    "long length": '"' + "9" * 3000 + ' mm"',
-    "huge length": '"1e300 mm"',
-    "tiny length": '"1e-300 mm"',
-    "power": '"9**9**9 mm"',
-    "ratio": '"1/99999999999999999999"',
-    "nested": "[" * 30 + "]" * 30,
-    "unclosed": "[" * 4000,
-    "table": "{a = {b = 1}}",
-    "date": "1979-05-27T07:32:00Z",
-    "huge pair": f"[{2**62}, {2**62}]",
-    "long list": str([1] * 1000),
-    "long pairs": str([[1, 1]] * 500),
-    "true": "true",
-}
-
-
-def keys() -> list[str]:
-    """Every key of the scene file, as --set names it, but for those inside lists of surfaces and of sub-imagers."""
-    dotted = [key for key in known_keys(Scene) if not re.search(r"\.(surfaces|sub_imager)\.", key)]
-    return [key.replace("camera.lens.", "camera.lens.I.") for key in dotted]
-
-
-@pytest.mark.parametrize("value", EXTREME.values(), ids=EXTREME.keys())
-def test_every_key_takes_a_value_or_refuses_it_in_a_short_sentence(value: str) -> None:
-    source = Path("s.toml")
-    for key in keys():
-        base = BASES["sensor" if key.startswith(("sensor", "light")) else "noise"]
-        try:
-            derive(with_changes(base, source, [f"{key}={value}"], ()))
-        except InputError as error:
-            sentence = str(error)
-            assert sentence.startswith(("s.toml: ", str(Path.cwd()))), sentence  # those of files name the file
-            assert len(sentence) <= LONGEST, sentence
 
 
 @pytest.mark.parametrize("text", ["\udcff", "a\udcffb.png"])

@@ -14,7 +14,6 @@ from scipy import sparse
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views, gradient
-from ommatid.scenes.fitted.real_boxes import real_box
 from ommatid.scenes.fitted.view import (
     COLUMN,
     COUNT,
@@ -27,6 +26,7 @@ from ommatid.scenes.fitted.view import (
     entries,
     misaligned,
     misalignment,
+    real_box,
 )
 from ommatid.scenes.optics.footprints import sub_matrix
 from ommatid.scenes.pose import Misalignment, pose_of

@@ -123,17 +123,6 @@ def test_a_moved_and_lengthened_pinhole_sees_moved_and_smaller_boxes() -> None:
         np.testing.assert_allclose(found, np.kron(*axes), rtol=0, atol=1e-13)
 
 
-def test_a_unit_square_rotated_by_45_degrees() -> None:
-    """It shares an octagon of area 2 sqrt(2) - 2 with the original, and a quarter of the rest with each neighbour."""
-    cam = camera((3, 3), ((1, [1, 1], [1, 1]),))
-    sub = cam.sub_imagers[0]
-    found = sub_matrix(cam, sub, pose_of(sub, Misalignment(rotation=np.pi / 4))).toarray().reshape(3, 3)
-    middle = 2 * np.sqrt(2) - 2
-    beside = (1 - middle) / 4
-    expected = [[0, beside, 0], [beside, middle, beside], [0, beside, 0]]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
-
-
 @pytest.mark.parametrize("k", [(0.0, 0.0), (-0.2, 0.05)])
 def test_a_quarter_turn_of_the_patch_rotates_its_pixels(k: tuple[float, float]) -> None:
     cam = distorted(camera(lenses=THREE[1:2]), *k)
@@ -223,29 +212,6 @@ def test_a_texels_column_is_the_area_of_its_image(
         inside = (uv < np.array(sub.type.pixels[::-1]) / 2 * cam.pixel_pitch - 0.5 * cam.pixel_pitch).all(axis=2)
         assert inside.sum() >= 9
         np.testing.assert_allclose(columns[inside], area[inside], rtol=1e-12)
-
-
-def shares_by_points(cam: Camera, sub: SubImager, pose: Pose, pixel: tuple[int, int], count: int) -> Vector:
-    """One row of H from count x count points of the pixel, traced by Newton's method."""
-    at = (np.arange(count) + 0.5) / count
-    left, top = corner_offset(cam, sub)
-    v, u = np.meshgrid(top + (pixel[0] + at) * cam.pixel_pitch, left + (pixel[1] + at) * cam.pixel_pitch, indexing="ij")
-    row, column = (np.floor(axis).astype(int) for axis in footprint(cam, sub, pose, u, v))
-    hit = (row >= 0) & (row < cam.rows) & (column >= 0) & (column < cam.columns)
-    return np.bincount((row * cam.columns + column)[hit], minlength=cam.unknowns) / count**2
-
-
-@pytest.mark.parametrize("k", [(-0.15, 0.02), (0.3, 0.3)])
-def test_distortion_against_points(k: tuple[float, float]) -> None:
-    """An edge crosses at most 2 n of n x n cells, each of which then errs by at most 1/n^2."""
-    cam = distorted(camera(), *k)
-    for index, pixel in ((0, (0, 0)), (20, (2, 1)), (49, (3, 0))):
-        sub = cam.sub_imagers[index]
-        pose = pose_of(sub, NUDGED)
-        exact = sub_matrix(cam, sub, pose).toarray()[pixel[0] * sub.type.pixels[1] + pixel[1]]
-        coarse, fine = (shares_by_points(cam, sub, pose, pixel, count) - exact for count in (50, 1000))
-        assert np.abs(fine).max() < 4 * 2 / 1000
-        assert np.linalg.norm(fine) < np.linalg.norm(coarse) / 20  # at least in proportion to 1/n
 
 
 small = st.floats(-1, 1, allow_nan=False)

@@ -14,8 +14,7 @@ from ommatid.pipeline.camera_files import import_file
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks
 from ommatid.scenes.formats.picture import LUMINANCE, grey
-from ommatid.scenes.hardware.frame_files import FrameNotes, files_in, pictures_of, stored_pictures
-from ommatid.scenes.hardware.frames import AcquisitionSettings
+from ommatid.scenes.hardware.frames import AcquisitionSettings, FrameNotes, files_in, pictures_of, stored_pictures
 
 from . import picture_bytes as made
 from .mosaics import SCENE, SHAPE

@@ -19,13 +19,12 @@ from ommatid.scenes.optics.negligible import (
     SkippedEffect,
     light_kept_in_focus,
     negligible_shot_noise,
-    noise_variance,
+    skipped_effects,
     without_negligible_effects,
 )
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.skipped import skipped_effects
 from ommatid.scenes.stack import stack_from_recording
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light
@@ -61,7 +60,7 @@ def test_the_bound_holds_for_the_worst_target(rule: str) -> None:
         assert worst.max() > 0.2 * sum(effect.bound for effect in skipped), "the bound is not far too wide"
 
 
-@pytest.mark.parametrize("rule", ["nearly in focus", "hardly diffracting"])
+@pytest.mark.parametrize("rule", ["nearly in focus", pytest.param("hardly diffracting", marks=pytest.mark.slow)])
 def test_the_expected_error_without_the_effect_is_low_by_two_percent_at_most(rule: str) -> None:
     """At the least noise at which the effect is skipped, by dense algebra; at the corners rays miss the target.
 
@@ -88,7 +87,10 @@ def test_the_expected_error_without_the_effect_is_low_by_two_percent_at_most(rul
     assert 1 < (errors[1] + noisy) / (errors[0] + noisy) < 1.02
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(
+    "rule",
+    ["nearly in focus", *(pytest.param(rule, marks=pytest.mark.slow) for rule in ("in focus", "hardly diffracting"))],
+)
 def test_the_reduced_rendering_agrees_with_the_complete_one(rule: str) -> None:
     """To the bound and the noise of both, at a familywise significance of 1 %."""
     needs("llvm_ad_mono")
@@ -172,14 +174,6 @@ def test_skipped_effects_have_a_reason_and_a_bound() -> None:
     assert "bound" not in next(effect for effect in skipped if effect["what"] == "interreflection")
 
 
-def test_the_noise_of_a_real_sensor_counts() -> None:
-    data = with_optics({"aperture": "0.4 mm", "focus": "970 mm"}, {})[0].plain()
-    sensor = {"illuminance": "500 lux", "exposure": "10 ms", "read_noise": 4}
-    described = parse({**data, "sensor": sensor}, Path("test.toml"))
-    assert noise_variance(described, derive(described)) > 0.01
-    assert noise_variance(*with_optics({}, {})) == 0
-
-
 def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
     """No plugin, kernel or table of an absent effect is loaded."""
     needs("llvm_ad_mono")
@@ -220,6 +214,7 @@ def dim(**more: Any) -> tuple[Any, Any]:
     return described, derive(described)
 
 
+@pytest.mark.slow
 def test_negligible_shot_noise_changes_exposures_by_less_than_its_bound() -> None:
     """Means and variances over 60 exposures with and without shot noise, to five standard errors."""
     described, camera = dim()

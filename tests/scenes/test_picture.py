@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -130,19 +129,3 @@ def test_values_that_are_not_light_are_refused(name: str, mode: str, words: str,
     colour.convert(mode).save(tmp_path / name, **options)
     with pytest.raises(InputError, match=f"{name}: expected grey or RGB, got .*{words}"):
         load(looking_at(tmp_path / name))
-
-
-def test_the_palette_of_a_png_is_looked_up(tmp_path: Path) -> None:
-    from PIL import Image
-
-    Image.fromarray(GREY).convert("P").save(tmp_path / "a.png")
-    np.testing.assert_allclose(load(looking_at(tmp_path / "a.png")), GREY, rtol=1e-6)
-
-
-@pytest.mark.skipif(find_spec("imagecodecs") is not None, reason="imagecodecs reads this compression")
-def test_an_unknown_compression_is_named(tmp_path: Path) -> None:
-    from PIL import Image
-
-    Image.fromarray(GREY).save(tmp_path / "a.tif", compression="tiff_lzw")
-    with pytest.raises(InputError, match=r"a.tif: its compression LZW is not read; save it without"):
-        load(looking_at(tmp_path / "a.tif"))

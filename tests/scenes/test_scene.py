@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import Scene, read, resolved, with_changes, write
 from ommatid.scenes.tables import toml
-from ommatid.scenes.tables.overrides import apply_overrides
+from ommatid.scenes.tables.toml import apply_overrides
 from ommatid.scenes.tables.units import FACTORS
 
 from ..examples import GALLERY, scene

@@ -8,35 +8,12 @@ from pathlib import Path
 import pytest
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.hardware.source_positions import read_positions
+from ommatid.scenes.hardware.point_sources import read_positions
 
 from ..examples import camera
 
 FILES = [Path("a.png"), Path("b.png")]
 NINES = "9" * 5000
-
-
-@pytest.mark.parametrize(
-    ("text", "match"),
-    [
-        (f"0,{NINES},1", "line 2: expected a whole number as its row"),
-        (f"0,1,-{NINES}", "line 2: expected a whole number as its column"),
-        (f"{NINES},1,1", "line 2: expected an image"),
-        ("0,1,1\n1,1,1\n0,1,1", "line 4: row 1, column 1 is given twice"),
-        ("0,1e400,1", "line 2: expected a whole number"),
-        ("0,\u0661\u0662,100", "lies outside f"),
-        ("0,1", "line 2: expected an image, a row and a column, got fewer"),
-        ('0,"1,1\n' * 100_000, "could not be read as a CSV file|expected a whole number|got fewer"),
-        ("\0,1,1", "."),
-    ],
-    ids=["row", "column", "image", "twice", "exponent", "digits", "fewer", "quote", "NUL"],
-)
-def test_misleading_lines_are_refused_in_a_short_sentence(text: str, match: str, tmp_path: Path) -> None:
-    path = tmp_path / "p.csv"
-    path.write_text(f"\ufeffimage,row,column\n{text}\n", encoding="utf-8")
-    with pytest.raises(InputError, match=match) as refusal:
-        read_positions(path, camera(), FILES)
-    assert len(str(refusal.value).replace(str(path), "")) <= 300
 
 
 def test_files_without_an_end_are_refused(tmp_path: Path) -> None:

@@ -83,6 +83,7 @@ def test_electrons_of_daylight_are_those_by_hand() -> None:
     assert 204 < lumens / np.trapezoid(power, TENS) < 206, "lm/W, of D65 from 380 to 780 nm"
 
 
+@pytest.mark.slow
 def test_the_tables_are_those_of_another_library() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -177,37 +178,6 @@ def test_files_hold_curves(tmp_path: Path) -> None:
     assert read(tmp_path / "elsewhere.toml").light == described.light
 
 
-@pytest.mark.parametrize(
-    ("light", "words"),
-    [
-        ("D56", "'D65', 'LED-B3' or the name of a file, got 'D56'"),
-        ("650-450 nm", "expected the shorter wavelength first"),
-        ("5-6 mm", "expected wavelengths from 100 to 20000 nm"),
-        ("0 nm", "above zero"),
-        ([[500, 1]], "expected 2 to 10000 points of a wavelength in nm and a value, got 1"),
-        ([[500, 1], [500, 1]], "ascending order, got 500 after 500 nm"),
-        ([[500, 1], [600, -1]], "expected values from 0 to 1e"),
-        ([[500, 0], [600, 0]], "at least one value above 0"),
-        ([[500, 1], [600]], "pairs of a wavelength in nm and a value, got"),
-        (550, "a text such as"),
-    ],
-)
-def test_spectra_that_are_none_are_refused(light: Any, words: str) -> None:
-    with pytest.raises(InputError, match=r"^test\.toml: light\.spectrum: ") as refused:
-        lit(light)
-    assert words in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("efficiency", "words"),
-    [(0.0, "above 0 and at most 1, got 0"), ([[500, 1], [600, 1.2]], "from 0 to 1, got 1.2"), (True, "expected")],
-)
-def test_efficiencies_that_are_none_are_refused(efficiency: Any, words: str) -> None:
-    with pytest.raises(InputError, match=r"sensor\.quantum_efficiency: ") as refused:
-        lit("D65", efficiency)
-    assert words in str(refused.value)
-
-
 def test_light_that_is_not_seen_or_not_detected_is_refused() -> None:
     with pytest.raises(InputError, match="lux, which measure light from 360 to 830 nm"):
         white(lit("900 nm"))
@@ -217,24 +187,3 @@ def test_light_that_is_not_seen_or_not_detected_is_refused() -> None:
         lit("450-650 nm", [[700, 1.0], [800, 1.0]])
     with pytest.raises(InputError, match=r"camera\.wavelength or light\.spectrum, got both"):
         lit("D65", wavelength="550 nm")
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("500, 1\n600\n", "line 2: expected a wavelength in nm and a value, got '600'"),
-        ("500, 1\n600, nan\n", "line 2: expected a wavelength"),
-        ("500, 1\n400, 1\n", "ascending"),
-        ("", "got 0"),
-        ("# " + "x" * 2_000_000, "at most 1 MB"),
-    ],
-)
-def test_damaged_curves_are_refused(content: str, words: str, tmp_path: Path) -> None:
-    (tmp_path / "lamp.csv").write_text(content, encoding="utf-8")
-    data = lit()[0].plain() | {"light": {"spectrum": "lamp.csv"}}
-    with pytest.raises(InputError, match=r"lamp\.csv") as refused:
-        with_changes(data, tmp_path / "mine.toml", (), ())
-    assert words in str(refused.value)
-    (tmp_path / "lamp.csv").unlink()
-    with pytest.raises(InputError, match="no such file"):
-        with_changes(data, tmp_path / "mine.toml", (), ())

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.hardware.frame_files import pictures_of
-from ommatid.scenes.hardware.frames import AcquisitionSettings, patches, read_frames
+from ommatid.scenes.hardware.frames import AcquisitionSettings, patches, pictures_of, read_frames
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_model
@@ -206,16 +205,10 @@ def test_an_imported_stack_is_reconstructed_with_the_predicted_error(imaging_cam
 
 
 PLACES = {
-    "header": "row,column\n1,2",
     "outside": "image,row,column\n0,12,0",
-    "negative": "image,row,column\n0,-1,0",
-    "word": "image,row,column\n0,one,0",
-    "stranger": "image,row,column\nother.png,0,0",
-    "short": "image,row,column\n0,1",
     "twice": "image,row,column\nm.npy,0,0\n0,0,0",
     "close": "image,row,column\nm.npy,5,5\n0,6,6",
     "few": "image,row,column\n0,0,0",
-    "none": "image,row,column",
 }
 
 
@@ -225,9 +218,6 @@ def write_files() -> None:
     save(Path("small.npy"), np.zeros((20, 30)))
     save(Path("dark.npy"), np.zeros((42, 61)))
     save(Path("three.npy"), np.zeros((3, *SHAPE)))
-    save(Path("complex.npy"), np.zeros(SHAPE, dtype=complex))
-    Path("note.npy").write_text("This is a note.\n", encoding="utf-8")
-    Path("photo.jpg").write_bytes(b"no")
     Path("empty").mkdir()
     for name, text in PLACES.items():
         Path(f"{name}.csv").write_text(text + "\n", encoding="utf-8")
@@ -239,55 +229,37 @@ IMPORT, CALIBRATE = ("import", "scene.toml", "-o", "new"), ("calibrate", "scene.
 SMALL = ["small.npy"] * 13
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ((*IMPORT, "small.npy"), ("small.npy", "I.00.00", "20 x 30", "--origin")),
-        ((*IMPORT, "m.npy", "--origin", "30,30"), ("leaves the mosaic", "42 x 62")),
-        ((*IMPORT, "m.npy", "--origin", "3"), ("--origin", "ROW,COLUMN")),
-        ((*IMPORT, "m.npy", "--origin", "-3,1"), ("leaves the mosaic",)),
-        ((*IMPORT, "m.npy", "small.npy"), ("13 pictures", "got 2")),
-        ((*IMPORT, "three.npy"), ("13 pictures", "got 3")),
-        ((*IMPORT, *SMALL), ("small.npy", "5 x 6", "20 x 30")),
-        ((*IMPORT, *SMALL, "--origin", "1,1"), ("--origin", "mosaic")),
-        ((*IMPORT, "gone.png"), ("gone.png", "no such file")),
-        ((*IMPORT, "note.npy"), ("note.npy", "could not be read")),
-        ((*IMPORT, "photo.jpg"), ("photo.jpg", "PNG, TIFF, EXR or NPY")),
-        ((*IMPORT, "complex.npy"), ("complex.npy", "complex128")),
-        ((*IMPORT, "empty"), ("empty", "none of them")),
-        ((*IMPORT, "m.npy", "--dark", "dark.npy"), ("dark.npy", "42 x 62", "42 x 61")),
-        ((*IMPORT, "m.npy", "--flat", "dark.npy"), ("dark.npy", "42 x 62", "42 x 61")),
-        ((*IMPORT, "m.npy", "--flat-value", "0"), ("--flat-value", "above 0")),
-        (("import", "scene.toml", "m.npy", "-o", "m.npy"), ("m.npy", "would replace")),
-        (("import", "scene.toml", "m.npy", "-o", "dark.npy", "--dark", "dark.npy"), ("would replace",)),
-        (("import", "scene.toml", "m.npy", "-o", "no/new"), ("does not exist",)),
-        ((*CALIBRATE, "m.npy"), ("168 pixels", "got 1", "--places")),
-        ((*CALIBRATE, "m.npy", "--places", "header.csv"), ("header.csv", "image,row,column")),
-        ((*CALIBRATE, "m.npy", "--places", "gone.csv"), ("gone.csv", "could not be read")),
-        ((*CALIBRATE, "m.npy", "--places", "outside.csv"), ("line 2", "row 12", "12 x 14")),
-        ((*CALIBRATE, "m.npy", "--places", "negative.csv"), ("line 2", "row -1")),
-        ((*CALIBRATE, "m.npy", "--places", "word.csv"), ("line 2", "'one'")),
-        ((*CALIBRATE, "m.npy", "--places", "stranger.csv"), ("line 2", "other.png")),
-        ((*CALIBRATE, "m.npy", "--places", "short.csv"), ("line 2", "fewer")),
-        ((*CALIBRATE, "m.npy", "--places", "twice.csv"), ("line 3", "twice")),
-        ((*CALIBRATE, "m.npy", "--places", "close.csv"), ("m.npy", "(5, 5)", "(6, 6)", "two images")),
-        ((*CALIBRATE, "m.npy", "--places", "few.csv"), ("few.csv", "row 0, column 1")),
-        ((*CALIBRATE, "m.npy", "--places", "none.csv"), ("none.csv", "m.npy")),
-        ((*CALIBRATE, "m.npy", "--point-value", "-1"), ("--point-value",)),
-        (("calibrate", "scene.toml", "-o", "new", "--places", "few.csv"), ("--points",)),
-    ],
-)
+WRONG: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
+    ((*IMPORT, "small.npy"), ("small.npy", "I.00.00", "20 x 30", "--origin")),
+    ((*IMPORT, "m.npy", "--origin", "30,30"), ("leaves the mosaic", "42 x 62")),
+    ((*IMPORT, "m.npy", "--origin", "-3,1"), ("leaves the mosaic",)),
+    ((*IMPORT, "three.npy"), ("13 pictures", "got 3")),
+    ((*IMPORT, *SMALL), ("small.npy", "5 x 6", "20 x 30")),
+    ((*IMPORT, *SMALL, "--origin", "1,1"), ("--origin", "mosaic")),
+    ((*IMPORT, "empty"), ("empty", "none of them")),
+    ((*IMPORT, "m.npy", "--flat", "dark.npy"), ("dark.npy", "42 x 62", "42 x 61")),
+    ((*IMPORT, "m.npy", "--flat-value", "0"), ("--flat-value", "above 0")),
+    (("import", "scene.toml", "m.npy", "-o", "m.npy"), ("m.npy", "would replace")),
+    ((*CALIBRATE, "m.npy"), ("168 pixels", "got 1", "--places")),
+    ((*CALIBRATE, "m.npy", "--places", "outside.csv"), ("line 2", "row 12", "12 x 14")),
+    ((*CALIBRATE, "m.npy", "--places", "twice.csv"), ("line 3", "twice")),
+    ((*CALIBRATE, "m.npy", "--places", "close.csv"), ("m.npy", "(5, 5)", "(6, 6)", "two images")),
+    ((*CALIBRATE, "m.npy", "--places", "few.csv"), ("few.csv", "row 0, column 1")),
+    ((*CALIBRATE, "m.npy", "--point-value", "-1"), ("--point-value",)),
+    (("calibrate", "scene.toml", "-o", "new", "--places", "few.csv"), ("--points",)),
+]
+
+
 @pytest.mark.usefixtures("imaging_camera")
-def test_wrong_input_is_refused_in_one_sentence(
-    ommatid: Command, arguments: tuple[str, ...], words: tuple[str, ...]
-) -> None:
+def test_wrong_input_is_refused_in_one_sentence(ommatid: Command) -> None:
     write_files()
     before = {path: path.stat().st_mtime_ns for path in Path().iterdir()}
-    ended = ommatid(*arguments)
-    assert ended.code == 2, ended.err
-    assert len(ended.err.splitlines()) == 1, ended.err
-    for word in words:
-        assert word in ended.err, ended.err
+    for arguments, words in WRONG:
+        ended = ommatid(*arguments)
+        assert ended.code == 2, ended.err
+        assert len(ended.err.splitlines()) == 1, ended.err
+        for word in words:
+            assert word in ended.err, ended.err
     assert {path: path.stat().st_mtime_ns for path in Path().iterdir()} == before
 
 

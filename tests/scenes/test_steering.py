@@ -13,7 +13,7 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.hardware.assignment import unrecorded
+from ommatid.scenes.hardware.point_sources import unrecorded
 from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.scenes.setup import Setup
@@ -137,9 +137,10 @@ OPTICS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize(
     ("variant", "optics", "rotation"),
     [
-        ("scalar_rgb", "pinhole", None),
-        *(("llvm_ad_mono", name, None) for name in OPTICS),
-        *(("llvm_ad_mono", name, "5 deg") for name in ("pinhole", "distorted")),
+        ("llvm_ad_mono", "pinhole", "5 deg"),
+        pytest.param("scalar_rgb", "pinhole", None, marks=pytest.mark.slow),
+        *(pytest.param("llvm_ad_mono", name, None, marks=pytest.mark.slow) for name in OPTICS),
+        pytest.param("llvm_ad_mono", "distorted", "5 deg", marks=pytest.mark.slow),
     ],
 )
 def test_rendered_against_the_closed_form(variant: str, optics: str, rotation: str | None) -> None:
@@ -158,8 +159,9 @@ def test_rendered_against_the_closed_form(variant: str, optics: str, rotation: s
     assert_student(rendering.mean - ideal_matrix(setup.camera) @ setup.image.ravel(), variance, rendering.passes)
 
 
-@pytest.mark.parametrize("method", ["points", "transport"])
-@pytest.mark.parametrize("rotation", [None, "5 deg"])
+@pytest.mark.parametrize(
+    ("method", "rotation"), [("transport", "5 deg"), pytest.param("points", None, marks=pytest.mark.slow)]
+)
 def test_calibrated_against_the_closed_form(method: str, rotation: str | None) -> None:
     """Entry by entry, by the variance that the calibration states from its batches."""
     needs("llvm_ad_mono")
@@ -189,20 +191,6 @@ def test_dense_tiled_and_banded_estimates_agree(rotation: str | None) -> None:
     assert_methods_agree(described, ("tiles", "frame"), 1e-3)
 
 
-def test_many_tiles_hold_their_measurements() -> None:
-    """Tiles of a frame find the sub-imagers that look into them: with all of H in each, they are the dense estimate."""
-    described = windows(noise={"variance": 1e-2}, estimator={"method": "tiles"}, tiles={"size": 20, "overlap": 9})
-    whole = windows(noise={"variance": 1e-2}, estimator={"method": "information"})
-    image = 127.5 + np.random.default_rng(0).normal(0, 70, 360)
-    tiled, dense = (
-        restore(recorded(each, image, 1e-2), ideal_model(each, derive(each)), image) for each in (described, whole)
-    )
-    assert tiled.error is not None
-    assert tiled.interval is not None
-    assert tiled.interval.low < tiled.error.mse < tiled.interval.high
-    assert tiled.expected.mse >= dense.expected.mse * (1 - 1e-6)
-
-
 def whole_tile() -> Scene:
     """The paper's 19 x 19 tile, in which the nine lenses of type I look further apart, and one is turned."""
     data = read(GALLERY / "tile19.toml").plain()
@@ -214,6 +202,7 @@ def whole_tile() -> Scene:
     )
 
 
+@pytest.mark.slow
 def test_a_camera_of_steered_windows_from_scene_file_to_verdict(tmp_path: Path, ommatid: Command) -> None:
     needs("llvm_ad_mono")
     write(tmp_path / "steered.toml", whole_tile())
@@ -225,6 +214,7 @@ def test_a_camera_of_steered_windows_from_scene_file_to_verdict(tmp_path: Path, 
     assert given["low"] < report["error"]["mse"] < given["high"]
 
 
+@pytest.mark.slow
 def test_twenty_images_err_as_predicted() -> None:
     """With the H in closed form the mean error has the variance 2 trace(C^2) / N^2."""
     described = whole_tile()
@@ -255,32 +245,10 @@ def test_only_steered_cameras_have_another_description() -> None:
     assert [sub.lens for sub in moved.on_grids.sub_imagers] == [sub.lens for sub in plain.sub_imagers]
 
 
-def test_a_finer_world_keeps_the_windows() -> None:
-    camera = derive(windows())
-    fine = camera.types[0].finer(3)
-    assert fine.view(0, 2).window == (Fraction(9, 2), 27)
-
-
 def test_written_and_read_again(tmp_path: Path) -> None:
     before = steered({(0, 2): {"window": ["3/2", 9], "rotation": "-1 deg"}})
     write(tmp_path / "scene.toml", before)
     assert derive(read(tmp_path / "scene.toml")).types[0].steered == derive(before).types[0].steered
-
-
-@pytest.mark.parametrize(
-    ("named", "expected"),
-    [
-        ({(2, 0): {"window": [0, 0]}}, "not in an array of 2 x 3"),
-        ({(0, 0): {}}, "needs a window, a rotation or both"),
-        ({(0, 0): {"window": [12, 0]}}, "at most row 11, column 9"),
-        ({(0, 0): {"window": [-1, 0]}}, "of 0 or more"),
-        ({(0, 0): {"window": [1]}}, "of 0 or more"),
-        ({(0, 0): {"window": [0, 0], "rotation": 3}}, "an angle"),
-    ],
-)
-def test_impossible_windows_are_refused(named: dict[tuple[int, int], dict[str, Any]], expected: str) -> None:
-    with pytest.raises(InputError, match=expected):
-        derive(steered(named))
 
 
 def test_one_sub_imager_twice_is_refused() -> None:

@@ -10,18 +10,13 @@ import numpy as np
 import pytest
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.hardware.assignment import unrecorded
+from ommatid.scenes.hardware.point_sources import unrecorded
 from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.scenes.scene import Scene, parse, read, write
-from ommatid.scenes.setup import Setup
-from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.render import light
-from ommatid.simulate.sampling.passes import rounding_variance
 
-from ..examples import assert_student, needs, scene
+from ..examples import scene
 from ..frames import assert_methods_agree
 
 
@@ -64,38 +59,6 @@ def test_h_is_that_of_counted_cells(step: list[Any]) -> None:
     np.testing.assert_array_equal(unrecorded(camera, np.zeros((0, 2), dtype=np.int64)), np.flatnonzero(seen))
 
 
-OPTICS: dict[str, dict[str, Any]] = {
-    "pinhole": {},
-    "out of focus": {"aperture": "0.4 mm", "focus": "950 mm"},
-    "distorted": {"distortion": [0.03, 0.01]},
-}
-
-
-@pytest.mark.parametrize(
-    ("variant", "optics"), [("scalar_rgb", "pinhole"), *(("llvm_ad_mono", name) for name in OPTICS)]
-)
-def test_rendered_against_the_closed_form(variant: str, optics: str) -> None:
-    needs(variant)
-    render = {"variant": variant, "samples": 4096, "complete": True}
-    setup = Setup.from_scene(stepped([2, 1], more=OPTICS[optics], render=render))
-    rendering = light(setup)
-    variance = np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
-    assert_student(rendering.mean - ideal_matrix(setup.camera) @ setup.image.ravel(), variance, rendering.passes)
-
-
-@pytest.mark.parametrize("method", ["points", "transport"])
-def test_calibrated_against_the_closed_form(method: str) -> None:
-    """Entry by entry, by the variance that the calibration states from its batches."""
-    needs("llvm_ad_mono")
-    tables: dict[str, Any] = {"render": {"variant": "llvm_ad_mono"}, "calibration": {"samples": 1024, "method": method}}
-    setup = Setup.from_scene(stepped([2, 1], **tables))
-    model = calibrate(setup)
-    exact = ideal_matrix(setup.camera)
-    difference = np.asarray((model.matrix - exact).toarray())
-    limit = 5 * np.sqrt(model.variance.max())
-    assert np.abs(difference).max() < limit < 0.02, "entries are 1/9 and 1/4"
-
-
 @pytest.mark.parametrize("shape", [(24, 23), (32, 30)])
 def test_frames_and_tiles_agree_with_the_dense_estimate(shape: tuple[int, int]) -> None:
     def described(method: str) -> Scene:
@@ -123,12 +86,6 @@ def test_written_and_read_again(step: Any, tmp_path: Path) -> None:
     write(tmp_path / "scene.toml", before)
     assert read(tmp_path / "scene.toml").camera.lens[0].step == before.camera.lens[0].step
     assert read(tmp_path / "scene.toml", ["camera.lens.A.step=[3, 1]"]).camera.lens[0].step == (3, 1)
-
-
-@pytest.mark.parametrize("step", [[1], [1, 2, 3], [-1, 1], [1, "x"], [], [[1, 2], 3]])
-def test_other_lists_are_refused(step: list[Any]) -> None:
-    with pytest.raises(InputError, match=r"camera\.lens\.\w+\.step"):
-        stepped(step)
 
 
 def test_the_array_fits_the_target_along_either_axis() -> None:

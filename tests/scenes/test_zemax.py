@@ -9,11 +9,10 @@ import pytest
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.lens_file import read_lens
+from ommatid.scenes.optics.dispersion import Dispersion
 from ommatid.scenes.scene import read, with_changes, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface
-from ommatid.scenes.zemax.agf import read_catalogue
-from ommatid.scenes.zemax.dispersion import Dispersion
 from ommatid.simulate.lenses.prescription import prescription_of
 
 from ..examples import GALLERY
@@ -158,23 +157,6 @@ def test_what_is_not_supported_is_named(name: str, tmp_path: Path) -> None:
         lens(tmp_path, text.replace(old, new))
 
 
-def test_files_without_a_lens_are_refused(tmp_path: Path) -> None:
-    for text in ("", "SURF 0\nSURF 1\n", "\0" * 50, "PARM\nUNIT\nMODE\nSURF\nGLAS\n"):
-        with pytest.raises(InputError, match="expected surfaces between"):
-            lens(tmp_path, text)
-    with pytest.raises(InputError, match="flat surfaces without glass"):
-        lens(tmp_path, "SURF 0\nSURF 1\n  DIAM 1\nSURF 2\n")
-    (tmp_path / "lens.zmx").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="could not be read as a lens file"):
-        read_lens(tmp_path / "lens.zmx")
-    with pytest.raises(InputError, match="no such lens file"):
-        read_lens(tmp_path / "other.zmx")
-    with (tmp_path / "lens.zmx").open("wb") as stream:
-        stream.truncate(2**24 + 1)
-    with pytest.raises(InputError, match=r"at most 16\.8 MB"):
-        read_lens(tmp_path / "lens.zmx")
-
-
 # Coefficients of materials, and their indices as printed, by wavelength in um.
 MATERIALS = {
     # SCHOTT 1992, BK7: nd and nF of the catalogue
@@ -303,29 +285,6 @@ def test_zemax_s_names_of_the_built_in_glasses(tmp_path: Path) -> None:
     assert surfaces is not None
     assert isinstance(surfaces[1], Surface)
     assert surfaces[1].glass == "fused silica"
-
-
-def test_damaged_catalogues_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "glass.agf"
-    path.write_text("CC nothing\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"glass.agf: expected a glass catalogue"):
-        read_catalogue(path)
-    good = agf(A=(2, (1.2, 0.01)))
-    for old, new, words in (
-        ("LD 0.3 11\n", "", "expected a line LD with 2 values"),
-        ("LD 0.3 11", "LD 11 0.3", "expected shortest of at most longest"),
-        ("LD 0.3 11", "LD 0 11", "shortest: expected a length above zero"),
-        ("LD 0.3 11", "LD 0.3 nan", "expected a wavelength in micrometres, .*got 'nan'"),
-        ("CD 1.2", "CD one", "expected a coefficient, .*got 'one'"),
-        ("NM A 2", "NM A two", "the number of its formula, .*got 'two'"),
-        ("NM A 2", "NM A", "formula"),
-    ):
-        path.write_text(good.replace(old, new), encoding="utf-8")
-        with pytest.raises(InputError, match=rf"glass\.agf, line 2, glass A: .*{words}"):
-            read_catalogue(path).dispersion("A")
-    path.write_text(good.replace("CD 1.2 0.01", "CD -5"), encoding="utf-8")
-    with pytest.raises(InputError, match="coefficients of A that yield an index"):
-        read_catalogue(path).dispersion("A").index(550e-6, "A")
 
 
 def test_a_wavelength_outside_the_catalogue_s_range_is_refused() -> None:

@@ -11,11 +11,11 @@ from scipy import stats
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics.negligible import skipped_effects
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.pose import corner_offset
 from ommatid.scenes.scene import Scene, parse, read
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.skipped import skipped_effects
 from ommatid.simulate.calibration.entries import rendered_model
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.renderer import Renderer

@@ -18,7 +18,7 @@ from scipy import stats
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.calibration.point_sources import responses_from_points
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, light

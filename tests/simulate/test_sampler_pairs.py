@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.sampling.samplers import fitting
 from ommatid.simulate.sampling.seeds import sampler_seeds

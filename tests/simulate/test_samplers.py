@@ -15,7 +15,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.optics.boxes import overlap
 from ommatid.scenes.scene import Scene
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate

@@ -10,7 +10,7 @@ from scipy import stats
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.adaptive_render import render_until
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.draws import DIMENSIONS, SobolDraws, sobol_points

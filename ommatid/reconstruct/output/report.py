@@ -11,8 +11,7 @@ import numpy as np
 
 from ommatid.runtime.versions import versions
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.negligible import SkippedEffect
-from ommatid.scenes.skipped import assumptions, skipped_effects
+from ommatid.scenes.optics.negligible import SkippedEffect, assumptions, skipped_effects
 from ommatid.scenes.stack import STRAIGHT, Stack
 
 from ..estimator.estimate import Solver

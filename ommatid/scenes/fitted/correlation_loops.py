@@ -1,4 +1,4 @@
-"""Correlations of an image with kernels that vary over the field, and their adjoint, compiled.
+"""Correlations of an image with kernels that vary over the field, compiled.
 
 Work is divided into ranges of rows that do not depend on the number of threads, so neither do the results.
 """
@@ -44,29 +44,6 @@ def correlate_line(image, kernels, top, left, length, source, lines):
 
 
 @compiled
-def spread_line(lines, kernels, top, left, source, first, last, out):
-    """Add the adjoint of `correlate_line`, applied to `lines`, to rows first to last of `out`."""
-    columns = out.shape[1]
-    count, length = lines.shape
-    tall, wide = kernels.shape[1:]
-    begin, end = max(left, 0), min(left + source.size, columns)
-    for dy in range(tall):
-        y = top + dy
-        if y < first or y >= last:
-            continue
-        source[:] = 0.0
-        for s in range(count):
-            line = lines[s]
-            for dx in range(wide):
-                share = kernels[s, dy, dx]
-                for x in range(length):
-                    source[x + dx] += share * line[x]
-        target = out[y]
-        for x in range(begin, end):
-            target[x] += source[x - left]
-
-
-@compiled
 def correlate(image, kernels, weights, down, across, order, top, left, columns_at, out, first, last):
     """Fill `out`, (K, L, rows, columns), for sensor rows order[first:last].
 
@@ -93,31 +70,6 @@ def correlate(image, kernels, weights, down, across, order, top, left, columns_a
                     share += factors[s, b] * across[column, b]
                 total += share * lines[s, x]
             out[k, column // out.shape[3], i, column % out.shape[3]] = total
-
-
-@compiled
-def spread(readings, kernels, weights, down, across, order, top, left, columns_at, out, first, last):
-    """Add the adjoint of `correlate`, applied to `readings`, to rows first to last of `out`."""
-    count, powers = weights.shape[0], weights.shape[1]
-    length, tall, wide = columns_at.max() + 1, kernels.shape[1], kernels.shape[2]
-    lines, source = np.zeros((count, length)), np.empty(length + wide - 1)
-    factors = np.empty((count, powers))
-    for position in range(order.size):
-        row = order[position]
-        if top[row] + tall <= first or top[row] >= last:
-            continue
-        _factors(weights, down[row], factors)
-        k, i = row // readings.shape[2], row % readings.shape[2]
-        for column in range(columns_at.size):
-            value, x = readings[k, column // readings.shape[3], i, column % readings.shape[3]], columns_at[column]
-            for s in range(count):
-                share = 0.0
-                for b in range(powers):
-                    share += factors[s, b] * across[column, b]
-                lines[s, x] += share * value
-        if position + 1 == order.size or top[order[position + 1]] != top[row]:
-            spread_line(lines, kernels, top[row], left, source, first, last, out)
-            lines[:] = 0.0
 
 
 @compiled

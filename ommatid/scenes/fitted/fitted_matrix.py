@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -20,8 +20,7 @@ from ..camera import Camera
 from ..lens_type import LensType, SubImager
 from ..tables.table import LARGEST
 from .kernels import KernelFootprints
-from .real_boxes import RealBoxes, real_box
-from .view import COUNT, K1, LEAST, MOST, ROTATION, designed, displacements, entries
+from .view import COUNT, K1, LEAST, MOST, ROTATION, RealBoxes, designed, displacements, entries, real_box
 
 STRUCTURES = {"own", "shared", "designed"}
 ALIKE = 0.05  # pixels of f that views may be displaced by where error maps take H as designed
@@ -207,7 +206,7 @@ class FittedMatrix:
                 parts.append(moves @ views.own[number])
                 common.append(moves @ views.shared[number])
             columns = [sparse.csc_array((lens.measurements, 0), dtype=np.float64)]
-            columns += [_block_diagonal(parts)] if own else []
+            columns += [sparse.csc_array(sparse.block_diag([sparse.csc_array(part) for part in parts]))] if own else []
             columns += [sparse.csc_array(np.concatenate(common))] if shared else []
             blocks.append(sparse.csc_array(sparse.hstack(columns)))
         return sparse.csc_array(sparse.block_diag(blocks))
@@ -248,10 +247,6 @@ class FittedMatrix:
         index = np.indices(sub.type.pixels).reshape(2, -1).astype(np.float64)
         rows, columns = displacements(self.camera, sub, (index[0], index[1]))
         return gradients[0][place, None] * rows + gradients[1][place, None] * columns
-
-
-def _block_diagonal(blocks: list[FloatArray]) -> sparse.csc_array:
-    return sparse.csc_array(cast(Any, sparse).block_diag(blocks))
 
 
 def gradient(image: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:

@@ -11,22 +11,22 @@ that one sampling of the kernels serves all pixels. Light beside the target is c
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy import sparse
+from numpy.typing import NDArray
+from scipy import fft, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import shortened_repr
+from ommatid.runtime.processors import processors
 
 from ..camera import Camera
 from ..lens_type import LensType
 from ..optics.boxes import by_rows
-from .wide_correlation import WideCorrelation
 
 PIXELS_AT_ONCE = 2**14
 MOST_DEGREE = 50  # of polynomials in a file
@@ -118,7 +118,7 @@ class KernelPlaces:
 
 @dataclass(frozen=True, eq=False)
 class KernelFootprints:
-    """H of one lens type, applied from its kernels.
+    """H of one lens type by its kernels.
 
     kernels : (S, W, W), the mean kernel first;  coefficients : (S, P) of their polynomials, of `degree`
     error_kernels, error_coefficients : (E, W, W), (q, E, P): directions of the error of H, each of variance 1
@@ -146,15 +146,6 @@ class KernelFootprints:
         """The same H, taken for exact."""
         return replace(self, error_coefficients=self.error_coefficients[:0])
 
-    @property
-    def entries(self) -> int:
-        """Number of entries of H, if it were stored."""
-        tall, wide = (
-            int((np.minimum(start + self.places.width, size) - np.maximum(start, 0)).sum())
-            for start, size in zip(self.places.starts, self.places.camera.shape, strict=True)
-        )
-        return tall * wide
-
     @cached_property
     def _shape(self) -> tuple[int, int, int, int]:
         return (*self.places.lens_type.array, *self.places.lens_type.pixels)
@@ -171,17 +162,15 @@ class KernelFootprints:
         lines = down.astype(np.float64), across.astype(np.float64)
         return np.ascontiguousarray(kernels), weights, *lines, order, top, left, columns - left
 
-    def forward(self, image: FloatArray) -> FloatArray:
-        """H f: (N,) or (rows, columns) to (measurements of the type,)."""
-        return self._correlate(image, self.kernels, self.coefficients)
-
     def _correlate(self, image: FloatArray, kernels: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Return what kernels with these coefficients read of an image: (measurements of the type,)."""
         from .correlation_loops import correlate  # pyright: ignore[reportUnknownVariableType]
 
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.places.camera.shape)
+        tables = self._tables(kernels, coefficients)
         if self.places.width >= WIDE:
-            return self._arranged(self._wide(kernels, coefficients).forward(grid))
-        tables, out = self._tables(kernels, coefficients), np.empty(self._shape)
+            return self._arranged(self._transformed(grid, *tables[:4]))
+        out = np.empty(self._shape)
 
         def work(first: int, last: int) -> None:
             correlate(grid, *tables, out, first, last)
@@ -189,26 +178,24 @@ class KernelFootprints:
         by_rows(self.places.starts[0].size, work)
         return out.ravel()
 
-    def adjoint(self, readings: FloatArray, out: FloatArray) -> None:
-        """Add H^T g to `out`: (measurements of the type,) to (rows, columns)."""
-        from .correlation_loops import spread  # pyright: ignore[reportUnknownVariableType]
+    def _transformed(
+        self, image: FloatArray, kernels: FloatArray, weights: FloatArray, down: FloatArray, across: FloatArray
+    ) -> FloatArray:
+        """Return the sums of `_correlate` by Fourier transforms: (sensor rows, sensor columns).
 
-        source = np.ascontiguousarray(readings, dtype=np.float64).reshape(self._shape)
-        if self.places.width >= WIDE:
-            lines = source.swapaxes(1, 2).reshape(tuple(start.size for start in self.places.starts))
-            out += self._wide(self.kernels, self.coefficients).adjoint(lines)
-            return
-        tables = self._tables(self.kernels, self.coefficients)
-
-        def work(first: int, last: int) -> None:
-            spread(source, *tables, out, first, last)
-
-        by_rows(out.shape[0], work)
-
-    def _wide(self, kernels: FloatArray, coefficients: FloatArray) -> WideCorrelation:
-        _, weights, down, across, *_ = self._tables(kernels, coefficients)
-        shares: list[tuple[FloatArray, FloatArray]] = [(down @ weight, across) for weight in weights]
-        return WideCorrelation(self.places.camera.shape, kernels, *self.places.starts, shares)
+        weights : (S, P, P) of products of polynomials down and across, (sensor rows, P) and (sensor columns, P)
+        """
+        wide = self.places.width
+        rows, columns = (fft.next_fast_len(size + wide - 1, real=True) for size in self.places.camera.shape)
+        seen = _spectrum(image, (rows, columns))
+        top, left = self.places.starts
+        places = np.ix_(top % rows, left % columns)
+        out: FloatArray = np.zeros((top.size, left.size))
+        for kernel, weight in zip(kernels, weights, strict=True):
+            product = seen * np.conj(_spectrum(kernel, (rows, columns)))
+            every = fft.irfft2(product, (rows, columns), workers=processors(), overwrite_x=True)
+            out += every[places] * ((down @ weight) @ across.T)
+        return out
 
     def _arranged(self, lines: FloatArray) -> FloatArray:
         """Return readings, (sensor rows, sensor columns), in the order of measurements."""
@@ -243,36 +230,6 @@ class KernelFootprints:
             columns[:, number] = self._correlate(image, self.error_kernels, coefficients)
         return sparse.csc_array(columns)
 
-    def entry_deviation(self, pixels: IntArray) -> FloatArray:
-        """Return standard deviations of the entries of some pixels, within the error's directions: (n, W, W)."""
-        squares = np.zeros((pixels.size, self.places.width, self.places.width))
-        for coefficients in self.error_coefficients:
-            squares += np.square(self._values(pixels, self.error_kernels, coefficients))
-        return np.sqrt(squares)
-
-    def signature(self, rows: slice, columns: slice) -> Hashable:
-        """A key that is equal for two windows only if their submatrices are equal."""
-        return rows.start, columns.start
-
-    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
-        """Indices of the type's measurements that see nothing outside a window of f: (m,)."""
-        lit: list[IntArray] = []
-        for start, window, size in zip(self.places.starts, (rows, columns), self.places.camera.shape, strict=True):
-            first, last = np.maximum(start, 0), np.minimum(start + self.places.width, size)
-            lit.append(np.flatnonzero((first >= window.start) & (last <= window.stop)))
-        k, i = np.divmod(lit[0], self._shape[2])
-        l, j = np.divmod(lit[1], self._shape[3])  # noqa: E741
-        pixels = ((k[:, None] * self._shape[1] + l) * self._shape[2] + i[:, None]) * self._shape[3] + j
-        return np.sort(pixels.ravel())
-
-    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
-        """H from the window to the measurements inside it: (m, pixels of the window)."""
-        inside = self.rows(self.measurements_inside(rows, columns))
-        row, column = np.divmod(inside.indices, self.places.camera.columns)
-        shape = rows.stop - rows.start, columns.stop - columns.start
-        texels = (row - rows.start) * shape[1] + column - columns.start
-        return sparse.csr_array((inside.data, texels, inside.indptr), shape=(inside.shape[0], shape[0] * shape[1]))
-
     @property
     def description(self) -> dict[str, Any]:
         """The numbers that a file holds beside `arrays`, in JSON's types."""
@@ -289,6 +246,10 @@ class KernelFootprints:
             "error_kernels": self.error_kernels,
             "error_coefficients": self.error_coefficients,
         }
+
+
+def _spectrum(image: FloatArray, padded: tuple[int, int]) -> NDArray[np.complex128]:
+    return fft.rfft2(image, padded, workers=processors())
 
 
 def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, FloatArray]) -> KernelFootprints:

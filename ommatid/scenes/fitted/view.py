@@ -4,11 +4,14 @@ The numbers, in this order: the shift of the middle of its view, in pixels of f 
 (`column`), from its design; the relative error of its `magnification`; its `rotation` about the axis in radians, as in
 `pose.Misalignment`; and `k1` of its distortion. k2 is as designed. A view grows as its lens comes nearer to the sensor,
 and turns with the sensor.
+
+H of box footprints is applied without being stored, however their views are displaced and magnified.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import hypot, pi
 
 import numpy as np
@@ -17,7 +20,8 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray
 
 from ..camera import Camera
-from ..lens_type import LensOptics, SubImager
+from ..lens_type import LensOptics, LensType, SubImager
+from ..optics.boxes import Box, BoxAxis, BoxFootprints, designed_box
 from ..pose import Misalignment, pose_of
 
 UNITS = {
@@ -112,3 +116,59 @@ def scales(camera: Camera, sub: SubImager) -> FloatArray:
     furthest = half + aside / camera.target_pitch
     corner = camera.half_diagonal / camera.target_pitch
     return np.array([1.0, 1.0, 1 / half, 1 / half, corner**2 / furthest**3])
+
+
+def real_overlap(ratio: float, pixels: int, start: float, size: int) -> sparse.csr_array:
+    """Shares of `size` unit cells in `pixels` adjacent intervals of length `ratio` from `start` on: (pixels, size).
+
+    Every interval has an entry, 0 where it lies outside all cells.
+    """
+    lower = start + ratio * np.arange(pixels)
+    first = np.clip(np.floor(lower), 0, size - 1).astype(np.int64)
+    cells = first[:, None] + np.arange(int(np.ceil(ratio)) + 1)
+    shared = np.minimum((lower + ratio)[:, None], cells + 1.0) - np.maximum(lower[:, None], cells)
+    shared = np.where(cells < size, np.maximum(shared, 0.0), 0.0)
+    kept = shared > 0
+    kept[:, 0] = True
+    rows = np.broadcast_to(np.arange(pixels)[:, None], cells.shape)[kept]
+    return sparse.csr_array((shared[kept] / ratio, (rows, cells[kept])), shape=(pixels, size))
+
+
+def real_box(shape: tuple[int, int], sub: SubImager, numbers: FloatArray) -> Box:
+    """H of a sub-imager whose view has these numbers, (5,), of which it takes shift and magnification."""
+    ratio = float(sub.type.ratio) / (1 + float(numbers[MAGNIFICATION]))
+    middle = sub.type.middle(sub.window)
+    alone = replace(sub.type, array=(1, 1), steered=())
+    axes = [
+        BoxAxis(real_overlap(ratio, pixels, centre + float(numbers[number]) - ratio * pixels / 2, size))
+        for pixels, centre, number, size in zip(sub.type.pixels, middle, (ROW, COLUMN), shape, strict=True)
+    ]
+    return Box(alone, *axes)
+
+
+@dataclass(frozen=True)
+class RealBoxes(BoxFootprints):
+    """H of sub-imagers of which some have displaced views.
+
+    numbers : (sub-imagers, 5), of `view`;  moved : lens types whose sub-imagers are not where the design has them
+    """
+
+    numbers: FloatArray
+    moved: tuple[str, ...]
+
+    @cached_property
+    def boxes(self) -> tuple[Box, ...]:
+        """H of each lens type as designed, and of each sub-imager of the others."""
+        boxes: list[Box] = []
+        subs = iter(zip(self.camera.sub_imagers, self.numbers, strict=True))
+        for lens_type in self.camera.types:
+            own = [next(subs) for _ in range(lens_type.count)]
+            if lens_type.name in self.moved:
+                boxes += [real_box(self.camera.shape, sub, numbers) for sub, numbers in own]
+            else:
+                boxes += _designed(self.camera, lens_type)
+        return tuple(boxes)
+
+
+def _designed(camera: Camera, lens_type: LensType) -> list[Box]:
+    return [designed_box(camera.shape, part) for part in lens_type.on_grids]

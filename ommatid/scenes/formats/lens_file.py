@@ -2,7 +2,7 @@
 
 Three formats are read. A TOML file holds the key of a scene file, `surfaces = [{radius = "1 mm", thickness = "0.5 mm",
 glass = "N-BK7", semi_diameter = "0.2 mm"}, ...]`, and optionally a `title`. A file .zmx is a sequential lens of Zemax
-(`ommatid.scenes.zemax.zmx`). Any other file is read as the text of PBRT's realistic camera: rows of radius, thickness,
+(`.zemax`). Any other file is read as the text of PBRT's realistic camera: rows of radius, thickness,
 index of refraction and diameter, in millimetres, with comments after a #; a single number in the first row is the focal
 length. PBRT's radii have the sign used here, positive if the centre of curvature lies towards the film. Its index 0 is
 air; its last thickness, to the film, is ignored, because the magnification determines the distance of the sensor; a
@@ -25,8 +25,7 @@ from ..tables import glass, toml
 from ..tables.camera import MOST_SURFACES, SURFACES, CameraTable, Surface
 from ..tables.messages import explain
 from ..tables.table import Table
-from ..zemax.agf import Catalogue, read_catalogue
-from ..zemax.zmx import read_zmx
+from .zemax import Catalogue, read_catalogue, read_zmx
 
 LARGEST = 10**6  # bytes
 COLUMNS = "radius, thickness, index of refraction, diameter"

@@ -4,26 +4,106 @@ A mosaic is a picture of the whole flat sensor, seen from behind the camera look
 towards -x, its rows towards -y, and its middle is the camera's axis (0, 0) unless an `origin` is given. A lens rotates
 its image by 180 degrees, so that sub-images lie upside down in a mosaic and are rotated when they are cut out.
 Pictures of single sub-imagers are in the order of measurements, and upright by default.
+
+They are imported as a stack, which is reconstructed like a rendered one.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.input_files import open_input
+from ommatid.runtime.files import fingerprint
+from ommatid.runtime.input_files import check_regular, open_input
+from ommatid.runtime.versions import versions
 
 from ..camera import Camera
 from ..constants import WHITE
-from ..formats.picture import grey
-from .frame_files import FrameNotes, files_in, pictures_of, stored_pictures
+from ..formats.picture import grey, notes_of
+from ..formats.picture_file import read_frames_of
+from ..formats.stored_picture import StoredPicture
+from ..recording import Recording
+from ..setup import Setup
+from ..stack import Stack, stack_from_recording
+from ..tables.sensor import SensorTable
+
+SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy")
+FLOATING = "floating-point"
+
+
+@dataclass
+class FrameNotes:
+    """What is lost or changed when frames are read, and the types of their numbers.
+
+    sentences : of the first file of images, of dark and of flat frames;  types : kinds of frames by type
+    """
+
+    sentences: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    types: dict[str, str] = field(default_factory=dict[str, str])
+
+    def add(self, path: Path, stored: StoredPicture, what: str) -> None:
+        """Note one picture."""
+        self.sentences.setdefault(what, notes_of(str(path), stored))
+        dtype = stored.pixels.dtype
+        bits = 8 * dtype.itemsize if stored.bits is None else stored.bits
+        self.types.setdefault(FLOATING if dtype.kind == "f" else f"{bits}-bit", what)
+
+    def describe(self) -> list[str]:
+        """Return a sentence each."""
+        sentences = [sentence for of_kind in self.sentences.values() for sentence in of_kind]
+        whole = [f"{words} numbers ({what})" for words, what in self.types.items() if words != FLOATING]
+        if len(whole) > 1:
+            sentences.append(
+                f"frames have {' and '.join(whole)}, which are taken as they are: record all of them with the same bits"
+            )
+        return sentences
+
+
+def files_in(path: Path) -> list[Path]:
+    """The file itself, or the pictures in a folder sorted by name. Raises InputError if there is none."""
+    if not path.is_dir():
+        return [path]
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
+    if not files:
+        raise InputError(f"{path}: expected a folder of PNG, TIFF, EXR or NPY files, got none of them in it")
+    return files
+
+
+def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
+    """The numbers of the pictures in a file: a single one, or all of a (count, rows, columns) array or of all pages.
+
+    Raises InputError if there is none.
+    """
+    return [stored.pixels for stored in stored_pictures(path, what)]
+
+
+def stored_pictures(path: Path, what: str) -> list[StoredPicture]:
+    """The pictures in a file, with what is lost when they are read. Raises InputError if there is none."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: expected {what} as PNG, TIFF, EXR or NPY files, whose numbers are the sensor's")
+    try:
+        check_regular(path)
+    except OSError as error:
+        raise InputError(f"{path}: there is no such file among the {what}") from error
+    pictures = read_frames_of(path, what)
+    for stored in pictures:
+        if stored.pixels.dtype.kind not in "uif":
+            raise InputError(
+                f"{path}: expected whole or floating-point numbers, got {stored.pixels.dtype}, {stored.pixels.shape}"
+            )
+    if not pictures:
+        raise InputError(f"{path}: expected {what}, got a file without pictures")
+    return pictures
+
 
 TIE = 1e-6  # sensor pixels, rounding error of a position half way between two pixels
 DARK, FLAT = "dark frames", "flat frames"
@@ -249,3 +329,52 @@ def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:
 def _sha256(path: Path) -> str:
     with open_input(path) as stream:
         return hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
+
+
+def import_stack(setup: Setup, images: Sequence[Path], settings: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:
+    """Read recorded images as a stack; also return the frames.
+
+    images : one mosaic, or one picture per sub-imager in the order of measurements
+    The stack's variance, which is that of a rendering, is 0; dead pixels are NaN. Raises InputError for images that do
+    not fit the camera.
+    """
+    camera, start = setup.camera, perf_counter()
+    frames = read_frames(camera, images, settings, mosaics=False)
+    made_from = {"camera": camera.describe(), "bench": settings.describe(), "source": frames.sources}
+    record = {
+        "fingerprint": fingerprint(made_from),
+        "method": "imported",
+        "flat": frames.flat is not None,
+        "source": frames.sources,
+        "seconds": perf_counter() - start,
+        "versions": versions("scikit-image", "OpenEXR"),
+    }
+    stored, zeros = setup.resolved, np.zeros(camera.measurements)
+    if stored.sensor is None:
+        return Stack(stored, camera, _as_float32(frames.values()[0]), zeros, record), frames
+    recording = _recording(stored.source, stored.sensor, frames)
+    stored = stored.model_copy(update={"sensor": recording.sensor})
+    return stack_from_recording(stored, camera, recording, zeros, record), frames
+
+
+def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Recording:
+    """The recording of unscaled digital numbers.
+
+    A single dark or flat frame is taken for the mean of `sensor.frames`; of several, their number is used instead.
+    """
+    if frames.dark is None or frames.flat is None:
+        raise InputError(
+            f"{source}: a [sensor] needs dark and flat frames to convert its readings; pass them with --dark and"
+            " --flat, or remove [sensor]"
+        )
+    if frames.averaged > 1:
+        sensor = sensor.model_copy(update={"frames": frames.averaged})
+    digital, dark, flat = (_as_float32(values) for values in (frames.numbers[0], frames.dark, frames.flat))
+    return Recording(sensor, digital, dark, flat, np.full(digital.size, frames.settings.flat_value))
+
+
+def _as_float32(values: FloatArray) -> FloatArray:
+    """Values rounded to float32, as the file stores them; NaN beyond its range, which marks dead pixels."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = values.astype(np.float32).astype(np.float64)
+    return np.where(np.isinf(rounded), np.nan, rounded)

@@ -8,8 +8,11 @@ sensor pixel near to two of them is assigned to the nearer one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 
@@ -17,19 +20,198 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import fingerprint
+from ommatid.runtime.input_files import read_text
 from ommatid.runtime.versions import versions
 
 from ..camera import Camera
 from ..constants import WHITE
+from ..lens_type import LensType
 from ..model import RECORDED, Model
 from ..scene import Scene
 from ..setup import Setup
-from .assignment import FootprintAssignment, unrecorded
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
 from .photon_transfer import background, photon_transfer, rounding
-from .source_positions import positions_by_rows, read_positions
+
+TIE = 1e-9  # pixels of f, below which a distance to the edge of a footprint counts as 0
+
+
+@dataclass(frozen=True)
+class FootprintInterval:
+    """Footprints of a type's (sub-imagers x pixels) along one axis: `middle`, (S,), and `half` their length, in f."""
+
+    middle: FloatArray
+    half: float
+
+    def near(self, position: int, margin: float) -> tuple[IntArray, FloatArray]:
+        """Indices of the intervals within `margin` of pixel `position` of f, and the distances of their middles."""
+        distance = np.abs(self.middle - (position + 0.5))
+        near = np.flatnonzero(distance < self.half + margin + 0.5 - TIE)
+        return near, distance[near]
+
+
+@dataclass(frozen=True)
+class FootprintAssignment:
+    """Footprints of all sensor pixels, widened by a `margin` in pixels of f."""
+
+    camera: Camera
+    margin: float
+
+    @cached_property
+    def _axes(self) -> list[tuple[FootprintInterval, FootprintInterval]]:
+        return [(_interval(lens_type, 0), _interval(lens_type, 1)) for lens_type in self.camera.on_grids.types]
+
+    def reached(self, row: int, column: int) -> tuple[IntArray, FloatArray]:
+        """Sensor pixels that a source may reach, and the distances of their footprints: (n,) each.
+
+        The distance is the larger one along rows and columns, in pixels of f, minus half a footprint.
+        """
+        pixels: list[IntArray] = []
+        distances: list[FloatArray] = []
+        for lens_type, first, (down, across) in zip(
+            self.camera.on_grids.types, self.camera.on_grids.type_slices(), self._axes, strict=True
+        ):
+            (rows, row_distance), (columns, column_distance) = (
+                down.near(row, self.margin),
+                across.near(column, self.margin),
+            )
+            k, i = np.divmod(rows, lens_type.pixels[0])
+            l, j = np.divmod(columns, lens_type.pixels[1])  # noqa: E741
+            pixel = ((k[:, None] * lens_type.array[1] + l) * lens_type.pixels[0] + i[:, None]) * lens_type.pixels[1] + j
+            pixels.append(first.start + pixel.ravel())
+            distances.append(np.maximum(row_distance[:, None], column_distance).ravel() - down.half)
+        return np.concatenate(pixels), np.concatenate(distances)
+
+    def nearest_sources(self, positions: IntArray, file: Path) -> tuple[IntArray, IntArray]:
+        """Sensor pixels that any source of one exposure may reach, and the pixel of f of the nearest: (n,) each.
+
+        positions : (sources, 2) rows and columns of f
+        Raises InputError if two sources lie in the footprint of one sensor pixel.
+        """
+        reached = [self.reached(row, column) for row, column in positions.tolist()]
+        pixel = np.concatenate([pixels for pixels, _ in reached])
+        distance = np.concatenate([distances for _, distances in reached])
+        source = np.repeat(np.arange(len(reached)), [pixels.size for pixels, _ in reached])
+        order = np.lexsort((distance, pixel))
+        pixel, distance, source = pixel[order], distance[order], source[order]
+        repeated = pixel[1:] == pixel[:-1]
+        both_inside = repeated & (distance[1:] < 0.5 - TIE)  # the source before is nearer, so it is inside too
+        if both_inside.any():
+            first = int(np.flatnonzero(both_inside)[0])
+            nearer, farther = (tuple(positions[source[first + step]].tolist()) for step in (0, 1))
+            raise InputError(
+                f"{file}: the points at {nearer} and {farther}, row and column of f, lie in the footprint of one sensor"
+                " pixel; record them in two images"
+            )
+        nearest = np.concatenate([[True], ~repeated])
+        unknown = positions[:, 0] * self.camera.columns + positions[:, 1]
+        return pixel[nearest], unknown[source[nearest]]
+
+
+def _interval(lens_type: LensType, axis: int) -> FootprintInterval:
+    """The footprints of a lens type along rows (axis 0) or columns (1) of f."""
+    starts = [float(start) for start in lens_type.starts(axis)]
+    ratio = float(lens_type.ratio)
+    middles = np.array(starts)[:, None] + ratio * (np.arange(lens_type.pixels[axis], dtype=np.float64) + 0.5)
+    return FootprintInterval(np.asarray(middles.ravel(), dtype=np.float64), ratio / 2)
+
+
+def unrecorded(camera: Camera, positions: IntArray) -> IntArray:
+    """Indices of the pixels of f that lie in some footprint but are not in `positions`, (n, 2) rows and columns."""
+    seen = np.zeros(camera.shape, dtype=bool)
+    for lens_type in camera.on_grids.types:
+        down, across = _interval(lens_type, 0), _interval(lens_type, 1)
+        rows = [bool(down.near(row, 0.0)[0].size) for row in range(camera.rows)]
+        columns = [bool(across.near(column, 0.0)[0].size) for column in range(camera.columns)]
+        seen |= np.outer(rows, columns)
+    seen[positions[:, 0], positions[:, 1]] = False
+    return np.flatnonzero(seen)
+
+
+LONGEST = 20  # characters of a number
+COLUMNS = ("image", "row", "column")
+
+
+def positions_by_rows(camera: Camera, files: Sequence[Path]) -> list[IntArray]:
+    """Return the positions, (1, 2) each, of a source that scans f row by row, once or several times."""
+    count = len(files)
+    if count == 0 or count % camera.unknowns:
+        raise InputError(
+            f"expected an image for each of the {camera.unknowns} pixels of f, once or several times, got {count}; give"
+            " the positions of the points with --places"
+        )
+    rows, columns = np.divmod(np.arange(count) % camera.unknowns, camera.columns)
+    return list(np.stack([rows, columns], axis=1)[:, None, :])
+
+
+def read_positions(path: Path, camera: Camera, files: Sequence[Path]) -> list[IntArray]:
+    """Row and column of f of every source of each exposure, (sources, 2) each, from a CSV file.
+
+    Its columns are image, row and column; an image is given by its file name, or by its number from 0.
+    Raises InputError, naming the line, for a position that is damaged, outside f, or given twice.
+    """
+    positions: list[dict[tuple[int, int], None]] = [{} for _ in files]  # in order, as a set is not
+    for number, line in _lines(path):
+        where = f"{path}: line {number}"
+        image = _image(line["image"], files, where)
+        row, column = (_integer(line[name], name, where) for name in ("row", "column"))
+        if not (0 <= row < camera.rows and 0 <= column < camera.columns):
+            raise InputError(
+                f"{where}: row {row}, column {column} lies outside f of {camera.rows} x {camera.columns} pixels, which"
+                " are counted from 0"
+            )
+        if (row, column) in positions[image]:
+            raise InputError(f"{where}: row {row}, column {column} is given twice for one image; remove one of them")
+        positions[image][row, column] = None
+    for file, of_file in zip(files, positions, strict=True):
+        if not of_file:
+            raise InputError(f"{path}: has no point of {file}; add its position, or leave the image out")
+    return [np.array([*of_file], dtype=np.int64) for of_file in positions]
+
+
+def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield the lines with their numbers, one by one: a file may have millions of them before a wrong one."""
+    try:
+        reader = csv.DictReader(io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), skipinitialspace=True)
+        header = [name.strip() for name in reader.fieldnames or ()]
+        reader.fieldnames = header
+        if not set(COLUMNS) <= set(header):
+            given = shortened(",".join(header))
+            raise InputError(f"{path}: expected the columns image,row,column in its first line, got '{given}'")
+        for line in reader:
+            if any(line[name] is None for name in COLUMNS):
+                raise InputError(f"{path}: line {reader.line_num}: expected an image, a row and a column, got fewer")
+            yield reader.line_num, line
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a CSV file in UTF-8, got other bytes at {error.start}") from error
+    except (OSError, csv.Error) as error:
+        reason = shortened(str(error))
+        raise InputError(f"{path}: could not be read as a CSV file of positions ({reason})") from error
+
+
+def _image(text: str, files: Sequence[Path], where: str) -> int:
+    name = text.strip()
+    if name.isdecimal() and len(name) <= LONGEST and int(name) < len(files):
+        return int(name)
+    matches = [index for index, file in enumerate(files) if name in (str(file), file.name)]
+    if len(matches) == 1:
+        return matches[0]
+    reason = f"{len(matches)} images have that name" if matches else "no image has that name"
+    raise InputError(
+        f"{where}: expected an image by its file's name or by its number from 0 to {len(files) - 1}, got"
+        f" '{shortened(name)}'; {reason}"
+    )
+
+
+def _integer(text: str, name: str, where: str) -> int:
+    try:
+        if len(text) > LONGEST:
+            raise ValueError
+        return int(text)
+    except ValueError as error:
+        raise InputError(f"{where}: expected a whole number as its {name}, got '{shortened(text)}'") from error
+
 
 MARGIN = 2.0  # pixels of f around an ideal footprint
 CHANCE = 0.01  # probability that any noise beyond all footprints counts as light

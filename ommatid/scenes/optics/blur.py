@@ -31,9 +31,8 @@ from ommatid.runtime.memory import check_memory
 
 from ..camera import Camera
 from ..lens_type import LensType
-from .blur_moments import moments, slopes
 from .diffraction import MOST_WAVES, Pattern, end_of, pattern
-from .radial_density import RadialDensity, disk_density, disk_slant
+from .radial_density import RadialDensity, disk_density, disk_slant, moments, slopes
 
 MOST_REACH = 1000  # pixels of f
 MOST_WEIGHT = 1.0  # of f/0.5; beyond, the first order in the height of a pixel does not describe the cos^4 law

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_
 from ommatid.runtime.errors import shortened_repr
 
 from ..geometry.quantities import FieldOfView, FNumber, SensorSize
-from ..zemax.dispersion import Dispersion
+from ..optics.dispersion import Dispersion
 from .table import Table, allow_absent, at_most
 from .units import (
     Angle,

@@ -17,7 +17,7 @@ import difflib
 from ommatid.runtime.errors import InputError, shortened
 
 from ..constants import GREEN
-from ..zemax.dispersion import Dispersion
+from ..optics.dispersion import Dispersion
 from .camera import Surface
 
 AIR = "air"

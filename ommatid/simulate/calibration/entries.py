@@ -13,8 +13,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.fitted.fitted_model import fitted_model
-from ommatid.scenes.model import Model
+from ommatid.scenes.model import Model, fitted_model
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 

@@ -19,7 +19,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import write_truth
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.samplers import fitting
 from .variant import activate

@@ -17,9 +17,9 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.layout.pixel_places import PixelPlaces
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.pose import PixelPlaces
+from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.samplers import RELATED_DRAWS, fitting
 from .draws import Grid, ReseededSampler, SobolDraws

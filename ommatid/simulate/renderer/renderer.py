@@ -22,7 +22,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import ceil, inf, isqrt, log
 
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.tables.sampling import Sampler
+from ommatid.scenes.tables.estimation import Sampler
 
 RELATED_DRAWS: tuple[Sampler, ...] = ("stratified", "ldsampler")  # successive draws of a ray are far from independent
 STRATIFIED, INDEPENDENT = 1.5, 1.0  # exponents of the fall of a variance with samples, before it is measured

@@ -20,9 +20,9 @@ from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views
-from ommatid.scenes.fitted.fitted_model import MeasuredRows
 from ommatid.scenes.fitted.view import COUNT, UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
+from ommatid.scenes.model import MeasuredRows
 
 from ..point_sources import Responses, Subsets
 from .chart import ChartRows, chart_of, chart_rows

@@ -1,17 +1,25 @@
-"""Sequential lens files of Zemax (.zmx), from the object to the image, which is the order of a scene file, too.
+"""Files of Zemax: sequential lens files (.zmx) and glass catalogues (AGF), as glass makers publish them.
 
-Spheres, conics and even aspheres are read (STANDARD, EVENASPH), with curvature, thickness, semi-diameter, conic and
-glass. Curvatures have the sign used here, positive if the centre lies towards the image. The object, the image and flat
-surfaces without glass on either side are left out, unless they are the stop. The distance to the image is ignored,
-because the magnification determines it. So are wavelengths, fields, the system aperture (the stop is as wide as its
-semi-diameter) and everything else that is no surface.
+Lens files go from the object to the image, which is the order of a scene file, too. Spheres, conics and even aspheres
+are read (STANDARD, EVENASPH), with curvature, thickness, semi-diameter, conic and glass. Curvatures have the sign used
+here, positive if the centre lies towards the image. The object, the image and flat surfaces without glass on either
+side are left out, unless they are the stop. The distance to the image is ignored, because the magnification determines
+it. So are wavelengths, fields, the system aperture (the stop is as wide as its semi-diameter) and everything else that
+is no surface.
 
 A glass without a name, by its index nd and Abbe number vd (a "model" glass), has the index A + B / w^2 with that nd and
 vd, from 400 to 700 nm; it differs from real glasses of the same nd and vd by some 1e-4 at 550 nm.
+
+A glass of a catalogue begins with a line `NM name formula ...`; its line `CD` holds the coefficients of the formula,
+and `LD` the shortest and the longest wavelength in micrometres. All other lines are ignored. A glass is checked when it
+is used, so that a catalogue may hold glasses that cannot be read. Files are in UTF-16, UTF-8 or Latin-1, as programs of
+several decades wrote them.
 """
 
 from __future__ import annotations
 
+import codecs
+import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import inf
@@ -21,10 +29,102 @@ from typing import Any
 from pydantic import ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.input_files import read_bytes
 
+from ..optics.dispersion import COEFFICIENTS, Dispersion
 from ..tables.camera import MOST_SURFACES, Surface
 from ..tables.messages import explain
-from .text import number, read_text
+
+LARGEST = 2**24  # bytes; the largest catalogues of glass makers have one million
+EXTREME = 1e9  # largest number
+
+
+def read_text(path: Path, kind: str) -> str:
+    """Return the text of a file, such as a "lens file". Raises InputError."""
+    try:
+        data = read_bytes(path, LARGEST)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such {kind}; expected one beside the scene file") from error
+    except OSError as error:
+        raise InputError(f"{path}: could not be read as a {kind} ({error.strerror or error})") from error
+    try:
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return data.decode("utf-16")
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise InputError(f"{path}: could not be read as a {kind} ({error})") from error
+        return data.decode("latin-1")
+
+
+def number(word: str, where: str, what: str) -> float:
+    """Convert a word of a file to a number. Raises InputError that begins with `where`."""
+    try:
+        value = float(word.replace(",", "."))  # some programs write the comma of their language
+    except ValueError:
+        value = float("nan")
+    if not abs(value) <= EXTREME:
+        raise InputError(f"{where}: expected {what}, a number of at most {EXTREME:g}, got '{shortened(word)}'")
+    return value
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """A glass catalogue: for each glass, by its name, the number of its line NM, and the words of NM, CD and LD."""
+
+    path: Path
+    entries: dict[str, tuple[int, dict[str, list[str]]]]
+
+    def find(self, name: str) -> str | None:
+        """Return the catalogue's own spelling of a name, None if it has no such glass."""
+        if name in self.entries:
+            return name
+        folded = {other.casefold(): other for other in reversed(self.entries)}
+        return folded.get(name.casefold())
+
+    def nearest(self, name: str) -> str | None:
+        """Return the name of a glass of the catalogue that resembles `name`, None if none does."""
+        folded = {other.casefold(): other for other in reversed(self.entries)}
+        near = difflib.get_close_matches(name.casefold()[:80], folded, n=1)
+        return folded[near[0]] if near else None
+
+    def dispersion(self, name: str) -> Dispersion:
+        """Return the dispersion of a glass of the catalogue. Raises InputError for a damaged entry."""
+        line, words = self.entries[name]
+        where = f"{self.path}, line {line}, glass {shortened(name)}"
+        for keyword, fewest in (("NM", 2), ("CD", 1), ("LD", 2)):
+            if len(words.get(keyword, [])) < fewest:
+                raise InputError(f"{where}: expected a line {keyword} with {fewest} values or more, got fewer")
+        formula = number(words["NM"][1], where, "the number of its formula")
+        coefficients = [number(word, where, "a coefficient") for word in words["CD"][:COEFFICIENTS]]
+        shortest, longest = (number(word, where, "a wavelength in micrometres") for word in words["LD"][:2])
+        data = {
+            "formula": int(formula),
+            "coefficients": coefficients,
+            "shortest": f"{shortest!r} um",
+            "longest": f"{longest!r} um",
+        }
+        try:
+            return Dispersion.model_validate(data)
+        except ValidationError as error:
+            raise InputError(f"{where}: {explain(error, data, Dispersion)}") from error
+
+
+def read_catalogue(path: Path) -> Catalogue:
+    """Read a glass catalogue. Raises InputError that names the file."""
+    entries: dict[str, tuple[int, dict[str, list[str]]]] = {}
+    words: dict[str, list[str]] = {}
+    for line, text in enumerate(read_text(path, "glass catalogue").splitlines(), start=1):
+        keyword, *rest = text.split(maxsplit=1) or [""]
+        if keyword == "NM" and rest:
+            words = {"NM": rest[0].split()}
+            entries.setdefault(words["NM"][0], (line, words))  # the first of two with the same name
+        elif keyword in ("CD", "LD") and rest:
+            words.setdefault(keyword, rest[0].split())
+    if not entries:
+        raise InputError(f"{path}: expected a glass catalogue (AGF) with lines 'NM name formula ...', got none")
+    return Catalogue(path, entries)
+
 
 MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0, "METER": 1000.0}
 ASPHERE = "EVENASPH"

@@ -1,1 +1,0 @@
-"""Files of Zemax: lenses, glass catalogues, and the formulas of these."""

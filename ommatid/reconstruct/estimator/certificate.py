@@ -27,7 +27,6 @@ from .error_norms import (
     NEGLIGIBLE_VARIANCE,
     Indices,
     Residuals,
-    distance_from_exact,
     infinite,
     last_digit,
     norms,
@@ -67,18 +66,11 @@ class RefinedSolution:
 
 
 def refine(
-    form: Form,
-    residuals: ExactResiduals,
-    shift: FloatArray | DoubleDouble,
-    recorded: DoubleDouble,
-    right: DoubleDouble | None = None,
+    form: Form, residuals: ExactResiduals, shift: FloatArray | DoubleDouble, recorded: DoubleDouble
 ) -> RefinedSolution:
-    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), with refinement; keep the solution of least bound.
-
-    right : the right u, (K, q), where it is known: then the bound is the distance from it
-    """
+    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), with refinement; keep the solution of least bound."""
     with np.errstate(all="ignore"):  # overflow gives a bound that fails every tolerance
-        certifier = _Certifier(form, residuals, as_exact(shift), recorded, right)
+        certifier = _Certifier(form, residuals, as_exact(shift), recorded)
         (u, multipliers), bound, first, steps = certifier.refined()
         change = relative(norms(u.high - first), norms(u.high))
     return RefinedSolution(u.high, u.low, multipliers.high, bound, change + bound, steps)
@@ -115,8 +107,6 @@ def variance_error(form: Form, residuals: ExactResiduals) -> float:
         variance = form.variance()
         if not np.isfinite(variance).all():
             return float("inf")
-        if residuals.reference is not None:
-            return distance_from_exact(variance, residuals.reference)
         pixels = sampled_pixels(variance, prior.variance)
         accurate, uncertainty = exact_variances(form, residuals, pixels)
         # A variance of 0 is right if the accurate one cannot be distinguished from 0.
@@ -139,7 +129,6 @@ class _Certifier:
     system: ExactResiduals
     shift: DoubleDouble
     recorded: DoubleDouble
-    right: DoubleDouble | None = None
 
     def refined(self) -> tuple[Solution, FloatArray, FloatArray, int]:
         """Return the best u and l, the bound on u, the first u, and the number of refinements."""
@@ -168,9 +157,6 @@ class _Certifier:
         """Return the residuals of u and l, a certain bound on the error of u relative to |u|, and an estimated one."""
         u, multipliers = solution
         residuals = self.system.residuals(u, multipliers, self.shift, self.recorded)
-        if self.right is not None:
-            bound = relative(norms((u - self.right).high), norms(self.right.high))
-            return residuals, bound, bound
         values = residuals[0].high, residuals[1].high
         rounding = self.system.rounding_errors(u.high, multipliers.high, self.shift.high, self.recorded.high)
         bound, size = self._rigorous_distance(values, rounding), norms(u.high)

@@ -12,7 +12,6 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from ..forms.form import Form
-from ..forms.multiple_precision import MultiplePrecision
 from .certificate import exact_sums, refine
 from .double_double import exact
 from .refined_form import RefinedForm
@@ -31,10 +30,8 @@ def is_stiff(form: Form) -> bool:
 def refined_solutions(form: Form, residuals: ExactResiduals, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Solve for c = `shift`, (K, q), and r = 0 with refinement: u, (K, q), and l, (M, q)."""
     zero = np.zeros((form.problem.measurements, shift.shape[1]))
-    if isinstance(form, RefinedForm | MultiplePrecision):
+    if isinstance(form, RefinedForm):
         return form.solve(shift, zero)
-    if residuals.reference is not None:
-        return residuals.reference.solve(shift, zero)
     refined = refine(form, residuals, shift, exact(zero))
     return refined.coefficients, refined.multipliers
 
@@ -45,13 +42,8 @@ def sum_variance(form: Form, weights: FloatArray, noise_variance: FloatArray) ->
     Raises InputError if the sum of squares and the quadratic form c^T u of Eq. 5 differ, or if that one is uncertain.
     """
     problem, residuals = form.problem, ExactResiduals(form.problem)
-    if residuals.reference is not None:
-        u, multipliers = residuals.reference.solve_sum(weights[:, None])
-        return float(np.square(u).sum() + noise_variance @ np.square(multipliers[:, 0]))
-    inner, shift = (
-        form.form if isinstance(form, RefinedForm) else form,
-        residuals.root_transposed(exact(weights[:, None])),
-    )
+    inner = form.form if isinstance(form, RefinedForm) else form
+    shift = residuals.root_transposed(exact(weights[:, None]))
     refined = refine(inner, residuals, shift, exact(np.zeros((problem.measurements, 1))))
     prior, squares = float(np.square(refined.coefficients).sum()), np.square(refined.multipliers[:, 0])
     variance = prior + float(noise_variance @ squares)

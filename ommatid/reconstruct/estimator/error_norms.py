@@ -7,14 +7,12 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..forms.balls import LEAST_FLOAT
-from ..forms.multiple_precision import MultiplePrecision
-
 Indices = NDArray[np.intp]
 Residuals = tuple[FloatArray, FloatArray]
 
 ALL_CHECKED = 128  # pixels, up to which every variance is checked
 SAMPLE = 16  # pixels checked beyond that
+LEAST_FLOAT = 2.0**-1074  # the smallest float64 above 0
 NEGLIGIBLE_VARIANCE = 1e-28  # relative to the prior variance: smaller posterior variances count as 0
 
 
@@ -54,12 +52,3 @@ def last_digit(variance: FloatArray) -> float:
     """Return the smallest float64 relative to the least variance above 0."""
     least = float(variance[variance > 0].min(initial=np.inf))
     return LEAST_FLOAT / least
-
-
-def distance_from_exact(variance: FloatArray, reference: MultiplePrecision) -> float:
-    """Return the largest relative difference of variances from exact ones, with the rounding errors of those."""
-    exact_ones, uncertainty = reference.variance(), reference.variance_error
-    negligible = NEGLIGIBLE_VARIANCE * reference.problem.prior.variance
-    error = np.abs(variance - exact_ones)
-    error[(variance == 0) & (error <= negligible)] = 0.0
-    return worst(relative(error, exact_ones)) + uncertainty

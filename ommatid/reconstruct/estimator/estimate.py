@@ -24,7 +24,6 @@ from ..forms.covariance import covariance
 from ..forms.dual import dual
 from ..forms.form import Form, NotSolvableError
 from ..forms.information import information
-from ..forms.multiple_precision import MultiplePrecision
 from ..forms.square_root_covariance import square_root_covariance
 from ..forms.square_root_information import square_root_information
 from ..forms.svd import svd
@@ -141,8 +140,7 @@ def _by_form_of(
     """Return the estimate by the form of another one, None where that form does not reach the tolerance by itself."""
     if before is None or before.solver.method not in FORMS:
         return None
-    reference = _exact_solution(before.residuals, recorded)
-    solver, refined = _with_estimate(before.solver, before.form, before.residuals, recorded, reference)
+    solver, refined = _with_estimate(before.solver, before.form, before.residuals, recorded)
     return (before.form, solver, refined) if _accepted(solver, tolerance, []) else None
 
 
@@ -168,7 +166,6 @@ def _first_accepted(
 ) -> tuple[Form, Solver, RefinedSolution | None]:
     problem = residuals.problem
     names, why = _candidates(problem, method)
-    reference = _exact_solution(residuals, recorded)
     tried: list[tuple[str, str]] = []
     refinable: list[Form] = []  # forms whose estimate is accurate and whose variances are not
     solver, refined = Solver("", why, 0.0, 0.0), None
@@ -178,7 +175,7 @@ def _first_accepted(
             error, rounding = variance_error(form, residuals), variance_rounding(form)
             solver = Solver(name, why, form.condition, error + rounding, tuple(tried))
             _check_rounding(error, rounding, tolerance)
-            solver, refined = _with_estimate(solver, form, residuals, recorded, reference)
+            solver, refined = _with_estimate(solver, form, residuals, recorded)
         except (NotSolvableError, np.linalg.LinAlgError) as failure:
             tried.append((name, str(failure)))
             continue
@@ -189,12 +186,7 @@ def _first_accepted(
     for form in _last_resorts(residuals, refinable) if method == "auto" else []:
         error = form.variance_error + variance_rounding(form)
         solver = Solver(form.description, why, form.condition, error, tuple(tried))
-        if isinstance(form, RefinedForm):
-            solver, refined = _with_estimate(solver, form.form, residuals, recorded, None)
-        elif reference is not None:
-            columns = reference.coefficients[:, 0], reference.multipliers[:, 0]
-            bound = float(reference.bound[0]) + estimate_rounding(form, *columns)
-            solver, refined = replace(solver, bound=bound), reference
+        solver, refined = _with_estimate(solver, form.form, residuals, recorded)
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
     if refined is not None and recorded is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND:
@@ -215,27 +207,14 @@ def _check_rounding(error: float, rounding: float, tolerance: float) -> None:
         )
 
 
-def _last_resorts(residuals: ExactResiduals, refinable: list[Form]) -> list[RefinedForm] | list[MultiplePrecision]:
-    """Return multiple precision for a small problem, else forms whose every solution is refined, most robust first."""
-    if residuals.reference is not None:
-        return [residuals.reference]
+def _last_resorts(residuals: ExactResiduals, refinable: list[Form]) -> list[RefinedForm]:
+    """Return forms whose every solution is refined, most robust first; none where a measurement has no noise.
+
+    A bound on the estimate from nearly equal rows without noise is itself an estimate, which refinement can mislead.
+    """
+    if not residuals.problem.noisy:
+        return []
     return [RefinedForm(form.problem, form.condition, form, residuals) for form in reversed(refinable)]
-
-
-def _exact_solution(residuals: ExactResiduals, recorded: FloatArray | None) -> RefinedSolution | None:
-    """Return the estimate of a small problem in multiple precision. Raises InputError for contradictions."""
-    if residuals.reference is None or recorded is None:
-        return None
-    try:
-        solution = residuals.reference.estimate(recorded)
-    except NotSolvableError as error:
-        raise InputError(f"the estimate is too sensitive: {error}; raise estimator.noise_variance") from error
-    _refuse_contradiction(solution.contradiction)
-    size = float(np.linalg.norm(solution.high))
-    uncertainty = 0.0 if solution.uncertainty == 0 else (solution.uncertainty / size if size > 0 else np.inf)
-    bound = np.array([uncertainty + EPS])
-    columns = solution.high[:, None], solution.low[:, None], solution.multipliers[:, None]
-    return RefinedSolution(*columns, bound, bound, 0)
 
 
 def _with_estimate(
@@ -243,17 +222,15 @@ def _with_estimate(
     form: Form,
     residuals: ExactResiduals,
     recorded: FloatArray | None,
-    reference: RefinedSolution | None,
 ) -> tuple[Solver, RefinedSolution | None]:
     if recorded is None:
         return solver, None
-    right = None if reference is None else DoubleDouble(reference.coefficients, reference.low)
     with np.errstate(all="ignore"):
         deviation = residuals.recorded(recorded)
-    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation, right)
-    bound = float(refined.bound[0]) + (EPS if reference is None else float(reference.bound[0]))
+    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation)
+    bound = float(refined.bound[0]) + EPS
     bound += estimate_rounding(form, refined.coefficients[:, 0], refined.multipliers[:, 0])
-    if reference is None and bound <= USEFUL_BOUND:
+    if bound <= USEFUL_BOUND:
         _check_contradictions(residuals, recorded, refined)
     return replace(solver, bound=bound, refinements=refined.steps), refined
 
@@ -270,10 +247,7 @@ def _accepted(solver: Solver, tolerance: float, tried: list[tuple[str, str]]) ->
 
 def _check_contradictions(residuals: ExactResiduals, recorded: FloatArray, refined: RefinedSolution) -> None:
     with np.errstate(all="ignore"):
-        _refuse_contradiction(residuals.contradiction(recorded, DoubleDouble(refined.coefficients, refined.low)))
-
-
-def _refuse_contradiction(misfit: float) -> None:
+        misfit = residuals.contradiction(recorded, DoubleDouble(refined.coefficients, refined.low))
     if misfit > CONTRADICTION:
         raise InputError(
             f"measurements without noise contradict one another or the prior by {misfit:.2g} of their values; set"

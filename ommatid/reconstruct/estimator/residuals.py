@@ -17,8 +17,6 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..forms.form import NotSolvableError
-from ..forms.multiple_precision import MultiplePrecision, multiple_precision
 from ..prior import Prior
 from ..problem import Problem
 from .double_double import ROUNDING, DoubleDouble, SparseRows, exact, sparse_rows
@@ -48,14 +46,6 @@ class ExactResiduals:
         """|H|, and the prior with |L|."""
         prior = self.problem.prior
         return abs(self.problem.matrix), Prior(prior.mean, np.abs(prior.root))
-
-    @cached_property
-    def reference(self) -> MultiplePrecision | None:
-        """The problem in multiple precision; None if it is not small."""
-        try:
-            return multiple_precision(self.problem)
-        except NotSolvableError:
-            return None
 
     @property
     def rounding(self) -> float:

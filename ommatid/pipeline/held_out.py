@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ommatid.reconstruct.held_out.check import check_held_out
-from ommatid.reconstruct.output.held_out_report import HeldOutReport, held_out_report
 from ommatid.reconstruct.output.result_files import with_estimator_changes
+from ommatid.reconstruct.output.run_json import HeldOutReport
 from ommatid.reconstruct.restore import check_match
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes import model_file
@@ -33,4 +33,4 @@ def check_files(
         recorded, calibrated = recorded.restrict(tuple(lenses)), calibrated.restrict(tuple(lenses))
     recorded = with_estimator_changes(recorded, list(changes), stack)
     check_match(recorded, calibrated, (stack, model))
-    return held_out_report(check_held_out(recorded, calibrated, fitted=fitted, progress=progress))
+    return check_held_out(recorded, calibrated, fitted=fitted, progress=progress)

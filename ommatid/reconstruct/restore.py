@@ -21,7 +21,6 @@ from ommatid.scenes.tables.estimation import PriorTable
 
 from .assumptions import Assumptions, assumptions_for, with_fallback
 from .detail.detailed_model import DetailedModel
-from .estimator.estimate import Solver
 from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
@@ -29,23 +28,10 @@ from .method_choice import MethodChoice
 from .methods.method import EstimationTask, Execution, MethodResult, total_variance
 from .methods.prepared import Prepared
 from .noise import Noise, UsablePixels
+from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .run_verdict import verdict_of
-from .verdict.residual_parts import ResidualPart
-from .verdict.verdict import Verdict
 
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration", "detail")
-
-
-@dataclass(frozen=True)
-class Residual:
-    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation if the noise is that.
-
-    expected : for images drawn from the prior, M - trace(A H);  deviation : upper bound of the standard deviation
-    """
-
-    chi_squared: float
-    expected: float
-    deviation: float
 
 
 @dataclass(frozen=True)
@@ -61,7 +47,7 @@ class Reconstruction:
     choice: MethodChoice
     prior: PriorTable
     trimmed_mse: float | None
-    residual: Residual | None
+    residual: ResidualReport | None
     shape: tuple[int, int]
     usable: UsablePixels
     noise: Noise
@@ -71,7 +57,7 @@ class Reconstruction:
     truth: FloatArray | None
     error: MeasuredError | None
     task: EstimationTask
-    verdict: Verdict
+    verdict: VerdictReport
 
     @property
     def estimate(self) -> FloatArray:
@@ -89,7 +75,7 @@ class Reconstruction:
         return self.result.interval
 
     @property
-    def solver(self) -> Solver:
+    def solver(self) -> SolverReport:
         """The form that ran, with the bounds on its numerical error."""
         return self.result.solver
 
@@ -205,12 +191,12 @@ def _image(truth: FloatArray, camera: Camera) -> FloatArray:
     return averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
 
 
-def _residual(whole: ResidualPart, assumed: Assumptions, degrees_of_freedom: float) -> Residual:
+def _residual(whole: ResidualPart, assumed: Assumptions, degrees_of_freedom: float) -> ResidualReport:
     """Return chi-squared beside what it would be if the noise were as expected."""
     expected = whole.prior
     if not np.allclose(total_variance(assumed.noise), assumed.method.task.expected_noise, rtol=1e-9):
         expected = max(whole.measurements - degrees_of_freedom, 0.0)
-    return Residual(whole.chi_squared, expected, (2 * expected) ** 0.5)
+    return ResidualReport(chi_squared=whole.chi_squared, expected=expected, deviation=(2 * expected) ** 0.5)
 
 
 def _spurious_information(task: EstimationTask, expected: ExpectedError) -> FloatArray:

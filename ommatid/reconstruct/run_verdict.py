@@ -16,9 +16,10 @@ from .measured_error import MeasuredError
 from .methods.method import MethodResult, is_uniform, total_variance
 from .misalignment.robust_noise import CAUSE
 from .noise import uniform
+from .output.run_json import ResidualPart, VerdictReport
 from .verdict.causes import evidence_of, without_pixels
-from .verdict.residual_parts import ResidualPart, WhitenedResidual, residual_parts
-from .verdict.verdict import ErrorCheck, Verdict, judge
+from .verdict.residual_parts import WhitenedResidual, residual_parts
+from .verdict.verdict import ErrorCheck, judge
 
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
 BEYOND = 0.1  # share of the error by the next order, likewise
@@ -32,7 +33,7 @@ def verdict_of(
     result: MethodResult,
     error: MeasuredError | None,
     spurious: FloatArray,
-) -> Verdict:
+) -> VerdictReport:
     """Return the verdict on a reconstruction.
 
     spurious : (N,) share of each pixel's apparent information that the noise of H may have produced

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ommatid.reconstruct.output.held_out_report import HeldOutEntry, HeldOutReport
+from ommatid.reconstruct.output.run_json import HeldOutEntry, HeldOutReport
 
 from .table import entry_words
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ommatid.reconstruct.output.held_out_report import HeldOutEntry, HeldOutPrior, HeldOutReport
+from ommatid.reconstruct.output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport
 
 Row = tuple[str, str]
 

@@ -11,8 +11,8 @@ error or on its variances exceeds the tolerance, the next more robust one runs. 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from math import log10
+from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from ..forms.information import information
 from ..forms.square_root_covariance import square_root_covariance
 from ..forms.square_root_information import square_root_information
 from ..forms.svd import svd
+from ..output.run_json import RejectedForm, SolverReport
 from ..problem import Problem
 from .certificate import RefinedSolution, refine, variance_error
 from .double_double import DoubleDouble
@@ -54,31 +55,6 @@ FORMS: dict[str, Callable[[Problem], Form]] = {
 
 
 @dataclass(frozen=True)
-class Solver:
-    """The form that computed an estimate, the reason for it, and its numerical error.
-
-    bound : on the error of the estimate, in `unit`; None if nothing was estimated
-    variance_bound : on the relative error of posterior variances, from a sample of pixels
-    tried : forms that were tried or skipped before, each with the reason
-    """
-
-    method: str
-    why: str
-    condition: float
-    variance_bound: float
-    tried: tuple[tuple[str, str], ...] = ()
-    bound: float | None = None
-    refinements: int = 0
-    unit: str = "standard deviation of the prior"
-
-    @property
-    def digits(self) -> float:
-        """Correct decimal digits of the estimate according to the bound."""
-        bound = self.bound if self.bound is not None else self.variance_bound
-        return -log10(max(bound, EPS)) if bound >= 0 else 0.0
-
-
-@dataclass(frozen=True)
 class Estimate:
     """The image f^, (N,), the multipliers l = Rv^-1 (g - H f^), (M,), and the form that computed them.
 
@@ -90,11 +66,11 @@ class Estimate:
     coefficients: FloatArray
     multipliers: FloatArray
     form: Form
-    solver: Solver
+    solver: SolverReport
     residuals: ExactResiduals
 
 
-def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, Solver]:
+def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, SolverReport]:
     """Return the form whose posterior variances are accurate to `tolerance`. Raises InputError if there is none."""
     form, solver, _ = _first_accepted(ExactResiduals(problem), method, tolerance, None)
     return form, solver
@@ -136,7 +112,7 @@ def estimate(
 
 def _by_form_of(
     before: Estimate | None, tolerance: float, recorded: FloatArray
-) -> tuple[Form, Solver, RefinedSolution | None] | None:
+) -> tuple[Form, SolverReport, RefinedSolution | None] | None:
     """Return the estimate by the form of another one, None where that form does not reach the tolerance by itself."""
     if before is None or before.solver.method not in FORMS:
         return None
@@ -163,21 +139,22 @@ def _candidates(problem: Problem, method: str) -> tuple[list[str], str]:
 
 def _first_accepted(
     residuals: ExactResiduals, method: str, tolerance: float, recorded: FloatArray | None
-) -> tuple[Form, Solver, RefinedSolution | None]:
+) -> tuple[Form, SolverReport, RefinedSolution | None]:
     problem = residuals.problem
     names, why = _candidates(problem, method)
-    tried: list[tuple[str, str]] = []
+    tried: list[RejectedForm] = []
     refinable: list[Form] = []  # forms whose estimate is accurate and whose variances are not
-    solver, refined = Solver("", why, 0.0, 0.0), None
+    solver: SolverReport | None = None
+    refined: RefinedSolution | None = None
     for name in names:
         try:
             form = _factorised(name, problem)
             error, rounding = variance_error(form, residuals), variance_rounding(form)
-            solver = Solver(name, why, form.condition, error + rounding, tuple(tried))
+            solver = _solver(name, why, form.condition, error + rounding, tried)
             _check_rounding(error, rounding, tolerance)
             solver, refined = _with_estimate(solver, form, residuals, recorded)
         except (NotSolvableError, np.linalg.LinAlgError) as failure:
-            tried.append((name, str(failure)))
+            tried.append(RejectedForm(method=name, why_not=str(failure)))
             continue
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
@@ -185,16 +162,31 @@ def _first_accepted(
             refinable.append(form)
     for form in _last_resorts(residuals, refinable) if method == "auto" else []:
         error = form.variance_error + variance_rounding(form)
-        solver = Solver(form.description, why, form.condition, error, tuple(tried))
+        solver = _solver(form.description, why, form.condition, error, tried)
         solver, refined = _with_estimate(solver, form.form, residuals, recorded)
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
-    if refined is not None and recorded is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND:
+    known = solver is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND
+    if refined is not None and recorded is not None and known:
         _check_contradictions(residuals, recorded, refined)
     raise InputError(
         f"no form of the estimator reaches a relative error of {tolerance:g} here ("
-        + "; ".join(f"{name}: {reason}" for name, reason in tried)
+        + "; ".join(f"{form.method}: {form.why_not}" for form in tried)
         + "); raise estimator.noise_variance or estimator.tolerance"
+    )
+
+
+def _solver(method: str, why: str, condition: float, variance_bound: float, tried: list[RejectedForm]) -> SolverReport:
+    return SolverReport(
+        way="",
+        method=method,
+        why=why,
+        condition=condition if isfinite(condition) else None,
+        bound=None,
+        unit="standard deviation of the prior",
+        variance_bound=variance_bound,
+        refinements=0,
+        tried=tuple(tried),
     )
 
 
@@ -218,11 +210,11 @@ def _last_resorts(residuals: ExactResiduals, refinable: list[Form]) -> list[Refi
 
 
 def _with_estimate(
-    solver: Solver,
+    solver: SolverReport,
     form: Form,
     residuals: ExactResiduals,
     recorded: FloatArray | None,
-) -> tuple[Solver, RefinedSolution | None]:
+) -> tuple[SolverReport, RefinedSolution | None]:
     if recorded is None:
         return solver, None
     with np.errstate(all="ignore"):
@@ -232,16 +224,16 @@ def _with_estimate(
     bound += estimate_rounding(form, refined.coefficients[:, 0], refined.multipliers[:, 0])
     if bound <= USEFUL_BOUND:
         _check_contradictions(residuals, recorded, refined)
-    return replace(solver, bound=bound, refinements=refined.steps), refined
+    return solver.model_copy(update={"bound": bound, "refinements": refined.steps}), refined
 
 
-def _accepted(solver: Solver, tolerance: float, tried: list[tuple[str, str]]) -> bool:
+def _accepted(solver: SolverReport, tolerance: float, tried: list[RejectedForm]) -> bool:
     """Return True if both bounds meet the tolerance, which NaN does not; else note the reason."""
     met = solver.variance_bound <= tolerance and (solver.bound is None or solver.bound <= tolerance)
     if not met:
         bad = not solver.variance_bound <= tolerance
         quantity, worst = ("variances are", solver.variance_bound) if bad else ("the estimate is", solver.bound)
-        tried.append((solver.method, f"{quantity} accurate to {worst:.1e} only"))
+        tried.append(RejectedForm(method=solver.method, why_not=f"{quantity} accurate to {worst:.1e} only"))
     return met
 
 

@@ -17,8 +17,8 @@ from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables import estimation
 
-from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval
+from ..output.run_json import SolverReport
 from ..prior import Prior, prior_of, spectrum_of
 from ..verdict.residual_power import ResidualPower
 from .prepared import Conditions, Prepared
@@ -135,7 +135,7 @@ class MethodResult:
 
     image: FloatArray
     multipliers: FloatArray
-    solver: Solver
+    solver: SolverReport
     expected: ExpectedError
     interval: Interval | None
     variance_of_sum: Callable[[FloatArray], float]

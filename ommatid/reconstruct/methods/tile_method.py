@@ -5,7 +5,6 @@ The error it states is that of the tiled estimate: each pixel is estimated from 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +14,8 @@ from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import digest
 from ommatid.runtime.processors import one_thread, processors
 
-from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, interval
+from ..output.run_json import SolverReport
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .iterative_operators import iterative_operators
 from .method import Method, MethodResult, PosteriorOperators, is_uniform, residual_multipliers, total_variance
@@ -188,8 +187,13 @@ class TileMethod(Method):
         return task.prior_variance_of_sum(unexplained) + float(actual @ np.square(gain))
 
 
-def _worst(solvers: list[Solver], factorisations: int, cost: str) -> Solver:
+def _worst(solvers: list[SolverReport], factorisations: int, cost: str) -> SolverReport:
     worst = max(solvers, key=lambda solver: max(solver.bound or 0.0, solver.variance_bound))
-    condition = max(solver.condition for solver in solvers)
-    why = f"each tile separately, {factorisations} factorisations{cost}"
-    return replace(worst, method=f"tiles, {worst.method}", why=why, condition=condition)
+    conditions = [solver.condition for solver in solvers if solver.condition is not None]
+    return worst.model_copy(
+        update={
+            "method": f"tiles, {worst.method}",
+            "why": f"each tile separately, {factorisations} factorisations{cost}",
+            "condition": max(conditions) if len(conditions) == len(solvers) else None,
+        }
+    )

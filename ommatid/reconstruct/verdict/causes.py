@@ -12,7 +12,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
-from .residual_parts import ResidualPart
+from ..output.run_json import ResidualPart
 
 DARK = 0.5  # share of the light of a type's other sub-imagers below which one counts as dark, and
 UNEXPLAINED = 0.8  # share of the light that the estimate predicts, since a part of the target may be dark

@@ -14,8 +14,9 @@ import numpy as np
 from scipy import optimize, special
 
 from ..expected_error import COVERAGE, Interval
+from ..output.run_json import ResidualPart, VerdictReport
 from .causes import RunEvidence, likely_causes, listed, named
-from .residual_parts import ResidualPart, sidak
+from .residual_parts import sidak
 
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
@@ -24,23 +25,6 @@ UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calib
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 MOST_NAMED = 5  # sub-imagers in one sentence
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether the error bars of a run can be trusted.
-
-    reasons : why not, empty if trusted;  passed : checks that found nothing wrong;  notes : everything else, such as
-        checks that were not possible
-    p_value : of the residual in all and by part together, None if it was not checked
-    """
-
-    trusted: bool
-    reasons: tuple[str, ...]
-    passed: tuple[str, ...]
-    notes: tuple[str, ...]
-    p_value: float | None
-    parts: tuple[ResidualPart, ...]
 
 
 @dataclass(frozen=True)
@@ -74,7 +58,7 @@ class _Findings:
     notes: list[str]
 
 
-def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -> Verdict:
+def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -> VerdictReport:
     """Return the verdict from the residual by part, none where it was not checked, and the other checks."""
     findings = _Findings([], [], [])
     if check.pixels_used:
@@ -84,9 +68,13 @@ def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -
     else:
         findings.reasons.append("no sensor pixel could be used, so this is the prior and not an image")
     p_value = sidak([part.p_value for part in parts]) if parts else None
-    trusted = not findings.reasons
-    return Verdict(
-        trusted, tuple(findings.reasons), tuple(findings.passed), tuple(findings.notes), p_value, tuple(parts)
+    return VerdictReport(
+        trusted=not findings.reasons,
+        reasons=tuple(findings.reasons),
+        passed=tuple(findings.passed),
+        notes=tuple(findings.notes),
+        p_value=p_value,
+        parts=tuple(parts),
     )
 
 

@@ -10,8 +10,8 @@ import pytest
 from scipy import sparse
 
 from ommatid.reconstruct.frame.banded_system import leaves_null_space
-from ommatid.reconstruct.gram import gram
 from ommatid.reconstruct.method_choice import choose_method
+from ommatid.reconstruct.problem import gram
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive

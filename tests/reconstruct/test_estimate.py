@@ -14,8 +14,8 @@ from scipy import sparse
 from ommatid.reconstruct.estimator.certificate import variance_error
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, estimate, factorise
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
-from ommatid.reconstruct.forms.information import information
-from ommatid.reconstruct.forms.square_root_information import square_root_information
+from ommatid.reconstruct.forms.cholesky import information
+from ommatid.reconstruct.forms.square_root import square_root_information
 from ommatid.reconstruct.prior import Prior, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray

@@ -6,13 +6,13 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from ommatid.reconstruct.forms.multiple_precision import multiple_precision
 from scipy import sparse
 
 from ommatid.reconstruct.estimator import residuals
-from ommatid.reconstruct.estimator.error_bars import bias_of, sum_variance
 from ommatid.reconstruct.estimator.estimate import estimate, factorise
+from ommatid.reconstruct.expected_error import bias_of, variance_of_sum
 from ommatid.reconstruct.forms.form import NotSolvableError
-from ommatid.reconstruct.forms.multiple_precision import multiple_precision
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.errors import InputError
@@ -118,8 +118,8 @@ def test_multiple_precision_reads_sums_and_estimates_alike() -> None:
     innovation = Fraction(2) + Fraction(noise)
     exact = Fraction(2) - Fraction(2) ** 2 / innovation
     form, _ = factorise(problem)
-    assert sum_variance(form, weights, problem.noise_variance) == pytest.approx(float(exact), rel=1e-12)
-    doubled = sum_variance(form, weights, 2 * problem.noise_variance)
+    assert variance_of_sum(form, weights, problem.noise_variance) == pytest.approx(float(exact), rel=1e-12)
+    doubled = variance_of_sum(form, weights, 2 * problem.noise_variance)
     assert doubled == pytest.approx(2 * float(exact), rel=1e-9)  # the prior's part is noise^2
     with pytest.raises(NotSolvableError, match="at most 64"):
         multiple_precision(Problem(sparse.csr_array((65, 65)), independent(0.0, 1.0, 65), np.ones(65)))
@@ -133,7 +133,7 @@ def test_error_bars_keep_their_digits_beyond_multiple_precision(noise: float) ->
     form, _ = factorise(problem, "covariance")
     posterior = noise / (1 + noise / 4)
     weights = np.full(count, 1 / count)
-    assert sum_variance(form, weights, problem.noise_variance) == pytest.approx(posterior / count, rel=1e-9)
+    assert variance_of_sum(form, weights, problem.noise_variance) == pytest.approx(posterior / count, rel=1e-9)
     difference = np.random.default_rng(0).normal(size=count)
     share = (noise / 4) / (1 + noise / 4)
     np.testing.assert_allclose(bias_of(form, difference), share * difference, rtol=1e-9)

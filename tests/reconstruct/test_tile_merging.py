@@ -11,7 +11,7 @@ from scipy import sparse
 from ommatid.reconstruct.estimator.certificate import exact_variances
 from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
-from ommatid.reconstruct.forms.sorted_qr import Indices
+from ommatid.reconstruct.forms.square_root import Indices
 from ommatid.reconstruct.methods.tile_merging import (
     Posterior,
     disjoint_tiles,

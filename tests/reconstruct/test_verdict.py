@@ -14,7 +14,7 @@ from scipy import stats
 
 from ommatid.reconstruct.estimator.estimate import factorise
 from ommatid.reconstruct.expected_error import Interval, expected_error, interval
-from ommatid.reconstruct.forms.information import information
+from ommatid.reconstruct.forms.cholesky import information
 from ommatid.reconstruct.methods.dense_method import DRAWS, residual_power
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore

@@ -25,7 +25,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .local import WINDOW, local_interpolation, unexplained_variance
+from .local import NEIGHBOURS, local_interpolation, unexplained_variance
 from .world_prior import WorldPrior, averaging, repetition
 
 MAX_WORLD = 32_000  # pixels of the world, and
@@ -171,7 +171,7 @@ def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
     world = WorldPrior.of(prior, camera.shape, camera.target_pitch, camera.detail)
     if model.unknowns <= MAX_WORLD and model.measurements <= MAX_MEASUREMENTS:
         return _exact(model, camera, prior.mean, world)
-    sides = min(camera.rows, WINDOW), min(camera.columns, WINDOW)
+    sides = min(camera.rows, NEIGHBOURS), min(camera.columns, NEIGHBOURS)
     return _local(model, camera, prior, world, WorldPrior.of(prior, sides, camera.target_pitch, camera.detail))
 
 

@@ -1,6 +1,6 @@
 """Detail finer than f where the exact moments are too large: each pixel's world is predicted from its neighbourhood.
 
-B of `world_prior` decays within a few pixels of f. Here a pixel of the world is predicted from a window of WINDOW x
+B of `world_prior` decays within a few pixels of f. Here a pixel of the world is predicted from a window of NEIGHBOURS x
 WINDOW pixels of f around it, moved inwards at the edges of the image: B of an image of that size serves them all. What
 a measurement leaves unexplained has the variance z^T P z with z = h - A^T g, h its row of H and g that of G: for any
 prediction, the best or not, this is right.
@@ -19,14 +19,14 @@ from ommatid.runtime.processors import processors
 
 from .world_prior import WorldPrior, averaging
 
-WINDOW = 5  # pixels of f, odd
+NEIGHBOURS = 5  # pixels of f, odd
 VALUES = 2**24  # of the patches that are transformed at once
 
 
 def local_interpolation(prior: WorldPrior, window: WorldPrior) -> sparse.csr_array:
     """Return B, (pixels of the world, N), each row from the neighbourhood of its pixel.
 
-    window : the same prior for an image of at most WINDOW x WINDOW pixels
+    window : the same prior for an image of at most NEIGHBOURS x NEIGHBOURS pixels
     """
     detail, weights = prior.detail, window.interpolation
     fine, sides = prior.fine_shape, window.shape

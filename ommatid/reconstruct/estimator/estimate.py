@@ -20,21 +20,30 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import free_memory
 
-from ..forms.covariance import covariance
+from ..forms.cholesky import covariance, information
 from ..forms.dual import dual
 from ..forms.form import Form, NotSolvableError
-from ..forms.information import information
-from ..forms.square_root_covariance import square_root_covariance
-from ..forms.square_root_information import square_root_information
+from ..forms.square_root import square_root_covariance, square_root_information
 from ..forms.svd import svd
 from ..output.run_json import RejectedForm, SolverReport
 from ..problem import Problem
-from .certificate import RefinedSolution, refine, variance_error
-from .double_double import DoubleDouble
-from .memory import needed_memory
-from .prior_rounding import estimate_rounding, variance_rounding
-from .refined_form import RefinedForm
-from .residuals import ExactResiduals
+from .certificate import RefinedForm, RefinedSolution, estimate_rounding, refine, variance_error, variance_rounding
+from .residuals import DoubleDouble, ExactResiduals
+
+
+def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bool = False) -> int:
+    """Return the bytes needed by a form and its error analysis; a `correlated` prior adds its root and copies of it."""
+    both = measurements + unknowns
+    matrix = {
+        "covariance": 3 * measurements**2 + 2 * measurements * unknowns + 2 * unknowns**2,
+        "information": 7 * unknowns**2,
+        "square-root-information": 4 * both * unknowns + 2 * unknowns**2,
+        "square-root-covariance": 3 * both**2,
+        "svd": 4 * measurements * unknowns + 5 * unknowns**2,
+        "dual": 5 * measurements * both + 4 * both * unknowns,
+    }
+    return 8 * (matrix[form] + (4 * unknowns**2 if correlated else 0))
+
 
 TOLERANCE = 1e-8
 LEAST_DIGITS = 1.0  # digits that the condition number must leave to a form that squares the matrix

@@ -18,14 +18,14 @@ from ..fitting.evidence import Evidence
 from ..fitting.prior_fit import MIN_MEASUREMENTS, fit_prior
 from ..methods.method import EstimationTask
 
-WINDOW = 16  # pixels, side of a window of narrow footprints
-REACHES = 2  # footprints that fit side by side into a window
+FIT_WINDOW = 16  # pixels, side of a window of narrow footprints
+FIT_REACHES = 2  # footprints that fit side by side into a window
 PER_AXIS = 3  # most windows along each axis
 
 
 def fitted_prior(task: EstimationTask) -> PriorTable | None:
     """Return the exponential prior of largest evidence with the task's noise; None if measurements are too few."""
-    side = max(WINDOW, REACHES * task.model.reach)
+    side = max(FIT_WINDOW, FIT_REACHES * task.model.reach)
     windows = product(*(_spread(size, side) for size in task.shape))
     order: IntArray = np.cumsum(task.used) - 1
     blocks = [_window(task, order, rows, columns) for rows, columns in windows]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ommatid.reconstruct.output.single_sub_image import best_single_sub_image, enlarged
+from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.stack import Stack
 

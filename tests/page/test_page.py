@@ -29,6 +29,7 @@ from ommatid.page.cached import cached_page
 from ommatid.page.document import page, page_of
 from ommatid.page.panels import error_groups, point_response, sensor, time_curves
 from ommatid.page.panels.embedded import decoded
+from ommatid.reconstruct.measured_error import best_single_sub_image
 from ommatid.reconstruct.output.run_json import (
     DepthBin,
     DiagnosticsReport,
@@ -39,7 +40,6 @@ from ommatid.reconstruct.output.run_json import (
     TimeReport,
     VerdictReport,
 )
-from ommatid.reconstruct.output.single_sub_image import best_single_sub_image
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats import exr

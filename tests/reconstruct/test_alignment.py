@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.reconstruct.misalignment.alignment import Alignment, align, misaligned_recording
-from ommatid.reconstruct.misalignment.likelihood import LikelihoodPoint, likelihood_at
+from ommatid.reconstruct.misalignment.alignment import (
+    Alignment,
+    LikelihoodPoint,
+    align,
+    likelihood_at,
+    misaligned_recording,
+)
 from ommatid.reconstruct.misalignment.robust_noise import as_table, misaligned_matrix, tolerances
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.runtime.arrays import FloatArray

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from ommatid.reconstruct.frame.banded_system import leaves_null_space
+from ommatid.reconstruct.frame.conjugate_gradients import leaves_null_space
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.problem import gram
 from ommatid.reconstruct.restore import Reconstruction, restore

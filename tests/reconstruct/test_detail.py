@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.reconstruct.detail import detailed_model
-from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
-from ommatid.reconstruct.detail.local import unexplained_variance
+from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f, unexplained_variance
 from ommatid.reconstruct.detail.world_prior import WorldPrior, averaging, repetition
 from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.prior import prior_of

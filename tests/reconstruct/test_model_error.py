@@ -9,8 +9,8 @@ import pytest
 from scipy import sparse
 
 from ommatid.reconstruct.methods.dense_method import DenseMethod
-from ommatid.reconstruct.methods.iterative_operators import iterative_operators
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, PosteriorOperators
+from ommatid.reconstruct.methods.tile_method import iterative_operators
 from ommatid.reconstruct.model_error.attenuation import Attenuation
 from ommatid.reconstruct.model_error.contrast import Waves, continued, likeliest_share, true_contrast
 from ommatid.runtime.arrays import FloatArray

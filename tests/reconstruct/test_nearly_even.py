@@ -7,12 +7,15 @@ from functools import partial
 import numpy as np
 import pytest
 
-from ommatid.reconstruct.frame.nearly_even import LARGEST_GAP, NearlyEven
 from ommatid.reconstruct.frame.preconditioner import preconditioner_for
-from ommatid.reconstruct.frame.selected_inverse import stencil_variances
-from ommatid.reconstruct.frame.stencil import box_stencil, even_couplings
-from ommatid.reconstruct.frame.variance_map import interior_variance
-from ommatid.reconstruct.frame.window_variances import EvenNoise, frame_variances
+from ommatid.reconstruct.frame.variance_map import LARGEST_GAP, NearlyEven, interior_variance
+from ommatid.reconstruct.frame.window_variances import (
+    EvenNoise,
+    box_stencil,
+    even_couplings,
+    frame_variances,
+    stencil_variances,
+)
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 

@@ -10,8 +10,7 @@ from scipy import sparse, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.fitting.evidence import Evidence
-from ommatid.reconstruct.fitting.evidence_search import search
-from ommatid.reconstruct.fitting.prior_fit import PriorFit, fit_prior
+from ommatid.reconstruct.fitting.prior_fit import PriorFit, fit_prior, search
 from ommatid.reconstruct.prior import Prior, exponential, independent, prior_of
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray

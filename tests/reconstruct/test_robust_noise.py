@@ -10,12 +10,12 @@ import pytest
 from scipy import linalg, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
-from ommatid.reconstruct.misalignment.parameter_grid import points_of
 from ommatid.reconstruct.misalignment.robust_noise import (
     MisalignmentNoise,
     as_misalignments,
     as_table,
     misaligned_matrix,
+    points_of,
     robust_error,
     robust_noise,
     tolerances,

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from ommatid.analysis import run_table
-from ommatid.reconstruct.noise import usable_pixels
+from ommatid.reconstruct.noise import censored, usable_pixels
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
-from ommatid.reconstruct.saturation import censored
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks

@@ -8,13 +8,17 @@ from scipy import fft, linalg, sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.preconditioner import preconditioner_for
-from ommatid.reconstruct.frame.selected_inverse import inverse_diagonal, stencil_variances
-from ommatid.reconstruct.frame.stencil import pixel_numbers, stored_stencil
 from ommatid.reconstruct.frame.variance_map import (
     posterior_variance,
     sliding_variance_map,
     small_posterior_variance,
     small_shape,
+)
+from ommatid.reconstruct.frame.window_variances import (
+    inverse_diagonal,
+    pixel_numbers,
+    stencil_variances,
+    stored_stencil,
 )
 from ommatid.reconstruct.prior import spectrum_of
 from ommatid.scenes.optics.boxes import BoxFootprints

@@ -10,12 +10,19 @@ import pytest
 from scipy import linalg, sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
-from ommatid.reconstruct.frame.map_check import SPACING, ExactVariances, check_map, spread_pixels
+from ommatid.reconstruct.frame.error_map import SPACING, ExactVariances, check_map, spread_pixels
 from ommatid.reconstruct.frame.preconditioner import preconditioner_for
-from ommatid.reconstruct.frame.selected_inverse import stencil_variances
-from ommatid.reconstruct.frame.stencil import Source, box_stencil, even_couplings, pixel_numbers, stored_stencil
 from ommatid.reconstruct.frame.variance_map import interior_variance
-from ommatid.reconstruct.frame.window_variances import EvenNoise, frame_variances
+from ommatid.reconstruct.frame.window_variances import (
+    EvenNoise,
+    Source,
+    box_stencil,
+    even_couplings,
+    frame_variances,
+    pixel_numbers,
+    stencil_variances,
+    stored_stencil,
+)
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive

@@ -29,10 +29,8 @@ from ..methods.method import (
 from ..methods.prepared import SAME_NOISE
 from ..output.run_json import SolverReport
 from ..verdict.residual_power import ResidualInputs, ResidualPower
-from .banded_system import BandedSystem, serves
-from .conjugate_gradients import FrameSystem, Solution, posterior_operators
-from .error_map import MANY, ErrorMap
-from .map_check import MapCheck
+from .conjugate_gradients import BandedSystem, FrameSystem, Solution, posterior_operators, serves
+from .error_map import MANY, ErrorMap, MapCheck
 from .preconditioner import is_sliding
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"

@@ -29,8 +29,7 @@ from ..detail.detailed_model import DetailedModel
 from ..method_choice import MethodChoice
 from ..methods.method import EstimationTask, Execution
 from ..output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, HeldOutVerdict, HeldOutWindows
-from .stationary_prior import fitted_prior
-from .windows import HeldOutSums, held_out_sums, windows
+from .windows import HeldOutSums, fitted_prior, held_out_sums, windows
 
 SIGNIFICANCE = 1e-4  # of all sub-imagers together
 LEAST_EXCESS = 0.1  # of the sum of squares over its expectation

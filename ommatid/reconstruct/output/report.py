@@ -16,6 +16,7 @@ from ommatid.scenes.skipped import assumptions, skipped_effects
 from ommatid.scenes.stack import STRAIGHT, Stack
 
 from ..held_out.check import quick_check, with_fitted_prior
+from ..measured_error import best_single_sub_image
 from ..restore import Reconstruction
 from .run_json import (
     BaselineReport,
@@ -29,7 +30,6 @@ from .run_json import (
     SkippedReport,
     StageReport,
 )
-from .single_sub_image import best_single_sub_image
 from .time_spent import time_spent
 
 

@@ -47,6 +47,11 @@ from .noise import (
     with_shared_noise,
 )
 
+Result = TypeVar("Result")
+
+NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
+RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
+
 
 @dataclass(frozen=True)
 class ObservedStack:
@@ -110,12 +115,6 @@ class ObservedStack:
             scene.prior_ratio,
             shared_image,
         )
-
-
-Result = TypeVar("Result")
-
-NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
-RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
 
 
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:

@@ -23,8 +23,12 @@ from .estimator.certificate import RefinedForm, exact_sums, refine
 from .estimator.residuals import ExactResiduals, exact
 from .forms.form import Form
 
+Pixels = NDArray[np.intp]
+
 STIFF = 1e-14  # posterior over prior variance, below which the rounding of u relative to c matters
 LEAST_ACCURACY = 1e-3  # of the error bar of a sum, relative
+CHUNK = 512  # pixels solved for at once
+COVERAGE = (0.005, 0.995)  # quantiles of the interval
 
 
 def is_stiff(form: Form) -> bool:
@@ -91,12 +95,6 @@ def bias_of(form: Form, difference: FloatArray) -> FloatArray:
         deviation, rest = np.zeros(prior.dimension), difference
     u, _ = refined_solutions(form, ExactResiduals(form.problem), deviation[:, None])
     return prior.apply_root(u[:, 0]) + rest - form.gain(form.problem.matrix @ rest)
-
-
-Pixels = NDArray[np.intp]
-
-CHUNK = 512  # pixels solved for at once
-COVERAGE = (0.005, 0.995)  # quantiles of the interval
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from ommatid.scenes.pose import corner_offset, pose_of
 from ommatid.scenes.stack import Stack
 
 TRIM = 2  # pixels of the border that trimmed errors leave out
-
 SMALLEST_SSIM = 7  # pixels, the window of structural similarity
+MOST_COMPARED = 2**16  # pixels of f on which the sub-images of a large frame are compared: every n-th row
+SHARPNESS = -0.5  # Keys's a, with which quadratic pictures are interpolated exactly
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,6 @@ def measure_error(estimate: FloatArray, truth: FloatArray, shape: tuple[int, int
         similarity = cast(Any, metrics).structural_similarity
         ssim = float(similarity(truth.reshape(shape), estimate.reshape(shape), data_range=WHITE))
     return MeasuredError(mse, trimmed_mean(squared, shape), psnr, ssim)
-
-
-MOST_COMPARED = 2**16  # pixels of f on which the sub-images of a large frame are compared: every n-th row
-SHARPNESS = -0.5  # Keys's a, with which quadratic pictures are interpolated exactly
 
 
 @dataclass(frozen=True)

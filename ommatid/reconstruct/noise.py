@@ -32,6 +32,7 @@ from .methods.method import is_uniform, total_variance
 from .prior import spectrum_of
 
 Noise = dict[str, FloatArray]  # variances by cause
+
 SATURATION = "saturation"  # in the error budget
 SHARED = "shared calibration"  # by errors of few numbers of H, which many measurements share; "calibration" in budgets
 SHARED_NOTABLE = 1e-3  # of the other noise of a measurement, below which SHARED is left out
@@ -43,6 +44,9 @@ CERTAIN = (
     DETAIL,
     SATURATION,
 )  # noise that stays known when the rest of it is to be fitted
+ROUNDS = 6
+UNCHANGED = 0.05  # standard deviations of its noise: change of the light expected on a saturated pixel
+LEAST_INFORMATION = 0.01  # of an unsaturated pixel: a saturated one with less is left out
 
 
 @dataclass(frozen=True)
@@ -174,11 +178,6 @@ def at_used(values: FloatArray, used: BoolArray) -> FloatArray:
     if used.all():
         return values
     return uniform(float(values[0]), int(used.sum())) if is_uniform(values) else values[used]
-
-
-ROUNDS = 6
-UNCHANGED = 0.05  # standard deviations of its noise: change of the light expected on a saturated pixel
-LEAST_INFORMATION = 0.01  # of an unsaturated pixel: a saturated one with less is left out
 
 
 def censored(

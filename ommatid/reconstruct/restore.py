@@ -37,6 +37,7 @@ from .verdict.verdict import ErrorCheck, evidence_of, judge, without_pixels
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
 BEYOND = 0.1  # share of the error by the next order, likewise
 LEAST_FREEDOMS = 5  # of a sample variance, from which its inverse has a variance
+BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration", "detail")
 
 
 def verdict_of(
@@ -121,9 +122,6 @@ def _shared(model: Model, assumed: Assumptions, total: FloatArray, result: Metho
     if not model.record.get("fit") or "calibration" not in assumed.noise:
         return uniform(0.0, total.size)
     return np.divide(assumed.noise["calibration"], total, out=np.zeros(total.size), where=total > 0)
-
-
-BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration", "detail")
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,27 @@ from ommatid.runtime.outputs.occupied import occupied
 from .cases import Matrices, StabilityCase, extreme_cases, noise_sweep
 from .exact_answer import ExactAnswer, exact_answer
 
+FLOAT64_DIGITS = 16.0
+PANELS = (("alone", "estimate, the form alone"), ("refined", "estimate, refined"), ("variance", "worst variance"))
+STYLES = {
+    "covariance": ("tab:orange", "v"),
+    "information": ("tab:red", "s"),
+    "square-root-information": ("tab:purple", "D"),
+    "square-root-covariance": ("tab:brown", "^"),
+    "svd": ("tab:green", "o"),
+    "dual": ("tab:blue", "P"),
+    "auto": ("black", "x"),
+}
+FIRST_LANE, LANE_HEIGHT = FLOAT64_DIGITS + 1.5, 0.75  # of the marks of refusals, one lane per form
+TITLES = {"three": "three types: H has full rank", "two": "two types: H has a null space"}
+_TEXT = {"ha": "right", "fontsize": 8, "color": "0.4"}
+AUTO = "auto"
+DIGITS = 9.0  # of the estimate and of every posterior variance
+ALLOWED_EXCESS = 10.0  # ratio of an error to its bound: variances are checked on a sample of pixels
+NO_STATEMENT = 0.1  # a bound above it states nothing
+ANY_TOLERANCE = 1e300  # accepts every answer, with its bound
+RIGHT, REFUSED, FEWER, SILENT = "right", "refused", "fewer digits, as stated", "SILENT LOSS"
+
 
 @dataclass(frozen=True)
 class StabilityOutcome:
@@ -58,22 +79,6 @@ class SweepOutcome:
     lenses: str
     noise: float
     outcome: StabilityOutcome
-
-
-FLOAT64_DIGITS = 16.0
-PANELS = (("alone", "estimate, the form alone"), ("refined", "estimate, refined"), ("variance", "worst variance"))
-STYLES = {
-    "covariance": ("tab:orange", "v"),
-    "information": ("tab:red", "s"),
-    "square-root-information": ("tab:purple", "D"),
-    "square-root-covariance": ("tab:brown", "^"),
-    "svd": ("tab:green", "o"),
-    "dual": ("tab:blue", "P"),
-    "auto": ("black", "x"),
-}
-FIRST_LANE, LANE_HEIGHT = FLOAT64_DIGITS + 1.5, 0.75  # of the marks of refusals, one lane per form
-TITLES = {"three": "three types: H has full rank", "two": "two types: H has a null space"}
-_TEXT = {"ha": "right", "fontsize": 8, "color": "0.4"}
 
 
 @own_style()
@@ -125,14 +130,6 @@ def _draw_form(panel: Any, points: list[SweepOutcome], field: str, form: str, la
     refused = [point.noise for point, value in zip(points, values, strict=True) if value is None]
     hollow = {"markerfacecolor": "none", "markersize": 5, "linestyle": "none"}
     panel.plot(refused, [lane] * len(refused), color=colour, marker=marker, **hollow)
-
-
-AUTO = "auto"
-DIGITS = 9.0  # of the estimate and of every posterior variance
-ALLOWED_EXCESS = 10.0  # ratio of an error to its bound: variances are checked on a sample of pixels
-NO_STATEMENT = 0.1  # a bound above it states nothing
-ANY_TOLERANCE = 1e300  # accepts every answer, with its bound
-RIGHT, REFUSED, FEWER, SILENT = "right", "refused", "fewer digits, as stated", "SILENT LOSS"
 
 
 def assess(case: StabilityCase, method: str, exact: ExactAnswer | None) -> StabilityOutcome:

@@ -17,7 +17,7 @@ STARTER = """
 import os, sys
 import mitsuba, numba, scipy.linalg, skimage.metrics, matplotlib.backends.backend_agg
 import ommatid.pipeline.stages, ommatid.analysis.depth_error, ommatid.analysis.study, ommatid.batch.sweep_table
-import ommatid.reconstruct.output.figures, ommatid.reconstruct.output.run_json, ommatid.reconstruct.output.result_files
+import ommatid.reconstruct.output.run_json, ommatid.reconstruct.output.result_files
 from ommatid.cli import app
 for line in sys.stdin:
     number = os.fork()

@@ -36,6 +36,11 @@ from .world_prior import WorldPrior, averaging, repetition
 
 NEIGHBOURS = 5  # pixels of f, odd
 VALUES = 2**24  # of the patches that are transformed at once
+MAX_WORLD = 32_000  # pixels of the world, and
+MAX_MEASUREMENTS = 1_500  # measurements, up to which the exact moments take seconds
+CAUSE = "detail"  # in the error budget
+SEED = 20260405  # of random detail, different from those of data, calibration and the other analyses
+DRAWS = 4
 
 
 def local_interpolation(prior: WorldPrior, window: WorldPrior) -> sparse.csr_array:
@@ -133,13 +138,6 @@ def _central_lags(lags: FloatArray, shape: tuple[int, int]) -> FloatArray:
         for size, known in zip(shape, lags.shape, strict=True)
     )
     return lags[rows[:, None], columns[None, :]]
-
-
-MAX_WORLD = 32_000  # pixels of the world, and
-MAX_MEASUREMENTS = 1_500  # measurements, up to which the exact moments take seconds
-CAUSE = "detail"  # in the error budget
-SEED = 20260405  # of random detail, different from those of data, calibration and the other analyses
-DRAWS = 4
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,25 @@ from .residuals import DoubleDouble, ExactResiduals, as_exact, column_dots, exac
 
 Indices = NDArray[np.intp]
 Residuals = tuple[FloatArray, FloatArray]
+Solution = tuple[DoubleDouble, DoubleDouble]
 
 ALL_CHECKED = 128  # pixels, up to which every variance is checked
 SAMPLE = 16  # pixels checked beyond that
 LEAST_FLOAT = 2.0**-1074  # the smallest float64 above 0
 NEGLIGIBLE_VARIANCE = 1e-28  # relative to the prior variance: smaller posterior variances count as 0
+MAX_REFINEMENTS = 12
+MAX_STALLED = 4  # refinements in a row that do not halve the bound
+EPS = float(np.finfo(np.float64).eps)
+CONVERGED = 1e-15  # relative bound; the precision of float64
+REPRODUCTION_TOLERANCE = 1e-4  # relative error of a known u, above which a form is not trusted to estimate errors
+PROBES = 3
+SIGN_DRAWS = 6  # for noise-free measurements: a single draw may by chance agree with a contradiction
+REPRODUCTION_STEPS = 4  # solutions after which measurements without noise must be met
+ROUNDING_MARGIN = 1e4  # times the rounding of double-double arithmetic: some 1e-26 of the values
+SAFETY = 10  # for variances, which are checked on a sample and added up by expected errors
+CHUNK = 256  # pixels solved together
+DRAWS = 4
+MARGIN = 2.0  # times the standard deviation of dV_i
 
 
 def sampled_pixels(variance: FloatArray, prior: FloatArray) -> Indices:
@@ -81,20 +95,6 @@ def last_digit(variance: FloatArray) -> float:
     """Return the smallest float64 relative to the least variance above 0."""
     least = float(variance[variance > 0].min(initial=np.inf))
     return LEAST_FLOAT / least
-
-
-Solution = tuple[DoubleDouble, DoubleDouble]
-
-MAX_REFINEMENTS = 12
-MAX_STALLED = 4  # refinements in a row that do not halve the bound
-EPS = float(np.finfo(np.float64).eps)
-CONVERGED = 1e-15  # relative bound; the precision of float64
-REPRODUCTION_TOLERANCE = 1e-4  # relative error of a known u, above which a form is not trusted to estimate errors
-PROBES = 3
-SIGN_DRAWS = 6  # for noise-free measurements: a single draw may by chance agree with a contradiction
-REPRODUCTION_STEPS = 4  # solutions after which measurements without noise must be met
-ROUNDING_MARGIN = 1e4  # times the rounding of double-double arithmetic: some 1e-26 of the values
-SAFETY = 10  # for variances, which are checked on a sample and added up by expected errors
 
 
 @dataclass(frozen=True)
@@ -314,9 +314,6 @@ class _Certifier:
         return bool((np.abs(values[1]) <= ROUNDING_MARGIN * rounding)[noise_free].all())
 
 
-CHUNK = 256  # pixels solved together
-
-
 @dataclass(frozen=True)
 class RefinedForm(Form):
     """The refined solutions of another form."""
@@ -354,10 +351,6 @@ class RefinedForm(Form):
         error = np.where(error >= 0, error, np.inf)  # NaN counts as an unbounded error
         relative = np.divide(error, variance, out=np.where(error > 0, np.inf, 0.0), where=variance > 0)
         return float(relative.max(initial=0.0)) + last_digit(variance)
-
-
-DRAWS = 4
-MARGIN = 2.0  # times the standard deviation of dV_i
 
 
 def estimate_rounding(form: Form, u: FloatArray, multipliers: FloatArray) -> float:

@@ -30,6 +30,22 @@ from ..problem import Problem
 from .certificate import RefinedForm, RefinedSolution, estimate_rounding, refine, variance_error, variance_rounding
 from .residuals import DoubleDouble, ExactResiduals
 
+TOLERANCE = 1e-8
+LEAST_DIGITS = 1.0  # digits that the condition number must leave to a form that squares the matrix
+EPS = float(np.finfo(np.float64).eps)
+CONTRADICTION = 1e-6  # relative misfit of noise-free measurements; the precision of float32 files
+USEFUL_BOUND = 1e-3  # bound below which an estimate shows whether noise-free measurements are met
+UNKNOWN_BOUND = 10.0  # bound above which u is unknown, and with it which measurements contradict
+WIDE_NOISE = 1e12  # ratio of the largest to the least noise variance from which the SVD loses the noisy rows
+FORMS: dict[str, Callable[[Problem], Form]] = {
+    "covariance": covariance,
+    "information": information,
+    "square-root-information": square_root_information,
+    "square-root-covariance": square_root_covariance,
+    "svd": svd,
+    "dual": dual,
+}
+
 
 def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bool = False) -> int:
     """Return the bytes needed by a form and its error analysis; a `correlated` prior adds its root and copies of it."""
@@ -43,24 +59,6 @@ def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bo
         "dual": 5 * measurements * both + 4 * both * unknowns,
     }
     return 8 * (matrix[form] + (4 * unknowns**2 if correlated else 0))
-
-
-TOLERANCE = 1e-8
-LEAST_DIGITS = 1.0  # digits that the condition number must leave to a form that squares the matrix
-EPS = float(np.finfo(np.float64).eps)
-CONTRADICTION = 1e-6  # relative misfit of noise-free measurements; the precision of float32 files
-USEFUL_BOUND = 1e-3  # bound below which an estimate shows whether noise-free measurements are met
-UNKNOWN_BOUND = 10.0  # bound above which u is unknown, and with it which measurements contradict
-WIDE_NOISE = 1e12  # ratio of the largest to the least noise variance from which the SVD loses the noisy rows
-
-FORMS: dict[str, Callable[[Problem], Form]] = {
-    "covariance": covariance,
-    "information": information,
-    "square-root-information": square_root_information,
-    "square-root-covariance": square_root_covariance,
-    "svd": svd,
-    "dual": dual,
-}
 
 
 @dataclass(frozen=True)

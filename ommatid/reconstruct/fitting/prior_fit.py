@@ -38,6 +38,17 @@ LEAST_GAIN = 1e-3  # of the log evidence, below which a box has gained nothing
 LEVEL = 1.0  # slope by a logarithm below which the evidence is level
 STEP = 1e-3  # of the logarithms, for the curvature
 LARGEST_MISS = 0.05  # units of log evidence that another Newton step may gain at a maximum
+TILE = 24  # pixels, side of the tiles that a larger image is cut into
+MAX_COMPLETE = 10_000  # pixels, of an image all of whose tiles are used
+MAX_TILES = 8  # tiles of a larger image along each axis
+MIN_USED = 0.5  # share of the measurements that must lie inside one tile; else tiles grow
+MIN_LENGTH, MAX_LENGTH = 0.05, 100.0  # correlation length: in pixels, and in sides of the image
+GRID_LENGTHS = (1.0, 5.0, 25.0)  # pixels
+GRID_NOISES = (1e-8, 1e-5, 1e-3, 1e-1)  # of the measurements' mean square
+STARTS = 2  # points of the grid from which a search starts
+RANGE = 1e12  # variances lie within this factor of the measurements' mean square
+SEEN = 7.0  # units of log likelihood by which an image must be more likely than none: p = 1e-3 for two parameters
+MIN_MEASUREMENTS = 10  # for three parameters
 
 
 @dataclass(frozen=True)
@@ -138,19 +149,6 @@ def _partly(curvature: FloatArray, size: int) -> tuple[float, ...]:
     return tuple(float(value) ** 0.5 if value > 0 else float("nan") for value in variances)
 
 
-TILE = 24  # pixels, side of the tiles that a larger image is cut into
-MAX_COMPLETE = 10_000  # pixels, of an image all of whose tiles are used
-MAX_TILES = 8  # tiles of a larger image along each axis
-MIN_USED = 0.5  # share of the measurements that must lie inside one tile; else tiles grow
-MIN_LENGTH, MAX_LENGTH = 0.05, 100.0  # correlation length: in pixels, and in sides of the image
-GRID_LENGTHS = (1.0, 5.0, 25.0)  # pixels
-GRID_NOISES = (1e-8, 1e-5, 1e-3, 1e-1)  # of the measurements' mean square
-STARTS = 2  # points of the grid from which a search starts
-RANGE = 1e12  # variances lie within this factor of the measurements' mean square
-SEEN = 7.0  # units of log likelihood by which an image must be more likely than none: p = 1e-3 for two parameters
-MIN_MEASUREMENTS = 10  # for three parameters
-
-
 @dataclass(frozen=True)
 class PriorFit:
     """Fitted parameters, None for those that were known. Lengths in pixels.
@@ -187,15 +185,10 @@ def evidence_of(task: EstimationTask, *, prior_known: bool, noise_known: bool) -
     blocks: list[Evidence] = []
     shape = TILE, TILE
     prior = task.prior_on(shape) if prior_known else None
-    index_among_used = np.cumsum(task.used) - 1
     for row, column in product(*starts):
-        window = slice(row, row + TILE), slice(column, column + TILE)
-        measurements = task.model.measurements_inside(*window)
-        used = task.used[measurements]
-        matrix = task.model.submatrix(*window)[used]
-        residual = task.recorded[measurements[used]] - matrix @ np.full(TILE * TILE, mean)
-        noise = task.expected_noise[index_among_used[measurements[used]]]
-        blocks.append(Evidence(matrix, residual, noise, shape, prior, noise_known))
+        window = task.window(slice(row, row + TILE), slice(column, column + TILE))
+        residual = window.recorded - window.matrix @ np.full(TILE * TILE, mean)
+        blocks.append(Evidence(window.matrix, residual, window.expected_noise, shape, prior, noise_known))
     joined = sparse.csr_array(sparse.block_diag([block.matrix for block in blocks], format="csr"))
     residual = np.concatenate([block.residual for block in blocks])
     known = np.concatenate([block.known_noise for block in blocks])

@@ -32,11 +32,15 @@ from ommatid.scenes.camera import Camera
 from ..methods.method import EstimationTask, PosteriorOperators
 from .preconditioner import WORKERS, Preconditioner, is_sliding, preconditioner_for
 
+Indices = NDArray[np.intp]
+
 ACCURACY = 0.01  # numerical error, in posterior standard deviations
 MEAN_ACCURACY = 0.01  # of operators for means over the frame, likewise
 MAX_STEPS = 600
 MAX_STARTS = 3  # each from the recomputed residual
 SAFETY = 0.5  # of the least eigenvalue of P K, which the Lanczos matrix overestimates
+MOST_WORK = 1.2e11  # pixels times the square of the band: a minute or two with the error bars
+MAX_REFINEMENTS = 4
 
 
 class NotReachedError(InputError):
@@ -224,12 +228,6 @@ class _Lanczos:
         diagonal[1:] += ratios[:-1] / lengths[:-1]
         beside = np.sqrt(ratios[:-1]) / lengths[:-1]
         return float(linalg.eigvalsh_tridiagonal(diagonal, beside, select="i", select_range=(index, index))[0])
-
-
-Indices = NDArray[np.intp]
-
-MOST_WORK = 1.2e11  # pixels times the square of the band: a minute or two with the error bars
-MAX_REFINEMENTS = 4
 
 
 @dataclass(frozen=True)

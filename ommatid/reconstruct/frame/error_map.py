@@ -65,6 +65,13 @@ SINGLE = 6  # pixels where errors are correlated over any distance, and each nee
 FEW_SINGLE = 2  # of many pixels
 MANY = 250_000
 EXACT = 1e-3  # relative accuracy of a solution
+EVEN = 1e-3  # relative range of noise variances that count as equal
+HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
+SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
+LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies a thousandfold
+WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
+LEVELS = 4  # of even noise, for a correlated prior
+LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 
 @dataclass(frozen=True)
@@ -143,15 +150,6 @@ def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bo
         if len(chosen) < MOST and (np.abs(np.array(chosen) - pixel).max(axis=1) >= SPACING).all():
             chosen.append(pixel)
     return np.array([row * columns + column for row, column in chosen], dtype=np.intp)
-
-
-EVEN = 1e-3  # relative range of noise variances that count as equal
-HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
-SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
-LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies a thousandfold
-WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
-LEVELS = 4  # of even noise, for a correlated prior
-LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,10 @@ FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
 DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
 STEP = 1e-4  # relative step of a finite difference, and the largest relative error it causes
 SIDE = 44  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
+GRID = 128  # pixels of the periodic frame on which shares are computed
+REACH = 32  # pixels beyond which a measurement has no share
+SLAB = 480  # rows that are transformed together
+LARGEST_GAP = 1e-3  # between the two bounds of a variance, relative
 
 
 @dataclass(frozen=True)
@@ -180,12 +184,6 @@ def _small_index(size: int, side: int) -> NDArray[np.intp]:
     """Index, on an axis of `side` pixels, of each of `size`: equally far from the nearer edge, or in the middle."""
     index = np.arange(size)
     return index if side >= size else np.where(index < side // 2, index, np.maximum(side - (size - index), side // 2))
-
-
-GRID = 128  # pixels of the periodic frame on which shares are computed
-REACH = 32  # pixels beyond which a measurement has no share
-SLAB = 480  # rows that are transformed together
-LARGEST_GAP = 1e-3  # between the two bounds of a variance, relative
 
 
 @dataclass(frozen=True)

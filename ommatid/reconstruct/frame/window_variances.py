@@ -30,6 +30,12 @@ from ommatid.runtime.processors import one_thread, processors
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
+Places = NDArray[np.intp]
+
+CORE = 24  # columns of a window whose variances it gives
+LENGTH = 256  # its rows
+BESIDE = 4  # rows and columns by which the strips along edges give more than the halo
+
 
 @dataclass(frozen=True)
 class Stencil:
@@ -168,9 +174,6 @@ def pixel_numbers(shape: tuple[int, int], rows: slice, columns: slice) -> NDArra
     return down[:, None] * shape[1] + across
 
 
-Places = NDArray[np.intp]
-
-
 def inverse_diagonal(count: int, block: Callable[[int, int], FloatArray]) -> FloatArray:
     """Return the diagonal of the inverse of `count` x `count` blocks; `block` gives the diagonal and upper blocks.
 
@@ -263,11 +266,6 @@ def whole_variances(precision: sparse.csr_array, shape: tuple[int, int], reach: 
             len(blocks), lambda row, column: precision[blocks[row]][:, blocks[column]].toarray()
         ).reshape(ordered.shape)
     return variances if upright else variances.T
-
-
-CORE = 24  # columns of a window whose variances it gives
-LENGTH = 256  # its rows
-BESIDE = 4  # rows and columns by which the strips along edges give more than the halo
 
 
 @dataclass(frozen=True)

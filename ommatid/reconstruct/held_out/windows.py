@@ -10,7 +10,7 @@ image that one sub-imager alone sees.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise, product
@@ -18,7 +18,7 @@ from itertools import pairwise, product
 import numpy as np
 from scipy import linalg, sparse
 
-from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.scenes.camera import Camera
@@ -33,6 +33,13 @@ from ..prior import Prior, covariance_root
 from ..problem import Problem
 from .block_errors import block_errors
 
+Window = tuple[slice, slice]
+
+MOST_WHOLE = 1700  # pixels of a target that is one window
+WINDOW, WIDEST_WINDOW = 32, 60  # pixels, largest side of a window of a frame: of narrow and of wide footprints
+REACHES = 3  # footprints that fit side by side into a window
+LEAST_NOISE = 1e-3  # share of the expected noise that is independent, at least
+MOST_WINDOWS = 8  # along each axis; of larger frames so many at equal distances
 FIT_WINDOW = 16  # pixels, side of a window of narrow footprints
 FIT_REACHES = 2  # footprints that fit side by side into a window
 PER_AXIS = 3  # most windows along each axis
@@ -42,8 +49,7 @@ def fitted_prior(task: EstimationTask) -> PriorTable | None:
     """Return the exponential prior of largest evidence with the task's noise; None if measurements are too few."""
     side = max(FIT_WINDOW, FIT_REACHES * task.model.reach)
     windows = product(*(_spread(size, side) for size in task.shape))
-    order: IntArray = np.cumsum(task.used) - 1
-    blocks = [_window(task, order, rows, columns) for rows, columns in windows]
+    blocks = [_window(task, rows, columns) for rows, columns in windows]
     residual = np.concatenate([block.residual for block in blocks])
     if residual.size < MIN_MEASUREMENTS or not residual.any():
         return None
@@ -66,24 +72,11 @@ def _spread(size: int, side: int) -> list[slice]:
     return [slice(int(start), int(start) + side) for start in starts]
 
 
-def _window(task: EstimationTask, order: IntArray, rows: slice, columns: slice) -> Evidence:
-    """Return the evidence of the used measurements inside a window; `order` numbers the used ones, (M,)."""
-    inside = task.model.measurements_inside(rows, columns)
-    used = task.used[inside]
-    matrix, inside = task.model.submatrix(rows, columns)[used], inside[used]
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    residual = task.recorded[inside] - task.prior.mean * matrix.sum(axis=1)
-    return Evidence(matrix, residual, task.expected_noise[order[inside]], shape, None, True)
-
-
-MOST_WHOLE = 1700  # pixels of a target that is one window
-WINDOW, WIDEST_WINDOW = 32, 60  # pixels, largest side of a window of a frame: of narrow and of wide footprints
-REACHES = 3  # footprints that fit side by side into a window
-LEAST_NOISE = 1e-3  # share of the expected noise that is independent, at least
-MOST_WINDOWS = 8  # along each axis; of larger frames so many at equal distances
-
-Window = tuple[slice, slice]
-Unwhitening = Callable[[FloatArray], FloatArray]
+def _window(task: EstimationTask, rows: slice, columns: slice) -> Evidence:
+    """Return the evidence of the used measurements inside a window."""
+    window = task.window(rows, columns)
+    residual = window.recorded - task.prior.mean * window.matrix.sum(axis=1)
+    return Evidence(window.matrix, residual, window.expected_noise, window.shape, None, True)
 
 
 @dataclass(frozen=True)
@@ -241,21 +234,17 @@ def _whole_robust(task: EstimationTask) -> WindowProblem:
 
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:
     """Yield the problem of every window, one at a time to bound memory."""
-    camera, index_among_used, shared = task.model.camera, np.cumsum(task.used) - 1, _SharedErrors(task)
+    camera, shared, used = task.model.camera, _SharedErrors(task), np.flatnonzero(task.used)
 
     @cache
     def prior_on(shape: tuple[int, int]) -> Prior:
         return task.prior_on(shape)
 
     for rows, columns in chosen:
-        inside = task.model.measurements_inside(rows, columns)
-        kept: BoolArray = task.used[inside]
-        matrix = task.model.submatrix(rows, columns)[kept]
-        inside = inside[kept]
-        noise = task.expected_noise[index_among_used[inside]]
-        prior = prior_on((rows.stop - rows.start, columns.stop - columns.start))
-        problem = shared.problem(matrix, prior, noise, index_among_used[inside])
-        yield WindowProblem(problem, task.recorded[inside], _sub_imager_of(camera, inside), len(camera.sub_imagers))
+        window = task.window(rows, columns)
+        problem = shared.problem(window.matrix, prior_on(window.shape), window.expected_noise, window.index)
+        sub_imager = _sub_imager_of(camera, used[window.index])
+        yield WindowProblem(problem, window.recorded, sub_imager, len(camera.sub_imagers))
 
 
 def _sums(window: WindowProblem) -> HeldOutSums:

@@ -10,14 +10,13 @@ to a few hundredths. Conjugate gradients compute them to the few digits that mea
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
 from scipy import fft, linalg, sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import digest
 from ommatid.runtime.processors import one_thread, processors
@@ -49,6 +48,11 @@ TILES = 3  # sides of the window, in tiles
 PIXELS = 12  # whose variances are compared
 NOTABLE = 1.1  # factor that is worth saying
 SEED = 20261122
+RESIDUAL = 1e-3  # relative: the error of the solution is about 5 times as large
+MAX_STEPS = 1000  # reached only where lens types leave pixels undetermined
+MAX_TILES = 256  # in one task
+MANY = 250_000  # pixels above which each draw takes long and few are enough
+DRAWS, FEW_DRAWS = 8, 2  # of images and noise for the expected residual
 
 
 def tile_cost(task: EstimationTask, variance: FloatArray) -> float | None:
@@ -66,13 +70,10 @@ def tile_cost(task: EstimationTask, variance: FloatArray) -> float | None:
     rows, columns = (
         slice((length - side) // 2, (length + side) // 2) for length, side in zip(task.shape, sides, strict=True)
     )
-    inside = task.model.measurements_inside(rows, columns)
-    used = task.used[inside]
-    matrix = task.model.submatrix(rows, columns)[used]
-    weights = task.on_all_measurements(1 / task.expected_noise, 0.0)[inside][used]
-    information = matrix.T @ sparse.csr_array(matrix.multiply(weights[:, None]))
+    window = task.window(rows, columns)
+    matrix, shape = window.matrix, window.shape
+    information = matrix.T @ sparse.csr_array(matrix.multiply((1 / window.expected_noise)[:, None]))
     precision = sparse.csr_array(information + sparse.eye_array(matrix.shape[1], format="csr") / task.prior.variance)
-    shape = rows.stop - rows.start, columns.stop - columns.start
     pixels = _middle_pixels(shape, size)
     exact = _variances(precision, shape, pixels)
     frame_rows, frame_columns = np.divmod(pixels, shape[1])
@@ -108,10 +109,6 @@ def _variances(precision: sparse.csr_array, shape: tuple[int, int], pixels: Indi
     return solved[place[pixels], columns]
 
 
-RESIDUAL = 1e-3  # relative: the error of the solution is about 5 times as large
-MAX_STEPS = 1000  # reached only where lens types leave pixels undetermined
-
-
 def iterative_operators(task: EstimationTask) -> PosteriorOperators:
     """Return the operators of a task whose every measurement has noise."""
     matrix = task.model.matrix if task.complete else sparse.csr_array(task.model.matrix[task.used])
@@ -143,11 +140,6 @@ def _precision(image: FloatArray, precision: float | FloatArray, shape: tuple[in
         return precision * image
     waves = precision * np.asarray(fft.dctn(image.reshape(shape), 2, norm="ortho"))
     return np.asarray(fft.idctn(waves, 2, norm="ortho")).ravel()
-
-
-MAX_TILES = 256  # in one task
-MANY = 250_000  # pixels above which each draw takes long and few are enough
-DRAWS, FEW_DRAWS = 8, 2  # of images and noise for the expected residual
 
 
 class TileMethod(Method):
@@ -250,7 +242,8 @@ class TileMethod(Method):
         digests: list[str] = []
         if varied or not task.complete:
             inside = task.model.measurements_inside(*tile.window)
-            digests = [digest(task.used[inside]), *(digest(values[self._used_index(inside)]) for values in varied)]
+            index = task.among_used(task.used_inside(*tile.window))
+            digests = [digest(task.used[inside]), *(digest(values[index]) for values in varied)]
         return task.model.signature(*tile.window), tile.shape, tile.kept.tobytes(), *digests
 
     def _tile_task(
@@ -261,32 +254,22 @@ class TileMethod(Method):
         deviations: FloatArray | None = None,
     ) -> TileTask:
         task, first = self.task, tiles[0]
-        inside = [task.model.measurements_inside(*tile.window) for tile in tiles]
-        index = self._used_index(inside[0])
+        inside = [task.used_inside(*tile.window) for tile in tiles]
+        window = task.window(*first.window)
         true_image = None if truth is None else truth.reshape(task.shape)
         return TileTask(
-            matrix=task.model.submatrix(*first.window)[task.used[inside[0]]],
-            recorded=np.stack([task.recorded[numbers[task.used[numbers]]] for numbers in inside], axis=1),
-            expected_noise=task.expected_noise[index],
-            noise={name: values[index] for name, values in noise.items()},
+            matrix=window.matrix,
+            recorded=np.stack([task.recorded[numbers] for numbers in inside], axis=1),
+            expected_noise=window.expected_noise,
+            noise={name: values[window.index] for name, values in noise.items()},
             prior=task.prior_on(first.shape),
             kept=first.kept,
             settings=task.settings,
             truth=None if true_image is None else np.stack([true_image[tile.window].ravel() for tile in tiles], axis=1),
             deviations=None
             if deviations is None
-            else np.stack([deviations[self._used_index(numbers)] for numbers in inside], axis=1),
+            else np.stack([deviations[task.among_used(numbers)] for numbers in inside], axis=1),
         )
-
-    def _used_index(self, numbers: IntArray) -> IntArray:
-        """Return the indices of measurements among the used ones; unused ones are left out."""
-        if self.task.complete:
-            return numbers
-        return self._order[numbers[self.task.used[numbers]]]
-
-    @cached_property
-    def _order(self) -> IntArray:
-        return np.cumsum(self.task.used) - 1
 
     def _variance_of_sum(self, weights: FloatArray, actual: FloatArray) -> float:
         """Return Eq. 5 of w^T f^; the A^T w of the tiles add up on the measurements that they share."""
@@ -296,7 +279,7 @@ class TileMethod(Method):
             inside = np.zeros_like(image)
             inside[tile.core] = image[tile.core]
             if inside.any():
-                index = self._used_index(task.model.measurements_inside(*tile.window))
+                index = task.among_used(task.used_inside(*tile.window))
                 gain[index] += transposed_gain(self._tile_task([tile], {}, None), inside[tile.window].ravel())
         unexplained = weights - task.model.adjoint(task.on_all_measurements(gain, 0.0))
         return task.prior_variance_of_sum(unexplained) + float(actual @ np.square(gain))

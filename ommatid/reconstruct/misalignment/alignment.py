@@ -40,6 +40,16 @@ from ommatid.scenes.pose import Misalignment
 from ..prior import Prior
 from .robust_noise import as_misalignments, misaligned_matrix, tolerances
 
+MAX_PIXELS = 4000  # of f: beyond, its dense matrices take too long
+MAX_ITERATIONS = 40
+INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-6, 1e6
+CONVERGED = 0.1  # change of the value that ends the search; one standard deviation of one parameter is worth 0.5
+MIN_STEP = 1e-5  # of a difference, in tolerances, so that it keeps its digits
+NARROWING = 0.8  # factor by which steps may still shrink when the search ends
+COOLING, COLD = 0.25, 0.1  # factor on the additional noise per iteration; share of Rv below which it is dropped
+LEAPS = (-1.0, -0.3, -0.1, 0.1, 0.3, 1.0)  # tolerances, across a kink
+MAX_LEAPS = 6  # tried with exact values
+
 
 @dataclass(frozen=True)
 class MisalignedRecording:
@@ -210,17 +220,6 @@ def likelihood_at(recording: MisalignedRecording, scores: FloatArray) -> Likelih
     determinant = float(np.log(noise).sum() + 2 * np.log(np.diagonal(factor)).sum())
     image = prior.mean + prior.apply_root(u)
     return LikelihoodPoint(recording, scores, matrix, factor, 0.5 * (squares + determinant), multipliers, image)
-
-
-MAX_PIXELS = 4000  # of f: beyond, its dense matrices take too long
-MAX_ITERATIONS = 40
-INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-6, 1e6
-CONVERGED = 0.1  # change of the value that ends the search; one standard deviation of one parameter is worth 0.5
-MIN_STEP = 1e-5  # of a difference, in tolerances, so that it keeps its digits
-NARROWING = 0.8  # factor by which steps may still shrink when the search ends
-COOLING, COLD = 0.25, 0.1  # factor on the additional noise per iteration; share of Rv below which it is dropped
-LEAPS = (-1.0, -0.3, -0.1, 0.1, 0.3, 1.0)  # tolerances, across a kink
-MAX_LEAPS = 6  # tried with exact values
 
 
 @dataclass(frozen=True)

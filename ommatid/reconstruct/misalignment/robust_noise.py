@@ -43,6 +43,8 @@ MAGNITUDES = (0.5615901610541997, 0.2499019887107961, 0.5615901610541997, 1.8184
 COLUMNS = (0, 1, 2, 3, 4, 7)
 ORDER = 8  # of the Galois field, and number of signed levels
 MODULUS = 0b1011  # x^3 + x + 1
+PARAMETERS = 6  # position x and y, tilt about x and about y, rotation, focal length: the columns of every table here
+CAUSE = "misalignment"  # in the error budget
 
 
 def points_of(free: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -66,10 +68,6 @@ def _product(first: int, second: int) -> int:
     for power in (4, 3):
         product ^= (MODULUS << (power - 3)) * (product >> power & 1)
     return product
-
-
-PARAMETERS = 6  # position x and y, tilt about x and about y, rotation, focal length: the columns of every table here
-CAUSE = "misalignment"  # in the error budget
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,12 @@ DARK = 0.5  # share of the light of a type's other sub-imagers below which one c
 UNEXPLAINED = 0.8  # share of the light that the estimate predicts, since a part of the target may be dark
 FEW = 0.2  # share of the sub-imagers that are few
 MOST_NAMED = 5  # sub-imagers in one sentence
+SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
+SIZE = 0.1  # relative deviation from which a number is wrong
+STRIKING = 1.5  # ratio to the whole from which a region is worth naming
+UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
+SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
+SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
 
 @dataclass(frozen=True)
@@ -161,14 +167,6 @@ def named(names: Sequence[str]) -> str:
     word = "sub-imager" if len(names) == 1 else "sub-imagers"
     groups = [f"{', '.join(places)} of type {lens}" for lens, places in by_type.items()]
     return f"{word} {' and '.join(groups)}"
-
-
-SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
-SIZE = 0.1  # relative deviation from which a number is wrong
-STRIKING = 1.5  # ratio to the whole from which a region is worth naming
-UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
-SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
-SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
 
 @dataclass(frozen=True)

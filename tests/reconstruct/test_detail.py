@@ -274,4 +274,4 @@ def test_held_out_errors_are_those_of_the_world() -> None:
         error = residual[block] - gain @ residual[others]
         spread = covariance[np.ix_(block, block)] - gain @ covariance[np.ix_(others, block)]
         assert sub.chi_squared == pytest.approx(error @ np.linalg.solve(spread, error), rel=1e-6)
-    assert checked.trusted
+    assert checked.verdict.trusted

@@ -110,8 +110,8 @@ def test_the_next_more_robust_form_runs_if_the_bound_is_too_large(
     g = problem.matrix @ rng.uniform(0, 255, 361) + rng.normal(0, noise**0.5, problem.measurements)
     solver = estimate(problem, g).solver
     assert solver.method == method
-    assert [name for name, _ in solver.tried] == failed
-    assert all(reason for _, reason in solver.tried)
+    assert [form.method for form in solver.tried] == failed
+    assert all(form.why_not for form in solver.tried)
     assert solver.bound is not None
     assert solver.bound <= TOLERANCE
     assert solver.variance_bound <= TOLERANCE
@@ -126,7 +126,7 @@ def test_noise_that_differs_widely_between_measurements() -> None:
     descending = Problem(problem.matrix[::-1], problem.prior, noise[::-1])
     image, _ = sequential_update(descending, np.arange(9.0)[::-1])
     assert solution.image == pytest.approx(image, rel=1e-6)
-    assert "svd" not in [solution.solver.method, *(name for name, _ in solution.solver.tried)]
+    assert "svd" not in [solution.solver.method, *(form.method for form in solution.solver.tried)]
 
 
 def test_the_certificate_detects_a_wrong_factorisation() -> None:

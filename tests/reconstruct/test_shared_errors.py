@@ -329,7 +329,7 @@ def test_the_held_out_check_allows_for_errors_of_few_numbers() -> None:
     for _ in range(4):
         image = model.scene.prior.mean + model.scene.prior.variance**0.5 * rng.normal(size=model.unknowns)
         check = check_held_out(recorded(stack, model, image, rng), model, fitted=False)
-        assert check.trusted
+        assert check.verdict.trusted
         deviates += [sub.z for sub in check.sub_imagers if sub.z is not None]
     # Taken for independent, they make the deviates spread by 1.2 to 1.6.
     assert abs(np.std(deviates) - 1) < 4 / (2 * len(deviates)) ** 0.5
@@ -337,4 +337,4 @@ def test_the_held_out_check_allows_for_errors_of_few_numbers() -> None:
     part, values = model.camera.slices()[4], wrong.values.copy()
     values[part] += 10 * model.changes(image)[1][part]
     check = check_held_out(replace(wrong, values=values), model, fitted=False)
-    assert [sub.sub.name for sub in check.sub_imagers if sub.named] == [model.camera.sub_imagers[4].name]
+    assert [sub.name for sub in check.sub_imagers if sub.named] == [model.camera.sub_imagers[4].name]

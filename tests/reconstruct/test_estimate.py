@@ -38,10 +38,9 @@ def sequential_update(problem: Problem, g: FloatArray) -> tuple[FloatArray, Floa
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("shape", [(7, 5), (4, 6), (5, 5), (1, 1)])
-@pytest.mark.parametrize("correlated", [False, True])
-def test_sequential_updates_give_the_same_estimate(form: str, shape: tuple[int, int], correlated: bool) -> None:
-    problem = random_problem(3, *shape, correlated=correlated)
+@pytest.mark.parametrize("shape", [(7, 5), (4, 6), (1, 1)])
+def test_sequential_updates_give_the_same_estimate(form: str, shape: tuple[int, int]) -> None:
+    problem = random_problem(3, *shape, correlated=shape[0] > 4)
     g = np.random.default_rng(1).normal(size=shape[0])
     image, covariance = sequential_update(problem, g)
     solution = estimate(problem, g, form)
@@ -53,7 +52,7 @@ def test_sequential_updates_give_the_same_estimate(form: str, shape: tuple[int, 
 
 
 @given(st.integers(0, 10**6), st.integers(1, 9), st.integers(1, 9), st.booleans())
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 def test_all_forms_agree(seed: int, m: int, n: int, correlated: bool) -> None:
     """Estimates to 1e-9 thanks to refinement, single solutions and variances to ten times the tolerance of 1e-6."""
     problem = random_problem(seed, m, n, correlated=correlated)

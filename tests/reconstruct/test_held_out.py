@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import flint
@@ -71,9 +72,14 @@ def exact_prediction(problem: Problem, values: FloatArray, block: IntArray) -> t
     return as_array[0][:, 0], np.diagonal(as_array[1]).copy(), float(chi_squared)
 
 
-@pytest.mark.parametrize("correlated", [False, True])
-@pytest.mark.parametrize("types", [1, 2])
-@pytest.mark.parametrize("noise", [1e-2, 1e-6])
+@pytest.mark.parametrize(
+    ("noise", "types", "correlated"),
+    [
+        (1e-6, 1, True),
+        pytest.param(1e-6, 2, False, marks=pytest.mark.slow),
+        pytest.param(1e-2, 2, True, marks=pytest.mark.slow),
+    ],
+)
 def test_predictions_are_those_of_exact_conditioning(noise: float, types: int, correlated: bool) -> None:
     """To ten digits of each block's largest error."""
     camera = derive(scene((12, 12), SMALL[:types]))
@@ -92,8 +98,7 @@ def chi_squared(errors: list[BlockErrors]) -> FloatArray:
     return np.array([float(block.whitened @ block.whitened) for block in errors])
 
 
-@pytest.mark.parametrize("correlated", [False, True])
-@pytest.mark.parametrize("noise", [1e-2, 1e-6])
+@pytest.mark.parametrize(("noise", "correlated"), [(1e-2, False), pytest.param(1e-6, True, marks=pytest.mark.slow)])
 def test_the_two_factorisations_agree_within_the_precision_that_they_state(
     noise: float, correlated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,6 +113,7 @@ def test_the_two_factorisations_agree_within_the_precision_that_they_state(
         np.testing.assert_allclose(second.precision, first.precision, rtol=module.PRECISION)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lenses", [THREE, TWO, THREE[:1]], ids=["three", "two", "one"])
 def test_whitened_errors_of_each_sub_imager_are_standard_normal_over_draws(lenses: Any) -> None:
     """Mean and mean square of 50 draws, two-sided, at a significance of 1 % for all sub-imagers together."""
@@ -161,7 +167,7 @@ def names(check: HeldOutReport) -> list[str]:
     return [entry.name for entry in check.sub_imagers if entry.named]
 
 
-@pytest.mark.parametrize("index", [0, 20, 45])
+@pytest.mark.parametrize("index", [20, pytest.param(45, marks=pytest.mark.slow)])
 def test_a_sub_imager_moved_by_a_twentieth_of_a_pixel_is_the_one_that_is_named(index: int) -> None:
     described = scene(lenses=THREE, noise={"variance": 1e-4})
     camera = derive(described)
@@ -175,6 +181,7 @@ def test_a_sub_imager_moved_by_a_twentieth_of_a_pixel_is_the_one_that_is_named(i
     assert wrong.rms_error > 2 * wrong.expected_rms
 
 
+@pytest.mark.slow
 def test_a_moved_sub_imager_is_named_on_a_photograph() -> None:
     described = read(GALLERY / "tile19.toml")
     camera = derive(described)
@@ -192,6 +199,7 @@ def test_several_wrong_sub_imagers_are_named_and_no_other() -> None:
     assert names(check) == [camera.sub_imagers[index].name for index in wrong]
 
 
+@pytest.mark.slow
 def test_an_h_that_is_a_guess_names_none_but_is_not_to_be_trusted() -> None:
     described = scene(lenses=THREE, **NOISE)
     camera = derive(described)
@@ -202,7 +210,7 @@ def test_an_h_that_is_a_guess_names_none_but_is_not_to_be_trusted() -> None:
     assert sum(entry.disagrees for entry in check.sub_imagers) > 40
 
 
-@pytest.mark.parametrize("name", ["tile19", "tile35"])
+@pytest.mark.parametrize("name", ["tile19", pytest.param("tile35", marks=pytest.mark.slow)])
 def test_what_is_right_is_trusted_on_a_photograph(name: str) -> None:
     described = read(GALLERY / f"{name}.toml")
     check = checked(described, None, load(described).ravel(), fitted=name == "tile19")
@@ -211,6 +219,7 @@ def test_what_is_right_is_trusted_on_a_photograph(name: str) -> None:
     assert check.p_value > 1e-4
 
 
+@pytest.mark.slow
 def test_rendered_draws_of_the_prior_are_predicted_as_well_as_stated() -> None:
     """Five draws, with the variance of the rendering from its own passes; one wrong H is named."""
     described = scene(lenses=THREE, **NOISE, render={"variant": "scalar_rgb", "samples": 1024})
@@ -259,6 +268,7 @@ def test_a_frame_is_checked_in_windows_stored_or_not() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_frame_whose_h_is_a_guess_is_not_to_be_trusted_and_one_wrong_sub_imager_is_named() -> None:
     described, camera = frame()
     guess = checked(described, moved(camera, list(range(50)), 0.3), draw(camera))
@@ -303,8 +313,6 @@ def tolerant(method: str) -> tuple[Scene, Stack]:
     tables: dict[str, Any] = {"estimator": {"misalignment": method}, "calibration": {"method": "ideal"}}
     data = scene(lenses=THREE, **NOISE, **tables).plain()
     data["camera"]["tolerance"] = {"position": "41 nm"}
-    from pathlib import Path
-
     described = parse(data, Path("test.toml"))
     camera = derive(described)
     wrong = moved(camera, list(range(50)), 0.03)

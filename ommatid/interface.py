@@ -18,7 +18,7 @@ import numpy as np
 from ommatid.batch.remote import RunObserver
 from ommatid.pipeline import stages
 from ommatid.reconstruct.output import result_files
-from ommatid.reconstruct.output.held_out_report import HeldOutReport
+from ommatid.reconstruct.output.run_json import HeldOutReport
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.result import Reconstructor
 from ommatid.runtime.arrays import FloatArray
@@ -177,13 +177,12 @@ def check(stack: Stack, model: Model, *, fitted: bool = True) -> HeldOutReport:
     Raises InputError if stack and model are of different cameras, or if a measurement has no noise.
     """
     from ommatid.reconstruct.held_out.check import check_held_out
-    from ommatid.reconstruct.output.held_out_report import held_out_report
     from ommatid.reconstruct.restore import check_match
 
     check_type("stack", stack, Stack, "read_stack")
     check_type("model", model, Model, "read_model")
     check_match(stack, model, ("the stack", "the model"))
-    return held_out_report(check_held_out(stack, model, fitted=fitted))
+    return check_held_out(stack, model, fitted=fitted)
 
 
 def run(scene: Scene | str | Path, folder: str | Path) -> Result:

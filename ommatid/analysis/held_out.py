@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ommatid.reconstruct.output.held_out_report import HeldOutEntry, HeldOutPrior, HeldOutReport
+from ommatid.reconstruct.output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport
 
 Row = tuple[str, str]
 

@@ -11,10 +11,10 @@ from ommatid.reconstruct.output.run_json import (
     ModelReport,
     RegionReport,
     RunReport,
+    SolverReport,
     StageReport,
     TimeReport,
 )
-from ommatid.reconstruct.output.solver_report import SolverReport
 from ommatid.reconstruct.output.verdict_words import error_words, grounds, heading, is_trusted
 
 from .summary import skipped_words

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ommatid.reconstruct.methods.prepared import Prepared
-from ommatid.reconstruct.output import figures, result_files
+from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.estimate_formats import Format, check_formats, clear_formats, write_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RunReport
@@ -211,7 +211,7 @@ def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunR
     outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, prepared=prepared)
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
     clear_formats(frame.output)
-    figures.write_estimate(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
+    result_files.write_picture(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
     record = {"title": stack.scene.title, "fingerprint": frame.fingerprint, "report": report.plain()}
     result_files.write_estimate(frame.output, outcome, record)
     write_formats(frame.output, options.formats)

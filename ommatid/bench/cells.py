@@ -25,9 +25,8 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import Sampler
-from ommatid.simulate.adaptive_render import AdaptiveRendering
+from ommatid.simulate.adaptive_render import AdaptiveRendering, check_noise_target
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.adaptive_render import check_noise_target
 from ommatid.simulate.render import Rendering
 from ommatid.simulate.renderer.variant import PREFERENCE, release, unusable_reason
 from ommatid.simulate.sampling.seeds import repeat_seed

@@ -12,8 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from ommatid.reconstruct.estimator.estimate import FORMS, estimate
-from ommatid.reconstruct.estimator.memory import needed_memory
+from ommatid.reconstruct.estimator.estimate import FORMS, estimate, needed_memory
 from ommatid.reconstruct.forms.form import NotSolvableError
 from ommatid.reconstruct.frame.frame_method import FrameMethod
 from ommatid.reconstruct.frame.preconditioner import is_sliding

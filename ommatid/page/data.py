@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import ESTIMATE
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.single_sub_image import best_single_sub_image, enlarged
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import real_path

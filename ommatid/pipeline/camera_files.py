@@ -14,10 +14,8 @@ from ommatid.runtime.files import write_whole
 from ommatid.runtime.outputs.kinds import check_output
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file, stack
-from ommatid.scenes.hardware.frames import files_in
-from ommatid.scenes.hardware.frames import AcquisitionSettings, RecordedFrames
+from ommatid.scenes.hardware.frames import AcquisitionSettings, RecordedFrames, files_in, import_stack
 from ommatid.scenes.hardware.point_sources import RecordedCalibration, from_recorded_points
-from ommatid.scenes.hardware.frames import import_stack
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup

@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 from ommatid.analysis.study import remove_study
 from ommatid.page.batch_index import INDEX, cached_index
 from ommatid.page.cached import REPORT, cached_page
-from ommatid.reconstruct.output import figures, result_files, run_json
+from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import Format, check_formats, check_picture, clear_formats
-from ommatid.reconstruct.output.held_out_report import HeldOutReport, held_out_report
+from ommatid.reconstruct.output.held_out_report import held_out_report
 from ommatid.reconstruct.output.result_files import Region, region_reports
-from ommatid.reconstruct.output.run_json import RUN, RunReport
+from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
@@ -104,7 +104,7 @@ def reconstruct_files(
     report = report.with_changes(**region_reports(result, request.regions))
     clear_formats(output)
     result_files.write_estimate(output, result, {"title": recorded.scene.title})
-    figures.write_estimate(output.with_suffix(".png"), result.estimate.reshape(result.shape))
+    result_files.write_picture(output.with_suffix(".png"), result.estimate.reshape(result.shape))
     return report
 
 

@@ -1,4 +1,4 @@
-"""The prior and the noise that the estimator assumes, and the method prepared with them.
+"""The prior and the noise that the estimator assumes of a stack, and the method prepared with them.
 
 The assumed noise holds everything known: the sensor's, quantisation, the rendering's own variance, and the variance
 that the uncertainty of H adds at a first estimate of the image. The noise of a real sensor depends on the light, so it
@@ -17,35 +17,104 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .detail.detailed_model import DetailedModel, model_of_f
+from .detail.detailed_model import CAUSE as DETAIL
+from .detail.detailed_model import DetailedModel, independent_detail, model_of_f
 from .detail.world_fit import fit_world
 from .expected_error import interval
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
-from .methods.method import Execution, Method, MethodResult, total_variance
-from .methods.observed_stack import ObservedStack
+from .methods.method import EstimationTask, Execution, Method, MethodResult, total_variance
 from .model_error.attenuation import can_be_corrected, with_attenuation
 from .model_error.contrast import Contrast, true_contrast, without_noise
 from .model_error.shared_errors import NEGLIGIBLE as NEGLIGIBLE_PART
 from .model_error.shared_errors import bound, has_shared_errors, with_shared_errors
 from .noise import (
     CERTAIN,
+    ROUNDS,
+    SATURATION,
     SHARED,
     Noise,
     UsablePixels,
+    censored,
     check_noise_fit,
     depends_on_light,
+    has_converged,
+    initial_noise,
+    noise_for_image,
     uniform,
     usable_pixels,
     with_shared_noise,
 )
-from .saturation import ROUNDS, censored, has_converged
 
 Result = TypeVar("Result")
 
 NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
 RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
+
+
+@dataclass(frozen=True)
+class ObservedStack:
+    """A stack with the prior of f, and the model that this prior makes of H where the world is finer than f."""
+
+    stack: Stack
+    model: Model
+    usable: UsablePixels
+    prior: PriorTable
+
+    def with_prior(self, prior: PriorTable, model: Model) -> ObservedStack:
+        """Return the same stack under another prior; model : as calibrated."""
+        return replace(self, prior=prior, model=model_of_f(model, self.stack.camera, prior))
+
+    def initial_noise(self) -> Noise:
+        """Return the noise before there is an estimate."""
+        return self.with_detail(initial_noise(self.stack, self.model, self.usable, self.prior))
+
+    def noise_for(self, image: FloatArray, noise: Noise) -> Noise:
+        """Return the noise with the parts that depend on the light for an estimate, (N,)."""
+        return self.with_detail(noise_for_image(image, self.stack, self.model, self.usable, noise))
+
+    def with_detail(self, noise: Noise) -> Noise:
+        """Add the variance of detail finer than f, unless the method knows its covariance."""
+        known = {name: values for name, values in noise.items() if name != DETAIL}
+        return known | independent_detail(self.model, self.usable.used)
+
+    @property
+    def detail_variance(self) -> FloatArray | float:
+        """Variance of detail on the pixels used, (pixels used,)."""
+        return self.model.detail_variance[self.usable.used] if isinstance(self.model, DetailedModel) else 0.0
+
+    def expected_noise(self, noise: Noise) -> FloatArray:
+        """Return the variance that the estimator assumes, (pixels used,)."""
+        setting = self.stack.scene.estimator.noise_variance
+        if not isinstance(setting, float):
+            return total_variance(noise)
+        return uniform(setting, int(self.usable.used.sum())) + noise.get(SATURATION, 0.0)
+
+    @property
+    def expects_fixed_noise(self) -> bool:
+        """True if the scene fixes the expected noise to a number."""
+        return isinstance(self.stack.scene.estimator.noise_variance, float)
+
+    def task(self, expected_noise: FloatArray, shared_image: FloatArray | None = None) -> EstimationTask:
+        """Return the task of an estimation method; the offset of detail's mean is taken off the measurements.
+
+        shared_image : (N,) whose errors by few numbers of H are part of the expected noise; None: they are not
+        """
+        scene, model, recorded = self.stack.scene, self.model, self.stack.values
+        if isinstance(model, DetailedModel):
+            recorded = recorded - model.offset
+        return EstimationTask(
+            model,
+            recorded,
+            self.usable.used,
+            expected_noise,
+            self.prior,
+            scene.estimator,
+            scene.tiles,
+            scene.prior_ratio,
+            shared_image,
+        )
 
 
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:

@@ -2,8 +2,9 @@
 
     error covariance = (I - A H) P0 (I - A H)^T + A Rvm A^T                       (Eq. 5)
 
-Rvm is the actual noise, whatever the estimator expects. Every pixel's variance is a sum of squares, so that none can
-come out negative.
+Rvm is the actual noise, whatever the estimator expects. Every pixel's variance is a sum |u|^2 + l^T Rvm l of squares of
+solutions for r = 0, so that none can come out negative. The forms round u relative to c; if the posterior is many
+decades below the prior, |u|^2 is lost in that rounding, and refined solutions keep its digits.
 """
 
 from __future__ import annotations
@@ -16,15 +17,84 @@ from numpy.typing import NDArray
 from scipy import sparse, special
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
 
-from .estimator.error_bars import bias_of, is_stiff, refined_solutions, sum_variance
-from .estimator.residuals import ExactResiduals
+from .estimator.certificate import RefinedForm, exact_sums, refine
+from .estimator.residuals import ExactResiduals, exact
 from .forms.form import Form
 
 Pixels = NDArray[np.intp]
 
+STIFF = 1e-14  # posterior over prior variance, below which the rounding of u relative to c matters
+LEAST_ACCURACY = 1e-3  # of the error bar of a sum, relative
 CHUNK = 512  # pixels solved for at once
 COVERAGE = (0.005, 0.995)  # quantiles of the interval
+
+
+def is_stiff(form: Form) -> bool:
+    """Return True if a posterior variance is so far below the prior's that solutions need refinement."""
+    prior = form.problem.prior.variance
+    return bool((form.variance() < STIFF * prior).any())
+
+
+def refined_solutions(form: Form, residuals: ExactResiduals, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Solve for c = `shift`, (K, q), and r = 0 with refinement: u, (K, q), and l, (M, q)."""
+    zero = np.zeros((form.problem.measurements, shift.shape[1]))
+    if isinstance(form, RefinedForm):
+        return form.solve(shift, zero)
+    refined = refine(form, residuals, shift, exact(zero))
+    return refined.coefficients, refined.multipliers
+
+
+def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> float:
+    """Return the expected squared error (Eq. 5) of a weighted sum of pixels; weights : (N,), such as 1/n in a region.
+
+    Errors of neighbours are correlated, so this is not the sum of their variances.
+    Raises InputError if the sum of squares and the quadratic form c^T u of Eq. 5 differ, or if that one is uncertain.
+    """
+    problem, residuals = form.problem, ExactResiduals(form.problem)
+    inner = form.form if isinstance(form, RefinedForm) else form
+    shift = residuals.root_transposed(exact(weights[:, None]))
+    refined = refine(inner, residuals, shift, exact(np.zeros((problem.measurements, 1))))
+    prior, squares = float(np.square(refined.coefficients).sum()), np.square(refined.multipliers[:, 0])
+    variance = prior + float(noise_variance @ squares)
+    expected, bound = (float(values[0]) for values in exact_sums(inner, residuals, shift))
+    ratio = np.divide(
+        noise_variance,
+        problem.noise_variance,
+        out=np.ones_like(noise_variance, dtype=np.float64),
+        where=problem.noise_variance > 0,
+    )
+    error = abs(prior + float(problem.noise_variance @ squares) - expected) + bound
+    error *= max(1.0, float(ratio.max(initial=1.0)))
+    if not error <= LEAST_ACCURACY * variance and error > 0:
+        raise InputError(
+            f"the error bar of a sum of pixels is lost in rounding ({variance:.1e} +- {error:.1e}); raise"
+            " estimator.noise_variance"
+        )
+    return expected if np.array_equal(noise_variance, problem.noise_variance) else variance
+
+
+def bias_of(form: Form, difference: FloatArray) -> FloatArray:
+    """Return (I - A H) d, (N,), of an image less the prior's mean, without the cancellation of d and A H d.
+
+    With d = L c + e, it is L u + e - A H e, where u solves for c and r = 0; e is 0 or the rounding error of L c.
+    """
+    prior = form.problem.prior
+    deviation: FloatArray = np.zeros(prior.dimension)
+    with np.errstate(all="ignore"):
+        if prior.independent:
+            deviation = np.divide(difference, prior.root, out=np.zeros_like(difference), where=prior.root > 0)
+        elif prior.root.shape[0] == prior.root.shape[1]:
+            try:
+                deviation = np.asarray(np.linalg.solve(prior.root, difference), dtype=np.float64)
+            except np.linalg.LinAlgError:
+                deviation = np.zeros(prior.dimension)
+    rest = difference - prior.apply_root(deviation)
+    if not np.isfinite(rest).all() or np.linalg.norm(rest) > np.linalg.norm(difference):
+        deviation, rest = np.zeros(prior.dimension), difference
+    u, _ = refined_solutions(form, ExactResiduals(form.problem), deviation[:, None])
+    return prior.apply_root(u[:, 0]) + rest - form.gain(form.problem.matrix @ rest)
 
 
 @dataclass(frozen=True)
@@ -137,15 +207,6 @@ def kernel_widths(resolved: FloatArray) -> FloatArray:
     """Return 1 / sqrt((A H)_ii), infinite where nothing is seen: (N,)."""
     root = np.sqrt(np.maximum(resolved, 0.0))
     return np.divide(1.0, root, out=np.full_like(root, np.inf), where=root > 0)
-
-
-def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> float:
-    """Return the expected squared error (Eq. 5) of a weighted sum of pixels; weights : (N,), such as 1/n in a region.
-
-    Errors of neighbours are correlated, so this is not the sum of their variances. Raises InputError if it is lost in
-    rounding.
-    """
-    return sum_variance(form, weights, noise_variance)
 
 
 def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, FloatArray, FloatArray]]:

@@ -13,8 +13,8 @@ from ommatid.scenes.scene import Scene
 
 from .detail.detail_method import DetailMethod
 from .detail.detailed_model import detail_memory, is_exact_for
-from .estimator.memory import needed_memory
-from .frame.banded_system import band_width, band_work, leaves_null_space, serves
+from .estimator.estimate import needed_memory
+from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
 from .frame.error_map import window_memory
 from .frame.frame_method import FrameMethod
 from .frame.preconditioner import is_sliding

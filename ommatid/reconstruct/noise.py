@@ -2,14 +2,22 @@
 
 The noise of a real sensor depends on the light. It is first taken from the readings near a pixel and then, as the
 uncertainty of H is, from the light that the first estimate predicts.
+
+Saturated pixels are censored measurements: their reading says only that the light and its noise reached a limit.
+Without them, the readings that remain just below the limit are those whose noise happened to be low, and are biased: by
+0.6 standard deviations one deviation below the limit. With the limit a deviations above the expected light, noise of
+standard deviation s, and the inverse Mills ratio r = phi(a) / (1 - Phi(a)), a saturated pixel contributes log(1 - Phi)
+to the log likelihood, with slope r / s and curvature -i / s^2, i = r (r - a) between 0 and 1. So it acts as a
+measurement of (expected light) + s r / i with variance s^2 / i, and since the log likelihood is concave, a few
+repetitions find its maximum (Newton). Kept readings stay as they are (Tobin 1958).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import fft
+from scipy import fft, special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
@@ -19,10 +27,12 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import CAUSE as DETAIL
+from .fitting.prior_fit import PriorFit
 from .methods.method import is_uniform, total_variance
 from .prior import spectrum_of
 
 Noise = dict[str, FloatArray]  # variances by cause
+
 SATURATION = "saturation"  # in the error budget
 SHARED = "shared calibration"  # by errors of few numbers of H, which many measurements share; "calibration" in budgets
 SHARED_NOTABLE = 1e-3  # of the other noise of a measurement, below which SHARED is left out
@@ -34,6 +44,9 @@ CERTAIN = (
     DETAIL,
     SATURATION,
 )  # noise that stays known when the rest of it is to be fitted
+ROUNDS = 6
+UNCHANGED = 0.05  # standard deviations of its noise: change of the light expected on a saturated pixel
+LEAST_INFORMATION = 0.01  # of an unsaturated pixel: a saturated one with less is left out
 
 
 @dataclass(frozen=True)
@@ -165,3 +178,55 @@ def at_used(values: FloatArray, used: BoolArray) -> FloatArray:
     if used.all():
         return values
     return uniform(float(values[0]), int(used.sum())) if is_uniform(values) else values[used]
+
+
+def censored(
+    stack: Stack, model: Model, usable: UsablePixels, image: FloatArray, fit: PriorFit | None
+) -> tuple[Stack, UsablePixels]:
+    """Return the stack with values for saturated pixels at an estimate, (N,), and the pixels to use with it.
+
+    usable : of the stack as recorded;  fit : of its noise, if any
+    """
+    light, variance = model.light(image), _variance(stack, model, image, fit)
+    deviation = np.sqrt(variance)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        below = (_limit(stack) - light) / deviation
+    ratio = np.exp(-0.5 * below**2 - special.log_ndtr(-below)) / (2 * np.pi) ** 0.5
+    information = np.clip(ratio * (ratio - below), 0.0, 1.0)
+    taken = usable.full & (information >= LEAST_INFORMATION)
+    information = np.where(taken, information, 1.0)
+    values = np.where(taken, light + deviation * ratio / information, stack.values)
+    added = np.where(taken, variance * (1 / information - 1), 0.0)
+    return replace(stack, values=values), replace(usable, used=usable.used | taken, censoring=added)
+
+
+def has_converged(before: FloatArray, after: FloatArray, stack: Stack, usable: UsablePixels) -> bool:
+    """Return True if the light on saturated pixels, (M,), changed by little of the noise."""
+    change, noise = np.abs(after - before)[usable.full], total_variance(known_noise(stack))[usable.full]
+    return bool((change <= UNCHANGED * np.sqrt(noise)).all())
+
+
+def _variance(stack: Stack, model: Model, image: FloatArray, fit: PriorFit | None) -> FloatArray:
+    """Return the variance of a reading under the light of an image before it is clipped, (M,)."""
+    noise = known_noise(stack)
+    if stack.recording is not None:
+        noise |= stack.recording.noise(model.light(image))
+    if model.variance.any():
+        noise["calibration"] = model.variance_from_model(image)
+    shared = model.error_variance(image)
+    if shared is not None:
+        noise[SHARED] = shared
+    if fit is not None and fit.noise_variance is not None:
+        noise = {name: noise[name] for name in CERTAIN if name in noise}
+        noise["noise"] = uniform(fit.noise_variance, stack.values.size)
+    return total_variance(noise)
+
+
+def _limit(stack: Stack) -> FloatArray | float:
+    """Return the value from which on a reading is saturated, before it is rounded: (M,) or one for all."""
+    recording, table = stack.recording, stack.scene.noise
+    if recording is not None:
+        return (recording.sensor.full - 0.5 - recording.dark) / recording.slope
+    if table is None or table.saturation is None:
+        return np.inf
+    return table.saturation if table.bits is None else table.level * (np.ceil(table.saturation / table.level) - 0.5)

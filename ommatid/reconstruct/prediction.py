@@ -20,13 +20,12 @@ from .estimator.estimate import factorise
 from .expected_error import expected_error, kernel_widths
 from .forms.form import Form
 from .forms.svd import Svd, svd
-from .gram import gram
 from .measured_error import TRIM, trimmed_mean
 from .method_choice import METHODS, MethodChoice
 from .methods.method import EstimationTask, Execution
 from .noise import at_used, uniform
 from .prior import Prior
-from .problem import Problem
+from .problem import Problem, gram
 
 PRIOR_ALONE = 0.9  # of the prior's variance: error from which measurements bring next to nothing
 RANK_TOLERANCE = 1e-7  # of singular values, relative; their squares come from an eigenvalue problem in float64

@@ -2,19 +2,22 @@
 
 An answer is right if the estimate and every posterior variance have nine digits. Otherwise it has to be refused or
 state a large enough error bound; an answer with an error beyond its bound is a silent loss.
+
+The figure shows the digits lost by every form against the noise variance, with three panels per H: the form alone,
+refined, and the worst posterior variance. Refusals are marked above the curves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, astuple, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from math import log10
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
@@ -24,16 +27,109 @@ from ommatid.runtime.outputs.occupied import occupied
 
 from .cases import Matrices, StabilityCase, extreme_cases, noise_sweep
 from .exact_answer import ExactAnswer, exact_answer
-from .figure import write_figure
-from .outcome import StabilityOutcome, SweepOutcome
 
+FLOAT64_DIGITS = 16.0
+PANELS = (("alone", "estimate, the form alone"), ("refined", "estimate, refined"), ("variance", "worst variance"))
+STYLES = {
+    "covariance": ("tab:orange", "v"),
+    "information": ("tab:red", "s"),
+    "square-root-information": ("tab:purple", "D"),
+    "square-root-covariance": ("tab:brown", "^"),
+    "svd": ("tab:green", "o"),
+    "dual": ("tab:blue", "P"),
+    "auto": ("black", "x"),
+}
+FIRST_LANE, LANE_HEIGHT = FLOAT64_DIGITS + 1.5, 0.75  # of the marks of refusals, one lane per form
+TITLES = {"three": "three types: H has full rank", "two": "two types: H has a null space"}
+_TEXT = {"ha": "right", "fontsize": 8, "color": "0.4"}
 AUTO = "auto"
 DIGITS = 9.0  # of the estimate and of every posterior variance
-FLOAT64_DIGITS = 16.0
 ALLOWED_EXCESS = 10.0  # ratio of an error to its bound: variances are checked on a sample of pixels
 NO_STATEMENT = 0.1  # a bound above it states nothing
 ANY_TOLERANCE = 1e300  # accepts every answer, with its bound
 RIGHT, REFUSED, FEWER, SILENT = "right", "refused", "fewer digits, as stated", "SILENT LOSS"
+
+
+@dataclass(frozen=True)
+class StabilityOutcome:
+    """Result of one form for one case.
+
+    alone, refined, variance : correct digits of u from the form alone, of the refined u, of the worst variance
+    bound, variance_bound : relative error bounds stated by the estimator;  reason : why the case was refused
+    """
+
+    case: str
+    measurements: int
+    unknowns: int
+    asked: str
+    ran: str
+    verdict: str
+    alone: float | None = None
+    refined: float | None = None
+    variance: float | None = None
+    bound: float | None = None
+    variance_bound: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """An outcome of the noise sweep: the name of H, the noise variance and the result."""
+
+    lenses: str
+    noise: float
+    outcome: StabilityOutcome
+
+
+@own_style()
+def write_figure(path: Path, curves: list[SweepOutcome], files: FigureFiles = SCREEN_PNG) -> None:
+    """Draw the digits lost, with one row of panels per H and one column per quantity."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure: Any = Figure(figsize=(14, 9.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(TITLES), len(PANELS), sharex=True, sharey=True)
+    for row, (lenses, title) in enumerate(TITLES.items()):
+        for column, (field, quantity) in enumerate(PANELS):
+            panel = axes[row][column]
+            for lane, form in enumerate(STYLES):
+                points = [point for point in curves if point.lenses == lenses and point.outcome.asked == form]
+                _draw_form(panel, points, field, form, FIRST_LANE + lane * LANE_HEIGHT)
+            _draw_axes(panel)
+            panel.set_title(f"{title}\n{quantity}", fontsize=10)
+            panel.set_xlabel("noise variance (grey levels squared)")
+            panel.set_ylabel("decimal digits lost, of 16")
+            panel.tick_params(labelleft=True, labelbottom=True)
+    handles, names = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize=9)
+    figure.suptitle("Digits lost by the forms of the estimator, against exact arithmetic")
+    files.replace(figure, path)
+
+
+def _draw_axes(panel: Any) -> None:
+    top = FIRST_LANE + len(STYLES) * LANE_HEIGHT
+    panel.set_xscale("log")
+    panel.set_ylim(-0.5, top)
+    panel.set_yticks(range(0, int(FLOAT64_DIGITS) + 1, 2))
+    panel.grid(visible=True, color="0.9")
+    panel.axhline(FLOAT64_DIGITS - 9, color="0.5", linewidth=1, linestyle=":")
+    panel.axhspan(FIRST_LANE - LANE_HEIGHT, top, color="0.95", zorder=0)
+    along = panel.get_yaxis_transform()
+    panel.text(0.99, FLOAT64_DIGITS - 8.9, "nine digits left", **_TEXT, transform=along, va="bottom")
+    panel.text(0.99, top - 0.3, "refused", **_TEXT, transform=along, va="top")
+
+
+def _draw_form(panel: Any, points: list[SweepOutcome], field: str, form: str, lane: float) -> None:
+    """Draw the digits lost by a form, and hollow marks in its lane where it refuses."""
+    colour, marker = STYLES[form]
+    values = [getattr(point.outcome, field) for point in points]
+    lost = [float("nan") if value is None else FLOAT64_DIGITS - value for value in values]
+    style = {"linewidth": 2.2, "markersize": 6, "zorder": 5} if form == "auto" else {"linewidth": 1.2, "markersize": 5}
+    panel.plot([point.noise for point in points], lost, color=colour, marker=marker, label=form, **style)
+    refused = [point.noise for point, value in zip(points, values, strict=True) if value is None]
+    hollow = {"markerfacecolor": "none", "markersize": 5, "linestyle": "none"}
+    panel.plot(refused, [lane] * len(refused), color=colour, marker=marker, **hollow)
 
 
 def assess(case: StabilityCase, method: str, exact: ExactAnswer | None) -> StabilityOutcome:

@@ -12,7 +12,7 @@ import pytest
 from ommatid.analysis.predict import predict_scene
 from ommatid.analysis.prediction_table import json_of, rows
 from ommatid.reconstruct.expected_error import expected_error
-from ommatid.reconstruct.forms.information import information
+from ommatid.reconstruct.forms.cholesky import information
 from ommatid.reconstruct.misalignment.robust_noise import MisalignmentNoise, robust_noise
 from ommatid.reconstruct.misalignment.tolerance_cost import mismatch_of_image, mismatch_variance
 from ommatid.reconstruct.prior import Prior, independent

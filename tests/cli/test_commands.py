@@ -18,7 +18,7 @@ import pytest
 
 from ommatid.pipeline.camera_files import calibrate_file
 from ommatid.pipeline.stages import export_scene
-from ommatid.reconstruct.output.single_sub_image import best_single_sub_image
+from ommatid.reconstruct.measured_error import best_single_sub_image
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import stack

@@ -41,7 +41,6 @@ from ommatid.reconstruct.output.run_json import (
     TimeReport,
     VerdictReport,
 )
-from ommatid.reconstruct.output.single_sub_image import best_single_sub_image
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats import exr

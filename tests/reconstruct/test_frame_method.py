@@ -60,7 +60,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    ["exact H", *(pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "exact H")],
+)
 def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str) -> None:
     """The variance map has its stated accuracy of 1e-3; much expected noise correlates distant pixels (1e-2).
 
@@ -92,6 +95,7 @@ def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str) -> None:
     assert frame.region((8, 9), (6, 20)) == pytest.approx(dense.region((8, 9), (6, 20)), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_shares_of_the_error_are_unbiased(monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean over 12 seeds is the dense answer, within 4 standard errors."""
     scene, truth = wide(SHAPE, noise=NOISE), drawn()
@@ -110,6 +114,7 @@ def test_shares_of_the_error_are_unbiased(monkeypatch: pytest.MonkeyPatch) -> No
         assert np.mean(values) == pytest.approx(dense.budget()[name], abs=4 * float(np.std(values)) / 12**0.5)
 
 
+@pytest.mark.slow
 def test_dead_and_saturated_pixels() -> None:
     scene, truth = wide(SHAPE, noise={"variance": 1e-2, "saturation": 180.0}), drawn(2)
     stack = recorded(scene, truth, 1e-2)
@@ -135,6 +140,7 @@ def test_a_prior_of_correlated_pixels() -> None:
     assert np.abs(ratio[12:-12, 12:-12] - 1).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_fitted_prior_on_a_frame() -> None:
     """A smooth image with much noise has a fifth of the error under a fitted prior, inside its interval."""
     rough = np.random.default_rng(0).normal(size=SHAPE)
@@ -166,6 +172,7 @@ def test_the_prediction_of_a_frame_is_that_of_the_dense_problem() -> None:
     assert (prediction.rank, prediction.null_space, prediction.condition) == (None, None, None)
 
 
+@pytest.mark.slow
 def test_a_prediction_with_expected_noise_but_no_actual_noise() -> None:
     scene = wide(SHAPE, noise={"variance": 0.0}, estimator={"method": "frame", "noise_variance": 1e-2})
     camera = derive(scene)
@@ -177,6 +184,7 @@ def test_a_prediction_with_expected_noise_but_no_actual_noise() -> None:
     assert dense.budget()["noise"] == 0
 
 
+@pytest.mark.slow
 def test_peak_memory_is_below_the_stated_one() -> None:
     """The peak of a frame in its own process, against the figure that is compared with `estimator.memory`.
 

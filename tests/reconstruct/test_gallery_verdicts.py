@@ -47,6 +47,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", gallery_names())
 def test_a_scene_of_the_gallery_has_the_verdict_that_it_states(name: str, tmp_path: Path) -> None:
     needs("llvm_ad_mono")

@@ -9,8 +9,8 @@ import pytest
 from scipy import sparse
 
 from ommatid.reconstruct.methods.dense_method import DenseMethod
-from ommatid.reconstruct.methods.iterative_operators import iterative_operators
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, PosteriorOperators
+from ommatid.reconstruct.methods.tile_method import iterative_operators
 from ommatid.reconstruct.model_error.attenuation import Attenuation
 from ommatid.reconstruct.model_error.contrast import Waves, continued, likeliest_share, true_contrast
 from ommatid.runtime.arrays import FloatArray
@@ -81,6 +81,24 @@ def test_light_lost_beside_the_target_is_uncertain_too(closed: bool) -> None:
     assert squares.sum() / stated.sum() == pytest.approx(1, abs=5 * (2 / values + 2 / values / (BATCHES - 1)) ** 0.5)
 
 
+def test_the_attenuation_is_that_of_dense_matrices() -> None:
+    """C D f by the definition of D, with the exact share 1 - (H A)_ii of every residual."""
+    exact, rng = _exact(), np.random.default_rng(8)
+    image = 127.5 + 60 * rng.normal(size=361)
+    model = _measured(exact, rng)
+    noise = NOISE + model.variance_from_model(image)
+    method = _method(model, exact.matrix @ image, noise)
+    h = model.matrix.toarray()
+    posterior = np.linalg.inv(h.T @ (h / noise[:, None]) + np.eye(361) / model.scene.prior.variance)
+    share = 1 - np.einsum("ij,jk,ik->i", h, posterior, h) / noise
+    attenuation = replace(_attenuation(method, noise, rng), residual_share=share)
+    for half, errors in zip(attenuation.halves(image), model.error_halves, strict=True):
+        dense = [error.toarray() for error in errors]
+        total = sum((error.T @ (share / noise * (error @ image)) for error in dense), np.zeros(361))
+        np.testing.assert_allclose(half, posterior @ total, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.slow
 def test_the_attenuation_is_the_mean_effect_of_errors_of_h() -> None:
     """The mean of A E f over draws of E, against C D f from the batches of each draw."""
     exact = _exact()
@@ -102,6 +120,7 @@ def test_the_attenuation_is_the_mean_effect_of_errors_of_h() -> None:
     assert np.mean(stated) == pytest.approx(measured, abs=3 * error + 0.2 * measured)  # first order in the variances
 
 
+@pytest.mark.slow
 def test_errors_of_h_fit_the_residual_as_they_attenuate_the_estimate() -> None:
     """The residual with errors of H, less that of the same errors by the gain of another H, as the batches show it."""
     exact = _exact()
@@ -134,6 +153,7 @@ def test_residuals_show_where_the_uncertainty_of_h_lies() -> None:
         assert likeliest_share(variance * rng.chisquare(1, rest.size), rest, first, second) == share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contrast", [0.0, 0.3, 20.0])
 def test_the_noise_of_an_estimate_is_not_taken_for_contrast(contrast: float) -> None:
     """The variance that errors of H add is that for the true image, which the estimate shows noisy."""

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
-
 import numpy as np
 import pytest
 from scipy import sparse
 
-from ommatid.reconstruct.estimator import residuals
-from ommatid.reconstruct.estimator.error_bars import bias_of, sum_variance
 from ommatid.reconstruct.estimator.estimate import estimate, factorise
-from ommatid.reconstruct.forms.form import NotSolvableError
-from ommatid.reconstruct.forms.multiple_precision import multiple_precision
+from ommatid.reconstruct.expected_error import bias_of, variance_of_sum
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.errors import InputError
@@ -21,23 +16,23 @@ from ..benchmarks.nasty import FAMILIES, SILENT, assess, nearly_equal_exact, nea
 from ..exact_rationals import rational_answer, relative_error
 
 REFUSED = -1.0  # in place of an error
-EACH = 334  # problems of every family in the whole suite: 5,010
+EACH, FEW = 334, 12  # problems of every family: 5,010 of the long form
+# Those whose measurements without noise, or whose digits, float64 cannot tell apart.
+MOST_REFUSED = {"nearly equal rows, noise-free": 1.0, "contradiction": 0.65, "singular prior": 0.5}
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_no_random_problem_is_silently_wrong(family: str) -> None:
-    """Every one is right to its stated bound, or refused; of most families nine in ten are answered."""
-    outcomes = [assess(family, seed) for seed in range(EACH)]
-    assert [outcome for outcome in outcomes if outcome.outcome == SILENT] == []
-    refused = sum(outcome.outcome == "refused" for outcome in outcomes) / EACH
-    assert refused <= {"contradiction": 0.65, "denormal noise": 0.3, "nearly equal rows, noise-free": 0.15}.get(
-        family, 0.1
-    )
+@pytest.mark.parametrize("each", [FEW, pytest.param(EACH, marks=pytest.mark.slow)])
+def test_no_random_problem_is_silently_wrong(each: int) -> None:
+    """Every one is right to its stated bound, or refused; of most families two in three are answered."""
+    for family in FAMILIES:
+        outcomes = [assess(family, seed) for seed in range(each)]
+        assert [outcome for outcome in outcomes if outcome.outcome == SILENT] == []
+        refused = sum(outcome.outcome == "refused" for outcome in outcomes) / each
+        assert refused <= MOST_REFUSED.get(family, 0.45), family
 
 
-def test_a_bound_that_is_small_by_chance_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bound_that_is_small_by_chance_does_not_count() -> None:
     """A problem of 2 x 2 whose first refinement happens to find 1e-17 where 1e-7 is left."""
-    _without_multiple_precision(monkeypatch)
     matrix = np.array([[-0.24424669002776175, -0.21412895875953997], [-0.24424669002776692, -0.21412895875953805]])
     prior = Prior(np.array([127.5, 127.5]), np.array([5906.196726545196, 9.316377290829726]))
     noise = np.array([7.4696738971771692e-15, 1.4598793799778568e-22])
@@ -48,23 +43,9 @@ def test_a_bound_that_is_small_by_chance_does_not_count(monkeypatch: pytest.Monk
     assert sum(excess > REFUSED for excess in excesses) >= 15  # most are answered
 
 
-def test_a_dropped_row_without_noise_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows that differ in the last bit beside rows with noise, by the certificate of larger problems."""
-    _without_multiple_precision(monkeypatch)
+def test_rows_without_noise_that_differ_in_the_last_bit_are_answered_rightly_or_refused() -> None:
     drawn = map(nearly_equal_exact, _generators(30))
-    pairs = [nasty for nasty in drawn if (nasty.problem.noise_variance == 0).sum() == 2]
-    assert max(_excess(nasty.problem, nasty.recorded) for nasty in pairs) <= 1
-    monkeypatch.undo()
-    answered = [_excess(nasty.problem, nasty.recorded) for nasty in pairs]
-    assert max(answered) <= 1
-    assert min(answered) > REFUSED  # multiple precision answers all of them
-
-
-def _without_multiple_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: Problem) -> None:
-        raise NotSolvableError("too large")
-
-    monkeypatch.setattr(residuals, "multiple_precision", refuse)
+    assert max(_excess(nasty.problem, nasty.recorded) for nasty in drawn) <= 1
 
 
 def _generators(count: int) -> list[np.random.Generator]:
@@ -110,30 +91,15 @@ def test_contradictions_are_relative_to_the_image(mean: float) -> None:
     assert estimate(problem, np.array([1.5, 1.5])).image == pytest.approx([1.5], abs=1e-15 * max(mean, 1.5))
 
 
-def test_multiple_precision_reads_sums_and_estimates_alike() -> None:
-    """The variance of a sum is that of rational numbers: w^T (P0 - P0 H^T C^-1 H P0) w of two pixels, by hand."""
-    noise = 1e-30
-    problem = Problem(sparse.csr_array(np.array([[0.5, 0.5]])), independent(0.0, 4.0, 2), np.array([noise]))
-    weights = np.array([0.5, 0.5])
-    innovation = Fraction(2) + Fraction(noise)
-    exact = Fraction(2) - Fraction(2) ** 2 / innovation
-    form, _ = factorise(problem)
-    assert sum_variance(form, weights, problem.noise_variance) == pytest.approx(float(exact), rel=1e-12)
-    doubled = sum_variance(form, weights, 2 * problem.noise_variance)
-    assert doubled == pytest.approx(2 * float(exact), rel=1e-9)  # the prior's part is noise^2
-    with pytest.raises(NotSolvableError, match="at most 64"):
-        multiple_precision(Problem(sparse.csr_array((65, 65)), independent(0.0, 1.0, 65), np.ones(65)))
-
-
 @pytest.mark.parametrize("noise", [1e-6, 1e-20, 1e-30])
-def test_error_bars_keep_their_digits_beyond_multiple_precision(noise: float) -> None:
+def test_error_bars_keep_their_digits(noise: float) -> None:
     """80 pixels, each seen by its own measurement: variance and bias of a sum in closed form."""
     count = 80
     problem = Problem(sparse.csr_array(np.eye(count)), independent(0.0, 4.0, count), np.full(count, noise))
     form, _ = factorise(problem, "covariance")
     posterior = noise / (1 + noise / 4)
     weights = np.full(count, 1 / count)
-    assert sum_variance(form, weights, problem.noise_variance) == pytest.approx(posterior / count, rel=1e-9)
+    assert variance_of_sum(form, weights, problem.noise_variance) == pytest.approx(posterior / count, rel=1e-9)
     difference = np.random.default_rng(0).normal(size=count)
     share = (noise / 4) / (1 + noise / 4)
     np.testing.assert_allclose(bias_of(form, difference), share * difference, rtol=1e-9)

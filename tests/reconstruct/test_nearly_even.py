@@ -7,12 +7,15 @@ from functools import partial
 import numpy as np
 import pytest
 
-from ommatid.reconstruct.frame.nearly_even import LARGEST_GAP, NearlyEven
 from ommatid.reconstruct.frame.preconditioner import preconditioner_for
-from ommatid.reconstruct.frame.selected_inverse import stencil_variances
-from ommatid.reconstruct.frame.stencil import box_stencil, even_couplings
-from ommatid.reconstruct.frame.variance_map import interior_variance
-from ommatid.reconstruct.frame.window_variances import EvenNoise, frame_variances
+from ommatid.reconstruct.frame.variance_map import LARGEST_GAP, NearlyEven, interior_variance
+from ommatid.reconstruct.frame.window_variances import (
+    EvenNoise,
+    box_stencil,
+    even_couplings,
+    frame_variances,
+    stencil_variances,
+)
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 
@@ -35,7 +38,10 @@ def nearly_even(camera: Camera, weights: FloatArray) -> NearlyEven:
     return NearlyEven(camera, preconditioner_for(camera, means, 1 / P0))
 
 
-@pytest.mark.parametrize(("more", "share"), [(0.05, 0.02), (0.05, 1.0), (0.3, 0.02), (1.0, 0.5)])
+@pytest.mark.parametrize(
+    ("more", "share"),
+    [(0.3, 0.02), pytest.param(0.05, 1.0, marks=pytest.mark.slow), pytest.param(1.0, 0.5, marks=pytest.mark.slow)],
+)
 def test_the_variance_lies_within_the_gap_of_one_sweep(more: float, share: float) -> None:
     camera = frame_camera(SHAPE)
     weights = uneven(camera, more, share)
@@ -47,6 +53,7 @@ def test_the_variance_lies_within_the_gap_of_one_sweep(more: float, share: float
     assert even.max() > 2 * error.max()  # the map of even noise misses most of it
 
 
+@pytest.mark.slow
 def test_one_noisier_measurement_raises_the_variance_by_its_share() -> None:
     """The derivative by one weight, by a difference of two sweeps of the whole frame."""
     camera = frame_camera(SHAPE)
@@ -63,6 +70,7 @@ def test_one_noisier_measurement_raises_the_variance_by_its_share() -> None:
     np.testing.assert_allclose(computed, exact, atol=0.01 * exact.max())
 
 
+@pytest.mark.slow
 def test_only_windows_with_uneven_noise_are_computed() -> None:
     """A frame whose noise is uneven in one corner region, beside one sweep: no other window is needed."""
     camera = frame_camera((131, 127))

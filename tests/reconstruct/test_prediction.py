@@ -25,9 +25,9 @@ PRIOR = PriorTable()
         ("tile19", (), 2.79776586e-4, 361),
         ("tile19", ("I", "I"), 2057.42393, 225),
         ("tile19", ("I", "II"), 484.100274, 329),
-        ("tile35", (), 1.54401e-4, 1225),
-        ("tile35", ("I", "II"), 89.16378, 1205),
-        ("tile41", (), 1.24737e-3, 1681),
+        pytest.param("tile35", (), 1.54401e-4, 1225, marks=pytest.mark.slow),
+        pytest.param("tile35", ("I", "II"), 89.16378, 1205, marks=pytest.mark.slow),
+        pytest.param("tile41", (), 1.24737e-3, 1681, marks=pytest.mark.slow),
     ],
 )
 def test_reference_values_of_extended_precision(
@@ -68,8 +68,8 @@ def test_reference_values_where_the_expectation_is_wrong(
         ("tile19", ("I", "I"), 1e-2, 1e-4, 2058.5, None),
         ("tile19", ("I", "II"), 1e-2, 1e-4, 489.606, None),
         ("tile19", (), 1e-2, 1e-4, 2.79766, 1.85623),
-        ("tile35", (), 1.0, 1.0, 139.233, None),
-        ("tile35", ("I", "II"), 1.0, 1.0, 397.08, None),
+        pytest.param("tile35", (), 1.0, 1.0, 139.233, None, marks=pytest.mark.slow),
+        pytest.param("tile35", ("I", "II"), 1.0, 1.0, 397.08, None, marks=pytest.mark.slow),
     ],
 )
 def test_more_reference_values(
@@ -90,20 +90,17 @@ def test_more_reference_values(
         assert prediction.trimmed_mse == pytest.approx(trimmed_reference, rel=5e-6)
 
 
-@pytest.mark.parametrize("form", ["square-root-information", "svd", "dual"])
-@pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I", "I")])
-def test_every_stable_form_predicts_the_same(form: str, lenses: tuple[str, ...]) -> None:
-    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
+def test_every_stable_form_predicts_the_same() -> None:
+    camera = derive(read(GALLERY / "tile19.toml", (), ("I", "II")))
     matrix, prior = ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361)
-    references = {0: 2.79776586e-4, 2: 484.100274, 1: 2057.42393}
-    settings = EstimatorTable.model_validate({"method": form})
-    prediction = predict(matrix, prior, 1e-6, settings, (19, 19))
-    assert prediction.mse == pytest.approx(references[len(set(lenses))], rel=3e-9)
-    assert prediction.method == form
+    for form in ("square-root-information", "svd", "dual"):
+        prediction = predict(matrix, prior, 1e-6, EstimatorTable.model_validate({"method": form}), (19, 19))
+        assert prediction.mse == pytest.approx(484.100274, rel=3e-9)
+        assert prediction.method == form
 
 
 @pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I",)])
-@pytest.mark.parametrize("noise", [1e-6, 1e-2, 1.0])
+@pytest.mark.parametrize("noise", [1e-6, 1.0])
 def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> None:
     """With a white prior the expected error is the mean over H's singular values s of v P0 / (v + s^2 P0)."""
     camera = derive(read(GALLERY / "tile19.toml", (), lenses))

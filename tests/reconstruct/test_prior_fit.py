@@ -10,8 +10,7 @@ from scipy import sparse, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.fitting.evidence import Evidence
-from ommatid.reconstruct.fitting.evidence_search import search
-from ommatid.reconstruct.fitting.prior_fit import PriorFit, fit_prior
+from ommatid.reconstruct.fitting.prior_fit import PriorFit, fit_prior, search
 from ommatid.reconstruct.prior import Prior, exponential, independent, prior_of
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
@@ -80,8 +79,10 @@ def test_tiles_share_the_measurements_out() -> None:
     )
 
 
-KNOWN = [(3000.0, 8.0, noise) for noise in (400.0, 100.0, 1.0, 1e-2, 1e-6)] + [
-    (50.0, 3.0, noise) for noise in (1.0, 1e-2, 1e-6)
+KNOWN = [
+    (3000.0, 8.0, 1.0),
+    *(pytest.param(3000.0, 8.0, noise, marks=pytest.mark.slow) for noise in (400.0, 100.0, 1e-2, 1e-6)),
+    *(pytest.param(50.0, 3.0, noise, marks=pytest.mark.slow) for noise in (1.0, 1e-2, 1e-6)),
 ]
 
 
@@ -123,6 +124,7 @@ def whitened(prior: Prior, noise: float, whole: Evidence, image: FloatArray) -> 
     return float(error @ np.linalg.solve(covariance, error)) / 361
 
 
+@pytest.mark.slow
 def test_coverage_with_a_fitted_prior() -> None:
     """With the true prior the whitened error has its expectation; with a fitted one it exceeds that by 5 % at most.
 
@@ -143,6 +145,7 @@ def test_coverage_with_a_fitted_prior() -> None:
     assert by_truth == pytest.approx(1, abs=4 * (2 / 361 / 14) ** 0.5)
 
 
+@pytest.mark.slow
 def test_a_photograph_gains_from_a_fitted_prior() -> None:
     """At a noise variance of 1 its error falls to a third of that with the paper's prior, at 100 to a fifth."""
     flat = load(scene()).ravel()
@@ -180,7 +183,7 @@ def test_large_footprints_get_larger_tiles() -> None:
     assert fit.measurements == 64
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_prior_fits_at_the_noise_of_the_paper(seed: int) -> None:
     """A search over the whole range steps to its bounds there, finds no evidence, and returns where it began."""
     shape = (14, 14)

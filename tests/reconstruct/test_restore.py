@@ -36,10 +36,10 @@ def chain(described: Scene) -> tuple[Stack, Model, Reconstruction]:
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("tile19", []),
         ("tile19", ["noise.variance=1", "noise.bits=8", "calibration.samples=1024"]),
-        ("photo", ["calibration.method=ideal"]),
-        ("single", []),
+        pytest.param("tile19", [], marks=pytest.mark.slow),
+        pytest.param("photo", ["calibration.method=ideal"], marks=pytest.mark.slow),
+        pytest.param("single", [], marks=pytest.mark.slow),
     ],
 )
 def test_the_measured_error_is_the_expected_one(name: str, changes: list[str]) -> None:
@@ -50,6 +50,7 @@ def test_the_measured_error_is_the_expected_one(name: str, changes: list[str]) -
     assert restoration.interval.low < restoration.error.mse < restoration.interval.high
 
 
+@pytest.mark.slow
 def test_fewer_lens_types_are_worse() -> None:
     errors = []
     for lenses in ((), ("I", "II"), ("I",)):
@@ -61,6 +62,7 @@ def test_fewer_lens_types_are_worse() -> None:
     assert errors[1] < errors[2]
 
 
+@pytest.mark.slow
 def test_spurious_information_of_h_is_reported() -> None:
     """Two types leave a null space, which a noisy H seems to see: Eq. 5 then predicts half of the actual error."""
     shares: list[float] = []

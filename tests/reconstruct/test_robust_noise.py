@@ -10,12 +10,12 @@ import pytest
 from scipy import linalg, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
-from ommatid.reconstruct.misalignment.parameter_grid import points_of
 from ommatid.reconstruct.misalignment.robust_noise import (
     MisalignmentNoise,
     as_misalignments,
     as_table,
     misaligned_matrix,
+    points_of,
     robust_error,
     robust_noise,
     tolerances,
@@ -93,7 +93,11 @@ def test_tables_hold_the_drawn_misalignments() -> None:
 
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    [("independent", SMALL), ("exponential", {"position": "600 nm"}), ("exponential", ALL)],
+    [
+        ("independent", SMALL),
+        pytest.param("exponential", {"position": "600 nm"}, marks=pytest.mark.slow),
+        pytest.param("exponential", ALL, marks=pytest.mark.slow),
+    ],
     ids=["0.03 pixels", "0.4 pixels", "all"],
 )
 def test_moments_agree_with_random_cameras_and_images(name: str, tolerance: dict[str, Any]) -> None:
@@ -113,6 +117,7 @@ def test_moments_agree_with_random_cameras_and_images(name: str, tolerance: dict
     assert np.abs(z).max() < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["independent", "exponential"])
 def test_error_over_images_and_cameras_is_as_expected_and_below_that_of_trust(name: str) -> None:
     camera, rng, prior = misaligned_camera(), np.random.default_rng(2), priors()[name]
@@ -153,6 +158,7 @@ def test_parts_of_the_error_agree_with_dense_matrices() -> None:
     assert expected.degrees_of_freedom == pytest.approx(np.trace(a @ h), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_photograph_gains_with_a_correlated_prior() -> None:
     side = 19
     camera, rng, prior = misaligned_camera(side, lenses=THREE), np.random.default_rng(4), priors(side)["exponential"]

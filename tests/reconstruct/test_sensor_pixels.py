@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from ommatid.analysis import run_table
-from ommatid.reconstruct.noise import usable_pixels
+from ommatid.reconstruct.noise import censored, usable_pixels
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
-from ommatid.reconstruct.saturation import censored
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks
@@ -92,6 +91,7 @@ def test_saturated_pixels_are_known_to_reach_the_limit(bits: int | None) -> None
     assert abs(used.chi_squared - used.expected) > 4 * used.deviation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bits", [None, 7])
 def test_light_just_below_saturation_is_not_biased(bits: int | None) -> None:
     """Over images of the prior the estimate is right on average, with an error as expected, though some saturates.
@@ -178,6 +178,7 @@ def test_chi_squared_of_the_residual_detects_a_wrong_noise() -> None:
     assert wrong.residual.chi_squared > wrong.residual.expected + 10 * wrong.residual.deviation
 
 
+@pytest.mark.slow
 def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     """On a photograph the error falls below a third, the noise is fitted, and both are in the table."""
     paper = restored(scene(lenses=THREE, noise=SENSOR))
@@ -204,7 +205,7 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     "prior",
     [
         {"kind": "exponential", "correlation_length": "40 mm"},
-        {"kind": "power", "exponent": 2.0},
+        pytest.param({"kind": "power", "exponent": 2.0}, marks=pytest.mark.slow),
     ],
 )
 def test_correlated_priors_help_on_photographs(prior: dict[str, object]) -> None:
@@ -268,7 +269,7 @@ def test_without_noise_there_is_no_chi_squared() -> None:
     assert restoration.estimate == pytest.approx(truth, rel=1e-6)
 
 
-@pytest.mark.parametrize("estimator", [{"noise_variance": "fit"}, {}])
+@pytest.mark.parametrize("estimator", [{"noise_variance": "fit"}, pytest.param({}, marks=pytest.mark.slow)])
 def test_a_fit_with_an_uncertain_h(estimator: dict[str, Any]) -> None:
     """The variance due to H is computed at the fitted image: chi-squared is as expected."""
     described = scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}, estimator=estimator)

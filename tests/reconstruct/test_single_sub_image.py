@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ommatid.reconstruct.output.single_sub_image import best_single_sub_image, enlarged, positions
+from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged, positions
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load

@@ -70,6 +70,7 @@ def test_one_tile_is_the_dense_estimate() -> None:
     assert tiled.interval.low < dense.interval.low < dense.interval.high < tiled.interval.high  # conservative
 
 
+@pytest.mark.slow
 def test_the_difference_from_the_exact_estimate_is_the_excess_of_the_variance() -> None:
     """The error of the exact estimate is uncorrelated with the data, so mean squares of the difference from it are what
     Eq. 5 of the tiles exceeds its variance by: within 4 standard errors over 8 images, and rms below the stated 0.17.
@@ -108,6 +109,7 @@ def test_separate_factorisations_give_the_same_image() -> None:
     np.testing.assert_allclose(separate, shared, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_error_of_tiles_is_the_expected_one() -> None:
     """The mean squared error and the variance of a sum over several tiles, each within 4 standard errors."""
     shape, count = (40, 36), 24
@@ -134,6 +136,7 @@ def test_the_error_of_tiles_is_the_expected_one() -> None:
     assert expected.parts["noise"] / expected.parts["rendering"] == pytest.approx(7 / 3)
 
 
+@pytest.mark.slow
 def test_threads_and_processes_give_identical_results() -> None:
     scene = wide((75, 67))
     truth = drawn(scene, (75, 67))

@@ -8,13 +8,17 @@ from scipy import fft, linalg, sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.preconditioner import preconditioner_for
-from ommatid.reconstruct.frame.selected_inverse import inverse_diagonal, stencil_variances
-from ommatid.reconstruct.frame.stencil import pixel_numbers, stored_stencil
 from ommatid.reconstruct.frame.variance_map import (
     posterior_variance,
     sliding_variance_map,
     small_posterior_variance,
     small_shape,
+)
+from ommatid.reconstruct.frame.window_variances import (
+    inverse_diagonal,
+    pixel_numbers,
+    stencil_variances,
+    stored_stencil,
 )
 from ommatid.reconstruct.prior import spectrum_of
 from ommatid.scenes.optics.boxes import BoxFootprints
@@ -27,8 +31,10 @@ from ..frames import FITTED, P0, blurred, frame_camera, precision, wide
 STATED = 1e-3  # relative accuracy of the maps
 
 
-@pytest.mark.parametrize("shape", [(119, 119), (128, 101)])
-@pytest.mark.parametrize("noise", [1e-6, 1e-2, 10.0])
+@pytest.mark.parametrize(
+    ("shape", "noise"),
+    [((64, 71), 1e-2), *(pytest.param((119, 119), noise, marks=pytest.mark.slow) for noise in (1e-6, 1e-2, 10.0))],
+)
 def test_the_map_has_the_stated_accuracy(shape: tuple[int, int], noise: float) -> None:
     """At corners, at edges, near them and in the middle, with and without pixels outside some lens types' field."""
     camera = frame_camera(shape)
@@ -45,6 +51,7 @@ def test_the_map_has_the_stated_accuracy(shape: tuple[int, int], noise: float) -
         assert variance[row, column] == pytest.approx(exact, rel=STATED), (row, column)
 
 
+@pytest.mark.slow
 def test_the_interior_has_the_known_noise_gain() -> None:
     """95.8 for magnifications 1/3, 1/4 and 1/5, computed independently in exact arithmetic; it is given to 0.05."""
     camera = frame_camera((119, 119))
@@ -52,7 +59,7 @@ def test_the_interior_has_the_known_noise_gain() -> None:
     assert variance[60, 60] / 1e-6 == pytest.approx(95.8, abs=0.05)
 
 
-@pytest.mark.parametrize("actual", [(0.3, 0.3, 0.3), (1e-4, 1e-3, 1e-2), (0.01, 0.01, 0.01)])
+@pytest.mark.parametrize("actual", [(1e-4, 1e-3, 1e-2), (0.01, 0.01, 0.01)])
 def test_actual_noise_that_differs_from_the_expected_one(actual: tuple[float, float, float]) -> None:
     """Eq. 5 by finite differences of step 1e-4 against dense matrices, on a frame that strips cover entirely."""
     camera = frame_camera((38, 35))
@@ -71,6 +78,7 @@ def test_actual_noise_that_differs_from_the_expected_one(actual: tuple[float, fl
     np.testing.assert_allclose((variances.missing + variances.noisy).ravel(), expected, rtol=2e-4)
 
 
+@pytest.mark.slow
 def test_correlated_pixels() -> None:
     """The map from a small frame against the dense inverse of a frame half as large again."""
     shape = (66, 66)
@@ -95,10 +103,14 @@ def test_the_diagonal_of_an_inverse_by_blocks() -> None:
     np.testing.assert_allclose(diagonal, np.diagonal(linalg.inv(matrix)), rtol=1e-10)
 
 
-@pytest.mark.parametrize("lenses", [FITTED, (("1/4", [2, 3], "fit"), ("1/3", [3, 3], "fit"))], ids=["fitted", "other"])
+@pytest.mark.parametrize(
+    "lenses",
+    [pytest.param(FITTED, marks=pytest.mark.slow), (("1/4", [2, 3], "fit"), ("1/3", [3, 3], "fit"))],
+    ids=["fitted", "other"],
+)
 def test_any_h_and_any_noise(lenses: Lenses) -> None:
     """H with errors and noise over a decade, by one sweep, against the dense inverse."""
-    shape = (52, 47)
+    shape = (36, 31)
     model, _ = blurred(wide(shape, lenses), 0.004)
     weights = 10 ** np.random.default_rng(1).uniform(1, 2, model.measurements)
     pixels = pixel_numbers(shape, slice(0, shape[0]), slice(0, shape[1]))

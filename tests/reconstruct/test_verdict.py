@@ -14,13 +14,14 @@ from scipy import stats
 
 from ommatid.reconstruct.estimator.estimate import factorise
 from ommatid.reconstruct.expected_error import Interval, expected_error, interval
-from ommatid.reconstruct.forms.information import information
+from ommatid.reconstruct.forms.cholesky import information
 from ommatid.reconstruct.methods.dense_method import DRAWS, residual_power
+from ommatid.reconstruct.output.run_json import VerdictReport
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.reconstruct.verdict.residual_parts import WhitenedResidual, regions, residual_parts
 from ommatid.reconstruct.verdict.residual_power import ResidualInputs, ResidualPower
-from ommatid.reconstruct.verdict.verdict import Verdict, error_p_value, excesses
+from ommatid.reconstruct.verdict.verdict import error_p_value, excesses
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.stack import Stack
@@ -196,7 +197,7 @@ def drawn_image() -> FloatArray:
     return 127.5 + np.random.default_rng(3).normal(0, P0**0.5, 361)
 
 
-def verdict(stack: Stack, truth: FloatArray | None = None) -> Verdict:
+def verdict(stack: Stack, truth: FloatArray | None = None) -> VerdictReport:
     return restore(stack, ideal_model(stack.scene, stack.camera), truth).verdict
 
 

@@ -9,36 +9,41 @@ If a measurement has no noise, S is singular, and if prior and noise differ by f
 dominated by the rounding error of p. Then the distance is estimated with the form itself, times 2. A form is trusted
 with that only if it reproduces a random u and l to four digits; a form that loses a direction of the prior or of the
 measurements does not.
+
+The last resort is a form whose every solution is refined: if rows and columns of H both differ widely in size, a
+float64 factorisation may keep few digits of the smallest variances and still suffice for refinement to converge. It
+costs many solutions per pixel.
+
+The root L of a correlated prior is taken as exact. With the error E of L L^T as an approximation of P0, to first order,
+
+    df = (I - A H) E H^T l,    dV_i = ((I - A H) E (I - A H)^T)_ii,
+
+where |E_ij| is some epsilon of the prior's standard deviations, with signs drawn at random. It matters where P0 is
+nearly singular: pixels that are correlated over a million pixels differ by less than the rounding of their variance.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 
 from ..forms.form import Form
-from .double_double import DoubleDouble, as_exact, column_dots, exact
-from .error_norms import (
-    ALL_CHECKED,
-    NEGLIGIBLE_VARIANCE,
-    Indices,
-    Residuals,
-    distance_from_exact,
-    infinite,
-    last_digit,
-    norms,
-    relative,
-    sampled_pixels,
-    worst,
-)
-from .residuals import ExactResiduals
+from .residuals import DoubleDouble, ExactResiduals, as_exact, column_dots, exact
 
+Indices = NDArray[np.intp]
+Residuals = tuple[FloatArray, FloatArray]
 Solution = tuple[DoubleDouble, DoubleDouble]
 
+ALL_CHECKED = 128  # pixels, up to which every variance is checked
+SAMPLE = 16  # pixels checked beyond that
+LEAST_FLOAT = 2.0**-1074  # the smallest float64 above 0
+NEGLIGIBLE_VARIANCE = 1e-28  # relative to the prior variance: smaller posterior variances count as 0
 MAX_REFINEMENTS = 12
 MAX_STALLED = 4  # refinements in a row that do not halve the bound
 EPS = float(np.finfo(np.float64).eps)
@@ -49,6 +54,47 @@ SIGN_DRAWS = 6  # for noise-free measurements: a single draw may by chance agree
 REPRODUCTION_STEPS = 4  # solutions after which measurements without noise must be met
 ROUNDING_MARGIN = 1e4  # times the rounding of double-double arithmetic: some 1e-26 of the values
 SAFETY = 10  # for variances, which are checked on a sample and added up by expected errors
+CHUNK = 256  # pixels solved together
+DRAWS = 4
+MARGIN = 2.0  # times the standard deviation of dV_i
+
+
+def sampled_pixels(variance: FloatArray, prior: FloatArray) -> Indices:
+    """Return the pixels whose variances are checked: those of extreme variance, and random others."""
+    if variance.size <= ALL_CHECKED:
+        return np.arange(variance.size)
+    ratio = np.divide(variance, prior, out=np.ones_like(variance), where=prior > 0)
+    extremes = [variance.argmin(), variance.argmax(), ratio.argmin(), ratio.argmax()]
+    others = np.random.default_rng(2).choice(variance.size, SAMPLE - len(extremes), replace=False)
+    return np.concatenate([extremes, others])
+
+
+def norms(values: FloatArray) -> FloatArray:
+    """The 2-norm of every column, without overflow: (q,)."""
+    largest = np.abs(values).max(axis=0, initial=0.0)
+    scale = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
+    return scale * np.linalg.norm(values / scale, axis=0)
+
+
+def infinite(pairs: tuple[Residuals, Residuals]) -> FloatArray:
+    """Infinity for every column with a value other than 0, else 0: (q,)."""
+    return np.where(np.any([part.any(axis=0) for pair in pairs for part in pair], axis=0), np.inf, 0.0)
+
+
+def relative(error: FloatArray, size: FloatArray) -> FloatArray:
+    """Return error / size, 0 where both are 0."""
+    return np.divide(error, size, out=np.where(error == 0, 0.0, np.inf), where=size > 0)  # NaN is not 0
+
+
+def worst(bound: FloatArray) -> float:
+    """Return the largest bound; NaN counts as infinite."""
+    return float(np.nan_to_num(bound, nan=np.inf, posinf=np.inf).max(initial=0.0))
+
+
+def last_digit(variance: FloatArray) -> float:
+    """Return the smallest float64 relative to the least variance above 0."""
+    least = float(variance[variance > 0].min(initial=np.inf))
+    return LEAST_FLOAT / least
 
 
 @dataclass(frozen=True)
@@ -67,18 +113,11 @@ class RefinedSolution:
 
 
 def refine(
-    form: Form,
-    residuals: ExactResiduals,
-    shift: FloatArray | DoubleDouble,
-    recorded: DoubleDouble,
-    right: DoubleDouble | None = None,
+    form: Form, residuals: ExactResiduals, shift: FloatArray | DoubleDouble, recorded: DoubleDouble
 ) -> RefinedSolution:
-    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), with refinement; keep the solution of least bound.
-
-    right : the right u, (K, q), where it is known: then the bound is the distance from it
-    """
+    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), with refinement; keep the solution of least bound."""
     with np.errstate(all="ignore"):  # overflow gives a bound that fails every tolerance
-        certifier = _Certifier(form, residuals, as_exact(shift), recorded, right)
+        certifier = _Certifier(form, residuals, as_exact(shift), recorded)
         (u, multipliers), bound, first, steps = certifier.refined()
         change = relative(norms(u.high - first), norms(u.high))
     return RefinedSolution(u.high, u.low, multipliers.high, bound, change + bound, steps)
@@ -115,8 +154,6 @@ def variance_error(form: Form, residuals: ExactResiduals) -> float:
         variance = form.variance()
         if not np.isfinite(variance).all():
             return float("inf")
-        if residuals.reference is not None:
-            return distance_from_exact(variance, residuals.reference)
         pixels = sampled_pixels(variance, prior.variance)
         accurate, uncertainty = exact_variances(form, residuals, pixels)
         # A variance of 0 is right if the accurate one cannot be distinguished from 0.
@@ -139,7 +176,6 @@ class _Certifier:
     system: ExactResiduals
     shift: DoubleDouble
     recorded: DoubleDouble
-    right: DoubleDouble | None = None
 
     def refined(self) -> tuple[Solution, FloatArray, FloatArray, int]:
         """Return the best u and l, the bound on u, the first u, and the number of refinements."""
@@ -168,9 +204,6 @@ class _Certifier:
         """Return the residuals of u and l, a certain bound on the error of u relative to |u|, and an estimated one."""
         u, multipliers = solution
         residuals = self.system.residuals(u, multipliers, self.shift, self.recorded)
-        if self.right is not None:
-            bound = relative(norms((u - self.right).high), norms(self.right.high))
-            return residuals, bound, bound
         values = residuals[0].high, residuals[1].high
         rounding = self.system.rounding_errors(u.high, multipliers.high, self.shift.high, self.recorded.high)
         bound, size = self._rigorous_distance(values, rounding), norms(u.high)
@@ -279,3 +312,73 @@ class _Certifier:
         rounding = self.system.rounding_errors(solution[0].high, solution[1].high, shift, right.high)[1]
         noise_free = self.system.problem.noise_variance == 0
         return bool((np.abs(values[1]) <= ROUNDING_MARGIN * rounding)[noise_free].all())
+
+
+@dataclass(frozen=True)
+class RefinedForm(Form):
+    """The refined solutions of another form."""
+
+    form: Form
+    residuals: ExactResiduals
+
+    name: ClassVar[str] = "corrected"
+
+    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the refined solution."""
+        refined = refine(self.form, self.residuals, shift, exact(residual))
+        return refined.coefficients, refined.multipliers
+
+    @cached_property
+    def _variances(self) -> tuple[FloatArray, FloatArray]:
+        pixels = np.arange(self.problem.unknowns)
+        blocks = [pixels[start : start + CHUNK] for start in range(0, pixels.size, CHUNK)]
+        values, errors = zip(*(exact_variances(self.form, self.residuals, block) for block in blocks), strict=True)
+        return np.maximum(np.concatenate(values), 0.0), np.concatenate(errors)
+
+    def variance(self) -> FloatArray:
+        """Return the refined posterior variances."""
+        return self._variances[0]
+
+    @property
+    def description(self) -> str:
+        """Name of the form that is refined."""
+        return f"{self.form.name}, corrected"
+
+    @property
+    def variance_error(self) -> float:
+        """A bound on the relative error of every posterior variance."""
+        variance, error = self._variances
+        error = np.where(error >= 0, error, np.inf)  # NaN counts as an unbounded error
+        relative = np.divide(error, variance, out=np.where(error > 0, np.inf, 0.0), where=variance > 0)
+        return float(relative.max(initial=0.0)) + last_digit(variance)
+
+
+def estimate_rounding(form: Form, u: FloatArray, multipliers: FloatArray) -> float:
+    """Return |df| in standard deviations of the prior, relative to |u|; u : (K,), multipliers : (M,)."""
+    problem = form.problem
+    deviation = np.sqrt(problem.prior.variance)
+    if not problem.prior.rounding or not u.any():
+        return 0.0
+    with np.errstate(all="ignore"):
+        pull = float(norms((deviation * (problem.matrix.T @ multipliers))[:, None])[0])
+        signs = np.random.default_rng(4).choice([-1.0, 1.0], (problem.unknowns, DRAWS))
+        change = problem.prior.rounding * pull * deviation[:, None] * signs
+        change -= form.gain(problem.matrix @ change)
+        whitened = np.divide(change, deviation[:, None], out=np.zeros_like(change), where=deviation[:, None] > 0)
+        return float(norms(whitened).max() / norms(u[:, None])[0])
+
+
+def variance_rounding(form: Form) -> float:
+    """Return the largest dV_i / V_i of a sample of pixels."""
+    problem = form.problem
+    if not problem.prior.rounding:
+        return 0.0
+    variance = form.variance()
+    pixels = sampled_pixels(variance, problem.prior.variance)
+    pixels = pixels[variance[pixels] > 0]
+    with np.errstate(all="ignore"):
+        _, negative = form.pixel_solutions(pixels)
+        unresolved = problem.matrix.T @ negative
+        unresolved[pixels, np.arange(pixels.size)] += 1.0
+        squares = problem.prior.variance @ np.square(unresolved)
+        return float((MARGIN * problem.prior.rounding * squares / variance[pixels]).max(initial=0.0))

@@ -11,8 +11,8 @@ error or on its variances exceeds the tolerance, the next more robust one runs. 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from math import log10
+from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -20,21 +20,15 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import free_memory
 
-from ..forms.covariance import covariance
+from ..forms.cholesky import covariance, information
 from ..forms.dual import dual
 from ..forms.form import Form, NotSolvableError
-from ..forms.information import information
-from ..forms.multiple_precision import MultiplePrecision
-from ..forms.square_root_covariance import square_root_covariance
-from ..forms.square_root_information import square_root_information
+from ..forms.square_root import square_root_covariance, square_root_information
 from ..forms.svd import svd
+from ..output.run_json import RejectedForm, SolverReport
 from ..problem import Problem
-from .certificate import RefinedSolution, refine, variance_error
-from .double_double import DoubleDouble
-from .memory import needed_memory
-from .prior_rounding import estimate_rounding, variance_rounding
-from .refined_form import RefinedForm
-from .residuals import ExactResiduals
+from .certificate import RefinedForm, RefinedSolution, estimate_rounding, refine, variance_error, variance_rounding
+from .residuals import DoubleDouble, ExactResiduals
 
 TOLERANCE = 1e-8
 LEAST_DIGITS = 1.0  # digits that the condition number must leave to a form that squares the matrix
@@ -43,7 +37,6 @@ CONTRADICTION = 1e-6  # relative misfit of noise-free measurements; the precisio
 USEFUL_BOUND = 1e-3  # bound below which an estimate shows whether noise-free measurements are met
 UNKNOWN_BOUND = 10.0  # bound above which u is unknown, and with it which measurements contradict
 WIDE_NOISE = 1e12  # ratio of the largest to the least noise variance from which the SVD loses the noisy rows
-
 FORMS: dict[str, Callable[[Problem], Form]] = {
     "covariance": covariance,
     "information": information,
@@ -54,29 +47,18 @@ FORMS: dict[str, Callable[[Problem], Form]] = {
 }
 
 
-@dataclass(frozen=True)
-class Solver:
-    """The form that computed an estimate, the reason for it, and its numerical error.
-
-    bound : on the error of the estimate, in `unit`; None if nothing was estimated
-    variance_bound : on the relative error of posterior variances, from a sample of pixels
-    tried : forms that were tried or skipped before, each with the reason
-    """
-
-    method: str
-    why: str
-    condition: float
-    variance_bound: float
-    tried: tuple[tuple[str, str], ...] = ()
-    bound: float | None = None
-    refinements: int = 0
-    unit: str = "standard deviation of the prior"
-
-    @property
-    def digits(self) -> float:
-        """Correct decimal digits of the estimate according to the bound."""
-        bound = self.bound if self.bound is not None else self.variance_bound
-        return -log10(max(bound, EPS)) if bound >= 0 else 0.0
+def needed_memory(form: str, measurements: int, unknowns: int, *, correlated: bool = False) -> int:
+    """Return the bytes needed by a form and its error analysis; a `correlated` prior adds its root and copies of it."""
+    both = measurements + unknowns
+    matrix = {
+        "covariance": 3 * measurements**2 + 2 * measurements * unknowns + 2 * unknowns**2,
+        "information": 7 * unknowns**2,
+        "square-root-information": 4 * both * unknowns + 2 * unknowns**2,
+        "square-root-covariance": 3 * both**2,
+        "svd": 4 * measurements * unknowns + 5 * unknowns**2,
+        "dual": 5 * measurements * both + 4 * both * unknowns,
+    }
+    return 8 * (matrix[form] + (4 * unknowns**2 if correlated else 0))
 
 
 @dataclass(frozen=True)
@@ -91,11 +73,11 @@ class Estimate:
     coefficients: FloatArray
     multipliers: FloatArray
     form: Form
-    solver: Solver
+    solver: SolverReport
     residuals: ExactResiduals
 
 
-def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, Solver]:
+def factorise(problem: Problem, method: str = "auto", tolerance: float = TOLERANCE) -> tuple[Form, SolverReport]:
     """Return the form whose posterior variances are accurate to `tolerance`. Raises InputError if there is none."""
     form, solver, _ = _first_accepted(ExactResiduals(problem), method, tolerance, None)
     return form, solver
@@ -137,12 +119,11 @@ def estimate(
 
 def _by_form_of(
     before: Estimate | None, tolerance: float, recorded: FloatArray
-) -> tuple[Form, Solver, RefinedSolution | None] | None:
+) -> tuple[Form, SolverReport, RefinedSolution | None] | None:
     """Return the estimate by the form of another one, None where that form does not reach the tolerance by itself."""
     if before is None or before.solver.method not in FORMS:
         return None
-    reference = _exact_solution(before.residuals, recorded)
-    solver, refined = _with_estimate(before.solver, before.form, before.residuals, recorded, reference)
+    solver, refined = _with_estimate(before.solver, before.form, before.residuals, recorded)
     return (before.form, solver, refined) if _accepted(solver, tolerance, []) else None
 
 
@@ -165,22 +146,22 @@ def _candidates(problem: Problem, method: str) -> tuple[list[str], str]:
 
 def _first_accepted(
     residuals: ExactResiduals, method: str, tolerance: float, recorded: FloatArray | None
-) -> tuple[Form, Solver, RefinedSolution | None]:
+) -> tuple[Form, SolverReport, RefinedSolution | None]:
     problem = residuals.problem
     names, why = _candidates(problem, method)
-    reference = _exact_solution(residuals, recorded)
-    tried: list[tuple[str, str]] = []
+    tried: list[RejectedForm] = []
     refinable: list[Form] = []  # forms whose estimate is accurate and whose variances are not
-    solver, refined = Solver("", why, 0.0, 0.0), None
+    solver: SolverReport | None = None
+    refined: RefinedSolution | None = None
     for name in names:
         try:
             form = _factorised(name, problem)
             error, rounding = variance_error(form, residuals), variance_rounding(form)
-            solver = Solver(name, why, form.condition, error + rounding, tuple(tried))
+            solver = _solver(name, why, form.condition, error + rounding, tried)
             _check_rounding(error, rounding, tolerance)
-            solver, refined = _with_estimate(solver, form, residuals, recorded, reference)
+            solver, refined = _with_estimate(solver, form, residuals, recorded)
         except (NotSolvableError, np.linalg.LinAlgError) as failure:
-            tried.append((name, str(failure)))
+            tried.append(RejectedForm(method=name, why_not=str(failure)))
             continue
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
@@ -188,21 +169,31 @@ def _first_accepted(
             refinable.append(form)
     for form in _last_resorts(residuals, refinable) if method == "auto" else []:
         error = form.variance_error + variance_rounding(form)
-        solver = Solver(form.description, why, form.condition, error, tuple(tried))
-        if isinstance(form, RefinedForm):
-            solver, refined = _with_estimate(solver, form.form, residuals, recorded, None)
-        elif reference is not None:
-            columns = reference.coefficients[:, 0], reference.multipliers[:, 0]
-            bound = float(reference.bound[0]) + estimate_rounding(form, *columns)
-            solver, refined = replace(solver, bound=bound), reference
+        solver = _solver(form.description, why, form.condition, error, tried)
+        solver, refined = _with_estimate(solver, form.form, residuals, recorded)
         if _accepted(solver, tolerance, tried):
             return form, solver, refined
-    if refined is not None and recorded is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND:
+    known = solver is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND
+    if refined is not None and recorded is not None and known:
         _check_contradictions(residuals, recorded, refined)
     raise InputError(
         f"no form of the estimator reaches a relative error of {tolerance:g} here ("
-        + "; ".join(f"{name}: {reason}" for name, reason in tried)
+        + "; ".join(f"{form.method}: {form.why_not}" for form in tried)
         + "); raise estimator.noise_variance or estimator.tolerance"
+    )
+
+
+def _solver(method: str, why: str, condition: float, variance_bound: float, tried: list[RejectedForm]) -> SolverReport:
+    return SolverReport(
+        way="",
+        method=method,
+        why=why,
+        condition=condition if isfinite(condition) else None,
+        bound=None,
+        unit="standard deviation of the prior",
+        variance_bound=variance_bound,
+        refinements=0,
+        tried=tuple(tried),
     )
 
 
@@ -215,65 +206,47 @@ def _check_rounding(error: float, rounding: float, tolerance: float) -> None:
         )
 
 
-def _last_resorts(residuals: ExactResiduals, refinable: list[Form]) -> list[RefinedForm] | list[MultiplePrecision]:
-    """Return multiple precision for a small problem, else forms whose every solution is refined, most robust first."""
-    if residuals.reference is not None:
-        return [residuals.reference]
+def _last_resorts(residuals: ExactResiduals, refinable: list[Form]) -> list[RefinedForm]:
+    """Return forms whose every solution is refined, most robust first; none where a measurement has no noise.
+
+    A bound on the estimate from nearly equal rows without noise is itself an estimate, which refinement can mislead.
+    """
+    if not residuals.problem.noisy:
+        return []
     return [RefinedForm(form.problem, form.condition, form, residuals) for form in reversed(refinable)]
 
 
-def _exact_solution(residuals: ExactResiduals, recorded: FloatArray | None) -> RefinedSolution | None:
-    """Return the estimate of a small problem in multiple precision. Raises InputError for contradictions."""
-    if residuals.reference is None or recorded is None:
-        return None
-    try:
-        solution = residuals.reference.estimate(recorded)
-    except NotSolvableError as error:
-        raise InputError(f"the estimate is too sensitive: {error}; raise estimator.noise_variance") from error
-    _refuse_contradiction(solution.contradiction)
-    size = float(np.linalg.norm(solution.high))
-    uncertainty = 0.0 if solution.uncertainty == 0 else (solution.uncertainty / size if size > 0 else np.inf)
-    bound = np.array([uncertainty + EPS])
-    columns = solution.high[:, None], solution.low[:, None], solution.multipliers[:, None]
-    return RefinedSolution(*columns, bound, bound, 0)
-
-
 def _with_estimate(
-    solver: Solver,
+    solver: SolverReport,
     form: Form,
     residuals: ExactResiduals,
     recorded: FloatArray | None,
-    reference: RefinedSolution | None,
-) -> tuple[Solver, RefinedSolution | None]:
+) -> tuple[SolverReport, RefinedSolution | None]:
     if recorded is None:
         return solver, None
-    right = None if reference is None else DoubleDouble(reference.coefficients, reference.low)
     with np.errstate(all="ignore"):
         deviation = residuals.recorded(recorded)
-    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation, right)
-    bound = float(refined.bound[0]) + (EPS if reference is None else float(reference.bound[0]))
+    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation)
+    bound = float(refined.bound[0]) + EPS
     bound += estimate_rounding(form, refined.coefficients[:, 0], refined.multipliers[:, 0])
-    if reference is None and bound <= USEFUL_BOUND:
+    if bound <= USEFUL_BOUND:
         _check_contradictions(residuals, recorded, refined)
-    return replace(solver, bound=bound, refinements=refined.steps), refined
+    return solver.model_copy(update={"bound": bound, "refinements": refined.steps}), refined
 
 
-def _accepted(solver: Solver, tolerance: float, tried: list[tuple[str, str]]) -> bool:
+def _accepted(solver: SolverReport, tolerance: float, tried: list[RejectedForm]) -> bool:
     """Return True if both bounds meet the tolerance, which NaN does not; else note the reason."""
     met = solver.variance_bound <= tolerance and (solver.bound is None or solver.bound <= tolerance)
     if not met:
         bad = not solver.variance_bound <= tolerance
         quantity, worst = ("variances are", solver.variance_bound) if bad else ("the estimate is", solver.bound)
-        tried.append((solver.method, f"{quantity} accurate to {worst:.1e} only"))
+        tried.append(RejectedForm(method=solver.method, why_not=f"{quantity} accurate to {worst:.1e} only"))
     return met
 
 
 def _check_contradictions(residuals: ExactResiduals, recorded: FloatArray, refined: RefinedSolution) -> None:
     with np.errstate(all="ignore"):
-        _refuse_contradiction(residuals.contradiction(recorded, DoubleDouble(refined.coefficients, refined.low)))
-
-
-def _refuse_contradiction(misfit: float) -> None:
+        misfit = residuals.contradiction(recorded, DoubleDouble(refined.coefficients, refined.low))
     if misfit > CONTRADICTION:
         raise InputError(
             f"measurements without noise contradict one another or the prior by {misfit:.2g} of their values; set"

@@ -20,8 +20,8 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..gram import gram
 from ..prior import Prior, lag_distances, stationary_matrix
+from ..problem import gram
 
 OUTSIDE = 1e-6  # share of a measurement's footprint that may lie outside its tile
 

@@ -18,7 +18,7 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem
 from .form import Form, root_variance
-from .sorted_qr import Indices, SortedQr, sorted_qr
+from .square_root import Indices, SortedQr, sorted_qr
 
 EPS = float(np.finfo(np.float64).eps)
 SCALING_SWEEPS = 30

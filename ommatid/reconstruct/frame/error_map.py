@@ -3,6 +3,10 @@
 Even noise and an ideal H are served by the transfer function, any other noise and H by windows side by side, lens types
 that leave a null space by one sweep over the frame. A correlated prior takes the maps of even noise at several levels,
 between which each pixel finds that of the measurements near it.
+
+The error of a map is measured at random pixels by exact solutions of the frame's own system. With x = C z, z random
+signs at pixels k far from one another and 0 elsewhere, z_k x_k is C_kk: what the others add falls with the distance as
+C does (Tang and Saad 2012). So one solution measures the variances of some hundred pixels.
 """
 
 from __future__ import annotations
@@ -21,14 +25,11 @@ from ommatid.runtime.processors import processors
 from ommatid.scenes.camera import Camera
 
 from ..methods.method import EstimationTask, is_uniform
-from .banded_system import BandedSystem, leaves_null_space
-from .conjugate_gradients import FrameSystem
-from .map_check import ExactVariances, MapCheck, check_map
-from .nearly_even import LARGEST_GAP, NearlyEven
+from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, leaves_null_space
 from .preconditioner import Preconditioner, is_sliding
-from .selected_inverse import whole_variances
-from .stencil import Stencil, box_stencil, even_couplings, pixel_numbers, stored_stencil
 from .variance_map import (
+    LARGEST_GAP,
+    NearlyEven,
     VarianceMap,
     interior_variance,
     posterior_variance,
@@ -38,9 +39,32 @@ from .variance_map import (
     unseen_corners,
     variance_map,
 )
-from .window_variances import BESIDE, CORE, LENGTH, EvenNoise, frame_variances
+from .window_variances import (
+    BESIDE,
+    CORE,
+    LENGTH,
+    EvenNoise,
+    Stencil,
+    box_stencil,
+    even_couplings,
+    frame_variances,
+    pixel_numbers,
+    stored_stencil,
+    whole_variances,
+)
 
-MANY = 250_000  # pixels above which a shorter halo saves minutes
+Pixels = NDArray[np.intp]
+
+SEED = 20260401  # of the pixels, different from those of data and calibration
+SPACING = 80  # rows or columns between two pixels of a set, at least
+MOST = 200  # pixels of a set
+TRIALS = 2000  # random pixels that are tried for it
+EDGE = 4  # pixels: how near the edges the first of a set lie
+SETS = 2  # of few pixels; one of many
+SINGLE = 6  # pixels where errors are correlated over any distance, and each needs a solution of its own
+FEW_SINGLE = 2  # of many pixels
+MANY = 250_000
+EXACT = 1e-3  # relative accuracy of a solution
 EVEN = 1e-3  # relative range of noise variances that count as equal
 HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
 SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
@@ -48,6 +72,84 @@ LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies 
 WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
 LEVELS = 4  # of even noise, for a correlated prior
 LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
+
+
+@dataclass(frozen=True)
+class MapCheck:
+    """The difference of a map from exact variances at random pixels, relative: the largest, and that of the mean."""
+
+    worst: float
+    mean: float
+
+
+@dataclass(frozen=True)
+class ExactVariances:
+    """Exact variances of some pixels of a frame.
+
+    noise : (M,) Rvm / Rv^2, None where the actual noise Rvm is the expected one
+    accuracy : that of solutions in posterior standard deviations, if EXACT is out of reach
+    """
+
+    system: FrameSystem
+    noise: FloatArray | None
+    accuracy: float
+
+    def at(self, pixels: Pixels, posterior: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Return Eq. 5 of pixels whose errors are not correlated, (n,); posterior : (N,) about the diagonal of C."""
+        signs = np.zeros_like(posterior)
+        signs[pixels] = rng.choice([-1.0, 1.0], size=pixels.size)
+        finest = EXACT * float(np.sqrt(posterior[pixels].min()))
+        solved = self._solve(signs, finest)
+        if self.noise is not None:
+            readings = self.system.observation.forward(solved)
+            readings *= self.noise
+            right = self.system.observation.adjoint(readings) + self.system.apply_prior_precision(solved)
+            smallest = float(np.min((signs * solved)[pixels]))
+            solved = self._solve(right, min(finest, EXACT * max(smallest, 0.0) / float(posterior.max()) ** 0.5))
+        return (signs * solved)[pixels]
+
+    def _solve(self, right: FloatArray, accuracy: float) -> FloatArray:
+        try:
+            return self.system.solve(right, min(accuracy, self.accuracy)).image
+        except NotReachedError:
+            return self.system.solve(right, self.accuracy).image
+
+
+def check_map(
+    variance: FloatArray, posterior: FloatArray, shape: tuple[int, int], exact: ExactVariances, *, local: bool
+) -> MapCheck:
+    """Compare a map of Eq. 5, (N,), with exact solutions; posterior : (N,) the map of the diagonal of C.
+
+    local : False where errors are correlated over any distance, so that pixels are taken one at a time
+    """
+    rng = np.random.default_rng(SEED)
+    ratios: list[FloatArray] = []
+    many = variance.size > MANY
+    for number in range((1 if many else SETS) if local else (FEW_SINGLE if many else SINGLE)):
+        pixels = spread_pixels(shape, rng, edges=local or bool(number % 2))
+        if not local:
+            pixels = pixels[:1]
+        ratios.append(variance[pixels] / exact.at(pixels, posterior, rng) - 1)
+    ratio = np.concatenate(ratios)
+    worst = float(np.abs(ratio).max())
+    if not local:
+        return MapCheck(worst, worst)
+    return MapCheck(worst, min(worst, abs(float(ratio.mean())) + 2 * float(ratio.std()) / ratio.size**0.5))
+
+
+def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bool) -> Pixels:
+    """Return random pixels of a frame that lie SPACING rows or columns apart, (n,); with `edges` some lie near them."""
+    rows, columns = shape
+    trials = np.stack([rng.integers(rows, size=TRIALS), rng.integers(columns, size=TRIALS)], axis=1)
+    for number in range(4 if edges else 0):
+        axis, end = divmod(number, 2)
+        near = int(rng.integers(min(EDGE, shape[axis])))
+        trials[number, axis] = shape[axis] - 1 - near if end else near
+    chosen = [trials[0]]
+    for pixel in trials[1:]:
+        if len(chosen) < MOST and (np.abs(np.array(chosen) - pixel).max(axis=1) >= SPACING).all():
+            chosen.append(pixel)
+    return np.array([row * columns + column for row, column in chosen], dtype=np.intp)
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from math import isfinite
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
-from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import (
     EstimationTask,
@@ -27,11 +27,10 @@ from ..methods.method import (
     total_variance,
 )
 from ..methods.prepared import SAME_NOISE
+from ..output.run_json import SolverReport
 from ..verdict.residual_power import ResidualInputs, ResidualPower
-from .banded_system import BandedSystem, serves
-from .conjugate_gradients import FrameSystem, Solution, posterior_operators
-from .error_map import MANY, ErrorMap
-from .map_check import MapCheck
+from .conjugate_gradients import BandedSystem, FrameSystem, Solution, posterior_operators, serves
+from .error_map import MANY, ErrorMap, MapCheck
 from .preconditioner import is_sliding
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
@@ -123,10 +122,11 @@ class FrameMethod(Method):
         expected, check = errors.expected, errors.check
         deviation = None if truth is None else truth - task.prior.mean
         given = None if deviation is None else self._interval(deviation, actual, expected, check.mean)
-        solver = Solver(
+        solver = SolverReport(
+            way="frame",
             method="frame",
             why=NULL_SPACE if self._banded else "every lens type is shift-invariant except at the edges",
-            condition=solution.condition,
+            condition=solution.condition if isfinite(solution.condition) else None,
             variance_bound=check.worst + (difference or 0.0),
             bound=solution.bound,
             refinements=solution.steps,

@@ -26,9 +26,8 @@ from scipy import linalg, sparse
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
-from ..forms.cholesky import factorise_positive
+from ..forms.cholesky import factorise_positive, information
 from ..forms.form import NotSolvableError
-from ..forms.information import information
 from ..problem import Problem
 
 EPS = float(np.finfo(np.float64).eps)

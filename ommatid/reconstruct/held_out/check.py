@@ -10,7 +10,7 @@ is named and left out, and the rest is judged again, until the others agree.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import log
 
 import numpy as np
@@ -23,14 +23,13 @@ from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
-from ommatid.scenes.tables.estimation import PriorTable
 
 from ..assumptions import assumptions_for, with_fallback
 from ..detail.detailed_model import DetailedModel
 from ..method_choice import MethodChoice
 from ..methods.method import EstimationTask, Execution
-from .stationary_prior import fitted_prior
-from .windows import HeldOutSums, held_out_sums, windows
+from ..output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, HeldOutVerdict, HeldOutWindows
+from .windows import HeldOutSums, fitted_prior, held_out_sums, windows
 
 SIGNIFICANCE = 1e-4  # of all sub-imagers together
 LEAST_EXCESS = 0.1  # of the sum of squares over its expectation
@@ -40,50 +39,7 @@ MOST_QUICK_DETAILED = 1500  # where the world is finer than f, so that S is that
 MOST_NAMED = 10  # sub-imagers left out one after the other
 LEAST_DEVIATE = -37.0  # z of a probability of 1 in float64
 TERMS = 200  # of a continued fraction
-
-
-@dataclass(frozen=True)
-class HeldOutSubImager:
-    """How well a sub-imager is predicted from all others.
-
-    pixels : used for it; 0 if none is usable, and then the rest is None
-    z : normal deviate of the same probability as `chi_squared`
-    rms_error, expected_rms : of its error in grey levels, weighted by the precision of the prediction
-    disagrees : before any sub-imager was left out;  named : among those that explain the disagreement
-    """
-
-    sub: SubImager
-    pixels: int
-    chi_squared: float
-    z: float | None
-    p_value: float | None
-    rms_error: float | None
-    expected_rms: float | None
-    disagrees: bool
-    named: bool
-
-
-@dataclass(frozen=True)
-class HeldOutCheck:
-    """The check of a stack with a model.
-
-    p_value : of the largest deviation among all sub-imagers (Sidak), None if none can be predicted
-    explained : True if the named sub-imagers explain the disagreement of the others
-    prior : as assumed;  fitted : True if it was fitted to the stack
-    windows : windows of the target that were checked, and their number in all
-    """
-
-    sub_imagers: tuple[HeldOutSubImager, ...]
-    p_value: float | None
-    explained: bool
-    prior: PriorTable
-    fitted: bool
-    windows: tuple[int, int]
-
-    @property
-    def trusted(self) -> bool:
-        """True if no sub-imager disagrees."""
-        return not any(sub.disagrees for sub in self.sub_imagers)
+MOST_LISTED = 5  # sub-imagers in one sentence
 
 
 def log_survival(chi_squared: FloatArray, freedoms: FloatArray) -> FloatArray:
@@ -105,7 +61,7 @@ def log_survival(chi_squared: FloatArray, freedoms: FloatArray) -> FloatArray:
 @one_thread()
 def check_held_out(
     stack: Stack, model: Model, *, fitted: bool = True, progress: Progress = no_progress
-) -> HeldOutCheck:
+) -> HeldOutReport:
     """Predict every sub-imager of a stack from all others, and name those that disagree.
 
     fitted : True replaces an independent prior by one fitted to the stack, since a photograph is no draw of it; then
@@ -114,16 +70,16 @@ def check_held_out(
     """
     execution = Execution(progress=progress)
 
-    def checked(choice: MethodChoice) -> HeldOutCheck:
+    def checked(choice: MethodChoice) -> HeldOutReport:
         assumed = assumptions_for(stack, model, choice, execution)
         found = check_task(assumed.method.task, choice.method, fitted=fitted, execution=execution)
-        return replace(found, fitted=True) if stack.scene.prior.kind == "fit" else found
+        return with_fitted_prior(found) if stack.scene.prior.kind == "fit" else found
 
     return with_fallback(stack, model, checked)
 
 
 @one_thread()
-def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Execution | None = None) -> HeldOutCheck:
+def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Execution | None = None) -> HeldOutReport:
     """Check a task whose noise is known; `method` is that of the estimate. Arguments and errors: `check_held_out`."""
     if method == "fit":
         raise InputError(
@@ -141,14 +97,14 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
     if prior is None:
         return _check(task, robust, execution, fitted=False)
     narrow = _check(replace(task, prior=prior), robust, execution, fitted=True)
-    if narrow.trusted:
+    if narrow.verdict.trusted is not False:
         return narrow
     # Parts of a picture differ more from one another than the fitted prior knows; the scene's is wide enough for all.
     wide = _check(task, robust, execution, fitted=False)
-    return wide if wide.trusted else narrow
+    return wide if wide.verdict.trusted is not False else narrow
 
 
-def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: bool) -> HeldOutCheck:
+def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: bool) -> HeldOutReport:
     shown, total = windows(task, robust)
     rounds = _Rounds(task, robust, execution)
     first = rounds.sums(())
@@ -160,11 +116,31 @@ def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: 
         for index, sub in enumerate(task.model.camera.sub_imagers)
     )
     explained = bool(named) or not disagreeing.any()
-    return HeldOutCheck(subs, _familywise(first), explained, task.prior, fitted, (len(shown), total))
+    prior = HeldOutPrior(
+        kind=task.prior.kind,
+        mean=task.prior.mean,
+        variance=task.prior.variance,
+        correlation_length=task.prior.correlation_length,
+        fitted=fitted,
+    )
+    report = HeldOutReport(
+        verdict=HeldOutVerdict(trusted=None, reasons=()),
+        p_value=_familywise(first),
+        explained=explained,
+        prior=prior,
+        windows=HeldOutWindows(checked=len(shown), total=total),
+        sub_imagers=subs,
+    )
+    return report.model_copy(update={"verdict": _verdict(report)})
+
+
+def with_fitted_prior(report: HeldOutReport) -> HeldOutReport:
+    """Return the report of a prior that was fitted to the stack before."""
+    return report.model_copy(update={"prior": report.prior.model_copy(update={"fitted": True})})
 
 
 @one_thread()
-def quick_check(task: EstimationTask, method: str) -> HeldOutCheck | None:
+def quick_check(task: EstimationTask, method: str) -> HeldOutReport | None:
     """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
     possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())
     most = MOST_QUICK_DETAILED if isinstance(task.model, DetailedModel) else MOST_QUICK
@@ -260,19 +236,62 @@ def _deviate(log_p: float, chi_squared: float, freedoms: int) -> float:
     return max(float(special.ndtri(special.gammainc(freedoms / 2, chi_squared / 2))), LEAST_DEVIATE)
 
 
-def _sub_imager(sub: SubImager, index: int, sums: HeldOutSums, disagrees: bool, named: bool) -> HeldOutSubImager:
+def _sub_imager(sub: SubImager, index: int, sums: HeldOutSums, disagrees: bool, named: bool) -> HeldOutEntry:
     pixels, chi_squared = int(sums.pixels[index]), float(sums.chi_squared[index])
-    if not pixels:
-        return HeldOutSubImager(sub, 0, 0.0, None, None, None, None, disagrees, named)
-    log_p, precision = float(_log_p(sums)[index]), float(sums.precision[index])
-    return HeldOutSubImager(
-        sub=sub,
+    numbers: dict[str, float | None] = dict.fromkeys(("z", "p_value", "rms_error", "expected_rms"))
+    if pixels:
+        log_p, precision = float(_log_p(sums)[index]), float(sums.precision[index])
+        numbers = {
+            "z": _deviate(log_p, chi_squared, pixels),
+            "p_value": float(np.exp(log_p)),
+            "rms_error": (chi_squared / precision) ** 0.5,
+            "expected_rms": (pixels / precision) ** 0.5,
+        }
+    return HeldOutEntry(
+        name=sub.name,
+        type=sub.type.name,
+        k=sub.k,
+        l=sub.l,
         pixels=pixels,
-        chi_squared=chi_squared,
-        z=_deviate(log_p, chi_squared, pixels),
-        p_value=float(np.exp(log_p)),
-        rms_error=(chi_squared / precision) ** 0.5,
-        expected_rms=(pixels / precision) ** 0.5,
+        chi_squared=chi_squared if pixels else 0.0,
+        expected=float(pixels),
+        **numbers,
         disagrees=disagrees,
         named=named,
     )
+
+
+def _verdict(report: HeldOutReport) -> HeldOutVerdict:
+    if not report.judged:
+        reason = "not checked: fewer than two sub-imagers have pixels that can be predicted from one another"
+        return HeldOutVerdict(trusted=None, reasons=(reason,))
+    disagreeing = [entry for entry in report.worst() if entry.disagrees]
+    named = [entry for entry in report.worst() if entry.named]
+    if not disagreeing:
+        return HeldOutVerdict(trusted=True, reasons=())
+    if named:
+        one = len(named) == 1
+        subject = f"sub-imager {_listed(named)} contradicts" if one else f"sub-imagers {_listed(named)} contradict"
+        reason = (
+            f"{subject} the others: {_size(named[0])}; {'its' if one else 'their'} H is not this camera's, or"
+            f" {'its' if one else 'their'} pixels are damaged; the others agree"
+        )
+    else:
+        reason = (
+            f"{len(disagreeing)} of {report.judged} sub-imagers contradict one another, most {_listed(disagreeing)}:"
+            f" {_size(disagreeing[0])}; H is not this camera's, the world has depth or detail finer than f, or the"
+            " noise is larger than stated"
+        )
+    return HeldOutVerdict(trusted=False, reasons=(reason,))
+
+
+def _size(entry: HeldOutEntry) -> str:
+    return f"{entry.name} errs by {entry.rms_error:.3g} grey levels where {entry.expected_rms:.3g} are expected"
+
+
+def _listed(entries: list[HeldOutEntry]) -> str:
+    """Return "A", "A and B", or the first few names and the number of the others."""
+    names = [entry.name for entry in entries[:MOST_LISTED]]
+    more = len(entries) - len(names)
+    names += [f"{more} more"] if more else []
+    return f"{', '.join(names[:-1])} and {names[-1]}" if names[1:] else names[0]

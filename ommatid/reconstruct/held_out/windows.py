@@ -1,12 +1,16 @@
-"""The problems in which sub-imagers are predicted: the whole of a small target, or windows of a frame.
+"""The problems in which sub-imagers are predicted: the whole of a small target, or windows of a frame; and their prior.
 
 The windows of a frame do not overlap, and a window holds the measurements that see nothing outside it. So sums of
 squares of different windows are independent where the pixels of the prior are, and a sub-imager's sums add up.
+
+A prior of natural pictures is fitted to a few small windows of the stack: seconds, whatever the size. The errors of
+predictions hardly depend on it, since other sub-imagers see most of what one sees. It matters in components of the
+image that one sub-imager alone sees.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise, product
@@ -14,26 +18,65 @@ from itertools import pairwise, product
 import numpy as np
 from scipy import linalg, sparse
 
-from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.tables.estimation import PriorTable
 
 from ..detail.detailed_model import DetailedModel
+from ..fitting.evidence import Evidence
+from ..fitting.prior_fit import MIN_MEASUREMENTS, fit_prior
 from ..methods.method import EstimationTask, Execution
 from ..misalignment.robust_noise import robust_noise, whitening
 from ..prior import Prior, covariance_root
 from ..problem import Problem
 from .block_errors import block_errors
 
+Window = tuple[slice, slice]
+
 MOST_WHOLE = 1700  # pixels of a target that is one window
 WINDOW, WIDEST_WINDOW = 32, 60  # pixels, largest side of a window of a frame: of narrow and of wide footprints
 REACHES = 3  # footprints that fit side by side into a window
 LEAST_NOISE = 1e-3  # share of the expected noise that is independent, at least
 MOST_WINDOWS = 8  # along each axis; of larger frames so many at equal distances
+FIT_WINDOW = 16  # pixels, side of a window of narrow footprints
+FIT_REACHES = 2  # footprints that fit side by side into a window
+PER_AXIS = 3  # most windows along each axis
 
-Window = tuple[slice, slice]
-Unwhitening = Callable[[FloatArray], FloatArray]
+
+def fitted_prior(task: EstimationTask) -> PriorTable | None:
+    """Return the exponential prior of largest evidence with the task's noise; None if measurements are too few."""
+    side = max(FIT_WINDOW, FIT_REACHES * task.model.reach)
+    windows = product(*(_spread(size, side) for size in task.shape))
+    blocks = [_window(task, rows, columns) for rows, columns in windows]
+    residual = np.concatenate([block.residual for block in blocks])
+    if residual.size < MIN_MEASUREMENTS or not residual.any():
+        return None
+    matrix = sparse.csr_array(sparse.block_diag([block.matrix for block in blocks], format="csr"))
+    noise = np.concatenate([block.known_noise for block in blocks])
+    fit = fit_prior(Evidence(matrix, residual, noise, task.shape, None, True), blocks)
+    if fit.variance is None or fit.length is None:
+        return None
+    length = fit.length * task.model.camera.target_pitch
+    update = {"kind": "exponential", "variance": fit.variance, "correlation_length": length, "exponent": None}
+    return task.prior.model_copy(update=update)
+
+
+def _spread(size: int, side: int) -> list[slice]:
+    """Return windows of one axis in the middle of equal parts of it, or all of it where it is short."""
+    count = min(size // side, PER_AXIS)
+    if count <= 1:
+        return [slice(0, size)]
+    starts = (np.arange(count) + 0.5) * size / count - side / 2
+    return [slice(int(start), int(start) + side) for start in starts]
+
+
+def _window(task: EstimationTask, rows: slice, columns: slice) -> Evidence:
+    """Return the evidence of the used measurements inside a window."""
+    window = task.window(rows, columns)
+    residual = window.recorded - task.prior.mean * window.matrix.sum(axis=1)
+    return Evidence(window.matrix, residual, window.expected_noise, window.shape, None, True)
 
 
 @dataclass(frozen=True)
@@ -191,21 +234,17 @@ def _whole_robust(task: EstimationTask) -> WindowProblem:
 
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:
     """Yield the problem of every window, one at a time to bound memory."""
-    camera, index_among_used, shared = task.model.camera, np.cumsum(task.used) - 1, _SharedErrors(task)
+    camera, shared, used = task.model.camera, _SharedErrors(task), np.flatnonzero(task.used)
 
     @cache
     def prior_on(shape: tuple[int, int]) -> Prior:
         return task.prior_on(shape)
 
     for rows, columns in chosen:
-        inside = task.model.measurements_inside(rows, columns)
-        kept: BoolArray = task.used[inside]
-        matrix = task.model.submatrix(rows, columns)[kept]
-        inside = inside[kept]
-        noise = task.expected_noise[index_among_used[inside]]
-        prior = prior_on((rows.stop - rows.start, columns.stop - columns.start))
-        problem = shared.problem(matrix, prior, noise, index_among_used[inside])
-        yield WindowProblem(problem, task.recorded[inside], _sub_imager_of(camera, inside), len(camera.sub_imagers))
+        window = task.window(rows, columns)
+        problem = shared.problem(window.matrix, prior_on(window.shape), window.expected_noise, window.index)
+        sub_imager = _sub_imager_of(camera, used[window.index])
+        yield WindowProblem(problem, window.recorded, sub_imager, len(camera.sub_imagers))
 
 
 def _sums(window: WindowProblem) -> HeldOutSums:

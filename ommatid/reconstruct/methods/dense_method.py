@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -52,10 +51,12 @@ class DenseMethod(Method):
         make = partial(expected_error, solution.form, noise)
         expected, difference = self.shared("errors", self.conditions(noise), make, SAME_NOISE)
         solver = solution.solver
+        if difference:
+            solver = solver.model_copy(update={"variance_bound": solver.variance_bound + difference})
         return MethodResult(
             solution.image,
             solution.multipliers,
-            replace(solver, variance_bound=solver.variance_bound + difference) if difference else solver,
+            solver,
             expected,
             None if truth is None else expected_given(solution.form, truth, actual),
             lambda weights: variance_of_sum(solution.form, weights, actual),

@@ -11,14 +11,14 @@ from typing import TypeVar
 import numpy as np
 from scipy import fft, sparse
 
-from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables import estimation
 
-from ..estimator.estimate import Solver
 from ..expected_error import ExpectedError, Interval
+from ..output.run_json import SolverReport
 from ..prior import Prior, prior_of, spectrum_of
 from ..verdict.residual_power import ResidualPower
 from .prepared import Conditions, Prepared
@@ -33,6 +33,20 @@ class Execution:
     workers: Workers | None = None
     progress: Progress = no_progress
     prepared: Prepared | None = None
+
+
+@dataclass(frozen=True)
+class TaskWindow:
+    """The used measurements that see nothing outside a window of f of this shape: (m,) of them.
+
+    matrix : (m, pixels of the window) H;  index : (m,) of the measurements among all that are used
+    """
+
+    matrix: sparse.csr_array
+    recorded: FloatArray
+    expected_noise: FloatArray
+    index: IntArray
+    shape: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -64,6 +78,27 @@ class EstimationTask:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of f."""
         return self.model.camera.rows, self.model.camera.columns
+
+    def window(self, rows: slice, columns: slice) -> TaskWindow:
+        """Cut out a window of f with the used measurements that see nothing outside it."""
+        inside = self.model.measurements_inside(rows, columns)
+        used = self.used[inside]
+        numbers, shape = inside[used], (rows.stop - rows.start, columns.stop - columns.start)
+        index, matrix = self.among_used(numbers), self.model.submatrix(rows, columns)[used]
+        return TaskWindow(matrix, self.recorded[numbers], self.expected_noise[index], index, shape)
+
+    def used_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Return the numbers, in ascending order, of the used measurements that see nothing outside a window of f."""
+        inside = self.model.measurements_inside(rows, columns)
+        return inside if self.complete else inside[self.used[inside]]
+
+    def among_used(self, numbers: IntArray) -> IntArray:
+        """Return the indices of used measurements among those that are used."""
+        return numbers if self.complete else self._order[numbers]
+
+    @cached_property
+    def _order(self) -> IntArray:
+        return np.cumsum(self.used) - 1
 
     @property
     def _scale(self) -> tuple[float, int]:
@@ -135,7 +170,7 @@ class MethodResult:
 
     image: FloatArray
     multipliers: FloatArray
-    solver: Solver
+    solver: SolverReport
     expected: ExpectedError
     interval: Interval | None
     variance_of_sum: Callable[[FloatArray], float]

@@ -18,9 +18,10 @@ from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.processors import one_thread
 from ommatid.scenes.tables.estimation import EstimatorTable
 
-from ..estimator.estimate import FORMS, Solver, estimate
+from ..estimator.estimate import FORMS, estimate
 from ..expected_error import expected_error
 from ..forms.form import Form
+from ..output.run_json import SolverReport
 from ..prior import Prior
 from ..problem import Problem
 
@@ -104,7 +105,7 @@ class SolvedTiles:
     """
 
     image: FloatArray
-    solver: Solver
+    solver: SolverReport
     variance: FloatArray
     resolved: FloatArray
     missing: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from math import isfinite
 from time import perf_counter
 from typing import Any
@@ -14,10 +14,9 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.optics.negligible import SkippedEffect, assumptions, skipped_effects
 from ommatid.scenes.stack import STRAIGHT, Stack
 
-from ..estimator.estimate import Solver
-from ..held_out.check import quick_check
+from ..held_out.check import quick_check, with_fitted_prior
+from ..measured_error import best_single_sub_image
 from ..restore import Reconstruction
-from .held_out_report import held_out_report
 from .run_json import (
     BaselineReport,
     DiagnosticsReport,
@@ -25,15 +24,11 @@ from .run_json import (
     FittedNumber,
     IntervalReport,
     ModelReport,
-    ResidualReport,
     RunReport,
     SeedReport,
     SkippedReport,
     StageReport,
-    VerdictReport,
 )
-from .single_sub_image import best_single_sub_image
-from .solver_report import RejectedForm, SolverReport
 from .time_spent import time_spent
 
 
@@ -49,12 +44,12 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
     as_run = stack.scene.model_copy(update={"calibration": model.scene.calibration})
     return RunReport(
         title=stack.scene.title,
-        verdict=VerdictReport.model_validate(restoration.verdict),
+        verdict=restoration.verdict,
         measurements=model.measurements,
         unknowns=stack.camera.unknowns,
         stages=stages,
         error=error,
-        solver=_solver(restoration.choice.method, restoration.solver),
+        solver=restoration.solver.model_copy(update={"way": restoration.choice.method}),
         diagnostics=_diagnostics(restoration),
         model=_model(model, restoration.spurious_information),
         skipped=tuple(
@@ -82,11 +77,11 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
 
 
 def _held_out(restoration: Reconstruction) -> dict[str, Any]:
-    check = quick_check(restoration.task, restoration.choice.method)
-    if check is None:
+    report = quick_check(restoration.task, restoration.choice.method)
+    if report is None:
         return {}
     fitted = restoration.fit is not None and restoration.fit.variance is not None
-    return {"held_out": held_out_report(replace(check, fitted=fitted))}
+    return {"held_out": with_fitted_prior(report) if fitted else report}
 
 
 def _stage(record: dict[str, Any]) -> StageReport:
@@ -112,24 +107,9 @@ def _error(restoration: Reconstruction, stack: Stack) -> ErrorReport:
     )
 
 
-def _solver(method: str, solver: Solver) -> SolverReport:
-    return SolverReport(
-        way=method,
-        method=solver.method,
-        why=solver.why,
-        condition=solver.condition if isfinite(solver.condition) else None,
-        digits=solver.digits,
-        bound=solver.bound,
-        unit=solver.unit,
-        variance_bound=solver.variance_bound,
-        refinements=solver.refinements,
-        tried=tuple(RejectedForm(method=name, why_not=reason) for name, reason in solver.tried),
-    )
-
-
 def _diagnostics(restoration: Reconstruction) -> DiagnosticsReport:
     width = float(np.median(restoration.expected.resolution))
-    fit, residual = restoration.fit, restoration.residual
+    fit = restoration.fit
     fitted: dict[str, Any] = {}
     if fit is not None:
         numbers = {"variance": fit.variance, "correlation_length": fit.length, "noise_variance": fit.noise_variance}
@@ -150,7 +130,7 @@ def _diagnostics(restoration: Reconstruction) -> DiagnosticsReport:
         pixels_saturated=restoration.usable.saturated,
         degrees_of_freedom=restoration.expected.degrees_of_freedom,
         resolution=width if isfinite(width) else None,
-        chi_squared=None if residual is None else ResidualReport.model_validate(residual),
+        chi_squared=restoration.residual,
         **fitted,
     )
 

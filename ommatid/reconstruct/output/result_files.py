@@ -12,9 +12,10 @@ import numpy as np
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.workers import Workers
-from ommatid.runtime.files import cached, digest, fingerprint
+from ommatid.runtime.files import cached, digest, fingerprint, write_whole
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import origin
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.formats import exr
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
@@ -23,7 +24,7 @@ from ommatid.scenes.stack import Stack
 
 from ..methods.prepared import Prepared
 from ..restore import Reconstruction, check_match, restore
-from . import figures, run_json
+from . import run_json
 from .estimate_formats import format_file
 from .overview import ESTIMATE, OVERVIEW, write_overview
 from .report import report_of
@@ -103,6 +104,15 @@ def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, An
     exr.write(path, [exr.Part("estimate", maps, record)])
 
 
+def write_picture(path: Path, estimate: FloatArray) -> None:
+    """Write an estimate, (rows, columns), as 8-bit PNG, one pixel each; values outside 0 to 255 are clipped."""
+    from skimage import io
+
+    pixels = np.clip(np.round(estimate), 0, WHITE).astype(np.uint8)
+    imsave: Any = io.imsave  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    write_whole(path, lambda beside: imsave(beside, pixels, check_contrast=False))
+
+
 def write_results(folder: Path, stack: Stack, restoration: Reconstruction, report: RunReport) -> None:
     """Write the four files of a run. run.json comes last: where it is, all are there. Raises MachineError.
 
@@ -113,7 +123,7 @@ def write_results(folder: Path, stack: Stack, restoration: Reconstruction, repor
             format_file(folder / ESTIMATE, name).unlink(missing_ok=True)
     record = {"title": stack.scene.title, "fingerprint": report.fingerprint}
     write_estimate(folder / ESTIMATE, restoration, record)
-    figures.write_estimate(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
+    write_picture(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
     write_overview(folder, stack, report)
     run_json.write(folder, report)
 

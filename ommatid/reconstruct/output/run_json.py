@@ -7,21 +7,32 @@ None is null. Readers ignore keys that they do not know.
 from __future__ import annotations
 
 import json
+from math import log10
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, computed_field
 
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import check_unique_keys, read_bytes
 from ommatid.scenes.formats.provenance import FitRecord
 
-from .held_out_report import HeldOutReport
-from .record import Amount, Record
-from .solver_report import SolverReport
-
 RUN = "run.json"
+EPS = 2.0**-52  # of float64
+
+Amount = Annotated[float, Field(ge=0, le=1e100)]  # a squared error, or a time in seconds
+Index = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class Record(BaseModel):
+    """A part of run.json; frozen, and built from keywords, from JSON or from an object with these attributes."""
+
+    model_config = ConfigDict(frozen=True, from_attributes=True, allow_inf_nan=False)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the fields that were set, in JSON's types."""
+        return self.model_dump(mode="json", exclude_unset=True)
 
 
 class StageReport(Record):
@@ -76,17 +87,22 @@ class ErrorReport(Record):
 
 
 class ResidualReport(Record):
-    """Chi-squared of the residual, its expectation and its standard deviation."""
+    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation if the noise is that.
+
+    expected : for images drawn from the prior, M - trace(A H);  deviation : upper bound of the standard deviation
+    """
 
     chi_squared: float
     expected: Amount
     deviation: Amount
 
 
-class ResidualPartReport(Record):
-    """Chi-squared of a part of the residual: all, a lens type, a sub-imager or a region of the target.
+class ResidualPart(Record):
+    """Chi-squared of the measurements of a part, its expectation and standard deviation.
 
+    kind : "all", "lens type", "sub-imager" or "region"
     prior : expectation for images of the prior;  expected : the larger of that and of the true image's, if known
+    p_value : probability of a larger value by chance
     """
 
     kind: str
@@ -98,9 +114,14 @@ class ResidualPartReport(Record):
     deviation: Amount
     p_value: float
 
+    @property
+    def ratio(self) -> float:
+        """Chi-squared over its expectation."""
+        return self.chi_squared / self.expected if self.expected > 0 else float("inf")
+
 
 class VerdictReport(Record):
-    """Whether the error bars can be trusted: reasons against it, passed checks, and notes.
+    """Whether the error bars of a run can be trusted: reasons why not, checks that found nothing wrong, and notes.
 
     p_value : of the residual in all and by part together, None if it was not checked
     """
@@ -110,7 +131,7 @@ class VerdictReport(Record):
     passed: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     p_value: float | None = None
-    parts: tuple[ResidualPartReport, ...] = ()
+    parts: tuple[ResidualPart, ...] = ()
 
 
 class FittedNumber(Record):
@@ -232,6 +253,114 @@ class StudyCase(Record):
     low: float | None
     high: Amount | None
     seconds: Amount
+
+
+class RejectedForm(Record):
+    """A form of the estimator that was given up, with the reason."""
+
+    method: str
+    why_not: str
+
+
+class SolverReport(Record):
+    """The method and form that ran, the reason for them, and their numerical error.
+
+    way : the method, "" until it is chosen;  method : the form;  condition : None where it is infinite
+    bound : on the error of the estimate, in `unit`; None if nothing was estimated
+    variance_bound : on the relative error of posterior variances, from a sample of pixels
+    tried : forms that were tried or skipped before, each with the reason
+    """
+
+    model_config = ConfigDict(allow_inf_nan=True)  # of forms that are given up
+
+    way: str
+    method: str
+    why: str
+    condition: float | None
+    bound: float | None
+    unit: str
+    variance_bound: float
+    refinements: int
+    tried: tuple[RejectedForm, ...] = ()
+
+    @computed_field
+    @property
+    def digits(self) -> float:
+        """Correct decimal digits of the estimate according to the bound."""
+        bound = self.variance_bound if self.bound is None else self.bound
+        return -log10(max(bound, EPS)) if bound >= 0 else 0.0
+
+
+class HeldOutVerdict(Record):
+    """Whether the sub-imagers agree; None if none could be predicted from others."""
+
+    trusted: bool | None
+    reasons: tuple[str, ...]
+
+
+class HeldOutPrior(Record):
+    """The prior that predictions assumed, its length in millimetres, and whether it was fitted to the stack."""
+
+    kind: str
+    mean: float
+    variance: float
+    correlation_length: float | None
+    fitted: bool
+
+
+class HeldOutWindows(Record):
+    """Number of the windows that were checked, and of those that cover the target."""
+
+    checked: int
+    total: int
+
+
+class HeldOutEntry(Record):
+    """A sub-imager predicted from all others; named ones are left out of the predictions of the others.
+
+    chi_squared : of `pixels` whitened errors, `expected` is its expectation;  z : normal deviate of the same p_value
+    rms_error, expected_rms : in grey levels, weighted by the precision of the prediction
+    disagrees : before any was left out
+    """
+
+    name: str
+    type: str
+    k: Index
+    l: Index  # noqa: E741  (the paper's letter)
+    pixels: int
+    chi_squared: float
+    expected: float
+    z: float | None
+    p_value: float | None
+    rms_error: float | None
+    expected_rms: float | None
+    disagrees: bool
+    named: bool
+
+
+class HeldOutReport(Record):
+    """Every sub-imager predicted from all others.
+
+    p_value : of the largest deviation (Sidak), before any sub-imager was left out; None if none can be predicted
+    explained : True if the others agree once the named sub-imagers are left out
+    """
+
+    verdict: HeldOutVerdict
+    p_value: float | None
+    explained: bool
+    prior: HeldOutPrior
+    windows: HeldOutWindows
+    sub_imagers: tuple[HeldOutEntry, ...]
+
+    @property
+    def judged(self) -> int:
+        """Number of sub-imagers that were predicted."""
+        return sum(entry.pixels > 0 for entry in self.sub_imagers)
+
+    def worst(self) -> list[HeldOutEntry]:
+        """Return the predicted sub-imagers: those named first, then by z, the largest first."""
+        judged = [entry for entry in self.sub_imagers if entry.z is not None]
+        return sorted(judged, key=lambda entry: (not entry.named, -(entry.z or 0.0)))
 
 
 class RunReport(Record):

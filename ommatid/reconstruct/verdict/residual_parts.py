@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from scipy import special
@@ -21,9 +20,8 @@ from scipy import special
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
 
+from ..output.run_json import ResidualPart
 from .residual_power import ResidualPower, SharedResidual
-
-Kind = Literal["all", "lens type", "sub-imager", "region"]
 
 REGIONS = 3  # along each axis of the target
 LEAST_IN_REGION = 40  # measurements per region, on average, below which there are no regions
@@ -32,29 +30,6 @@ PLACES = (
     ("left", "middle", "right"),
     ("bottom left", "bottom", "bottom right"),
 )
-
-
-@dataclass(frozen=True)
-class ResidualPart:
-    """Chi-squared of the measurements of a part, its expectation and standard deviation.
-
-    prior : expectation for images of the prior;  expected : the larger of that and of the true image's, if known
-    p_value : probability of a larger value by chance
-    """
-
-    kind: Kind
-    name: str
-    measurements: int
-    chi_squared: float
-    prior: float
-    expected: float
-    deviation: float
-    p_value: float
-
-    @property
-    def ratio(self) -> float:
-        """Chi-squared over its expectation."""
-        return self.chi_squared / self.expected if self.expected > 0 else float("inf")
 
 
 @dataclass(frozen=True)
@@ -170,7 +145,7 @@ class _Sums:
             return _Contiguous(np.diff([*starts, used.size]))
         return _Contiguous(np.add.reduceat(used.astype(np.intp), starts))
 
-    def parts(self, kind: Kind, names: list[str], of: _Scattered | _Contiguous) -> list[ResidualPart]:
+    def parts(self, kind: str, names: list[str], of: _Scattered | _Contiguous) -> list[ResidualPart]:
         """Return the parts with these names."""
         residual, power = self.residual, self.residual.power
         sizes = of.sizes
@@ -191,14 +166,14 @@ class _Sums:
         p_values = _p_values(squares, expected, variance)
         return [
             ResidualPart(
-                kind,
-                name,
-                int(sizes[number]),
-                float(squares[number]),
-                float(prior[number]),
-                float(expected[number]),
-                float(variance[number]) ** 0.5,
-                float(p_values[number]),
+                kind=kind,
+                name=name,
+                measurements=int(sizes[number]),
+                chi_squared=float(squares[number]),
+                prior=float(prior[number]),
+                expected=float(expected[number]),
+                deviation=float(variance[number]) ** 0.5,
+                p_value=float(p_values[number]),
             )
             for number, name in enumerate(names)
             if sizes[number]

@@ -47,8 +47,11 @@ def judgement(case: Case, before: Done, after: Done, limits: dict[str, float], s
         sides = (("before", before), ("after", after))
         ends = [f"{name} fails ({done.code}): {done.message}" for name, done in sides if done.code]
         return False, "; ".join(ends)
-    old, new = (read(done.folder / case.result, done.folder / MATRIX) for done in (before, after))
-    every = (deviations if statistical else differences)(old, new)
+    try:
+        old, new = (read(done.folder / case.result, done.folder / MATRIX) for done in (before, after))
+        every = (deviations if statistical else differences)(old, new)
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        return False, f"results that cannot be read or compared: {error!r}"
     beyond = [item for item in every if not item.size <= limits.get(item.quantity, 0.0)]
     if beyond:
         return False, "; ".join(map(described if statistical else str, beyond))

@@ -23,7 +23,7 @@ UNITS = {
     "stack": "of the largest reading",
     "variance": "(relative, of the rendering)",
     "H": "of the largest entry",
-    "estimate": "posterior deviations",
+    "estimate": "standard deviations of the posterior",
     "deviation": "(relative)",
     "truth": "of the largest value",
     "interval": "(relative)",

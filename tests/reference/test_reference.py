@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from scipy import sparse
 
 from .__main__ import judgement, tolerance
 from .cases import Case, all_cases
-from .checkout import MATRIX, Done, NoCheckoutError, found
+from .checkout import MATRIX, ROOT, Checkout, Done, NoCheckoutError, found
 from .comparison import LIMITS, deviations, differences, read
 
 CASE = Case("made-up", (), "out")
@@ -104,8 +105,8 @@ def test_a_stored_zero_is_no_difference_of_value_but_of_bits(before: Done) -> No
 
 def test_a_shift_is_measured_in_the_unit_of_its_quantity(before: Done) -> None:
     shifted = TRUTH + NOISE[1]
-    shifted[1, 2] += np.float32(0.05)  # half a posterior deviation
-    assert compared(before, estimate=shifted) == "estimate 0.5 posterior deviations at estimate (1, 2)"
+    shifted[1, 2] += np.float32(0.05)  # half an error bar
+    assert compared(before, estimate=shifted) == "estimate 0.5 standard deviations of the posterior at estimate (1, 2)"
     assert compared(before, within={"estimate": 0.51}, estimate=shifted) == ""
     assert compared(before, within={"estimate": 0.49, "deviation": 1}, estimate=shifted) != ""
     assert compared(before, variance=np.full_like(TRUTH, 0.0404)).startswith("deviation 1 (relative)")
@@ -138,6 +139,14 @@ def test_a_case_that_fails_on_one_side_or_on_both_differs(before: Done) -> None:
         assert said.startswith(words)
 
 
+def test_results_that_are_incomplete_differ(before: Done) -> None:
+    after = finished(before.folder.parent / "incomplete")
+    (after.folder / "out" / "estimate.exr").unlink()
+    same, said = judgement(CASE, before, after, {}, False)
+    assert not same
+    assert said.startswith("results that cannot be read")
+
+
 def test_keys_of_one_side_are_left_out(before: Done) -> None:
     assert compared(before, report={"verdict.level": "green"}) == ""
 
@@ -148,15 +157,16 @@ def test_another_draw_of_the_noise_is_statistically_the_same_and_a_bias_is_not(b
     again: dict[str, Any] = {"estimate": draw, "readings": draw[:4], "report": {"error.mse": 0.011}}
     assert compared(before, statistical=True, **again) == ""
     assert compared(before, **again) != ""
-    for change, quantity in (
+    biased: list[tuple[dict[str, Any], str]] = [
         ({"readings": draw[:4] + np.float32(0.3)}, "stack"),
         ({"estimate": draw + np.float32(1.0)}, "estimate"),
         ({"variance": np.full_like(TRUTH, 0.012)}, "deviation"),
         ({"H": sparse.csr_array(np.eye(40, 30) * 1.1)}, "H"),
         ({"report": {"error.mse": 0.03}}, "interval"),
         ({"report": {"diagnostics.chi_squared.chi_squared": 160.0}}, "numbers"),
-    ):
-        assert compared(before, statistical=True, **{**again, **change}).startswith(quantity)
+    ]
+    for change, quantity in biased:
+        assert compared(before, statistical=True, **(again | change)).startswith(quantity)
 
 
 def test_every_quantity_of_a_run_is_compared(before: Done) -> None:
@@ -171,6 +181,45 @@ def test_cases_are_the_gallery_six_variants_and_three_frames() -> None:
     assert gallery <= names
     assert len(gallery) == 13
     assert len(names - gallery) == 9
+
+
+PROGRAM = """
+import os, pathlib, sys
+pathlib.Path("words.txt").open("a").write(" ".join(sys.argv[1:]) + chr(10))
+assert "OMMATID_X" not in os.environ and not sys.path[0].endswith("once")
+sys.exit({code})
+"""
+
+
+def test_a_finished_case_is_not_run_again_by_the_same_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMMATID_X", "a setting of the user")
+    program = tmp_path / "program"
+    (program / "ommatid").mkdir(parents=True)
+    (program / "ommatid" / "__init__.py").touch()
+    (program / "ommatid" / "__main__.py").write_text(PROGRAM.format(code=0))
+    case = Case("once", (("run", "a.toml"), ("reconstruct", "b.exr")), "out", {"a.toml": "text"})
+
+    def ended() -> Done:
+        return Checkout(program, Path(sys.executable), tmp_path / "store", ("render.seed=1",)).run(case)
+
+    assert [ended().reused, ended().reused] == [False, True]
+    words = (tmp_path / "store" / "once" / "words.txt").read_text().splitlines()
+    assert words == ["run a.toml --set render.seed=1", "reconstruct b.exr", "export-model out/model.npz -o H.npz"]
+    (program / "ommatid" / "__main__.py").write_text(PROGRAM.format(code=3))
+    failed = ended()
+    assert (failed.code, failed.reused, failed.message) == (3, False, "run: no message")
+    with pytest.raises(NoCheckoutError, match="in place of"):
+        assert Checkout(tmp_path, Path(sys.executable), tmp_path / "store").identity
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no repository, as in a source distribution")
+def test_a_revision_is_checked_out_beside_the_repository(tmp_path: Path) -> None:
+    folder, python = found("HEAD", sys.executable, tmp_path)
+    assert folder.parent == tmp_path
+    assert python == Path(sys.executable)
+    assert (folder / "ommatid" / "__init__.py").exists()
+    assert (folder / "scenes" / "tile19.toml").exists()
+    assert ROOT not in folder.parents
 
 
 def test_an_unknown_quantity_and_an_unknown_checkout_are_refused(tmp_path: Path) -> None:

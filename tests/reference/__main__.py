@@ -33,12 +33,13 @@ def tolerance(text: str) -> tuple[str, float]:
 
 
 def chosen(names: str | None) -> list[Case]:
-    """Cases of these names, or all."""
+    """Cases of these names, in their order, or all."""
     known = all_cases()
-    unknown = [name for name in names.split(",") if name not in known] if names else []
+    words = names.split(",") if names else list(known)
+    unknown = [name for name in words if name not in known]
     if unknown:
         raise SystemExit(f"{unknown[0]!r} is not a case: {', '.join(known)}")
-    return [case for case in known.values() if names is None or case.name in names.split(",")]
+    return [known[name] for name in words]
 
 
 def judgement(case: Case, before: Done, after: Done, limits: dict[str, float], statistical: bool) -> tuple[bool, str]:

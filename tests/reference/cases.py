@@ -39,16 +39,16 @@ def samples(render: int, calibration: int) -> dict[str, object]:
 
 GALLERY: dict[str, dict[str, object]] = {
     "tile19": {},
-    "tile35": samples(64, 256),
-    "tile41": samples(64, 256),
+    "tile35": samples(64, 64),
+    "tile41": samples(64, 64),
     "single": samples(64, 64),
     "corridor": samples(64, 64),
     "still_life": samples(64, 64),
     "misaligned": {},
     "distorted": samples(256, 256),
     "sensor": samples(256, 256),
-    "doublet": samples(1024, 1024),
-    "planoconvex": samples(1024, 1024),
+    "doublet": samples(256, 256),
+    "planoconvex": samples(256, 256),
     "photo": samples(64, 64),
 }  # and starter, the thirteenth, which `init` writes
 

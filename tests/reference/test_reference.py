@@ -86,8 +86,8 @@ def test_the_same_results_at_another_time_are_the_same_bit_for_bit(before: Done)
 def test_one_flipped_bit_is_noticed_in_every_array(before: Done) -> None:
     stack = compared(before, readings=flipped((TRUTH + NOISE[0])[:4], (2, 3)))
     assert stack.startswith("stack")
-    assert "I.00.00 (2, 3)" in stack
-    assert compared(before, estimate=flipped(TRUTH + NOISE[1], (5, 4))).endswith("at estimate (5, 4)")
+    assert "I.00.00 Y (2, 3)" in stack
+    assert compared(before, estimate=flipped(TRUTH + NOISE[1], (5, 4))).endswith("at estimate estimate (5, 4)")
     assert compared(before, variance=flipped(np.full_like(TRUTH, 0.01), (0, 0))).startswith("deviation")
     data = np.ones(30)
     data[7] = np.nextafter(1, 2)
@@ -106,10 +106,10 @@ def test_a_stored_zero_is_no_difference_of_value_but_of_bits(before: Done) -> No
 def test_a_shift_is_measured_in_the_unit_of_its_quantity(before: Done) -> None:
     shifted = TRUTH + NOISE[1]
     shifted[1, 2] += np.float32(0.05)  # half an error bar
-    assert compared(before, estimate=shifted) == "estimate 0.5 standard deviations of the posterior at estimate (1, 2)"
+    assert compared(before, estimate=shifted) == "estimate 0.5 error bars at estimate estimate (1, 2)"
     assert compared(before, within={"estimate": 0.51}, estimate=shifted) == ""
     assert compared(before, within={"estimate": 0.49, "deviation": 1}, estimate=shifted) != ""
-    assert compared(before, variance=np.full_like(TRUTH, 0.0404)).startswith("deviation 1 (relative)")
+    assert compared(before, variance=np.full_like(TRUTH, 0.0102)).startswith("deviation 0.01 (relative)")
     assert compared(before, report={"error.mse": 0.0202}) == "numbers 0.5 (relative) at error.mse"
     interval = compared(before, report={"error.expected_given_truth.high": 0.028})
     assert interval == "interval 0.5 (relative) at error.expected_given_truth.high"

@@ -1,0 +1,229 @@
+"""The comparison of two runs notices what it must: a flipped bit, a shifted value, another verdict, a failed side."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+from scipy import sparse
+
+from .__main__ import judgement, tolerance
+from .cases import Case, all_cases
+from .checkout import MATRIX, ROOT, Checkout, Done, NoCheckoutError, found
+from .comparison import LIMITS, deviations, differences, read
+
+CASE = Case("made-up", (), "out")
+RNG = np.random.default_rng(1)
+TRUTH = RNG.uniform(0, 255, (6, 5)).astype(np.float32)
+NOISE = RNG.normal(0, 0.1, (2, 6, 5)).astype(np.float32)
+REPORT: dict[str, Any] = {
+    "date": "2026-01-01",
+    "verdict": {"trusted": True, "reasons": []},
+    "stages": {"render": {"seconds": 1.0, "samples": 64}},
+    "error": {"mse": 0.0101, "expected_given_truth": {"mse": 0.01, "low": 0.007, "high": 0.014}},
+    "diagnostics": {"chi_squared": {"chi_squared": 55.0, "expected": 60.0, "deviation": 11.0}},
+}
+
+
+def write(path: Path, **parts: dict[str, Any]) -> None:
+    """Write an OpenEXR file of these parts."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File([OpenEXR.Part(dict(header), channels, name=name) for name, channels in parts.items()]).write(str(path))
+
+
+def finished(folder: Path, **changes: Any) -> Done:
+    """A folder of results as a run would leave it; changes : other arrays, H or leaves of run.json."""
+    (folder / "out").mkdir(parents=True)
+    readings: Any = changes.get("readings", (TRUTH + NOISE[0])[:4])
+    views = {f"I.00.0{number}": {"Y": readings + np.float32(number)} for number in range(2)}
+    write(folder / "out" / "stack.exr", **views)
+    image = {"estimate": changes.get("estimate", TRUTH + NOISE[1])}
+    image |= {"variance": changes.get("variance", np.full_like(TRUTH, 0.01)), "truth": TRUTH}
+    write(folder / "out" / "estimate.exr", estimate=image)
+    sparse.save_npz(folder / MATRIX, changes.get("H", sparse.csr_array(np.eye(40, 30))))
+    report = json.loads(json.dumps(REPORT))
+    for path, value in changes.get("report", {}).items():
+        *keys, last = path.split(".")
+        place = report
+        for key in keys:
+            place = place[key]
+        place[last] = value
+    (folder / "out" / "run.json").write_text(json.dumps(report), encoding="utf-8")
+    return Done(folder, 0, "", 1.0)
+
+
+@pytest.fixture
+def before(tmp_path: Path) -> Done:
+    return finished(tmp_path / "before")
+
+
+def compared(before: Done, statistical: bool = False, within: dict[str, float] | None = None, **changes: Any) -> str:
+    """What is said of a run with these changes; empty if it is the same."""
+    folder = before.folder.parent / "after"
+    shutil.rmtree(folder, ignore_errors=True)
+    limits = (LIMITS if statistical else {}) | (within or {})
+    same, words = judgement(CASE, before, finished(folder, **changes), limits, statistical)
+    return "" if same else words
+
+
+def flipped(values: Any, place: tuple[int, int], bit: int = 0) -> Any:
+    """The same values, but for one bit of one of them."""
+    changed = values.copy()
+    changed.view(np.uint32)[place] ^= 1 << bit
+    return changed
+
+
+def test_the_same_results_at_another_time_are_the_same_bit_for_bit(before: Done) -> None:
+    assert compared(before, report={"date": "2027-01-01", "stages.render.seconds": 9.0, "spent": {"seconds": 3}}) == ""
+
+
+def test_one_flipped_bit_is_noticed_in_every_array(before: Done) -> None:
+    stack = compared(before, readings=flipped((TRUTH + NOISE[0])[:4], (2, 3)))
+    assert stack.startswith("stack")
+    assert "I.00.00 Y (2, 3)" in stack
+    assert compared(before, estimate=flipped(TRUTH + NOISE[1], (5, 4))).endswith("at estimate estimate (5, 4)")
+    assert compared(before, variance=flipped(np.full_like(TRUTH, 0.01), (0, 0))).startswith("deviation")
+    data = np.ones(30)
+    data[7] = np.nextafter(1, 2)
+    matrix = sparse.csr_array((data, (range(30), range(30))), shape=(40, 30))
+    assert compared(before, H=matrix) == "H 2.2e-16 of the largest entry at measurement 7, pixel 7"
+
+
+def test_a_stored_zero_is_no_difference_of_value_but_of_bits(before: Done) -> None:
+    more = sparse.csr_array(
+        (np.append(np.ones(30), 0.0), (np.append(np.arange(30), 5), np.append(np.arange(30), 9))), shape=(40, 30)
+    )
+    assert "H 4.9e-324" in compared(before, H=more)
+    assert compared(before, within={"H": 1e-12}, H=more) == ""
+
+
+def test_a_shift_is_measured_in_the_unit_of_its_quantity(before: Done) -> None:
+    shifted = TRUTH + NOISE[1]
+    shifted[1, 2] += np.float32(0.05)  # half an error bar
+    assert compared(before, estimate=shifted) == "estimate 0.5 error bars at estimate estimate (1, 2)"
+    assert compared(before, within={"estimate": 0.51}, estimate=shifted) == ""
+    assert compared(before, within={"estimate": 0.49, "deviation": 1}, estimate=shifted) != ""
+    assert compared(before, variance=np.full_like(TRUTH, 0.0102)).startswith("deviation 0.01 (relative)")
+    assert compared(before, report={"error.mse": 0.0202}) == "numbers 0.5 (relative) at error.mse"
+    interval = compared(before, report={"error.expected_given_truth.high": 0.028})
+    assert interval == "interval 0.5 (relative) at error.expected_given_truth.high"
+
+
+def test_numbers_that_are_none_and_other_shapes_are_beyond_every_finite_tolerance(before: Done) -> None:
+    broken = TRUTH + NOISE[1]
+    broken[0, 0] = np.nan
+    assert compared(before, within={"estimate": 1e9}, estimate=broken).startswith("estimate inf")
+    assert compared(before, within={"H": 1e9}, H=sparse.csr_array(np.eye(41, 30))).startswith("H inf")
+    assert compared(before, within={"stack": 1e9}, readings=TRUTH[:3]).startswith("stack inf")
+
+
+def test_another_verdict_is_noticed_in_every_kind_of_comparison(before: Done) -> None:
+    change: dict[str, Any] = {"report": {"verdict.trusted": False}}
+    assert "verdict" in compared(before, **change)
+    assert "verdict" in compared(before, within=dict.fromkeys(LIMITS, 9.0) | {"verdict": 0.0}, **change)
+    assert "verdict" in compared(before, statistical=True, **change)
+    assert "verdict.reasons" in compared(before, report={"verdict.reasons": ["the residual is large"]})
+
+
+def test_a_case_that_fails_on_one_side_or_on_both_differs(before: Done) -> None:
+    failed = Done(before.folder, 2, "run: unknown key", 1.0)
+    for sides, words in (((before, failed), "after fails (2): run"), ((failed, failed), "before fails (2): run")):
+        same, said = judgement(CASE, *sides, LIMITS, False)
+        assert not same
+        assert said.startswith(words)
+
+
+def test_results_that_are_incomplete_differ(before: Done) -> None:
+    after = finished(before.folder.parent / "incomplete")
+    (after.folder / "out" / "estimate.exr").unlink()
+    same, said = judgement(CASE, before, after, {}, False)
+    assert not same
+    assert said.startswith("results that cannot be read")
+
+
+def test_keys_of_one_side_are_left_out(before: Done) -> None:
+    assert compared(before, report={"verdict.level": "green"}) == ""
+
+
+def test_another_draw_of_the_noise_is_statistically_the_same_and_a_bias_is_not(before: Done) -> None:
+    rng = np.random.default_rng(2)
+    draw = TRUTH + rng.normal(0, 0.1, TRUTH.shape).astype(np.float32)
+    again: dict[str, Any] = {"estimate": draw, "readings": draw[:4], "report": {"error.mse": 0.011}}
+    assert compared(before, statistical=True, **again) == ""
+    assert compared(before, **again) != ""
+    biased: list[tuple[dict[str, Any], str]] = [
+        ({"readings": draw[:4] + np.float32(0.3)}, "stack"),
+        ({"estimate": draw + np.float32(1.0)}, "estimate"),
+        ({"variance": np.full_like(TRUTH, 0.012)}, "deviation"),
+        ({"H": sparse.csr_array(np.eye(40, 30) * 1.1)}, "H"),
+        ({"report": {"error.mse": 0.03}}, "interval"),
+        ({"report": {"diagnostics.chi_squared.chi_squared": 160.0}}, "numbers"),
+    ]
+    for change, quantity in biased:
+        assert compared(before, statistical=True, **(again | change)).startswith(quantity)
+
+
+def test_every_quantity_of_a_run_is_compared(before: Done) -> None:
+    content = read(before.folder / "out", before.folder / MATRIX)
+    assert [item.size for item in differences(content, content)] == [0.0] * len(differences(content, content))
+    assert {item.quantity for item in deviations(content, content)} == set(LIMITS)
+
+
+def test_cases_are_the_gallery_six_variants_and_three_frames() -> None:
+    names = set(all_cases())
+    gallery = {path.stem for path in Path(__file__).parents[2].glob("ommatid/scenes/*.toml")}
+    assert gallery <= names
+    assert len(gallery) == 13
+    assert len(names - gallery) == 9
+
+
+PROGRAM = """
+import os, pathlib, sys
+pathlib.Path("words.txt").open("a").write(" ".join(sys.argv[1:]) + chr(10))
+assert "OMMATID_X" not in os.environ and not sys.path[0].endswith("once")
+sys.exit({code})
+"""
+
+
+def test_a_finished_case_is_not_run_again_by_the_same_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMMATID_X", "a setting of the user")
+    program = tmp_path / "program"
+    (program / "ommatid").mkdir(parents=True)
+    (program / "ommatid" / "__init__.py").touch()
+    (program / "ommatid" / "__main__.py").write_text(PROGRAM.format(code=0))
+    case = Case("once", (("run", "a.toml"), ("reconstruct", "b.exr")), "out", {"a.toml": "text"})
+
+    def ended() -> Done:
+        return Checkout(program, Path(sys.executable), tmp_path / "store", ("render.seed=1",)).run(case)
+
+    assert [ended().reused, ended().reused] == [False, True]
+    words = (tmp_path / "store" / "once" / "words.txt").read_text().splitlines()
+    assert words == ["run a.toml --set render.seed=1", "reconstruct b.exr", "export-model out/model.npz -o H.npz"]
+    (program / "ommatid" / "__main__.py").write_text(PROGRAM.format(code=3))
+    failed = ended()
+    assert (failed.code, failed.reused, failed.message) == (3, False, "run: no message")
+    with pytest.raises(NoCheckoutError, match="in place of"):
+        assert Checkout(tmp_path, Path(sys.executable), tmp_path / "store").identity
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no repository, as in a source distribution")
+def test_a_revision_is_checked_out_beside_the_repository(tmp_path: Path) -> None:
+    folder, python = found("HEAD", sys.executable, tmp_path)
+    assert folder.parent == tmp_path
+    assert python == Path(sys.executable)
+    assert (folder / "ommatid" / "__init__.py").exists()
+    assert (folder / "scenes" / "tile19.toml").exists()
+    assert ROOT not in folder.parents
+
+
+def test_an_unknown_quantity_and_an_unknown_checkout_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="expected NAME=VALUE of stack"):
+        tolerance("colour=1")
+    with pytest.raises(NoCheckoutError, match="neither a folder with a checkout nor a revision"):
+        found("no-such-revision", None, tmp_path)

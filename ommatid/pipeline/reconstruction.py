@@ -15,7 +15,6 @@ from ommatid.page.batch_index import INDEX, cached_index
 from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import Format, check_formats, check_picture, clear_formats
-from ommatid.reconstruct.output.held_out_report import held_out_report
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
 from ommatid.reconstruct.restore import check_match, check_region
@@ -154,7 +153,7 @@ def check_held_out_files(request: ReconstructionRequest, *, fitted: bool, progre
 
     recorded, calibrated = request.read()
     check_match(recorded, calibrated, (request.stack, request.model))
-    return held_out_report(check_held_out(recorded, calibrated, fitted=fitted, progress=progress))
+    return check_held_out(recorded, calibrated, fitted=fitted, progress=progress)
 
 
 def finish_folder(

@@ -28,6 +28,12 @@ def modules() -> dict[str, Path]:
     return {_name(path): path for path in sorted((ROOT / "ommatid").glob("**/*.py"))}
 
 
+@cache
+def tree(path: Path) -> ast.Module:
+    """Syntax tree of a file of Python."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def existing(*names: str) -> set[str]:
     """The names themselves. Raises ModuleNotFoundError if one does not exist, for instance after a renaming."""
     for name in names:
@@ -41,7 +47,7 @@ def imports(name: str) -> frozenset[str]:
     """Everything that a module imports, also inside functions: own modules by full name, others as written."""
     path = modules()[name]
     imported: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             imported |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -97,7 +97,7 @@ VARIANTS = {
     "one-type": scene((19, 19), NOISE, THREE[:1]),
     "two-types": scene((19, 23), NOISE, THREE[:2]),
     "five-by-two": scene((27, 29), NOISE, (("2/7", (5, 2)), ("3/8", (5, 2)))),
-    "sensor59": scene((59, 59), SENSOR + NEIGHBOURS + FEW_RAYS, aperture="0.4 mm"),
+    "sensor59": scene((59, 59), SENSOR + NEIGHBOURS + FEW_RAYS, THREE[:2], aperture="0.4 mm"),
     "detail35": scene((35, 35), NOISE + NEIGHBOURS + FEW_RAYS, aperture="0.4 mm", target=FINER),
     "frame119": scene((119, 119), NOISE),
     "frame239": scene((239, 239), NOISE + NEIGHBOURS + DESIGNED),

@@ -123,15 +123,17 @@ def test_a_scene_is_rendered_on_an_encrypted_cluster_with_the_files_of_dasks_con
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("impatient")
-def test_strangers_are_refused_on_both_sides(encrypted: str, files: Path) -> None:
-    for address, configured, message in (
-        (encrypted, settings(files, authority="b"), "was not signed by the authority of Dask's configuration"),
-        (encrypted, settings(files, member="b"), "no encrypted scheduler answers there that accepts the certificate"),
-        (encrypted, nullcontext(), "expected certificates in Dask's configuration"),
-        (encrypted, settings(files / "none"), "Dask's configuration names files that cannot be used"),
-        (encrypted.replace("tls://", "tcp://"), nullcontext(), "no scheduler answers there"),
+def test_strangers_are_refused_on_both_sides(encrypted: str, files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "PATIENCE", 6.0)  # on a busy machine it takes a second to tell the certificates apart
+    own = {"authority": "a", "member": "a"}
+    for address, names, message in (
+        (encrypted, {**own, "authority": "b"}, "was not signed by the authority of Dask's configuration"),
+        (encrypted, {**own, "member": "b"}, "no encrypted scheduler answers there that accepts the certificate"),
+        (encrypted, {**own, "member": "none"}, "Dask's configuration names files that cannot be used"),
+        (encrypted, {}, "expected certificates in Dask's configuration"),
+        (encrypted.replace("tls://", "tcp://"), {}, "no scheduler answers there"),
     ):
+        configured = settings(files, **names) if names else nullcontext()
         with configured, pytest.raises(InputError, match=message) as refused, worker_pool(Cluster(address)):
             pass
         assert str(refused.value).startswith(f"--scheduler {address}: ")

@@ -37,6 +37,7 @@ from ommatid.scenes.camera import derive
 
 from ..conftest import Command
 from ..examples import GALLERY, VARIANTS, needs, scene
+from ..kept_figures import KeptFigures
 from .tables import bench_table, cell, exactly
 
 FIGURES = ("render.png", "calibrate.png", "reconstruct.png")
@@ -225,6 +226,16 @@ def test_a_single_cell_is_drawn(tmp_path: Path) -> None:
     single = cell("reconstruct", way="covariance", error=exactly(1e-10), seconds=exactly(0.023146497000197996))
     write_figures(tmp_path, bench_table(derive(scene()), [single]))
     assert (tmp_path / "reconstruct.png").is_file()
+
+
+def test_an_adaptive_cell_without_error_leaves_the_scale_to_the_others(tmp_path: Path) -> None:
+    cells = [cell(samples=count, error=exactly(count**-0.5)) for count in (4, 16, 64)]
+    cells.append(cell(samples=18, setting=AUTO, error=exactly(1e-12)))
+    figures = KeptFigures()
+    write_figures(tmp_path, bench_table(derive(scene()), cells), figures)
+    panel = figures.kept["render"].axes[0]
+    assert panel.get_ylim()[0] > 0.01
+    assert "auto, below: 1e-12" in [text.get_text() for text in panel.texts]
 
 
 @pytest.fixture

@@ -140,6 +140,8 @@ def _draw_cells(
     curve = [(x, y) for x, y, cell in known if cell.counted and cell.samples is not None]
     single = [(x, y) for x, y, _ in known if y.median >= least and (x, y) not in curve]
     for points, options in ((curve, style), (single, {**style, "linestyle": "none"})):
+        if not points:  # which Matplotlib warns of on a logarithmic axis
+            continue
         below = [max(y.median - y.low, 0.0) for _, y in points]
         above = [y.high - y.median for _, y in points]
         medians = [y.median for _, y in points]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from pathlib import Path
 from time import perf_counter
 
@@ -232,7 +233,10 @@ def test_an_adaptive_cell_without_error_leaves_the_scale_to_the_others(tmp_path:
     cells = [cell(samples=count, error=exactly(count**-0.5)) for count in (4, 16, 64)]
     cells.append(cell(samples=18, setting=AUTO, error=exactly(1e-12)))
     figures = KeptFigures()
-    write_figures(tmp_path, bench_table(derive(scene()), cells), figures)
+    cells.append(cell("calibrate", way="transport, independent", mse=None))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_figures(tmp_path, bench_table(derive(scene()), cells), figures)
     panel = figures.kept["render"].axes[0]
     assert panel.get_ylim()[0] > 0.01
     assert "auto, below: 1e-12" in [text.get_text() for text in panel.texts]

@@ -231,8 +231,8 @@ class Subject:
 def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
     """Return all cells, and those that cannot be measured on this machine or for this scene, with the reason.
 
-    Few samples come before many, so that the curves of all ways grow together; an adaptive number of samples comes
-    where the curves are half finished.
+    Few samples come before many, so that the curves of all ways grow together; solvers and an adaptive number of
+    samples come where the curves are half finished.
     """
     reasons = {variant: unusable_reason(variant) for variant in PREFERENCE}
     working = [variant for variant in PREFERENCE if not reasons[variant]]
@@ -240,15 +240,17 @@ def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
     if not subject.camera.is_ideal_pinhole and "scalar_rgb" in working:
         working.remove("scalar_rgb")
         left_out.append(SkippedJob(what="scalar_rgb", why="lenses other than pinholes need a fast backend"))
-    counts: list[Samples] = [*SAMPLES]
+    few: list[Samples] = [*SAMPLES[: len(SAMPLES) // 2]]
+    many: list[Samples] = [*SAMPLES[len(few) :]]
     try:
         check_noise_target(subject.scene)
-        counts.insert(len(counts) // 2, AUTO)
+        many.insert(0, AUTO)
     except InputError as error:
         left_out.append(SkippedJob(what="samples 'auto'", why=str(error)))
     estimates, unsolvable = _estimates(subject)
-    by_name = {job.name: job for job in estimates}
-    for job in (job for samples in counts for job in _sampling(subject, working, samples)):
+    sampled = [[job for samples in counts for job in _sampling(subject, working, samples)] for counts in (few, many)]
+    by_name: dict[str, Job] = {}
+    for job in (*sampled[0], *estimates, *sampled[1]):
         by_name.setdefault(job.name, job)  # several numbers may be rounded up to the same
     return list(by_name.values()), [*left_out, *unsolvable]
 

@@ -6,6 +6,7 @@ Points are medians over seeds, error bars their 10 % and 90 % quantiles.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import log
 from pathlib import Path
 from typing import Any
 
@@ -56,17 +57,22 @@ def _draw(figure: Any, table: BenchTable, stage: Stage) -> None:
     panels = figure.subplots(1, len(axes))
     for panel, (x_of, y_of) in zip(panels, axes, strict=True):
         _prepare(panel)
+        least = 0.3 * min((y.median for cell in cells if cell.counted and (y := y_of(cell)) and y.median), default=0.0)
         for key, style in _styles(cells).items():
-            _draw_cells(panel, [cell for cell in cells if (cell.way, cell.variant) == key], style, x_of, y_of)
+            _draw_cells(panel, [cell for cell in cells if (cell.way, cell.variant) == key], style, x_of, y_of, least)
         panel.set_xlabel("samples per pixel" if x_of is _samples else "time (s)")
         panel.set_ylabel(ERRORS[stage] if y_of is _error else IMAGE_ERROR)
     *first, cost, image = panels
     for panel in first:
         panel.set_title(f"Convergence: slope ± standard error\nReference: {table.against}", fontsize=10)
+        panel.set_xticks(sorted({4 ** round(log(cell.samples, 4)) for cell in cells if cell.samples}))
+        panel.minorticks_off()
     cost.set_title("Cost", fontsize=10)
     image.set_title(f"Error of the image with {IMAGES[stage]}", fontsize=10)
     front = pareto_front(cells, median_seconds, median_error)
-    cost.plot([median_seconds(cell) for cell in front], [median_error(cell) for cell in front], zorder=1, **FRONT)
+    least = 0.3 * min((median_error(cell) for cell in cells if cell.counted), default=0.0)
+    errors = [max(median_error(cell), least) for cell in front]
+    cost.plot([median_seconds(cell) for cell in front], errors, zorder=1, **FRONT)
     if stage == "render" and table.noise_deviation > 0:
         for panel in (*first, cost):
             _draw_level(panel, table.noise_deviation, f"noise of the sensor, {table.noise_deviation:.2g}")
@@ -119,37 +125,50 @@ def _prepare(panel: Any) -> None:
     panel.set_axisbelow(True)
 
 
-def _draw_cells(panel: Any, cells: Sequence[Cell], style: dict[str, Any], x_of: Abscissa, y_of: Ordinate) -> None:
-    """Draw the cells of a way as a curve, those with a setting of their own as single points with its name."""
+def _draw_cells(
+    panel: Any, cells: Sequence[Cell], style: dict[str, Any], x_of: Abscissa, y_of: Ordinate, least: float
+) -> None:
+    """Draw the cells of a way as a curve, those with a setting of their own as single points with its name.
+
+    least : lower end of the panel: of smaller errors, where only rounding is left, the name states the value
+    """
     known: list[tuple[float, Quantiles, Cell]] = []
     for cell in sorted(cells, key=lambda cell: cell.samples or 0):
         x, y = x_of(cell), y_of(cell)
         if x is not None and y is not None and y.median > 0:
             known.append((x, y, cell))
     curve = [(x, y) for x, y, cell in known if cell.counted and cell.samples is not None]
-    for points, options in ((curve, style), ([(x, y) for x, y, _ in known], {**style, "linestyle": "none"})):
+    single = [(x, y) for x, y, _ in known if y.median >= least and (x, y) not in curve]
+    for points, options in ((curve, style), (single, {**style, "linestyle": "none"})):
+        if not points:  # which Matplotlib warns of on a logarithmic axis
+            continue
         below = [max(y.median - y.low, 0.0) for _, y in points]
         above = [y.high - y.median for _, y in points]
         medians = [y.median for _, y in points]
         panel.errorbar([x for x, _ in points], medians, yerr=[below, above], elinewidth=0.8, capsize=1.5, **options)
     for x, y, cell in known:
         if cell.samples is None or not cell.counted:
-            offset = {"xytext": (6, 4), "textcoords": "offset points", "fontsize": 8}
-            panel.annotate(cell.setting.split(",")[0], (x, y.median), color=style["color"], **offset)
+            name, offset = cell.setting.split(",")[0], {"xytext": (6, 4), "textcoords": "offset points", "fontsize": 8}
+            if y.median < least:
+                panel.plot(x, least, **style)
+                name = f"{name}, below: {y.median:.1g}"
+            panel.annotate(name, (x, max(y.median, least)), color=style["color"], **offset)
     if len({x for x, _, _ in known}) == 1:  # around a single value, limits of a logarithmic axis may coincide
         panel.update_datalim([(factor * known[0][0], 1.0) for factor in (0.5, 2.0)], updatey=False)
 
 
-def _draw_level(panel: Any, value: float, label: str) -> None:
+def _draw_level(panel: Any, value: float, label: str, side: str = "bottom") -> None:
     panel.axhline(value, color="0.35", linewidth=1, linestyle=":", zorder=2)
-    panel.text(0.01, value, label, transform=panel.get_yaxis_transform(), va="bottom", fontsize=8, color="0.3")
+    panel.text(0.01, value, label, transform=panel.get_yaxis_transform(), va=side, fontsize=8, color="0.3")
 
 
 def _draw_floor(panel: Any, table: BenchTable) -> None:
     floor = table.recommended.noise_floor
     if floor > 0:
         panel.axhspan(floor, floor * (1 + TOLERANCE), color="#009E73", alpha=0.15, linewidth=0, zorder=0)
-        _draw_level(panel, floor, f"noise floor {floor:.3g}, and {100 * TOLERANCE:g} % above it")
+        low, high = panel.get_ylim()
+        panel.set_ylim(min(low, floor / (high / floor) ** 0.08), high)
+        _draw_level(panel, floor, f"noise floor {floor:.3g}, and {100 * TOLERANCE:g} % above it", "top")
 
 
 def _mark_recommended(panel: Any, table: BenchTable, stage: Stage) -> None:

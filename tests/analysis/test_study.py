@@ -137,18 +137,17 @@ def test_a_study_is_cached_and_printed(tmp_path: Path) -> None:
         made.append(name)
         return model if name != "true" else exact_model(stack.scene, stack.camera, true_matrix(stack.camera), "true")
 
-    models = {name: (lambda name=name: give(name)) for name in ("ideal", "robust", "true")}
+    models = {name: (lambda name=name: give(name)) for name in ("ideal", "true")}
     cases, fresh = study.cached_study(tmp_path, stack, models, truth)
-    assert (fresh, made) == (True, ["ideal", "robust", "true"])
+    assert (fresh, made) == (True, ["ideal", "true"])
     assert study.cached_study(tmp_path, stack, models, truth) == (cases, False)
-    assert len(made) == 3, "no model is made again"
+    assert len(made) == 2, "no model is made again"
     rows = dict(study.rows(cases))
     assert "OUTSIDE" in rows["the ideal H"]
     assert "inside" in rows["the true H"]
-    assert "for this picture" not in rows["the ideal H, misalignment as noise"]
     table = (tmp_path / "study.csv").read_text(encoding="utf-8").splitlines()
     assert table[0].startswith("model,mse,predicted")
-    assert [line.split(",")[0] for line in table[1:]] == ["ideal", "robust", "true"]
+    assert [line.split(",")[0] for line in table[1:]] == ["ideal", "true"]
     other = replace(stack, scene=misaligned(noise={"variance": 2e-2}))
     assert study.cached_study(tmp_path, other, models, truth)[1]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from pathlib import Path
 from time import perf_counter
 
@@ -37,6 +38,7 @@ from ommatid.scenes.camera import derive
 
 from ..conftest import Command
 from ..examples import GALLERY, VARIANTS, needs, scene
+from ..kept_figures import KeptFigures
 from .tables import bench_table, cell, exactly
 
 FIGURES = ("render.png", "calibrate.png", "reconstruct.png")
@@ -171,7 +173,7 @@ def test_what_does_not_fit_is_left_out() -> None:
     """Time is proportional to samples: of a cell of 5 s in 60 s one with 4 times as many fits, one with 16 does not."""
     ran: list[tuple[int, int]] = []
     listed = [job(4, ran, 1.0), job(16, ran, 1.0), job(64, ran, 1.0)]
-    cells, left_out = measure(listed, {name_of(listed[0]): listed[0].measure()}, perf_counter() + 60, lambda _: None)
+    cells, _ = measure(listed, {}, perf_counter() + 60, lambda _: None)
     assert [cell.samples for cell in cells] == [4, 16, 64], "each as long as the one before"
     known = {name_of(cell): cell for cell in cells[:1]}
     cells, left_out = measure([listed[0], job(64, ran)], known, perf_counter() + 60, lambda _: None)
@@ -225,6 +227,19 @@ def test_a_single_cell_is_drawn(tmp_path: Path) -> None:
     single = cell("reconstruct", way="covariance", error=exactly(1e-10), seconds=exactly(0.023146497000197996))
     write_figures(tmp_path, bench_table(derive(scene()), [single]))
     assert (tmp_path / "reconstruct.png").is_file()
+
+
+def test_an_adaptive_cell_without_error_leaves_the_scale_to_the_others(tmp_path: Path) -> None:
+    cells = [cell(samples=count, error=exactly(count**-0.5)) for count in (4, 16, 64)]
+    cells.append(cell(samples=18, setting=AUTO, error=exactly(1e-12)))
+    figures = KeptFigures()
+    cells.append(cell("calibrate", way="transport, independent", mse=None))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_figures(tmp_path, bench_table(derive(scene()), cells), figures)
+    panel = figures.kept["render"].axes[0]
+    assert panel.get_ylim()[0] > 0.01
+    assert "auto, below: 1e-12" in [text.get_text() for text in panel.texts]
 
 
 @pytest.fixture

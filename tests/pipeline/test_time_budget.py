@@ -150,6 +150,7 @@ def test_more_time_brings_more_samples_and_a_repeated_run_keeps_them(tmp_path: P
     assert stamps(folder) == before, "nothing is made again"
 
 
+@pytest.mark.slow
 def test_scenes_with_a_common_time_are_repeated_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares differ from run to run, but not the request; a scene that fails leaves its share to the others."""
     monkeypatch.setattr("ommatid.pipeline.stages.write_page", lambda *_: None)
@@ -169,6 +170,7 @@ def test_scenes_with_a_common_time_are_repeated_too(tmp_path: Path, monkeypatch:
     assert run(folders[1:2], 1e-3)[0]["within"] == 0.9, "alone it has all of the time"
 
 
+@pytest.mark.slow
 def test_samples_are_adaptive_where_grids_fit_the_pixels(tmp_path: Path) -> None:
     description, _ = within(tmp_path / "x", setup_of("multijitter"), 60.0, ticking(1e-3))
     assert description["spent"]["chosen"] == dict.fromkeys(KEYS, "auto")
@@ -244,6 +246,7 @@ def test_curves_of_bench_are_used_for_the_same_camera_only(tmp_path: Path) -> No
     assert bench_error_curves(tmp_path / "x", other) is None
 
 
+@pytest.mark.slow
 def test_curves_of_bench_never_lead_to_fewer_samples_than_the_measuring_runs(tmp_path: Path) -> None:
     """`bench` begins at 4 samples, fewer than a scene can ask for; under much noise these would be the fastest."""
     setup = setup_of()

@@ -122,6 +122,7 @@ def test_full_pixels(changes: dict[str, Any], largest: float | None) -> None:
     assert not np.isnan(half.values).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "electrons", "brightest"),
     [
@@ -280,6 +281,7 @@ def test_the_measured_error_is_the_expected_one(lux: float) -> None:
     assert found.budget()["noise"] > found.budget()["quantisation"] > 0
 
 
+@pytest.mark.slow
 def test_the_second_estimate_of_the_noise_is_more_accurate_and_as_good_a_weight() -> None:
     """Few electrons, where a reading alone says little of the noise it has; against that, and against the truth."""
     errors: list[list[float]] = []

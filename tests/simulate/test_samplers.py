@@ -23,7 +23,7 @@ from ommatid.simulate.sampling.passes import plan
 from ommatid.simulate.sampling.samplers import corners, filling, fitting, law
 from ommatid.simulate.sampling.seeds import sampler_seeds
 
-from ..examples import THREE, VARIANTS, camera, needs, scene
+from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, needs, scene
 
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 
@@ -67,7 +67,7 @@ def errors(variant: str, sampler: Sampler, samples: int, repeats: int) -> NDArra
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_pixels_and_passes_have_independent_streams(variant: str, sampler: Sampler) -> None:
     """The sum over pixels of one seed scatters as that of independent ones; consecutive seeds have little in common.
 

@@ -22,7 +22,7 @@ from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.renderer.world import files, has_interreflections, stage
 
 from ..conftest import TINY, Command
-from ..examples import GALLERY, VARIANTS, assert_student, needs
+from ..examples import GALLERY, SLOW_SCALAR, VARIANTS, assert_student, needs
 from ..examples import scene as flat_scene
 from .world_files import FAST, THIRDS, Z, cube, floored, glow, rectangle, world
 
@@ -64,7 +64,7 @@ def test_the_ground_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: s
     assert found.samples == 4 * 256
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_a_ball_occludes_the_background(tmp_path: Path, variant: str) -> None:
     needs(variant)
     x, y, z, radius = 0.7, 0.4, 500.0, 1.2
@@ -103,7 +103,7 @@ def test_a_letter_f_of_cubes_is_upright_and_not_mirrored(tmp_path: Path, variant
     np.testing.assert_allclose(rendering.mean.reshape(12, 12), LETTER * 204.0, rtol=1e-5, atol=1e-3)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_a_near_square_moves_by_the_disparity(tmp_path: Path, variant: str) -> None:
     """At half the target's distance, by the lens's own offset from the centre, to the same side."""
     needs(variant)

@@ -170,24 +170,6 @@ def test_means_of_frames_are_distributed_like_frames_drawn_one_by_one(monkeypatc
         assert ratio == pytest.approx(1, abs=4 * (4 / pixels) ** 0.5)
 
 
-def test_averaging_does_not_help_against_rounding_without_noise() -> None:
-    """With dark signals spread over a step and hardly any noise, the mean of many frames errs by a step / sqrt(12)."""
-    told = sensor(read_noise=0.5, dark_current=0.0, gain=0.01, dsnu=60.0, prnu=0.0, black_level=20.0, frames=400)
-    found = exposed(told, field(28), 0.0, 0)
-    exact = 20 + 0.01 * np.concatenate([_offsets(told, field(28))])
-    measured = float(np.var(found.dark - exact))
-    said = float(found._mean_variance(np.zeros(1))[0])  # pyright: ignore[reportPrivateUsage]
-    # Four standard errors: the square of a uniform deviate has the relative variance 4/5.
-    assert measured == pytest.approx(1 / 12, rel=4 * (0.8 / found.dark.size) ** 0.5)
-    assert said == pytest.approx(1 / 12, rel=1 / 400), "rounding of single frames adds a 400th"
-
-
-def _offsets(told: SensorTable, camera: Camera) -> Vector:
-    """Return the dark signals, from a sensor that rounds to 1/50 of an electron."""
-    fine = told.model_copy(update={"gain": 50.0, "black_level": 1e5, "bits": 24, "read_noise": 0.0, "frames": 2})
-    return (exposed(fine, camera, 0.0, 0).dark - 1e5) / 50
-
-
 def test_the_fixed_pattern_belongs_to_the_camera_and_the_rest_to_the_exposure() -> None:
     quiet = sensor(read_noise=0.0, dark_current=0.0, bits=16, gain=5.0, black_level=100.0, frames=256)
     two, one = field(24, 2), field(24)
@@ -267,18 +249,6 @@ def inside(found: Reconstruction) -> bool:
     assert found.interval is not None
     assert found.error is not None
     return found.interval.low < found.error.mse < found.interval.high
-
-
-@pytest.mark.parametrize("lux", [30.0, 2000.0])
-def test_the_measured_error_is_the_expected_one(lux: float) -> None:
-    stack, model = taken(lux)
-    truth = load(stack.scene).ravel()
-    found = restore(stack, model, truth)
-    assert inside(found)
-    assert found.residual is not None
-    assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
-    assert sum(found.budget().values()) == pytest.approx(found.expected.mse)
-    assert found.budget()["noise"] > found.budget()["quantisation"] > 0
 
 
 @pytest.mark.slow

@@ -12,8 +12,17 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.lenses.prescription import Prescription, prescription_of
-from ommatid.simulate.lenses.ray_trace import Disk, exit_disk, path, spread, through, trace, trace_path
-from ommatid.simulate.lenses.surface_shapes import NUMPY, meet_asphere
+from ommatid.simulate.lenses.ray_trace import (
+    NUMPY,
+    Disk,
+    exit_disk,
+    meet_asphere,
+    path,
+    spread,
+    through,
+    trace,
+    trace_path,
+)
 
 from ..lenses import BICONVEX, camera_with, lens, turned_round
 

@@ -20,8 +20,18 @@ from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses import sharpness
 from ommatid.simulate.lenses.etendue import relative_illumination, solid_angle, solid_angles
 from ommatid.simulate.lenses.prescription import Prescription, prescribe, prescription_of
-from ommatid.simulate.lenses.ray_trace import Disk, exit_disk, exit_disk_of, path, reach, spread, through, trace
-from ommatid.simulate.lenses.surface_shapes import NUMPY, Functions
+from ommatid.simulate.lenses.ray_trace import (
+    NUMPY,
+    Disk,
+    Functions,
+    exit_disk,
+    exit_disk_of,
+    path,
+    reach,
+    spread,
+    through,
+    trace,
+)
 
 from ..examples import GALLERY, needs
 from ..lenses import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens, turned_round

@@ -27,6 +27,7 @@ GALLERY = Path(__file__).parent.parent / "scenes"
 Lenses = tuple[tuple[Any, Any, Any], ...]
 
 VARIANTS = ["scalar_rgb", "llvm_ad_mono"]
+SLOW_SCALAR = [pytest.param("scalar_rgb", marks=pytest.mark.slow), "llvm_ad_mono"]  # the long form of a law
 
 
 def scene(

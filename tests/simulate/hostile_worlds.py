@@ -68,40 +68,6 @@ def indices_of_ply(rng: random.Random, folder: Path) -> str:
     return mesh("m.ply")
 
 
-def counts_of_ply(rng: random.Random, folder: Path) -> str:
-    content = ply(4, [(0, 1, 2)], rng.choice("=<>"))
-    element, count = rng.choice([(b"vertex", b"4"), (b"face", b"1")])
-    more = str(rng.choice([9, 10**6, 10**9, 2**63, 10**15])).encode()
-    (folder / "m.ply").write_bytes(
-        content.replace(b"element " + element + b" " + count, b"element " + element + b" " + more)
-    )
-    return mesh("m.ply")
-
-
-def header_of_ply(rng: random.Random, folder: Path) -> str:
-    lines = ply(4, [(0, 1, 2)], "=").split(b"\n")
-    if rng.random() < 0.5:
-        del lines[rng.choice([0, 1, 2, 6, 7, 8])]
-    else:
-        lines.insert(
-            rng.randrange(1, 9), rng.choice([b"\xff" * 2000, b"property", b"element vertex 3", b"list \0", b"egg"])
-        )
-    (folder / "m.ply").write_bytes(b"\n".join(lines))
-    return mesh("m.ply")
-
-
-def positions(rng: random.Random, folder: Path) -> str:
-    value = rng.choice(["nan", "inf", "-inf", "1e39"])
-    if rng.random() < 0.5:
-        (folder / "m.obj").write_text(f"v 0 0 {value}\nv 0 1 0\nv 1 0 0\nf 1 2 3\n", encoding="utf-8")
-        return mesh("m.obj") if value != "1e39" else _shape("x/y")
-    content = ply(3, [(0, 1, 2)], "<")
-    (folder / "m.ply").write_bytes(
-        content.replace(struct.pack("<f", 1.0), struct.pack("<f", float(value) if value != "1e39" else 1e38))
-    )
-    return mesh("m.ply")
-
-
 def faces_of_obj(rng: random.Random, folder: Path) -> str:
     face = rng.choice(
         ["1 2", "1", "", "1 2 0", "1 2 -1", "1 2 99", "1 2 4294967297", "1/1 2/1 3/1", "1//9 2//9 3//9", "a b c"]
@@ -119,12 +85,6 @@ def serialized_mesh(rng: random.Random, folder: Path) -> str:
     bad += [good[:20], b"", good[:-4] + struct.pack("<I", 10**9), good[:10] + b"\xff" * 9 + good[19:]]
     (folder / "m.serialized").write_bytes(rng.choice(bad))
     return mesh("m.serialized")
-
-
-def nesting(rng: random.Random, folder: Path) -> str:
-    del folder
-    tag, depth = rng.choice(["bsdf", "shape", "egg", "texture"]), rng.choice([65, 100, 20_000])
-    return scene(f'<{tag} type="twosided">' * depth + f"</{tag}>" * depth)
 
 
 def laughs(rng: random.Random, folder: Path) -> str:
@@ -148,13 +108,6 @@ def cycles(rng: random.Random, folder: Path) -> str:
         content = f'<scene version="3.0.0"><include filename="{(i + 1) % length}.xml"/></scene>'
         (folder / f"{i}.xml").write_text(content, encoding="utf-8")
     return scene('<include filename="0.xml"/>')
-
-
-def entities(rng: random.Random, folder: Path) -> str:
-    (folder / "secret").write_text("secret", encoding="utf-8")
-    name = rng.choice(["secret", "file:///etc/passwd", "http://127.0.0.1:9/x"])
-    start = rng.choice([f'<!DOCTYPE s [<!ENTITY x SYSTEM "{name}">]>', f'<!DOCTYPE s SYSTEM "{name}">'])
-    return start + scene('<string name="x" value="1"/>')
 
 
 def _shape(kind: str) -> str:
@@ -201,32 +154,17 @@ def paths_in_other_keys(rng: random.Random, folder: Path) -> str:
     return scene(f'<shape type="sphere"><bsdf type="conductor"><string name="{name}" value="{value}"/></bsdf></shape>')
 
 
-def damaged(rng: random.Random, folder: Path) -> str:
-    del folder
-    text = scene('<shape type="sphere"/>')
-    at = rng.randrange(1, len(text) - 1)
-    return rng.choice(
-        [text[:at], text + "<", "", "egg", "\0", text.replace("scene", "shape"), text.replace("version", "vers")]
-    )
-
-
 FAMILIES: dict[str, Callable[[random.Random, Path], str]] = {
     make.__name__: make
     for make in (
         indices_of_ply,
-        counts_of_ply,
-        header_of_ply,
-        positions,
         faces_of_obj,
         serialized_mesh,
-        nesting,
         laughs,
         cycles,
-        entities,
         plugins,
         outside,
         paths_in_other_keys,
-        damaged,
     )
 }
 

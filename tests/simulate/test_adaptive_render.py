@@ -36,7 +36,7 @@ from ommatid.simulate.render import cached_stack, render
 from ommatid.simulate.sampling.passes import EXACT_PASSES, Plan, cells_of, on_grid, rounding_variance, samples_within
 
 from ..conftest import Command
-from ..examples import THREE, VARIANTS, needs, scene
+from ..examples import SLOW_SCALAR, THREE, VARIANTS, needs, scene
 
 FRACTIONAL = (("2/5", [2, 2], [5, 5]), ("3/8", [2, 2], [4, 4]))  # pixels see pixels of f in part
 
@@ -80,6 +80,7 @@ def test_a_grid_that_fits_the_pixels_of_f_leaves_no_error(variant: str) -> None:
     assert away.max() < 1.0
 
 
+@pytest.mark.slow
 def test_the_stated_variance_is_that_of_the_error() -> None:
     """Over seeds: the sum of squared errors over the sum of stated variances is 1 within its own scatter (t test)."""
     ratios: list[float] = []
@@ -96,7 +97,7 @@ def test_the_stated_variance_is_that_of_the_error() -> None:
     assert abs(mean - 1) < limit * deviation, f"{mean:.3f} +- {deviation:.3f}"
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_values_do_not_depend_on_other_sub_imagers(variant: str) -> None:
     needs(variant)
     both = auto(lenses=THREE, variant=variant, sampler="stratified")
@@ -223,7 +224,10 @@ def test_grids_fit_and_rounding_inverts() -> None:
         assert samples - 1 <= samples_within(values, variance) <= samples, "rounded down"
 
 
-@pytest.mark.parametrize(("variant", "method"), [("scalar_rgb", "points"), ("llvm_ad_mono", "transport")])
+@pytest.mark.parametrize(
+    ("variant", "method"),
+    [pytest.param("scalar_rgb", "points", marks=pytest.mark.slow), ("llvm_ad_mono", "transport")],
+)
 def test_calibration_continues_until_h_adds_little(tmp_path: Path, variant: str, method: str) -> None:
     needs(variant)
     described = scene(
@@ -281,6 +285,7 @@ def test_a_calibration_that_could_not_be_written_is_repeated_exactly(
     np.testing.assert_array_equal(found.matrix.data, whole.matrix.data)
 
 
+@pytest.mark.slow
 def test_few_rounds_reach_the_goal_and_an_unreachable_one_is_recorded() -> None:
     """With a stopping rule by which the addition of H falls like 1 / samples^1.5."""
     described, camera = endless()

@@ -118,20 +118,6 @@ def test_another_scene_ignores_the_checkpoint(tmp_path: Path) -> None:
     assert len(fractions) == 16
 
 
-def test_a_damaged_checkpoint_is_ignored(tmp_path: Path) -> None:
-    path = tmp_path / "result"
-    with pytest.raises(Interruption), open_checkpoint(path, "mine") as one:  # noqa: PT012
-        one.offer(lambda: {"done": np.arange(3)})
-        raise Interruption
-    kept = tmp_path / ".result.partial.npz"
-    assert list(Checkpoint(path, "mine").state()) == ["done"]
-    assert Checkpoint(path, "other").state() == {}
-    whole = kept.read_bytes()
-    for damaged in (b"", whole[: len(whole) // 2], b"PK" + whole[7:], whole[:200] + b"\0" * 50 + whole[250:]):
-        kept.write_bytes(damaged)
-        assert Checkpoint(path, "mine").state() == {}
-
-
 @pytest.mark.parametrize(
     "state", [{"other": np.array(1)}, {"mean": np.zeros(2), "variance": np.array("x"), "band": np.array(0)}]
 )
@@ -171,19 +157,3 @@ def test_large_checkpoints_take_a_small_share_of_the_time(tmp_path: Path, monkey
     assert writes[0] == pytest.approx(31)
     assert all(later - earlier >= 3 / checkpoint.SHARE for earlier, later in pairwise(writes))
     assert 3.0 * len(writes) <= 2 * checkpoint.SHARE * now[0]
-
-
-def test_a_folder_in_place_of_the_checkpoint_stays(tmp_path: Path) -> None:
-    folder = tmp_path / ".result.exr.partial.npz"
-    folder.mkdir()
-    with open_checkpoint(tmp_path / "result.exr", "one") as opened:
-        assert opened.state() == {}
-
-    def interrupted() -> None:
-        with open_checkpoint(tmp_path / "result.exr", "one") as opened:
-            opened.offer(lambda: {"number": np.array(1)})
-            raise Interruption
-
-    with pytest.raises(Interruption):
-        interrupted()
-    assert folder.is_dir()

@@ -122,6 +122,7 @@ def test_full_pixels(changes: dict[str, Any], largest: float | None) -> None:
     assert not np.isnan(half.values).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "electrons", "brightest"),
     [
@@ -167,24 +168,6 @@ def test_means_of_frames_are_distributed_like_frames_drawn_one_by_one(monkeypatc
         assert float(one_by_one.mean()) == pytest.approx(float(at_once.mean()), abs=4 * chance)
         ratio = float(one_by_one.var() / at_once.var())
         assert ratio == pytest.approx(1, abs=4 * (4 / pixels) ** 0.5)
-
-
-def test_averaging_does_not_help_against_rounding_without_noise() -> None:
-    """With dark signals spread over a step and hardly any noise, the mean of many frames errs by a step / sqrt(12)."""
-    told = sensor(read_noise=0.5, dark_current=0.0, gain=0.01, dsnu=60.0, prnu=0.0, black_level=20.0, frames=400)
-    found = exposed(told, field(28), 0.0, 0)
-    exact = 20 + 0.01 * np.concatenate([_offsets(told, field(28))])
-    measured = float(np.var(found.dark - exact))
-    said = float(found._mean_variance(np.zeros(1))[0])  # pyright: ignore[reportPrivateUsage]
-    # Four standard errors: the square of a uniform deviate has the relative variance 4/5.
-    assert measured == pytest.approx(1 / 12, rel=4 * (0.8 / found.dark.size) ** 0.5)
-    assert said == pytest.approx(1 / 12, rel=1 / 400), "rounding of single frames adds a 400th"
-
-
-def _offsets(told: SensorTable, camera: Camera) -> Vector:
-    """Return the dark signals, from a sensor that rounds to 1/50 of an electron."""
-    fine = told.model_copy(update={"gain": 50.0, "black_level": 1e5, "bits": 24, "read_noise": 0.0, "frames": 2})
-    return (exposed(fine, camera, 0.0, 0).dark - 1e5) / 50
 
 
 def test_the_fixed_pattern_belongs_to_the_camera_and_the_rest_to_the_exposure() -> None:
@@ -268,18 +251,7 @@ def inside(found: Reconstruction) -> bool:
     return found.interval.low < found.error.mse < found.interval.high
 
 
-@pytest.mark.parametrize("lux", [30.0, 2000.0])
-def test_the_measured_error_is_the_expected_one(lux: float) -> None:
-    stack, model = taken(lux)
-    truth = load(stack.scene).ravel()
-    found = restore(stack, model, truth)
-    assert inside(found)
-    assert found.residual is not None
-    assert abs(found.residual.chi_squared - found.residual.expected) < 4 * found.residual.deviation
-    assert sum(found.budget().values()) == pytest.approx(found.expected.mse)
-    assert found.budget()["noise"] > found.budget()["quantisation"] > 0
-
-
+@pytest.mark.slow
 def test_the_second_estimate_of_the_noise_is_more_accurate_and_as_good_a_weight() -> None:
     """Few electrons, where a reading alone says little of the noise it has; against that, and against the truth."""
     errors: list[list[float]] = []

@@ -58,6 +58,7 @@ def test_two_passes_show_every_pixel_without_error(variant: str) -> None:
     assert np.median(away**2 / rendering.variance) < 1
 
 
+@pytest.mark.slow
 def test_samples_keep_away_from_edges_by_what_float32_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     variant = choose("auto")
     if variant.startswith("scalar"):

@@ -81,6 +81,7 @@ def test_the_chart_is_a_grid_with_the_corners() -> None:
     np.testing.assert_array_equal(whole, np.r_[57:114, 171:228])
 
 
+@pytest.mark.slow
 def test_the_numbers_err_as_their_covariance_says() -> None:
     """Over 20 draws of 6 sub-imagers each: squared errors over their stated variances have mean 1."""
     _, pinholes = with_optics({}, WRONG, FEW)
@@ -132,7 +133,7 @@ def test_what_no_view_explains_is_measured_entry_by_entry() -> None:
     assert fit.matrix.views[cam.types[1].name].explained.all()
 
 
-@pytest.mark.parametrize("method", ["points", "transport"])
+@pytest.mark.parametrize("method", [pytest.param("points", marks=pytest.mark.slow), "transport"])
 def test_traced_rays_of_a_misaligned_camera(method: str, tmp_path: Path) -> None:
     """By rays through wrongly placed lenses, against exact areas; the file holds the numbers alone."""
     needs("llvm_ad_mono")

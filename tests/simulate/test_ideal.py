@@ -14,7 +14,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.optics.boxes import overlap
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import THREE, camera
+from ..examples import camera
 
 
 def by_supersampling(one: Camera, fine: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -100,7 +100,3 @@ def test_null_space_of_two_coprime_types_and_of_three() -> None:
     two = dense[one.types[0].measurements :]
     assert 29**2 - np.linalg.matrix_rank(two, tol=1e-9) == 2 * (3 - 1) * (5 - 1)
     assert np.linalg.matrix_rank(dense, tol=1e-9) == 29**2
-
-
-def test_three_types_have_the_rank_of_the_paper() -> None:
-    assert ideal_matrix(camera((19, 19), THREE)).shape == (706, 361)

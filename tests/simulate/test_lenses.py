@@ -51,9 +51,9 @@ def built(
     ("lens", "tables"),
     [
         ({"aperture": "0.4 mm", "focus": "700 mm"}, {"noise": {"variance": 1.0}}),
-        ({"distortion": [0.05, 0.0]}, {"noise": {"variance": 1.0}}),
-        ({"aperture": "0.4 mm", "focus": "900 mm"}, {"sensor": SENSOR}),
-        ({"surfaces": BIPLANE[1:]}, {"sensor": SENSOR}),
+        pytest.param({"distortion": [0.05, 0.0]}, {"noise": {"variance": 1.0}}, marks=pytest.mark.slow),
+        pytest.param({"aperture": "0.4 mm", "focus": "900 mm"}, {"sensor": SENSOR}, marks=pytest.mark.slow),
+        pytest.param({"surfaces": BIPLANE[1:]}, {"sensor": SENSOR}, marks=pytest.mark.slow),
     ],
     ids=["defocus", "distortion", "sensor", "surfaces and sensor"],
 )
@@ -70,6 +70,7 @@ def test_the_measured_error_is_the_expected_one(lens: dict[str, Any], tables: di
     assert found.interval.low < found.error.mse < found.interval.high
 
 
+@pytest.mark.slow
 def test_pixels_that_no_light_can_reach_are_dead() -> None:
     """A baffle vignettes the corners of the field: NaN in the stack, empty rows of H, unused by the estimate."""
     needs("llvm_ad_mono")
@@ -94,6 +95,7 @@ def test_pixels_that_no_light_can_reach_are_dead() -> None:
     assert np.isnan(counted.values[dark]).all()
 
 
+@pytest.mark.slow
 def test_electrons_follow_the_rendered_light() -> None:
     """Electrons from traced solid angles against the light that rendered rays bring: within 1 per cent."""
     needs("llvm_ad_mono")

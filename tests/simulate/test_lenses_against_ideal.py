@@ -67,6 +67,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
 
 
+@pytest.mark.slow
 def test_traced_h_of_several_wavelengths_is_the_closed_form() -> None:
     """Every ray has one of the wavelengths, with its share of the light; H of one wavelength is another."""
     needs("llvm_ad_mono")
@@ -90,7 +91,9 @@ def test_the_focus_has_these_waves(kind: str) -> None:
     assert blur_of(camera, camera.types[0]).waves == pytest.approx(float(kind.split()[0]), rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["in focus", "0.3 waves", "3 waves"])
+@pytest.mark.parametrize(
+    "kind", [*(pytest.param(kind, marks=pytest.mark.slow) for kind in ("in focus", "0.3 waves")), "3 waves"]
+)
 def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str) -> None:
     """Rays from points of the pupil that find the flat target's distance by themselves."""
     needs("llvm_ad_mono")

@@ -6,6 +6,7 @@ Radii are in units of the wavelength times the f-number on the target's side, ab
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import ceil, pi
 
 import numpy as np
 import pytest
@@ -13,12 +14,7 @@ from scipy import integrate
 from scipy.special import j0, j1
 
 from ommatid.runtime.errors import InputError
-from ommatid.simulate.lenses.point_spread import (
-    encircled_energy,
-    point_spread,
-    relative_intensity,
-    strehl_ratio,
-)
+from ommatid.simulate.lenses.point_spread import density, point_spread, relative_intensity, strehl_ratio
 from ommatid.simulate.lenses.wavefront import GRID_REACH, Wavefront, node_counts, polar_nodes, thin_wavefront
 
 WAVELENGTH = 5.5e-4
@@ -62,6 +58,17 @@ def by_autocorrelation(waves: Callable[[np.ndarray], np.ndarray], frequency: flo
     phase = waves(np.hypot(x + frequency, y[:, None])) - waves(np.hypot(x - frequency, y[:, None]))
     rows = half * (np.exp(2j * np.pi * phase) @ weights)
     return float(abs(np.sum(rows * np.cos(turn) * weights) * np.arcsin(top)) / np.pi)
+
+
+def encircled_energy(wave: Wavefront, radius: float) -> float:
+    """Return the share of the light within a distance of the centre. The wave's nodes must serve that distance."""
+    rings = 16 + ceil(4 * radius / wave.resolution)
+    turns = 32 + ceil(14 * radius / wave.resolution)
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    distance, angle = radius * (nodes + 1) / 2, 2 * pi * np.arange(turns) / turns
+    x, y = np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))
+    mean = density(wave, x.ravel(), y.ravel()).reshape(rings, turns).mean(axis=1)
+    return float(2 * pi * (mean * distance) @ weights * radius / 2)
 
 
 def test_an_open_pupil_is_airys() -> None:

@@ -230,42 +230,6 @@ def test_both_forms_of_file_hold_the_same_lens(tmp_path: Path) -> None:
     assert read_lens(tmp_path / "lens.toml") == read_lens(tmp_path / "lens.dat")
 
 
-DAMAGED = {
-    "1 2 1.5\n": "line 1: expected four numbers .*, got 3",
-    "# lens\n50\n1 2 1.5 2\n1 two 1 2\n": "line 4: expected numbers .*, got 'two'",
-    "1 0 nan 2\n": "line 1: expected numbers .*, got 'nan'",
-    "1 -1 1.5 2\n": "line 1: expected a thickness .*, got -1",
-    "1 1 0.5 2\n": "line 1: expected an index .*, got 0.5",
-    "1 1 1.5 0\n": "line 1: expected a diameter .*, got 0",
-    "# nothing\n50\n": "expected rows of radius, .*, got none",
-    "0 1 0 1\n0 1 0 1\n": "one aperture stop at most, got 2",
-}
-
-
-@pytest.mark.parametrize("text", DAMAGED)
-def test_damaged_text_is_refused_with_its_line(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "bad.dat"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=rf"bad\.dat.*{DAMAGED[text]}"):
-        read_lens(path)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("surfaces = [", "not valid TOML"),
-        ("surfaces = []", "surfaces"),
-        ('surfaces = [{radius = 1, semi_diameter = "1 mm"}]', "bare number"),
-        ('surfaces = [{radios = "1 mm", semi_diameter = "1 mm"}]', "surfaces.radius"),
-    ],
-)
-def test_damaged_tables_are_refused_with_their_key(text: str, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "bad.toml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=rf"bad\.toml: .*{words}"):
-        read_lens(path)
-
-
 def test_a_scene_holds_what_its_lens_file_holds(tmp_path: Path) -> None:
     """So that a resolved scene needs no other file."""
     for name, stop in (("planoconvex", 8.0), ("doublet", 6.0)):

@@ -17,7 +17,13 @@ from ..examples import OPTICS, assert_student, needs, with_optics
 SMALL = (("1/3", [2, 1], [2, 2]), ("1/4", [1, 2], [1, 1]))
 
 
-@pytest.mark.parametrize("kind", OPTICS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow) if kind in ("diffraction", "out of focus") else kind
+        for kind in OPTICS
+    ],
+)
 def test_h_is_that_of_point_sources(kind: str) -> None:
     """From the same rays, in float64: entries, variances and batches."""
     needs("llvm_ad_mono")

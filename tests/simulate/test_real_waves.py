@@ -10,11 +10,11 @@ import pytest
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.lenses.field import LensField, field_of
-from ommatid.simulate.lenses.point_spread import encircled_energy, point_spread, relative_intensity, strehl_ratio
+from ommatid.simulate.lenses.point_spread import point_spread, relative_intensity, strehl_ratio
 
 from ..examples import GALLERY
 from ..wave_optics import aberration, aperture_of, relative_light
-from .test_point_spread import FREQUENCIES, by_autocorrelation
+from .test_point_spread import FREQUENCIES, by_autocorrelation, encircled_energy
 
 GREEN = 5.5e-4
 BLUE = 4.5e-4

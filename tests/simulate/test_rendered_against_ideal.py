@@ -25,7 +25,7 @@ from ommatid.simulate.render import Rendering, light
 from ommatid.simulate.sampling.passes import rounding_variance
 from ommatid.simulate.sampling.samplers import corners, fitting
 
-from ..examples import THREE, VARIANTS, assert_student, familywise, needs, scene
+from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, familywise, needs, scene
 
 UNUSUAL = (("2/5", [2, 2], [4, 3]), ("3/10", [1, 2], [2, 3]), (1, [1, 1], [9, 8]))
 CUT = slice(450)  # pixels of three_types whose strata are cut by edges of pixels of f: those of 1/4 are not
@@ -67,7 +67,7 @@ def test_sub_images_of_a_photograph(variant: str, sampler: Sampler) -> None:
     assert_student(rendering.mean - ideal(setup), variance_of(rendering), rendering.passes)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_calibrated_h(variant: str) -> None:
     needs(variant)
     setup = three_types(variant, 4096)
@@ -81,7 +81,7 @@ def test_calibrated_h(variant: str) -> None:
     assert_student(matrix.data - exact[rows, matrix.indices], variance, responses.passes)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_calibrated_h_of_fractional_ratios(variant: str) -> None:
     """Footprints cut through pixels of f; the edges of one type almost coincide with theirs, to float32's rounding."""
     needs(variant)
@@ -102,7 +102,7 @@ def test_calibrated_h_of_fractional_ratios(variant: str) -> None:
     np.testing.assert_allclose(dense.sum(axis=1), 1, atol=1e-4)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_fractional_ratios(variant: str) -> None:
     """Footprints whose edges cut through pixels of the target, arrays that are not square, and magnification 1."""
     needs(variant)
@@ -138,7 +138,7 @@ def test_a_uniform_target_reads_its_own_value(variant: str) -> None:
 
 
 @pytest.mark.parametrize(("sampler", "power"), [("independent", 0.5), ("multijitter", 0.75)])
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_the_error_falls_by_the_law_of_the_sampler(variant: str, sampler: str, power: float) -> None:
     """n^-1/2 for independent samples; n^-3/4 for stratified ones and edges, up to the bound of `corners`.
 
@@ -160,7 +160,7 @@ def test_the_error_falls_by_the_law_of_the_sampler(variant: str, sampler: str, p
 
 
 @pytest.mark.parametrize("sampler", ["multijitter", "independent"])
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_the_stated_variance_is_the_mean_squared_error(variant: str, sampler: str) -> None:
     """The ratio of both, over n pixels, has the variance 2 / n (1 + 1/15): of the errors, and of 16 passes."""
     needs(variant)
@@ -183,7 +183,7 @@ def test_errors_of_data_calibration_and_seeds_are_uncorrelated(variant: str) -> 
     assert np.abs(correlations).max() < stats.norm.isf(familywise(6) / 2) / exact.size**0.5
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SLOW_SCALAR)
 def test_no_ray_is_assigned_to_another_sub_imager(variant: str) -> None:
     """Film coordinates are float32 and round up to the next pixel's once in some hundred thousand rays.
 

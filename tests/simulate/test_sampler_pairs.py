@@ -65,14 +65,6 @@ def test_cells_of_the_pixel_and_of_the_pupil_meet_equally_often(sampler: Sampler
     assert largest_score(shares(sampler, reseeded=True)) < limit
 
 
-@pytest.mark.parametrize("sampler", ["stratified", "ldsampler"])
-def test_successive_draws_of_one_seed_do_not(sampler: Sampler) -> None:
-    """Without seeds of their own, the shares of pairs of cells differ by a tenth and more, where noise is 2 %."""
-    needs(FAST)
-    relative = shares(sampler, reseeded=False).mean(axis=0) * CELLS**4
-    assert relative.std() > 0.1, "seeds of their own are no longer needed"
-
-
 @pytest.mark.parametrize("sampler", get_args(Sampler))
 def test_errors_of_pixels_are_independent(sampler: Sampler) -> None:
     """The scatter of the mean over pixels is that of one pixel over the square root of their number.

@@ -71,7 +71,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
 
 
-@pytest.mark.parametrize("kind", ["waves in focus", "waves out of focus", "waves with coma"])
+@pytest.mark.parametrize("kind", ["waves with coma"])
 def test_half_of_the_diffraction_is_seen(kind: str) -> None:
     """The same statistic between two cameras: light of twice the wavelength is another one."""
     surfaces, wavelength, more = CASES[kind]
@@ -113,7 +113,7 @@ def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> 
         assert row[texel] == pytest.approx(expected, abs=TOLERANCE / 9)
 
 
-@pytest.mark.parametrize("kind", ["waves out of focus", "waves with coma"])
+@pytest.mark.parametrize("kind", ["waves out of focus", pytest.param("waves with coma", marks=pytest.mark.slow)])
 def test_rays_that_follow_the_distance_of_what_they_meet(kind: str) -> None:
     """In a world as before a flat target: H of a flat target that lenses have to find."""
     needs("llvm_ad_mono")
@@ -135,6 +135,7 @@ def test_rays_that_follow_the_distance_of_what_they_meet(kind: str) -> None:
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
 
 
+@pytest.mark.slow
 def test_several_wavelengths(monkeypatch: pytest.MonkeyPatch) -> None:
     """Traced H is the closed form, which is the mean of those of the wavelengths with their glass."""
     needs("llvm_ad_mono")

@@ -79,6 +79,7 @@ def test_h_is_learnt_on_the_grid_of_the_world(method: str) -> None:
     assert model.record["agreement"]["p_value"] > 1e-3  # with H in closed form on the same grid
 
 
+@pytest.mark.slow
 def test_the_folder_of_a_run_holds_the_picture_and_its_average(ommatid: Command, tmp_path: Path) -> None:
     needs("llvm_ad_mono")
     tables = {"noise": {"variance": 1e-2}, "prior": {"kind": "exponential", "correlation_length": "25 mm"}}

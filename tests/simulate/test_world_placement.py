@@ -79,6 +79,7 @@ def test_a_world_reads_the_same_in_millimetres_and_inches(tmp_path: Path) -> Non
     np.testing.assert_allclose(known.depth, exact.depth, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_blur_behind_an_aperture_is_the_same_in_millimetres_and_metres(tmp_path: Path) -> None:
     needs(FAST)
     in_millimetres, in_metres = (

@@ -24,8 +24,7 @@ from ommatid.scenes.fitted.kernels import KernelFootprints, basis
 from ommatid.scenes.lens_type import LensType
 
 from ..calibration.point_sources import Responses
-from .chart import Chart, chart_of
-from .regression import Sums
+from .regression import Chart, Sums, chart_of
 from .selection import Candidate, Components, choose, components, seen
 
 DRAWS = 64

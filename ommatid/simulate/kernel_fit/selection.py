@@ -15,8 +15,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.fitted.kernels import basis
 
-from .chart import Chart
-from .regression import Sums, chance, excess, gram, residual, sums_of
+from .regression import Chart, Sums, chance, excess, gram, residual, sums_of
 
 LEVEL = 3.0  # mean squared over variance of a picture whose values are uniform between 0 and 255
 CORRELATED = 3.0  # pixels of f over which a picture's correlation falls to 1/e

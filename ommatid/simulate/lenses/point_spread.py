@@ -138,17 +138,6 @@ def _vertex(values: FloatArray) -> float:
     return float(np.clip((values[0] - values[2]) / (2 * bend), -1, 1)) if bend < 0 else 0.0
 
 
-def encircled_energy(wave: Wavefront, radius: float) -> float:
-    """Return the share of the light within a distance of the centre. The wave's nodes must serve that distance."""
-    rings = 16 + ceil(4 * radius / wave.resolution)
-    turns = 32 + ceil(14 * radius / wave.resolution)
-    nodes, weights = np.polynomial.legendre.leggauss(rings)
-    distance, angle = radius * (nodes + 1) / 2, 2 * pi * np.arange(turns) / turns
-    x, y = np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))
-    mean = density(wave, x.ravel(), y.ravel()).reshape(rings, turns).mean(axis=1)
-    return float(2 * pi * (mean * distance) @ weights * radius / 2)
-
-
 def _strength(wave: Wavefront) -> NDArray[np.complex128]:
     return np.asarray(wave.amplitude * np.exp(2j * pi / _wavelength(wave) * wave.path), dtype=np.complex128)
 

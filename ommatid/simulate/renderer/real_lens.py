@@ -19,8 +19,7 @@ from ommatid.scenes.lens_type import LensType
 
 from ..lenses.field import LensField, bands, check_waves, field_of, sampling_tables
 from ..lenses.prescription import prescription_of
-from ..lenses.ray_trace import exit_disk_of, path, reach, trace
-from ..lenses.surface_shapes import Functions
+from ..lenses.ray_trace import Functions, exit_disk_of, path, reach, trace
 from ..lenses.wavefront import GRID_REACH
 from .lens import Distance, Emission, LensModel, Point
 

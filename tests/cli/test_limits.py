@@ -209,7 +209,7 @@ def test_an_exr_picture_beyond_the_memory_is_refused(tmp_path: Path, monkeypatch
     exr.write(tmp_path / "a.exr", [exr.Part("one", {"Y": np.zeros((4000, 4000), np.float32)}, {})])
     monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 10**8)
     with pytest.raises(InputError, match=r"a.exr: to read it needs 0.128 GB of memory, 0.1 GB are free"):
-        exr.read_channels(tmp_path / "a.exr")
+        exr.read(tmp_path / "a.exr")
 
 
 # Memory

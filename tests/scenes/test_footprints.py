@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import sparse
@@ -16,7 +15,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.lens_type import LensOptics, SubImager
 from ommatid.scenes.optics.boxes import overlap
-from ommatid.scenes.optics.distortion import coefficients, distort, field, undistort
+from ommatid.scenes.optics.distortion import distort, undistort
 from ommatid.scenes.optics.footprints import matrix, sub_matrix
 from ommatid.scenes.pose import Misalignment, Pose, corner_offset, pose_of, poses
 from ommatid.scenes.scene import read
@@ -56,35 +55,6 @@ def image_tangents(cam: Camera, sub: SubImager, pose: Pose, row: Vector, column:
     k = sub.type.optics.distortion or (0.0, 0.0)
     tangents = (x - pose.lens[0]) / cam.distance, (y - pose.lens[1]) / cam.distance
     return np.column_stack(distort(*tangents, *k, cam.distance / cam.half_diagonal))
-
-
-def footprint(cam: Camera, sub: SubImager, pose: Pose, u: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """Row and column of f, as real numbers, where chief rays of points (u, v) of the patch come from."""
-    point = [at + along[0] * u + along[1] * v for at, along in zip(pose.middle, pose.axes, strict=True)]
-    tangents = point[0] / point[2], point[1] / point[2]
-    scale = cam.distance / cam.half_diagonal
-    x, y = undistort(*tangents, *coefficients(sub), scale, field(cam, sub, pose))
-    row = cam.rows / 2 - (pose.lens[1] + y * cam.distance) / cam.target_pitch
-    return row, cam.columns / 2 - (pose.lens[0] + x * cam.distance) / cam.target_pitch
-
-
-def reach(cam: Camera, sub: SubImager, pose: Pose) -> tuple[Vector, Vector, Vector, Vector]:
-    """Bounds of each pixel's footprint: first row and last + 1, first column and last + 1, from points on its sides.
-
-    Between points a curve rises above both by at most 1/8 of its second difference there; twice that is added.
-    """
-    rows, columns = sub.type.pixels
-    left, top = corner_offset(cam, sub)
-    side = np.linspace(0.0, 1.0, 9)
-    du = np.concatenate([side, np.ones(9), side[::-1], np.zeros(9)])
-    dv = np.concatenate([np.zeros(9), side, np.ones(9), side[::-1]])
-    i, j = np.divmod(np.arange(rows * columns), columns)
-    u, v = left + (j[:, None] + du) * cam.pixel_pitch, top + (i[:, None] + dv) * cam.pixel_pitch
-    bounds: list[Vector] = []
-    for at in footprint(cam, sub, pose, u, v):
-        bulge = np.abs(np.diff(at.reshape(at.shape[0], 4, -1), 2, axis=2)).max(axis=(1, 2)) / 4 + 1e-9
-        bounds += [np.floor(at.min(axis=1) - bulge), np.ceil(at.max(axis=1) + bulge)]
-    return bounds[0], bounds[1], bounds[2], bounds[3]
 
 
 @pytest.mark.parametrize(("shape", "lenses"), [((19, 19), THREE), ((23, 17), TWO_FIFTHS)])
@@ -215,35 +185,6 @@ def test_a_texels_column_is_the_area_of_its_image(
 
 
 small = st.floats(-1, 1, allow_nan=False)
-
-
-@given(st.lists(small, min_size=8, max_size=8))
-def test_entries_are_shares_within_the_bounds_of_footprints(drawn: list[float]) -> None:
-    cam = distorted(camera(lenses=(("1/3", [2, 2], [5, 5]), ("2/5", [1, 1], [6, 6]))), 0.12 * drawn[0], 0.06 * drawn[1])
-    for sub in cam.sub_imagers[::4]:
-        misalignment = Misalignment(
-            (drawn[2] / 100, drawn[3] / 100), (drawn[4] / 5, drawn[5] / 5), drawn[6], drawn[7] / 10
-        )
-        pose = pose_of(sub, misalignment)
-        h = sub_matrix(cam, sub, pose)
-        top, bottom, left, right = reach(cam, sub, pose)
-        row, column = np.divmod(h.indices, cam.columns)
-        pixel = np.repeat(np.arange(h.shape[0]), np.diff(h.indptr))
-        sums = np.asarray(h.sum(axis=1))
-        assert h.data.min(initial=1.0) > 0
-        assert sums.max() <= 1 + 1e-12
-        assert ((top[pixel] <= row) & (row < bottom[pixel])).all()
-        assert ((left[pixel] <= column) & (column < right[pixel])).all()
-        inside = (top >= 0) & (bottom <= cam.rows) & (left >= 0) & (right <= cam.columns)
-        np.testing.assert_allclose(sums[inside], 1, atol=1e-12)
-
-
-def test_bounds_of_footprints_are_tight() -> None:
-    """A footprint of m pixels meets m + 1 at most, and the margin for rounding adds one."""
-    cam = camera()
-    for sub in cam.sub_imagers[::7]:
-        top, bottom, left, right = reach(cam, sub, pose_of(sub))
-        assert max((bottom - top).max(), (right - left).max()) <= int(sub.type.ratio) + 2
 
 
 def test_a_steep_patch_has_valid_shares() -> None:

@@ -113,10 +113,10 @@ def test_values_whose_squares_files_cannot_hold_are_refused(tmp_path: Path, bad:
 @pytest.mark.parametrize(
     ("name", "mode", "words"),
     [
-        ("a.tif", "P", "a palette's colours"),
-        ("a.tif", "CMYK", r"inks \(CMYK\)"),
+        ("a.tif", "P", "the kind PALETTE"),
+        ("a.tif", "CMYK", "the kind SEPARATED"),
         ("a.jpg", "CMYK", r"inks \(CMYK\)"),
-        ("white.tif", "L", "0 is white"),
+        ("white.tif", "L", "the kind MINISWHITE"),
     ],
 )
 def test_values_that_are_not_light_are_refused(name: str, mode: str, words: str, tmp_path: Path) -> None:

@@ -293,7 +293,7 @@ def test_frames_without_pages_are_refused(tmp_path: Path) -> None:
     assert "expected a page for every frame" in refusal(path)
 
 
-GREY_EXR, RGB_EXR = {"Y": ("<f4", 1, 1)}, dict.fromkeys("RGB", ("<f2", 1, 1))
+GREY_EXR = {"Y": ("<f4", 1, 1)}
 WINDOW = (0, 0, 9, 7)
 
 

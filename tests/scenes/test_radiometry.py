@@ -213,6 +213,7 @@ def test_saturated_pixels_are_ignored_in_a_prediction() -> None:
         predicted_noise(long, camera, electrons(long, camera))
 
 
+@pytest.mark.slow
 def test_a_prediction_by_a_single_tile_is_the_dense_one() -> None:
     """With the noise of a sensor and a dead pixel."""
     described = real(estimator={"method": "tiles"})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import special, stats
+from scipy import stats
 
 from ommatid.scenes.shrinkage import posterior_variances, posterior_variances_among, shrink_variances
 
@@ -29,17 +29,6 @@ def test_sums_are_unbiased_under_weights_from_the_same_variances(freedom: int, p
     assert np.sum(plain * sample) / np.sum(plain * true) < 0.9 or freedom == 63
 
 
-def test_shrunk_variances_are_closer_to_the_true_ones() -> None:
-    rng = np.random.default_rng(4)
-    true = 10 / rng.chisquare(10, 5000)
-    sample = true * rng.chisquare(15, true.size) / 15
-    before, after = (
-        float(np.mean(np.log(variance / true) ** 2)) for variance in (sample, shrink_variances(sample, 16))
-    )
-    expected = special.polygamma(1, 25 / 2) / special.polygamma(1, 15 / 2)
-    assert after / before == pytest.approx(expected, rel=5 * np.sqrt(2 * 2 / true.size))
-
-
 def test_equal_variances_become_one_value_that_scales_with_them() -> None:
     """The mean of n variances of 15 degrees of freedom has the relative standard error sqrt(2 / 15 n)."""
     rng = np.random.default_rng(5)
@@ -48,11 +37,6 @@ def test_equal_variances_become_one_value_that_scales_with_them() -> None:
     assert shrunk.std() < 0.1 * sample.std()
     assert shrunk.mean() == pytest.approx(7, rel=5 * np.sqrt(2 / 15 / sample.size))
     np.testing.assert_allclose(shrink_variances(1e-12 * sample, 16), 1e-12 * shrunk, rtol=1e-6)
-
-
-def test_too_few_or_zero_variances_are_unchanged() -> None:
-    np.testing.assert_array_equal(shrink_variances(np.array([3.0]), 16), [3.0])
-    np.testing.assert_array_equal(shrink_variances(np.zeros(5), 16), np.zeros(5))
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1e6])

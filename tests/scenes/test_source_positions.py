@@ -13,7 +13,6 @@ from ommatid.scenes.hardware.point_sources import read_positions
 from ..examples import camera
 
 FILES = [Path("a.png"), Path("b.png")]
-NINES = "9" * 5000
 
 
 def test_files_without_an_end_are_refused(tmp_path: Path) -> None:

@@ -232,30 +232,10 @@ def test_twenty_images_err_as_predicted() -> None:
     assert np.mean(errors) == pytest.approx(float(np.trace(covariance)) / 361, abs=3 * spread)
 
 
-def test_only_steered_cameras_have_another_description() -> None:
-    grid = derive(steered({(0, 1): {"window": [5, 4]}}))
-    plain = derive(scene((20, 18), (("1/3", [2, 3], [3, 3]), ("1/2", [2, 2], [6, 6]))))
-    assert plain.types[0].origin == (5, 3)
-    np.testing.assert_array_equal(ideal_matrix(grid).toarray(), ideal_matrix(plain).toarray())
-    assert grid.sub_imagers[1].patch == plain.sub_imagers[1].patch
-    assert "sub_imagers" not in plain.describe()["camera.lens.A"]
-    moved = derive(steered({(0, 1): {"window": [5, "9/2"]}}))
-    assert moved.describe() != grid.describe()
-    assert [sub.name for sub in moved.sub_imagers] == [sub.name for sub in plain.sub_imagers]
-    assert [sub.lens for sub in moved.on_grids.sub_imagers] == [sub.lens for sub in plain.sub_imagers]
-
-
 def test_written_and_read_again(tmp_path: Path) -> None:
     before = steered({(0, 2): {"window": ["3/2", 9], "rotation": "-1 deg"}})
     write(tmp_path / "scene.toml", before)
     assert derive(read(tmp_path / "scene.toml")).types[0].steered == derive(before).types[0].steered
-
-
-def test_one_sub_imager_twice_is_refused() -> None:
-    data = steered({(0, 0): {"window": [0, 0]}}).plain()
-    data["camera"]["lens"][0]["sub_imager"] *= 2
-    with pytest.raises(InputError, match="twice"):
-        parse(data, Path("test.toml"))
 
 
 def test_patches_that_a_window_moves_onto_each_other_are_refused() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
-from ommatid.scenes.formats.exr import read_channels
+from ommatid.scenes.formats.exr import read_picture
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix
@@ -45,7 +45,7 @@ def test_mitsubas_own_command_renders_the_same(tmp_path: Path) -> None:
             str(picture.parent / "camera.xml"),
         ]
         subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
-        rendered = next(iter(read_channels(output).values()))
+        rendered = read_picture(output).pixels
         pixels = camera.sub_imagers[number].type.pixels
         assert rendered.shape == pixels
         # 4096 stratified samples of steps of at most 255 err by 255 / 4096^(3/4) = 0.5 at most.

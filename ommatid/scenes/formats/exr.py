@@ -98,14 +98,6 @@ def read_first_record(path: Path) -> dict[str, Any]:
     return _checked_record(path, parts[0][0], parts[0][2])[0]
 
 
-def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
-    """The channels of the first part of any OpenEXR picture. Raises InputError if it cannot be read."""
-    parts = _open(path)
-    if not parts or not parts[0][1]:
-        raise InputError(f"{path}: expected an OpenEXR picture, got a file without complete channels")
-    return parts[0][1]
-
-
 def read_picture(path: Path) -> StoredPicture:
     """Read Y, or R, G and B, of an OpenEXR picture, and A if it has one.
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import check_regular, open_input
 
-from . import exr, jpeg, npz, png, tiff
+from . import exr, npz, tiff
+from .png_and_jpeg import JPEG_SIGNATURE, read_jpeg, read_png
 from .stored_picture import StoredPicture, check_size
 
 TIFF, IMAGES = (".tif", ".tiff"), (".png", ".jpg", ".jpeg")
@@ -78,13 +79,13 @@ def _read(path: Path, where: str, reader: Reader) -> Any:
 
 def _read_image(stream: BinaryIO, path: Path) -> StoredPicture:
     """Read a PNG or JPEG file; their names are often exchanged."""
-    return jpeg.read(stream, path) if stream.read(3) == jpeg.SIGNATURE else png.read(stream, path)
+    return read_jpeg(stream, path) if stream.read(3) == JPEG_SIGNATURE else read_png(stream, path)
 
 
 def _read_lossless(stream: BinaryIO, path: Path) -> StoredPicture:
-    if stream.read(3) == jpeg.SIGNATURE:
+    if stream.read(3) == JPEG_SIGNATURE:
         raise InputError(f"{path}: expected a PNG file, got a JPEG, which does not keep the sensor's numbers")
-    return png.read(stream, path)
+    return read_png(stream, path)
 
 
 def _read_exr(_: BinaryIO, path: Path) -> StoredPicture:

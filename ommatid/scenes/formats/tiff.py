@@ -26,13 +26,6 @@ from ommatid.runtime.memory import check_memory
 
 from .stored_picture import BYTES, UPRIGHT, StoredPicture, check_single, profile_notes, upright
 
-UNSUPPORTED = {
-    "PALETTE": "a palette's colours",
-    "SEPARATED": "inks (CMYK)",
-    "MINISWHITE": "a picture in which 0 is white",
-    "YCBCR": "luminance and colour differences (YCbCr)",
-    "CFA": "the mosaic of a colour filter",
-}
 CHANNELS = {"MINISBLACK": 1, "RGB": 3}  # of light, by the kind of picture
 BITS = (1, 8, 16, 32, 64)  # per number
 UNCOMPRESSED, DEFLATE, PACKBITS = 1, (8, 32946), 32773
@@ -136,9 +129,7 @@ def _check_kind(path: Path, page: Any) -> None:
     """Raise InputError if a page is of a kind that is not read."""
     name = str(getattr(page.photometric, "name", page.photometric)) if 262 in page.tags else ""
     alpha, count = len(page.extrasamples), int(page.samplesperpixel)
-    stored = UNSUPPORTED.get(name)
-    if stored is None and name and name not in CHANNELS:
-        stored = f"the kind {name}"
+    stored = f"the kind {name}" if name and name not in CHANNELS else None
     if stored is None and count - alpha != CHANNELS.get(name, count - alpha):
         stored = f"{count} numbers per pixel of the kind {name}"
     if stored is not None:

@@ -1,7 +1,7 @@
-"""PNG pictures with all of their bits.
+"""PNG pictures with all of their bits, and JPEG pictures, grey or RGB, upright.
 
-The chunks are checked here, and only the pixel data reach Pillow, which inflates and filters them. Of a whole file,
-Pillow reduces 16-bit colour to 8 bits, scales 1, 2 and 4 bits, and inflates texts without a limit.
+The chunks of a PNG are checked here, and only the pixel data reach Pillow, which inflates and filters them. Of a whole
+file, Pillow reduces 16-bit colour to 8 bits, scales 1, 2 and 4 bits, and inflates texts without a limit.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.runtime.errors import InputError
+
 from .stored_picture import (
     StoredPicture,
     any_size,
@@ -27,7 +29,7 @@ from .stored_picture import (
     upright,
 )
 
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY, RGB, PALETTE, GREY_ALPHA, RGB_ALPHA = 0, 2, 3, 4, 6  # types of colour
 SAMPLES = {GREY: 1, RGB: 3, PALETTE: 1, GREY_ALPHA: 2, RGB_ALPHA: 4}
 DEPTHS = {GREY: (1, 2, 4, 8, 16), PALETTE: (1, 2, 4, 8)}  # bits per sample; of all others 8 or 16
@@ -63,8 +65,8 @@ class PngChunks:
     frames: int
 
 
-def read(stream: BinaryIO, path: Path) -> StoredPicture:
-    """Read a picture. Raises InputError for several frames and too large a picture, ValueError for a damaged file."""
+def read_png(stream: BinaryIO, path: Path) -> StoredPicture:
+    """Read a PNG file. Raises InputError for several frames and too large a picture, ValueError for a damaged file."""
     chunks = _chunks(stream)
     header = chunks.header
     check_single(path, chunks.frames, "frames")
@@ -84,7 +86,7 @@ def _chunks(stream: BinaryIO) -> PngChunks:
     """Walk the chunks, without reading pixel data. Raises ValueError for a damaged file."""
     size = stream.seek(0, io.SEEK_END)
     stream.seek(0)
-    if stream.read(len(SIGNATURE)) != SIGNATURE:
+    if stream.read(len(PNG_SIGNATURE)) != PNG_SIGNATURE:
         raise ValueError("it is no PNG file")
     header: PngHeader | None = None
     others: dict[bytes, bytes] = {}
@@ -170,7 +172,7 @@ def _bytes(header: PngHeader, bits: int, colour: int, data: bytes, order: str | 
         struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(content, zlib.crc32(name)))
         for name, content in ((b"IHDR", described), (b"IDAT", data), (b"IEND", b""))
     )
-    with any_size(), Image.open(io.BytesIO(SIGNATURE + content), formats=("PNG",)) as opened:
+    with any_size(), Image.open(io.BytesIO(PNG_SIGNATURE + content), formats=("PNG",)) as opened:
         if order is not None:
             opening = cast(Any, opened)
             decoder, extent, offset, _ = opening.tile[0]
@@ -217,3 +219,43 @@ def _coding_notes(others: dict[bytes, bytes]) -> tuple[str, ...]:
         return profile_notes(b"cICP")
     gamma = others.get(b"gAMA", b"")
     return gamma_notes(None if b"sRGB" in others or len(gamma) != 4 else int.from_bytes(gamma, "big") / 100_000)
+
+
+JPEG_SIGNATURE = b"\xff\xd8\xff"
+SCAN = b"\xff\xda"  # marker of a scan; a file with many of them is decoded as often
+MOST_SCANS = 500
+DENSEST = 1024  # pixels per byte, at most: of a block of 64 some bits are stored
+
+
+def read_jpeg(stream: BinaryIO, path: Path) -> StoredPicture:
+    """Read a JPEG file. Raises InputError for inks, several pictures and too large ones, Pillow's errors for damage."""
+    from PIL import Image
+
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(0)
+    with any_size(), Image.open(stream, formats=("JPEG",)) as opened:
+        check_single(path, int(getattr(opened, "n_frames", 1)), "pictures")
+        if opened.mode not in ("L", "RGB"):
+            inks = "inks (CMYK)" if opened.mode == "CMYK" else f"mode {opened.mode}"
+            raise InputError(f"{path}: expected grey or RGB, got {inks}; save it as RGB")
+        numbers = opened.size[0] * opened.size[1]
+        check_size(path, numbers * len(opened.getbands()), size)
+        if numbers > DENSEST * size:
+            raise ValueError("it is cut short")
+        _check_scans(stream)
+        pixels = np.asarray(opened)
+        info = cast(dict[str, Any], opened.info)
+    profile, exif = info.get("icc_profile") or b"", info.get("exif") or b""
+    return upright(StoredPicture(pixels, notes=profile_notes(profile)), orientation_of(exif))
+
+
+def _check_scans(stream: BinaryIO) -> None:
+    """Raise ValueError if a file has more scans than any encoder writes. The position in the stream is kept."""
+    position = stream.tell()
+    stream.seek(0)
+    scans = 0
+    while block := stream.read(1 << 20):
+        scans += block.count(SCAN)
+    stream.seek(position)
+    if scans > MOST_SCANS:
+        raise ValueError(f"it has {scans} scans")

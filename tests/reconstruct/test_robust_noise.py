@@ -13,7 +13,6 @@ from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.misalignment.robust_noise import (
     MisalignmentNoise,
     as_misalignments,
-    as_table,
     misaligned_matrix,
     points_of,
     robust_error,
@@ -31,7 +30,7 @@ from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.pose import misalignments
 from ommatid.scenes.tables.camera import Surface, ToleranceTable
 
-from ..examples import THREE, Lenses, scene
+from ..examples import THREE, Lenses, as_table, scene
 
 NOISE = 1e-2
 SIGNIFICANCE = 0.01

@@ -9,8 +9,7 @@ import pytest
 from scipy import stats
 
 from ommatid.reconstruct.estimator.estimate import factorise
-from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix, tolerances
-from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
+from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix, misalignment_variance, tolerances
 from ommatid.reconstruct.prior import exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import reduce
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,6 +16,7 @@ from ommatid.reconstruct.methods.tile_merging import (
     Posterior,
     disjoint_tiles,
     merge_posteriors,
+    merge_tiles,
     tile_posterior,
 )
 from ommatid.reconstruct.prior import Prior, exponential, independent
@@ -57,12 +56,6 @@ def random_chain(seed: int) -> tuple[Problem, FloatArray, list[Indices]]:
     ends = np.sort(rng.choice(np.arange(1, n), int(rng.integers(1, 4)), replace=False))
     recorded = dense @ image + problem.deviation * rng.normal(size=m)
     return problem, recorded, np.split(np.arange(n, dtype=np.intp), ends)
-
-
-def merge_tiles(problem: Problem, recorded: FloatArray, tiles: list[Indices]) -> Posterior:
-    """Estimate each tile alone and merge it with those before it."""
-    posteriors = (tile_posterior(problem, recorded, tile) for tile in tiles)
-    return reduce(lambda merged, tile: merge_posteriors(merged, tile, problem, recorded), posteriors)
 
 
 def assert_same(first: Posterior, second: Posterior, tolerance: float) -> None:
@@ -197,6 +190,8 @@ def test_invalid_tiles_and_measurements_are_refused() -> None:
     for wrong in ([], [0, 0], [2], [-1]):
         with pytest.raises(InputError, match="each once"):
             tile_posterior(noisy, recorded, np.array(wrong, dtype=np.intp))
+    with pytest.raises(InputError, match="one tile or more"):
+        merge_tiles(noisy, recorded, [])
     extreme = Problem(matrix, independent(0.0, 1e308, 2), np.full(2, 1e-320))
     with pytest.raises(InputError, match="double precision"):
         tile_posterior(extreme, recorded, np.array([0, 1]))

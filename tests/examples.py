@@ -14,7 +14,9 @@ from scipy import sparse, stats
 from ommatid.reconstruct.forms.form import Form
 from ommatid.reconstruct.prior import Prior, independent
 from ommatid.reconstruct.problem import Problem
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.pose import Misalignment
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
@@ -148,3 +150,8 @@ def mean_weights(renderer: Renderer, group: str, samples: int) -> NDArray[np.flo
         for block in renderer.blocks(group, samples)
     ]
     return np.concatenate([weight.mean(axis=1) for weight in weights if weight is not None])
+
+
+def as_table(misalignments: tuple[Misalignment, ...]) -> FloatArray:
+    """Return misalignments as an array: (sub-imagers, 6)."""
+    return np.array([[*each.position, *each.tilt, each.rotation, each.focal_length] for each in misalignments])

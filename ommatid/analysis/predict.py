@@ -8,7 +8,7 @@ from typing import Any
 
 from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
+from ommatid.reconstruct.misalignment.robust_noise import misalignment_variance
 from ommatid.reconstruct.prediction import Prediction, predict, predict_frame
 from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.errors import InputError

@@ -18,8 +18,13 @@ from ommatid.reconstruct.measured_error import TRIM, trimmed_mean
 from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS, METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import Execution, MethodResult
-from ommatid.reconstruct.misalignment.robust_noise import CAUSE, MisalignmentNoise, robust_noise
-from ommatid.reconstruct.misalignment.tolerance_cost import mismatch_of_image, mismatch_variance
+from ommatid.reconstruct.misalignment.robust_noise import (
+    CAUSE,
+    MisalignmentNoise,
+    mismatch_of_image,
+    mismatch_variance,
+    robust_noise,
+)
 from ommatid.reconstruct.prediction import Prediction, median_width, observability
 from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.restore import BUDGET, truth_for

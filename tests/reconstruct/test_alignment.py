@@ -16,7 +16,7 @@ from ommatid.reconstruct.misalignment.alignment import (
     likelihood_at,
     misaligned_recording,
 )
-from ommatid.reconstruct.misalignment.robust_noise import as_table, misaligned_matrix, tolerances
+from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix, tolerances
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -25,7 +25,7 @@ from ommatid.scenes.formats.picture import load
 from ommatid.scenes.pose import misalignments
 from ommatid.scenes.tables.camera import ToleranceTable
 
-from ..examples import familywise, scene
+from ..examples import as_table, familywise, scene
 
 NOISE = 1e-3
 SIGNIFICANCE = 0.01

@@ -12,7 +12,7 @@ from scipy import stats
 from ommatid.analysis.predict import predict_ideal
 from ommatid.analysis.run_prediction import predict_run
 from ommatid.reconstruct.estimator.estimate import factorise
-from ommatid.reconstruct.misalignment.tolerance_cost import misalignment_variance
+from ommatid.reconstruct.misalignment.robust_noise import misalignment_variance
 from ommatid.reconstruct.prior import independent, prior_of
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore

@@ -15,11 +15,10 @@ from ommatid.reconstruct.prior import Prior, exponential, independent, prior_of
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.formats.picture import load
 from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import camera, posterior_covariance, scene
+from ..examples import camera, posterior_covariance
 
 SHAPE = (19, 19)
 MATRIX = ideal_matrix(camera())
@@ -143,22 +142,6 @@ def test_coverage_with_a_fitted_prior() -> None:
     assert chance < 0.04
     assert by_fit == pytest.approx(1, abs=0.05 + 2.6 * chance)
     assert by_truth == pytest.approx(1, abs=4 * (2 / 361 / 14) ** 0.5)
-
-
-@pytest.mark.slow
-def test_a_photograph_gains_from_a_fitted_prior() -> None:
-    """At a noise variance of 1 its error falls to a third of that with the paper's prior, at 100 to a fifth."""
-    flat = load(scene()).ravel()
-    for noise, share in ((1.0, 1 / 3), (100.0, 1 / 5)):
-        whole = evidence(flat, 127.5, noise, 5)
-        fit = fit_prior(whole)
-        assert fit.noise_variance == pytest.approx(noise, rel=4 * fit.spread[2])
-        fitted = exponential(127.5, fit.variance or 0.0, SHAPE, fit.length or 0.0)
-        errors: list[float] = []
-        for prior in (fitted, independent(127.5, 5461.25, 361)):
-            result = estimate(Problem(MATRIX, prior, np.full(706, noise)), whole.residual + MATRIX @ prior.mean)
-            errors.append(float(np.mean((result.image - flat) ** 2)))
-        assert errors[0] < share * errors[1]
 
 
 def test_fits_without_information_are_refused_or_doubtful() -> None:

@@ -51,18 +51,6 @@ def test_the_measured_error_is_the_expected_one(name: str, changes: list[str]) -
 
 
 @pytest.mark.slow
-def test_fewer_lens_types_are_worse() -> None:
-    errors = []
-    for lenses in ((), ("I", "II"), ("I",)):
-        described = read(GALLERY / "tile19.toml", ["calibration.method=ideal"], lenses)
-        _, _, restoration = chain(described)
-        assert restoration.error is not None
-        errors.append(restoration.error.mse)
-    assert errors[0] < errors[1] / 100
-    assert errors[1] < errors[2]
-
-
-@pytest.mark.slow
 def test_spurious_information_of_h_is_reported() -> None:
     """Two types leave a null space, which a noisy H seems to see: Eq. 5 then predicts half of the actual error."""
     shares: list[float] = []
@@ -126,15 +114,9 @@ def test_a_stack_and_a_model_of_different_cameras_are_refused(other: Scene, key:
     stack = render(Setup(described, camera))
     with pytest.raises(InputError, match=key):
         check_match(stack, ideal_model(other, derive(other)), ("stack.exr", "model.npz"))
-
-
-def test_pitches_are_compared_too() -> None:
-    described = scene(lenses=THREE, render={"samples": 16})
-    camera = derive(described)
-    stack = render(Setup(described, camera))
-    model = replace(ideal_model(described, camera), camera=replace(camera, pixel_pitch=0.007))
+    wider = replace(ideal_model(described, camera), camera=replace(camera, pixel_pitch=0.007))
     with pytest.raises(InputError, match=r"camera\.pixel_pitch is 0\.006 in the stack and 0\.007"):
-        check_match(stack, model, ("stack.exr", "model.npz"))
+        check_match(stack, wider, ("stack.exr", "model.npz"))
 
 
 def test_without_the_truth_there_is_no_measured_error() -> None:

@@ -13,7 +13,6 @@ from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.misalignment.robust_noise import (
     MisalignmentNoise,
     as_misalignments,
-    as_table,
     misaligned_matrix,
     points_of,
     robust_error,
@@ -26,12 +25,11 @@ from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.formats.picture import load
 from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.pose import misalignments
 from ommatid.scenes.tables.camera import Surface, ToleranceTable
 
-from ..examples import THREE, Lenses, scene
+from ..examples import Lenses, as_table, scene
 
 NOISE = 1e-2
 SIGNIFICANCE = 0.01
@@ -156,26 +154,6 @@ def test_parts_of_the_error_agree_with_dense_matrices() -> None:
     assert expected.parts["noise"] == pytest.approx(np.trace(a @ np.diag(noise) @ a.T) / len(p), rel=1e-6)
     assert expected.parts["misalignment"] == pytest.approx(np.trace(a @ block @ a.T) / len(p), rel=1e-6)
     assert expected.degrees_of_freedom == pytest.approx(np.trace(a @ h), rel=1e-6)
-
-
-@pytest.mark.slow
-def test_a_photograph_gains_with_a_correlated_prior() -> None:
-    side = 19
-    camera, rng, prior = misaligned_camera(side, lenses=THREE), np.random.default_rng(4), priors(side)["exponential"]
-    image = load(scene((side, side), THREE)).astype(np.float64).ravel()
-    noise = np.full(camera.measurements, NOISE)
-    misaligned = robust_noise(camera, prior)
-    white = whitening(camera, misaligned, noise)
-    robust = estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form
-    ideal = misaligned_matrix(camera, np.zeros_like(tolerances(camera)))
-    trust = estimate(Problem(ideal, prior, noise), noise).form
-    gains: list[float] = []
-    for _ in range(8):
-        values = drawn_matrix(camera, rng) @ image + NOISE**0.5 * rng.standard_normal(noise.size)
-        by_robust = prior.mean + robust.gain(white.vector(values - misaligned.matrix @ prior.mean))
-        by_trust = prior.mean + trust.gain(values - ideal @ prior.mean)
-        gains.append(float(np.mean((by_trust - image) ** 2) - np.mean((by_robust - image) ** 2)))
-    assert np.mean(gains) > 3 * np.std(gains) / len(gains) ** 0.5
 
 
 def test_pixels_left_out_are_left_out_of_the_blocks() -> None:

@@ -18,7 +18,7 @@ from scipy import fft, ndimage
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.scenes.model import Model
 
-from ..methods.method import Method, PosteriorOperators, total_variance
+from ..methods.method import EstimationTask, Method, PosteriorOperators, total_variance
 from .attenuation import FIRST_ORDER, Attenuation
 
 SEED = 20260403  # of random images and noise, different from those of the other analyses
@@ -54,14 +54,11 @@ def true_contrast(method: Method, operators: PosteriorOperators, by_cause: dict[
     """
     task, actual = method.task, total_variance(by_cause)
     rng, waves = np.random.default_rng(SEED), Waves(task.shape)
-    count = 1 if task.model.unknowns > MANY else 2 if task.model.unknowns > FEW else 4
-    whites = [rng.normal(size=actual.size) for _ in range(count)]
     root = np.sqrt(actual)
+    whites = _white_noise(task, rng)
     noise = tuple(operators.gain(root * white) for white in whites)
     deviation = method.image - task.prior.mean
-    power, by_noise = waves.power(deviation), np.mean([waves.power(image) for image in noise], axis=0)
-    excess = power - by_noise
-    determined = excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
+    excess, determined = _excess(waves, deviation, noise)
     first = continued(waves.frequencies, excess, determined)
     attenuation = Attenuation.of(method, operators, whites, noise, root)
     if attenuation.strength(noise[0]) <= FIRST_ORDER:
@@ -84,17 +81,27 @@ def without_noise(method: Method, operators: PosteriorOperators, actual: FloatAr
     """
     task, waves = method.task, Waves(method.task.shape)
     rng, root = np.random.default_rng(SEED), np.sqrt(actual)
-    count = 1 if task.model.unknowns > MANY else 2 if task.model.unknowns > FEW else 4
-    noise = tuple(operators.gain(root * rng.normal(size=root.size)) for _ in range(count))
+    noise = tuple(operators.gain(root * white) for white in _white_noise(task, rng))
     deviation = method.image - task.prior.mean
-    by_noise = np.mean([waves.power(image) for image in noise], axis=0)
-    excess = waves.power(deviation) - by_noise
-    determined = excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
+    excess, determined = _excess(waves, deviation, noise)
     image = _placed(waves, deviation, noise, continued(waves.frequencies, excess, determined))
     whole, seen = waves.power(image), waves.power(image - operators.hidden(image))
     transfer = np.divide(seen, whole, out=np.ones_like(whole), where=whole > FAINT * whole.max())
     spectrum = continued(waves.frequencies, excess / np.clip(transfer, *TRANSFER), determined)
     return task.prior.mean + _placed(waves, deviation, noise, spectrum)
+
+
+def _white_noise(task: EstimationTask, rng: np.random.Generator) -> list[FloatArray]:
+    """Draw normal numbers, (measurements used,) each, for as many noise images as the size of the image needs."""
+    count = 1 if task.model.unknowns > MANY else 2 if task.model.unknowns > FEW else 4
+    return [rng.normal(size=task.expected_noise.size) for _ in range(count)]
+
+
+def _excess(waves: Waves, deviation: FloatArray, noise: tuple[FloatArray, ...]) -> tuple[FloatArray, BoolArray]:
+    """Return the power of an estimate beyond that of its noise, (bins,), and the bins in which it is determined."""
+    by_noise = np.mean([waves.power(image) for image in noise], axis=0)
+    excess = waves.power(deviation) - by_noise
+    return excess, excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
 
 
 def _placements(

@@ -13,8 +13,12 @@ from ommatid.analysis.predict import predict_scene
 from ommatid.analysis.prediction_table import json_of, rows
 from ommatid.reconstruct.expected_error import expected_error
 from ommatid.reconstruct.forms.cholesky import information
-from ommatid.reconstruct.misalignment.robust_noise import MisalignmentNoise, robust_noise
-from ommatid.reconstruct.misalignment.robust_noise import (mismatch_of_image, mismatch_variance)
+from ommatid.reconstruct.misalignment.robust_noise import (
+    MisalignmentNoise,
+    mismatch_of_image,
+    mismatch_variance,
+    robust_noise,
+)
 from ommatid.reconstruct.prior import Prior, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import restore

@@ -114,6 +114,7 @@ def test_results_that_are_up_to_date_here_are_not_made_again_on_a_cluster(
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [["--workers", "2"], ON_A_CLUSTER])
 def test_failures_of_scenes_are_independent_and_their_messages_the_same(
     options: list[str], here: Path, scenes: list[str], request: pytest.FixtureRequest, ommatid: Command

@@ -130,7 +130,7 @@ def test_dead_and_saturated_pixels() -> None:
 
 def test_a_prior_of_correlated_pixels() -> None:
     """The frame's prior is reflected at the edges: three correlation lengths inside, exp(-3) = 5 % of it remain."""
-    shape = (36, 34)
+    shape = (42, 37)
     prior = {"kind": "exponential", "variance": 2000.0, "correlation_length": "4 mm"}
     scene = wide(shape, noise={"variance": 1.0}, prior=prior)
     truth = drawn(3, shape)

@@ -7,10 +7,10 @@ passes or more, is half of the allowed one, and rounds are planned for a quarter
 by chance lets no bad pixel pass, and few rounds need another. Through pinholes, stratified samples make the variance
 fall like 1 / samples^1.5, since only those at the edges of pixels of f err. Where a grid of samples fits these edges
 none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.passes`), and are
-done where these agree. Behind lenses, where a ray
-has four numbers and more, points are Sobol's (`renderer.draws`) unless another sampler than the default is asked for:
-measured, their variance is 1.5 to 1.8 times lower than multijitter's at 256 samples in a pass, 1.9 to 2.3 times at
-1024 and 3.1 to 3.3 times at 4096, in the same time. The seeds of a sub-imager do not depend on the other ones.
+done where these agree. Behind lenses, where a ray has four numbers and more, points are Sobol's (`renderer.draws`)
+unless another sampler than the default is asked for: measured, their variance is 1.5 to 1.8 times lower than
+multijitter's at 256 samples in a pass, 1.9 to 2.3 times at 1024 and 3.1 to 3.3 times at 4096, in the same time. The
+seeds of a sub-imager do not depend on the other ones.
 """
 
 from __future__ import annotations
@@ -59,7 +59,6 @@ LEAST = 256  # samples per pixel of a first round, at least
 MOST = 2**20  # samples per pixel of a round, at most
 MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
 MOST_PASSES = 1024  # of all rounds of a sub-imager: they number its seeds
-
 SOBOL = "sobol"  # in records, Sobol's points of pixel and pupil
 REACHED = "reached"  # how a sub-imager ends; otherwise the reason why it could not:
 TIME, SAMPLES, FLOAT32 = "render.time is over", "no more samples are taken", "float32 rounds as much"

@@ -16,7 +16,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
-from .calibration.adaptive_rounds import StoppingRule
+from .calibration.adaptive_rounds import StoppingRule, calibrate_until
 from .calibration.entries import rendered_model
 from .ideal import ideal_model
 from .sampling.checkpoint import Checkpoint, open_checkpoint
@@ -56,8 +56,6 @@ def calibrate(
         record |= {"seconds": perf_counter() - start, "versions": versions("scipy")}
         return replace(model, record=record)
     if is_adaptive(scene):
-        from .calibration.adaptive_rounds import calibrate_until
-
         model = calibrate_until(setup, stopping_rule, progress, checkpoint)
         return replace(model, record=model.record | record | {"seconds": perf_counter() - start})
     model = rendered_model(setup, progress, checkpoint)

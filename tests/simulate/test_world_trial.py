@@ -121,7 +121,7 @@ def test_paths_that_may_be_endless_are_refused(most: int, sure: int, endless: bo
         parse_world(found.text, "scalar_rgb")
 
 
-def test_no_library_of_the_current_folder_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_library_of_the_current_folder_is_loaded(tmp_path: Path) -> None:
     """Neither under a new name nor in place of a plugin or a data file that Mitsuba ships."""
     compiler = shutil.which("cc")
     if compiler is None:
@@ -149,7 +149,6 @@ def test_no_library_of_the_current_folder_is_loaded(tmp_path: Path, monkeypatch:
         "cone",
     ):
         shutil.copy(library, tmp_path / "plugins" / f"{name}.so")
-    monkeypatch.chdir(tmp_path)
     activate("scalar_rgb")
     described, camera = world(tmp_path, '<shape type="cylinder"/><emitter type="point"/>', variant="scalar_rgb")
     truth(Setup(described, camera))

@@ -6,6 +6,7 @@ import ast
 import importlib
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,36 @@ def test_no_class_name_is_defined_twice() -> None:
             if isinstance(node, ast.ClassDef):
                 defined.setdefault(node.name, []).append(module)
     assert {name: where for name, where in defined.items() if len(where) > 1} == {}
+
+
+def test_no_regular_expression_needs_a_newer_python_than_3_11() -> None:
+    """`re` before Python 3.11.5 leaves a possessive repetition or an atomic group half-way when it fails."""
+    parser = importlib.import_module("re._parser")
+    found = dict[str, list[str | bytes]]()
+    for module, path in modules().items():
+        for text in _texts(path) if "re" in imports(module) else []:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    parsed = repr(parser.parse(text))
+                except (parser.error, OverflowError):  # no regular expression
+                    continue
+            if "POSSESSIVE_REPEAT" in parsed or "ATOMIC_GROUP" in parsed:
+                found.setdefault(module, []).append(text)
+    assert found == {}
+
+
+def _texts(path: Path) -> list[str | bytes]:
+    """All literals of a module but docstrings; of f-strings with a letter for what they format."""
+    nodes = list(ast.walk(tree(path)))
+    docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    texts = list[str | bytes]()
+    for node in nodes:
+        if isinstance(node, ast.JoinedStr):
+            texts.append("".join(str(part.value) if isinstance(part, ast.Constant) else "x" for part in node.values))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str | bytes) and id(node) not in docstrings:
+            texts.append(node.value)
+    return texts
 
 
 def test_names_of_modules_that_do_not_exist_are_errors() -> None:

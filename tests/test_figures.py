@@ -112,6 +112,7 @@ def test_which_type_to_add(ommatid: Command) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_camera_of_small_pixels(tmp_path: Path) -> None:
     (text,) = (block.text for block in blocks(DOCS / "camera.md") if block.file_name == "phone.toml")
     phone = tmp_path / "phone.toml"
@@ -144,6 +145,7 @@ def test_light_that_surfaces_reflect() -> None:
     check_figures("lenses.md", "`planoconvex` loses {} % of the light and `doublet` {} %", *lost)
 
 
+@pytest.mark.slow
 def test_which_f_number() -> None:
     """Errors are the trace of (H^T H)^-1 here, that of Eq. 5 over a noise variance that goes to zero."""
     stated = (0.1, 0.2, 0.25, 0.3, 0.4)

@@ -113,6 +113,7 @@ def test_it_yields_the_numbers_of_the_commands(
     np.testing.assert_array_equal(finished.truth, result.truth)
 
 
+@pytest.mark.slow
 def test_a_prepared_model_gives_the_same_results(
     scene: ommatid.Scene, stack: ommatid.Stack, model: ommatid.Model, result: ommatid.Result
 ) -> None:

@@ -77,6 +77,7 @@ def test_the_gallery_and_the_templates_are_in_it(wheel: Path) -> None:
     assert expected - set(names(wheel)) == set()
 
 
+@pytest.mark.slow
 def test_it_works_in_an_empty_folder(unpacked: Path, tmp_path: Path) -> None:
     """The commands of the first page, on the scene of `init` and on a gallery scene."""
     main = "from ommatid.__main__ import main\nmain()"

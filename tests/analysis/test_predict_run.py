@@ -46,7 +46,7 @@ DISTORTION = tuple(f"camera.lens.{name}.distortion=[0.05,0.02]" for name in ("I"
 @pytest.mark.parametrize(
     ("changes", "lenses"),
     [
-        pytest.param((), (), id="three types"),
+        pytest.param((), (), id="three types", marks=pytest.mark.slow),
         pytest.param(("calibration.method=ideal",), ("I", "II"), id="two types, ideal"),
         *(
             pytest.param(changes, (), id=name, marks=pytest.mark.slow)

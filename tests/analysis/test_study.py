@@ -54,6 +54,7 @@ def restored(how: str) -> Reconstruction:
     return restore(*recorded(misaligned(how)))
 
 
+@pytest.mark.slow
 def test_a_misaligned_camera_with_each_estimator() -> None:
     """With H as designed the error leaves its interval; with a fitted H it is inside, close to that of the true H."""
     restorations = {how: restored(how) for how in ("trust", "robust", "fit")}

@@ -65,6 +65,7 @@ def test_the_results_are_those_of_single_runs(film: Path, tmp_path: Path, ommati
     assert [document["diagnostics"].get("noise_difference") for document in documents] == [None, 0.0, 0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_processes_share_the_frames(film: Path, tmp_path: Path, ommatid: Command) -> None:
     """The files are those of one process, bit for bit; a frame that is damaged is named, and stops no other."""
     files = stacks(film)

@@ -24,6 +24,7 @@ from ommatid.runtime.progress import no_progress
 from ommatid.scenes import stack
 from ommatid.scenes.formats import exr
 from ommatid.scenes.tables import gallery
+from tests.modules import tracked
 
 from ..conftest import TINY, Command, Ended, shell
 from ..runs import FILES, FORBIDDEN, MADE, document, numbers, without
@@ -379,7 +380,7 @@ def _unknown(data: object, schemas: list[dict[str, Any]], root: dict[str, Any]) 
 
 def test_the_schema_knows_every_key_of_the_gallery(ommatid: Command) -> None:
     schema = document(ommatid("schema"))
-    for path in GALLERY.glob("*.toml"):
+    for path in tracked("ommatid/scenes/*.toml"):
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         assert _unknown(data, [schema], schema) == []
         data["target"]["distnace"] = data["target"].pop("distance")

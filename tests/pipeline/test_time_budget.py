@@ -134,6 +134,7 @@ def test_the_fewest_samples_are_taken_and_reported_if_they_take_too_long(tmp_pat
     assert "of 3 s with 256 and 256 samples per pixel, the fewest possible" in message
 
 
+@pytest.mark.slow
 def test_more_time_brings_more_samples_and_a_repeated_run_keeps_them(tmp_path: Path) -> None:
     folder = tmp_path / "x"
     description, messages = within(folder, setup_of(), 6.0, ticking(1e-3))

@@ -85,6 +85,7 @@ KNOWN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("variance", "length", "noise"), KNOWN)
 def test_drawn_parameters_are_fitted(noise: float, variance: float, length: float) -> None:
     """Within four of their standard deviations, from images that noise almost hides to those that it hardly touches."""
@@ -95,6 +96,7 @@ def test_drawn_parameters_are_fitted(noise: float, variance: float, length: floa
     assert np.abs(np.log(values / (variance, length, noise)) / fit.spread).max() < 4
 
 
+@pytest.mark.slow
 def test_noise_is_fitted_with_a_known_prior() -> None:
     """With the prior that the images are drawn from."""
     for prior in (
@@ -144,6 +146,7 @@ def test_coverage_with_a_fitted_prior() -> None:
     assert by_truth == pytest.approx(1, abs=4 * (2 / 361 / 14) ** 0.5)
 
 
+@pytest.mark.slow
 def test_fits_without_information_are_refused_or_doubtful() -> None:
     with pytest.raises(InputError, match="10 measurements or more, got 5"):
         fit_prior(Evidence(MATRIX[:5], np.ones(5), np.ones(5), SHAPE, None, True))
@@ -200,6 +203,7 @@ def test_a_search_keeps_out_of_where_no_evidence_is() -> None:
     assert result.spread == pytest.approx([(1 / 80 + 1 / 8e4) ** 0.5] * 2, rel=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_known", [True, False])
 def test_an_image_that_no_measurement_shows_makes_the_fit_doubtful(noise_known: bool) -> None:
     """A checkerboard under averages of 2 x 2 and 4 x 4 pixels is grey: the fit would promise almost no error."""

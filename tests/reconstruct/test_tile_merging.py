@@ -68,14 +68,14 @@ def assert_same(first: Posterior, second: Posterior, tolerance: float) -> None:
     assert (difference <= tolerance * np.outer(deviation, deviation)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lens_types", "columns", "noise", "error"),
     [
         (2, 38, 1e-6, 1e-11),
-        *(
-            pytest.param(types, columns, noise, error, marks=pytest.mark.slow)
-            for types, columns, noise, error in ((3, 38, 1e-2, 1e-12), (3, 57, 1e-6, 1e-11), (2, 57, 1e-6, 1e-11))
-        ),
+        (3, 38, 1e-2, 1e-12),
+        (3, 57, 1e-6, 1e-11),
+        (2, 57, 1e-6, 1e-11),
     ],
 )
 def test_a_row_of_tiles_is_the_estimate_of_the_frame(lens_types: int, columns: int, noise: float, error: float) -> None:

@@ -103,6 +103,7 @@ def test_vanishing_tolerances_change_nothing(tolerance: dict[str, float | str]) 
     assert cost_of(tolerated({**vanishing, **tolerance})) == pytest.approx(cost_of(tolerated(tolerance)), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_predict_includes_the_cost(ommatid: Command) -> None:
     tile = (GALLERY / "tile19.toml", "--no-rays", "--set", "noise.variance=1e-2")
     (strict,) = document(ommatid("predict", *tile, "--json"))

@@ -53,6 +53,7 @@ def sources(camera: Camera, weights: FloatArray) -> tuple[Source, Source]:
     return partial(box_stencil, camera, weights, 1 / P0), stored  # type: ignore[return-value]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [(slice(0, 33), slice(0, 30)), (slice(5, 28), slice(9, 30))], ids=["all", "part"])
 def test_a_window_is_that_part_of_the_dense_precision(window: tuple[slice, slice]) -> None:
     """Pixels beyond it count as known: the inverse of the block of K; the transposed stencil has the same inverse."""

@@ -13,6 +13,8 @@ import OpenEXR
 import pytest
 from scipy import sparse
 
+from tests.modules import tracked
+
 from .__main__ import judgement, tolerance
 from .cases import Case, all_cases
 from .checkout import MATRIX, ROOT, Checkout, Done, NoCheckoutError, found
@@ -177,7 +179,7 @@ def test_every_quantity_of_a_run_is_compared(before: Done) -> None:
 
 def test_cases_are_the_gallery_six_variants_and_three_frames() -> None:
     names = set(all_cases())
-    gallery = {path.stem for path in Path(__file__).parents[2].glob("ommatid/scenes/*.toml")}
+    gallery = {path.stem for path in tracked("ommatid/scenes/*.toml")}
     assert gallery <= names
     assert len(gallery) == 13
     assert len(names - gallery) == 9
@@ -205,7 +207,7 @@ def test_a_finished_case_is_not_run_again_by_the_same_program(tmp_path: Path, mo
     assert [ended().reused, ended().reused] == [False, True]
     words = (tmp_path / "store" / "once" / "words.txt").read_text().splitlines()
     assert words == ["run a.toml --set render.seed=1", "reconstruct b.exr", "export-model out/model.npz -o H.npz"]
-    (program / "ommatid" / "__main__.py").write_text(PROGRAM.format(code=3))
+    (program / "ommatid" / "__main__.py").write_text(PROGRAM.format(code="1 + 2"))  # of another length: bytecode
     failed = ended()
     assert (failed.code, failed.reused, failed.message) == (3, False, "run: no message")
     with pytest.raises(NoCheckoutError, match="in place of"):

@@ -159,6 +159,7 @@ def test_a_large_item_causes_no_warning(address: str) -> None:
         assert pool.map(len, [bytes(20_000_000)], no_progress, 1) == [20_000_000]
 
 
+@pytest.mark.slow
 def test_the_task_of_a_killed_process_is_repeated(tmp_path: Path) -> None:
     flag = tmp_path / "died"
     with worker_pool(count=2) as pool:

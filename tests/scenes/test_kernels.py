@@ -59,6 +59,7 @@ def test_the_field_is_measured_from_the_lens_s_axis() -> None:
     assert np.abs(field).max() == pytest.approx(places.scale * CAMERA.target_pitch)
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(boxes, "ROWS_AT_ONCE", 3)
     footprints, image = random_kernels(2), np.random.default_rng(3).normal(size=CAMERA.shape)

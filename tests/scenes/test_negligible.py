@@ -174,6 +174,7 @@ def test_skipped_effects_have_a_reason_and_a_bound() -> None:
     assert "bound" not in next(effect for effect in skipped if effect["what"] == "interreflection")
 
 
+@pytest.mark.slow
 def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
     """No plugin, kernel or table of an absent effect is loaded."""
     needs("llvm_ad_mono")

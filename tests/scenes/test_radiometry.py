@@ -169,6 +169,7 @@ def test_the_summary_has_the_light_of_each_type() -> None:
     assert "too little light" in light_rows(dark)[1][1]
 
 
+@pytest.mark.slow
 def test_a_prediction_with_unequal_noise() -> None:
     """Against the dense solution, with and without knowledge of the noise, and with dead pixels."""
     camera = derive(scene(lenses=THREE))

@@ -18,10 +18,11 @@ from ommatid.scenes.tables import toml
 from ommatid.scenes.tables.toml import apply_overrides
 from ommatid.scenes.tables.units import FACTORS
 
-from ..examples import GALLERY, scene
+from ..examples import scene
+from ..modules import tracked
 
 
-@pytest.mark.parametrize("path", sorted(GALLERY.glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", tracked("ommatid/scenes/*.toml"), ids=lambda path: path.stem)
 def test_gallery_reads_and_survives_writing(path: Path, tmp_path: Path) -> None:
     first = resolved(read(path), (19, 19))
     write(tmp_path / "scene.toml", first)

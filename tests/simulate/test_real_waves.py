@@ -31,6 +31,7 @@ def field(name: str, wavelength: float) -> LensField:
 CASES = [("planoconvex", GREEN), ("planoconvex", BLUE), ("doublet", GREEN), ("doublet", BLUE)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "wavelength"), CASES)
 def test_on_the_axis(name: str, wavelength: float) -> None:
     """Strehl ratio, encircled energy and MTF of the sensor's middle. In blue the glass defocuses both lenses."""

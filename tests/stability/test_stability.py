@@ -136,6 +136,7 @@ def test_small_problems_are_right_to_the_tolerance_or_refused(seed: int) -> None
         assert min(outcome.refined, outcome.variance) >= 7  # the tolerance of 1e-8, times 10 for sampled variances
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10**6))
 @settings(max_examples=60, deadline=None, derandomize=True)
 def test_graded_problems_have_no_silent_loss(seed: int) -> None:
@@ -144,6 +145,7 @@ def test_graded_problems_have_no_silent_loss(seed: int) -> None:
     assert assess(case_of(problem, g), method, exact_answer(problem, g)).verdict != SILENT
 
 
+@pytest.mark.slow
 def test_most_small_problems_are_solved() -> None:
     """Refusing all problems would pass the tests above; at least 180 of 200 have to be solved."""
     solved = 0
@@ -197,6 +199,7 @@ def test_an_error_of_one_in_a_million_is_a_silent_loss() -> None:
     assert [stability.digits(error) for error in errors] == [16.0, pytest.approx(3.0), 0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_the_files_hold_every_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ommatid.stability.cases.NOISES", (1e-12, 1.0))
     monkeypatch.setattr(stability, "extreme_cases", lambda _: [EXTREMES[0], *EXTREMES[-2:]])

@@ -67,6 +67,7 @@ def test_no_command_executes_anything_of_the_current_folder(trapped: tuple[Path,
     assert not [result for result in results if "numba" in result[2] or "matplotlib" in result[2]]
 
 
+@pytest.mark.slow
 def test_the_console_script_starts_without_the_current_folder(trapped: tuple[Path, Path]) -> None:
     folder, marks = trapped
     code, messages, _ = ended(("show", "tiny.toml"), folder)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ommatid.runtime.files import digest
 
-from ..examples import GALLERY
+from ..modules import tracked
 
 SCENE = "tiny.toml"  # an undamaged scene in the folder
 BASE = "base.toml"  # the scene to which --set options apply
@@ -92,7 +92,7 @@ def fingerprint(*parts: Any) -> str:
 
 def gallery_files(pattern: str, *more: bytes) -> Originals:
     """The files of the gallery that match, and further contents."""
-    return lambda _: [*more, *(path.read_bytes() for path in sorted(GALLERY.glob(pattern)))]
+    return lambda _: [*more, *(path.read_bytes() for path in tracked(f"ommatid/scenes/{pattern}"))]
 
 
 def from_folder(name: str) -> Originals:

@@ -13,12 +13,12 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.gallery import GALLERY, gallery_names, write_starter
 
 from ..conftest import TINY, Command
+from ..modules import tracked
 from ..runs import document
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_gallery_has_the_scenes_of_the_repository() -> None:
+    assert {*gallery_names(), "starter"} == {path.stem for path in tracked("ommatid/scenes/*.toml")}
 
 
 @pytest.mark.parametrize("name", gallery_names())

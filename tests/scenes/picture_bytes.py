@@ -74,16 +74,11 @@ def jpeg(pixels: NDArray[Any], **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def exr(
-    channels: dict[str, tuple[str, int, int]],
-    stored: tuple[int, int, int, int],
-    shown: tuple[int, int, int, int] | None = None,
-    kind: str = "",
-) -> bytes:
+def exr(channels: dict[str, tuple[str, int, int]], stored: tuple[int, int, int, int]) -> bytes:
     """An uncompressed OpenEXR file with 0, 1, 2 ... along the rows of every channel.
 
-    channels : type of number (<u4, <f2, <f4), and sampling across and down, by name;  stored, shown : data and
-        display window as left, top, right, bottom
+    channels : type of number (<u4, <f2, <f4), and sampling across and down, by name;  stored : data and display
+        window as left, top, right, bottom
     """
     types = {"<u4": 0, "<f2": 1, "<f4": 2}
 
@@ -97,11 +92,10 @@ def exr(
     start = struct.pack("<ii", 20000630, 2)
     start += attribute("channels", "chlist", listed + b"\0") + attribute("compression", "compression", b"\0")
     start += attribute("dataWindow", "box2i", struct.pack("<4i", *stored))
-    start += attribute("displayWindow", "box2i", struct.pack("<4i", *(shown or stored)))
+    start += attribute("displayWindow", "box2i", struct.pack("<4i", *stored))
     start += attribute("lineOrder", "lineOrder", b"\0") + attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
     start += attribute("screenWindowCenter", "v2f", bytes(8))
-    start += attribute("screenWindowWidth", "float", struct.pack("<f", 1))
-    start += (attribute("type", "string", kind.encode()) if kind else b"") + b"\0"
+    start += attribute("screenWindowWidth", "float", struct.pack("<f", 1)) + b"\0"
     lines: list[bytes] = []
     for row in range(stored[1], stored[3] + 1):
         content = b"".join(

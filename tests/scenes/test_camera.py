@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -39,21 +38,6 @@ def test_fit_takes_the_largest_sub_image() -> None:
     assert gallery("single").types[0].pixels == (59, 59)
 
 
-@pytest.mark.parametrize("ratio", [Fraction(10, 3), Fraction(17, 5), Fraction(9, 4), Fraction(3)])
-@pytest.mark.parametrize("step", [Fraction(1), Fraction(1, 3), Fraction(7, 10)])
-def test_arrays_stand_within_half_a_pixel_of_the_middle(ratio: Fraction, step: Fraction) -> None:
-    """By the middle of all windows; and within the target."""
-    for side in range(19, 24):
-        data = scene((side, side), ((f"{1 / ratio}", [3, 2], "fit"),)).plain()
-        data["camera"]["lens"][0]["step"] = str(step)
-        cam = derive(parse(data, Path("test.toml")))
-        for axis in (0, 1):
-            first, last = cam.sub_imagers[0].window[axis], cam.sub_imagers[-1].window[axis]
-            end = last + ratio * cam.types[0].pixels[axis]
-            assert abs((first + end) / 2 - Fraction(side, 2)) <= Fraction(1, 2)
-            assert 0 <= first < end <= side
-
-
 def test_thin_lens_equation_and_magnification() -> None:
     cam = camera()
     for lens_type, m in zip(cam.types, (3, 5, 4), strict=True):
@@ -85,14 +69,6 @@ def test_order_of_lenses_seen_from_behind() -> None:
     xs = [sub.lens[0] for sub in cam.sub_imagers]
     assert max(xs) == pytest.approx(-min(xs)), "the lenses are centred"
     assert list(subs) == sorted(subs)
-
-
-def test_slices_are_adjacent() -> None:
-    cam = camera()
-    slices = cam.slices()
-    assert slices[0].start == 0
-    assert slices[-1].stop == cam.measurements
-    assert all(before.stop == after.start for before, after in pairwise(slices))
 
 
 @given(

@@ -36,12 +36,10 @@ SINGLE = ("target.pixel_pitch=1 mm", "camera.lens_pitch=9 mm")
         # 2.44 * 0.55 um * 2 mm / 0.08 mm = 33.5 um
         (("camera.lens.I.aperture=80 um", RAYS), ("set camera.wavelength", "lens I is 5.6 sensor pixels wide at 550")),
         (("camera.lens.I.aperture=80 um",), ("wider than its sub-image", "5.59 sensor pixels", "aperture wider")),
-        (("target.pixel_pitch=1 um",), ("lens type I enlarges the target 2 times", "target.pixel_pitch")),
         (("target.distance=4 mm", *SINGLE), ("field of view of 124 degrees", "target.distance longer")),
         (("camera.lens.I.f_number=0.4", "camera.lens_pitch=20 mm"), ("lens type I is f/0.4", "f/0.5")),
         # the root of 10000 electrons, of which 255 stands for all
         (("noise=",), ("sensor noise is not modelled: add [noise] or [sensor]", "deviation of 2.55 of 255")),
-        (("camera.pixel_pitch=0.2 um",), ("camera.pixel_pitch is 0.2 um", "550 nm")),
     ],
 )
 def test_each_warning_names_the_number_and_the_key(changes: tuple[str, ...], words: tuple[str, ...]) -> None:

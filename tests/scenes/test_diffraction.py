@@ -44,17 +44,6 @@ def test_the_strehl_ratio_of_the_documentation() -> None:
     check_figures("diffraction.md", "with 0.21 waves of defocus, the Strehl ratio is {};", strehl)
 
 
-@pytest.mark.parametrize(("waves", "strehl", "half"), [(0.085, 0.98, 0.378), (0.21, 0.87, 0.318), (0.33, 0.69, 0.226)])
-def test_published_figures_of_slight_defocus(waves: float, strehl: float, half: float) -> None:
-    """Strehl ratio and modulation at half the cut-off of f/5 at 550 nm, computed elsewhere by wave optics.
-
-    The defocus is rounded to 0.005 waves, over which the two change by at most 0.009 and 0.004.
-    """
-    v = np.array([1e-4])
-    assert 2 * pattern(waves).spread(v)[0] / v[0] == pytest.approx(strehl, abs=0.009 + 0.005)
-    assert modulation(pattern(waves), 0.5) == pytest.approx(half, abs=0.004 + 0.0005)
-
-
 @pytest.mark.parametrize("waves", WAVES)
 def test_modulation_at_five_frequencies_is_hopkins(waves: float) -> None:
     for q in FREQUENCIES:

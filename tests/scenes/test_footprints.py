@@ -7,21 +7,18 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensOptics, SubImager
 from ommatid.scenes.optics.boxes import overlap
 from ommatid.scenes.optics.distortion import distort, undistort
 from ommatid.scenes.optics.footprints import matrix, sub_matrix
 from ommatid.scenes.pose import Misalignment, Pose, corner_offset, pose_of, poses
-from ommatid.scenes.scene import read
-from ommatid.scenes.tables.camera import Surface
 
-from ..examples import GALLERY, THREE, Lenses, camera
+from ..examples import THREE, Lenses, camera
 
 Vector = NDArray[np.float64]
 
@@ -33,12 +30,6 @@ TWO_FIFTHS: Lenses = (("2/5", [2, 3], "fit"), ("5/7", [1, 2], "fit"))
 def distorted(ideal: Camera, k1: float, k2: float) -> Camera:
     optics = LensOptics(distortion=(k1, k2))
     return replace(ideal, types=tuple(replace(lens_type, optics=optics) for lens_type in ideal.types))
-
-
-def expected_error(h: sparse.csr_array, noise: float = 1e-2, prior: float = 5461.25) -> float:
-    """Mean of the posterior variances (Wood et al., Eq. 5)."""
-    information = (h.T @ h).toarray() / noise + np.eye(h.shape[1]) / prior
-    return float(np.trace(np.linalg.inv(information))) / h.shape[1]
 
 
 def image_on_patch(pose: Pose, tangents: Vector) -> Vector:
@@ -184,9 +175,6 @@ def test_a_texels_column_is_the_area_of_its_image(
         np.testing.assert_allclose(columns[inside], area[inside], rtol=1e-12)
 
 
-small = st.floats(-1, 1, allow_nan=False)
-
-
 def test_a_steep_patch_has_valid_shares() -> None:
     """Part of the target is behind the plane of the patch, and is imaged nowhere on it."""
     cam = camera((5, 5), (("1/2", [1, 1], [2, 2]),))
@@ -208,14 +196,6 @@ def test_a_distortion_that_cannot_be_traced_is_refused() -> None:
     cam = distorted(camera(lenses=THREE[:1]), 40.0, 90.0)
     with pytest.raises(InputError, match=r"camera\.lens\.A\.distortion: \[40, 90\] bends .* follow them back"):
         matrix(cam, poses(cam))
-
-
-def test_lenses_with_surfaces_are_refused() -> None:
-    cam = camera(lenses=THREE[:1])
-    sub = cam.sub_imagers[0]
-    real = replace(sub, type=replace(sub.type, optics=LensOptics(surfaces=(Surface(index=1.5, semi_diameter="1 mm"),))))  # pyright: ignore
-    with pytest.raises(ValueError, match="surfaces"):
-        sub_matrix(cam, real, pose_of(real))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -242,12 +222,3 @@ def test_undistort_maps_points_beyond_its_limit_beyond_it() -> None:
     assert (np.diff(found) > 0).all()
     assert (found[x > 0.7] > 1).all()
     assert (found[x < 0.7] < 1).all()
-
-
-def test_one_distorted_type_replaces_three_types() -> None:
-    cam = derive(read(GALLERY / "distorted.toml"))
-    straight = replace(cam, types=(replace(cam.types[0], optics=LensOptics()),))
-    three = camera()
-    errors = [expected_error(matrix(one, poses(one))) for one in (straight, cam, three)]
-    assert errors[0] > 500
-    assert errors[1] < 2 * errors[2] < 6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,9 +11,8 @@ import tifffile
 
 from ommatid.pipeline.camera_files import import_file
 from ommatid.runtime.errors import InputError
-from ommatid.scenes import stack as stacks
 from ommatid.scenes.formats.picture import LUMINANCE, grey
-from ommatid.scenes.hardware.frames import AcquisitionSettings, FrameNotes, files_in, pictures_of, stored_pictures
+from ommatid.scenes.hardware.frames import AcquisitionSettings, FrameNotes, pictures_of, stored_pictures
 
 from . import picture_bytes as made
 from .mosaics import SCENE, SHAPE
@@ -74,41 +72,6 @@ def test_colour_and_orientation_are_said_once_per_kind_of_frames(tmp_path: Path)
     assert [Path(sentence.split()[0]).name for sentence in said] == ["images.png"] * 2 + ["dark.png"] * 2
     assert "only its luminance is used" in said[0]
     assert "orientation 3 of EXIF" in said[1]
-
-
-def test_a_folder_of_frames_may_hold_no_fifo(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "0.png")
-    (path,) = files_in(tmp_path)
-    with pytest.raises(InputError, match=r"0\.png: expected a regular file, got a FIFO"):
-        pictures_of(path, "images")
-
-
-SENSOR = """
-[sensor]
-illuminance = "500 lux"
-exposure = "4 ms"
-quantum_efficiency = 0.6
-full_well = 10000
-gain = 0.1
-bits = 12
-"""
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e308])
-@pytest.mark.parametrize("kind", ["image", "dark"])
-def test_they_are_dead_pixels_of_a_sensor_too(kind: str, value: float, tmp_path: Path) -> None:
-    (tmp_path / "s.toml").write_text(
-        SCENE.replace("pixels =", 'aperture = "5 um"\npixels =') + SENSOR, encoding="utf-8"
-    )
-    for name, level in {"image": 100, "dark": 50, "flat": 200}.items():
-        frame = np.full(SHAPE, level, np.float64)
-        frame[18:24, 27:33] = value if name == kind else level
-        np.save(tmp_path / f"{name}.npy", frame)
-    settings = AcquisitionSettings(dark=(tmp_path / "dark.npy",), flat=(tmp_path / "flat.npy",))
-    import_file(tmp_path / "s.toml", [tmp_path / "image.npy"], tmp_path / "stack.exr", settings, (), ())
-    values = stacks.read(tmp_path / "stack.exr").values
-    assert np.isnan(values).any()
-    assert np.isfinite(values).sum() > np.isnan(values).sum()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e308, np.longdouble("1e4000")])

@@ -97,9 +97,3 @@ def test_init_lists_the_gallery(ommatid: Command) -> None:
 def test_commands_list_the_gallery_and_take_its_names(command: str, ommatid: Command) -> None:
     listed = "".join(ommatid(command, "--help").out.split())
     assert ",".join(gallery_names()) in listed
-
-
-def test_a_command_takes_a_name(ommatid: Command) -> None:
-    ended = ommatid("show", "tile19")
-    assert ended.code == 0
-    assert "19 x 19" in ended.out

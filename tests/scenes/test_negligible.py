@@ -164,16 +164,6 @@ def test_the_aperture_of_a_single_type_is_skipped() -> None:
     assert [effect.what for effect in skipped] == ["samples of the aperture of lens type A"]
 
 
-def test_skipped_effects_have_a_reason_and_a_bound() -> None:
-    described, camera = with_optics(*RULES["nearly in focus"], **NOISY)
-    skipped = [effect.describe() for effect in skipped_effects(described, camera)]
-    apertures = [effect for effect in skipped if "samples of the aperture" in effect["what"]]
-    assert len(apertures) == 2
-    assert all(0 < effect["bound"] < 1 for effect in apertures)
-    assert "pixels of f wide" in apertures[0]["why"]
-    assert "bound" not in next(effect for effect in skipped if effect["what"] == "interreflection")
-
-
 @pytest.mark.slow
 def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
     """No plugin, kernel or table of an absent effect is loaded."""

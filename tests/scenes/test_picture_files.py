@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.formats.picture import LUMINANCE, conversions, load
+from ommatid.scenes.formats.picture import conversions, load
 from ommatid.scenes.formats.picture_file import read_picture
-from ommatid.scenes.formats.stored_picture import orientation_of
 
 from . import picture_bytes as made
 from .test_picture import looking_at
@@ -76,12 +75,6 @@ def test_the_largest_value_of_a_target_is_white(bits: int, tmp_path: Path) -> No
     assert (f"has {bits}-bit values" in sentences(tmp_path / "a.png")) == (bits != 8)
 
 
-def test_sixteen_bits_of_colour_reach_the_target(tmp_path: Path) -> None:
-    colours = RNG.integers(0, 2**16, (12, 12, 3))
-    (tmp_path / "a.png").write_bytes(made.png(colours, 2, 16))
-    np.testing.assert_allclose(load(looking_at(tmp_path / "a.png")), colours @ np.array(LUMINANCE) / 257, rtol=1e-6)
-
-
 def turned(orientation: int) -> NDArray[np.uint8]:
     """The letter as a camera stores it which notes this orientation: the inverse of what the tag asks for."""
     stored = {  # where row 0 and column 0 of the stored picture lie in the upright one
@@ -111,15 +104,6 @@ def test_pictures_are_turned_upright(orientation: int, tmp_path: Path) -> None:
     from PIL import ImageOps
 
     np.testing.assert_array_equal(np.asarray(ImageOps.exif_transpose(reference)), LETTER)
-
-
-def test_damaged_exif_data_mean_upright() -> None:
-    whole = made.exif(6)
-    assert orientation_of(whole) == 6
-    for length in range(len(whole) - 8):
-        assert orientation_of(whole[:length]) in (1, 6)
-    for value in (b"", b"II*\0" + b"\xff" * 4, b"MM\0*" + bytes(4), bytes(40)):
-        assert orientation_of(value) == 1
 
 
 def animated(frames: int) -> bytes:

@@ -21,7 +21,7 @@ from ommatid.simulate.ideal import ideal_matrix
 
 from ..conftest import Command
 from ..examples import camera, familywise
-from .mosaics import SCENE, SENSOR, SHAPE, Array, as_mosaic, assert_error_as_expected, save
+from .mosaics import SCENE, SENSOR, SHAPE, Array, as_mosaic, save
 
 GAIN, READ = 0.02, 0.3  # units of f: of one electron, and of the read noise
 
@@ -82,22 +82,6 @@ def test_swept_points_give_h_within_its_variance(imaging_camera: Camera, ommatid
     assert ("recorded once" in ended.err) == (times == 1)
     described = json.loads(ended.out)
     assert (described["method"], described["exposures"]) == ("recorded points", times * imaging_camera.unknowns)
-
-
-def test_an_image_is_reconstructed_with_the_recorded_h(imaging_camera: Camera, ommatid: Command) -> None:
-    rng = np.random.default_rng(7)
-    truth = blurred_matrix(imaging_camera)
-    image = rng.normal(127.5, 5461.25**0.5, imaging_camera.unknowns)
-    save(Path("m.npy"), as_mosaic(imaging_camera, truth @ image + rng.normal(0, 0.5, imaging_camera.measurements)))
-    np.save("points.npy", sweep(imaging_camera, truth, 3, rng))
-    assert ommatid("import", "scene.toml", "m.npy", "-o", "s.exr").code == 0
-    assert ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz").code == 0
-    ended = ommatid("reconstruct", "s.exr", "h.npz", "-o", "e.exr", "--json")
-    assert ended.code == 0, ended.err
-    described = json.loads(ended.out)
-    assert described["stages"]["calibrate"]["method"] == "recorded points"
-    assert described["error"]["budget"]["calibration"] > 0
-    assert_error_as_expected(image, Path("e.exr"), described["error"]["predicted_mse"])
 
 
 def test_variance_from_a_recorded_model_is_the_scatter_of_h_f(imaging_camera: Camera, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Electrons from lux against photometry from the target's side, limits and ratios; noise in predictions."""
+"""Electrons from lux: limits, ratios and integrals (`test_spectrum` has them by hand); noise in predictions."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import constants, integrate
+from scipy import integrate
 
 from ommatid.analysis.summary import light_rows
-from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.prediction import predict, predict_frame
+from ommatid.reconstruct.prediction import predict
 from ommatid.reconstruct.prior import independent
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.optics import radiometry
-from ommatid.scenes.optics.radiometry import electrons, expected_noise, predicted_noise, solid_angle, summary
+from ommatid.scenes.optics.radiometry import electrons, predicted_noise, solid_angle, summary
 from ommatid.scenes.pose import NO_MISALIGNMENT, Misalignment, pose_of
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.scenes.tables.estimation import EstimatorTable
 from ommatid.scenes.tables.sensor import SensorTable
-from ommatid.simulate.ideal import ideal_matrix, ideal_model
+from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import THREE, Lenses, scene
 
@@ -36,18 +35,6 @@ def real(lenses: Lenses = THREE, aperture: float = 0.1, **tables: Any) -> Scene:
     with_apertures = tuple(lens.model_copy(update={"aperture": aperture}) for lens in described.camera.lens)
     camera = described.camera.model_copy(update={"lens": with_apertures})
     return described.model_copy(update={"camera": camera, "sensor": SensorTable.model_validate(SENSOR)})
-
-
-def test_electrons_are_the_light_from_the_target_to_the_lens() -> None:
-    """A centred pixel sees m x m pixels of the target and collects their light through the lens's disk."""
-    described = real((("1/5", [1, 1], [3, 3]),))
-    camera = derive(described)
-    result = float(electrons(described, camera)[4]) * 255
-    patch, lens, distance = 5e-3**2, pi * 0.05e-3**2, 1.0  # m^2, m^2, m
-    lumens = 500 / pi * patch * lens / distance**2
-    photons = lumens * 10e-3 / (683.002 * 0.9949501) / (constants.h * constants.c / 550e-9)
-    assert result == pytest.approx(photons, rel=2e-3)  # neglecting sin^2 against tan^2, of 0.05 / 1.2
-    assert result == pytest.approx(photons / (1 + (0.05 / 1.2) ** 2), rel=2e-4)
 
 
 def test_electrons_are_proportional_to_light_and_time() -> None:
@@ -64,17 +51,6 @@ def test_electrons_are_proportional_to_light_and_time() -> None:
         np.testing.assert_allclose(electrons(changed, camera), factor * before, rtol=1e-12)
     red = described.model_copy(update={"camera": described.camera.model_copy(update={"wavelength": 660e-6})})
     np.testing.assert_allclose(electrons(red, camera), 660 / 550 * 0.9949501 / 0.061 * before, rtol=1e-6)
-
-
-def test_a_smaller_magnification_collects_more_light() -> None:
-    """Through the same small aperture in proportion to the square of the ratio of depths."""
-    described = real(aperture=1e-5)
-    camera = derive(described)
-    middle = [float(electrons(described, camera)[pixels].max()) for pixels in camera.type_slices()]
-    depths = [camera.depth(lens_type) for lens_type in camera.types]
-    assert middle[1] / middle[0] == pytest.approx((depths[0] / depths[1]) ** 2, rel=1e-4)
-    axis = [solid_angle(1e-5, depth) for depth in depths]
-    assert axis[1] / axis[0] == pytest.approx((5 / 3) ** 2, rel=1e-9)
 
 
 @pytest.mark.parametrize("aperture", [1e-3, 1.0, 5.0, 1e6])
@@ -212,16 +188,3 @@ def test_saturated_pixels_are_ignored_in_a_prediction() -> None:
     long = described.model_copy(update={"sensor": described.sensor.model_copy(update={"exposure": 1e3})})
     with pytest.raises(InputError, match=r"test\.toml: sensor: at the prior's mean, 127\.5, every pixel is full"):
         predicted_noise(long, camera, electrons(long, camera))
-
-
-@pytest.mark.slow
-def test_a_prediction_by_a_single_tile_is_the_dense_one() -> None:
-    """With the noise of a sensor and a dead pixel."""
-    described = real(estimator={"method": "tiles"})
-    camera = derive(described)
-    noise = expected_noise(described, camera, electrons(described, camera))
-    noise[3] = np.nan
-    dense = predict(ideal_matrix(camera), independent(127.5, 5461.25, 361), noise, EstimatorTable(), (19, 19))
-    tiled = predict_frame(choose_method(described, camera, exact=True), ideal_model(described, camera), noise)
-    assert tiled.mse == pytest.approx(dense.mse, rel=1e-6)
-    assert tiled.measurements == dense.measurements

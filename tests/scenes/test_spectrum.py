@@ -28,17 +28,6 @@ LUMEN_SECONDS = 3.11958e-13
 # and a photon has 1.986446e-25 J m / wavelength = 4.41432e-19 J, 3.61172e-19 J and 3.05607e-19 J.
 BY_HAND = {"450 nm": 16337.2, "550 nm": 762.63, "650 nm": 8380.7}
 
-# CIE's tables every 10 nm from 380 to 780 nm.
-SENSITIVITY = """
-0.000039 0.00012 0.000396 0.00121 0.0040 0.0116 0.023 0.038 0.060 0.09098 0.13902 0.20802 0.323 0.503 0.710 0.862 0.954
-0.99495 0.995 0.952 0.870 0.757 0.631 0.503 0.381 0.265 0.175 0.107 0.061 0.032 0.017 0.00821 0.004102 0.002091
-0.001047 0.00052 0.000249 0.00012 0.00006 0.00003 0.000015"""
-DAYLIGHT = """
-49.9755 54.6482 82.7549 91.4860 93.4318 86.6823 104.865 117.008 117.812 114.861 115.923 108.811 109.354 107.802 104.790
-107.689 104.405 104.046 100.000 96.3342 95.7880 88.6856 90.0062 89.5991 87.6987 83.2886 83.6992 80.0268 80.2146 82.2778
-78.2842 69.7213 71.6091 74.3490 61.6040 69.8856 75.0870 63.5927 46.4182 66.8054 63.3828"""
-TENS = np.arange(380.0, 781.0, 10.0)
-
 
 def lit(light: Any = None, efficiency: Any = 0.6, **more: Any) -> tuple[Scene, Camera]:
     """A scene of one thin lens on the axis of its pixels, lit by a spectrum, and its camera."""
@@ -72,15 +61,6 @@ def test_the_table_of_the_documentation() -> None:
     check_figures("noise.md", '| `"650 nm"` | {} | {} |', *row["650 nm"])
     check_figures("noise.md", '| `"D65"` | {} | {} |', *row["D65"])
     check_figures("noise.md", '| `"LED-B3"` | {} | {} |', *row["LED-B3"])
-
-
-def test_electrons_of_daylight_are_those_by_hand() -> None:
-    """Photons and lumens of D65, summed every 10 nm."""
-    sensitivity, power = (np.array(text.split(), dtype=float) for text in (SENSITIVITY, DAYLIGHT))
-    photons = np.trapezoid(power * TENS * 1e-9, TENS) / 1.986446e-25
-    lumens = 683.002 * np.trapezoid(power * sensitivity, TENS)
-    assert white(lit("D65")) == pytest.approx(0.6 * LUMEN_SECONDS * photons / lumens, rel=2e-3)
-    assert 204 < lumens / np.trapezoid(power, TENS) < 206, "lm/W, of D65 from 380 to 780 nm"
 
 
 @pytest.mark.slow
@@ -139,16 +119,6 @@ def test_a_few_wavelengths_diffract_as_the_whole_spectrum(light: str, count: int
     if count > 1:
         at, share = spectrum.gauss(at[weight > 0], weight[weight > 0] / weight.sum(), count - 1)
         assert np.abs(transfer(frequency * at) @ share - exact).max() > 1e-3
-
-
-def test_gauss_s_rule_is_legendre_s_for_a_flat_weight() -> None:
-    points = np.linspace(-1, 1, 20001)
-    weight = np.full(points.size, 1 / points.size)
-    for count in (1, 3, 6):
-        expected = np.polynomial.legendre.leggauss(count)
-        found = spectrum.gauss(points, weight, count)
-        np.testing.assert_allclose(found[0], expected[0], atol=2e-4)
-        np.testing.assert_allclose(found[1], expected[1] / 2, atol=2e-4)
 
 
 def test_one_wavelength_is_the_same_in_either_table() -> None:

@@ -127,23 +127,14 @@ def test_a_square_term_is_a_paraboloid(tmp_path: Path) -> None:
 
 REFUSED = {
     "mirror": ("GLAS PMMA", "GLAS MIRROR", "line 20, surface 3: .* got a mirror"),
-    "break": ("TYPE EVENASPH", "TYPE COORDBRK", "surface 3: .* got a coordinate break"),
     "type": ("TYPE EVENASPH", "TYPE BICONICX", "surface 3: .* got the type BICONICX"),
-    "mode": ("MODE SEQ", "MODE NSC", "line 2: expected a sequential lens"),
     "unit": ("UNIT MM", "UNIT FURLONG", "line 3: expected a unit among MM.* got 'FURLONG'"),
     "obscured": ("CLAP 0", "CLAP 0.5", "surface 7: .* inner radius"),
-    "square": ("CLAP 0 1.5 0", "SQAP 1 1", "surface 7: .* a rectangular aperture"),
-    "word": ("CURV 0.1", "CURV zero", "surface 3: expected CURV, a number .* got 'zero'"),
     "nan": ("CURV 0.1", "CURV nan", "surface 3: expected CURV, a number .* got 'nan'"),
-    "vast": ("PARM 8 -3e-9", "PARM 8 1e308", "surface 3: expected PARM 8, a number"),
     "strong": ("PARM 8 -3e-9", "PARM 8 1e3", "surface 3: .* aspheric term .* a16 = 1000"),
     "back": ("DISZ 2\n  GLAS", "DISZ -2\n  GLAS", r"surface 3: expected a finite thickness \(DISZ\) .* got -2 mm"),
-    "infinite": ("DISZ 2\n  GLAS", "DISZ INFINITY\n  GLAS", "surface 3: expected a finite thickness"),
-    "narrow": ("DIAM 3\nSURF 4", "DIAM 0\nSURF 4", "surface 3: expected a semi-diameter"),
     "index": ("1.5168 64.17", "9.9 0", "surface 6: .* nd from 1 to 5, got 9.9"),
-    "dispersion": ("1.5168 64.17", "1.5168 1e-300", "surface 6: expected .* vd .* from 5 to 200, got 1e-300"),
     "stops": ("SURF 4", "SURF 4\n  STOP", "expected one aperture stop at most, got 2"),
-    "steep": ("CURV 0.1", "CURV 1e-300", "surface 3: radius: expected"),
     "many": ("SURF 4", "SURF 4\n" * 2000, "expected at most 200 surfaces"),
 }
 

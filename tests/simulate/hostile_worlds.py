@@ -68,17 +68,6 @@ def indices_of_ply(rng: random.Random, folder: Path) -> str:
     return mesh("m.ply")
 
 
-def faces_of_obj(rng: random.Random, folder: Path) -> str:
-    face = rng.choice(
-        ["1 2", "1", "", "1 2 0", "1 2 -1", "1 2 99", "1 2 4294967297", "1/1 2/1 3/1", "1//9 2//9 3//9", "a b c"]
-    )
-    lines = ["v 0 0 0", "v 1 0 0", "v 0 1 0", f"f {face}"]
-    if rng.random() < 0.3:
-        lines.append("f 1 2 3")
-    (folder / "m.obj").write_text("\n".join(lines), encoding="utf-8")
-    return mesh("m.obj")
-
-
 def serialized_mesh(rng: random.Random, folder: Path) -> str:
     good = serialized(4, [(0, 1, 2)])
     bad = [serialized(4, [(0, 1, _index(rng, 4))]), serialized(4, [(0, 1, 2)], says=rng.choice([5, 10**9, 2**40]))]
@@ -146,25 +135,15 @@ def outside(rng: random.Random, folder: Path) -> str:
     )
 
 
-def paths_in_other_keys(rng: random.Random, folder: Path) -> str:
-    del folder
-    name, value = rng.choice(
-        [("material", "../../x"), ("material", "no such"), ("lut", "/etc/passwd"), ("file", "a\\b")]
-    )
-    return scene(f'<shape type="sphere"><bsdf type="conductor"><string name="{name}" value="{value}"/></bsdf></shape>')
-
-
 FAMILIES: dict[str, Callable[[random.Random, Path], str]] = {
     make.__name__: make
     for make in (
         indices_of_ply,
-        faces_of_obj,
         serialized_mesh,
         laughs,
         cycles,
         plugins,
         outside,
-        paths_in_other_keys,
     )
 }
 

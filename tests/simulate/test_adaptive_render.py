@@ -12,7 +12,6 @@ from scipy import stats
 
 from ommatid.analysis.calibration_goal import for_prior, for_stack
 from ommatid.reconstruct.restore import restore
-from ommatid.runtime.errors import MachineError
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
@@ -65,19 +64,6 @@ def test_the_target_variance_is_reached_in_every_pixel(variant: str, sampler: st
     assert stack.record["reached"]
     assert not stack.record["not_reached"]
     assert (stack.variance <= SHARE * (1.0 + described.noise.quantisation_variance)).all()
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_a_grid_that_fits_the_pixels_of_f_leaves_no_error(variant: str) -> None:
-    """Except for rays that float32 rounds across an edge, at most one in a pass: 255 / (16 x 16) here."""
-    needs(variant)
-    described = auto(variant=variant)
-    camera, image = derive(described), load(described)
-    found = render_until(Setup(described, camera, image))
-    assert found.details["samples"] < 1024, "a fixed number would take ten thousand"
-    away = np.abs(found.mean - ideal_matrix(camera) @ image.ravel())
-    assert np.median(away) < 1e-4
-    assert away.max() < 1.0
 
 
 @pytest.mark.slow
@@ -164,21 +150,6 @@ def test_a_scene_without_noise_is_refused_before_any_work(here: Path, ommatid: C
     assert "calibration.samples 'auto'" in ended.err
 
 
-@pytest.mark.usefixtures("here")
-def test_a_time_limit_requires_auto(ommatid: Command) -> None:
-    ended = ommatid("show", "tiny.toml", "--set", "render.time=3 s")
-    assert ended.code == 2
-    assert "render" in ended.err
-    assert 'samples = "auto"' in ended.err
-    described = json.loads(
-        ommatid("show", "tiny.toml", "--json", "--set", "render.time=3 s", "--set", "render.samples=auto").out
-    )
-    assert described["plan"]["render"]["samples"] == "auto for 3 s at most"
-    keys = json.loads(ommatid("schema").out)["$defs"]["RenderTable"]["properties"]
-    assert {"const": "auto"} in keys["samples"]["anyOf"]
-    assert "time" in keys
-
-
 def test_an_interrupted_rendering_continues(tmp_path: Path) -> None:
     described = auto(lenses=FRACTIONAL)
     camera, image = derive(described), load(described)
@@ -262,27 +233,6 @@ def endless() -> tuple[Scene, Camera]:
         noise={"variance": 1.0},
     )
     return described, derive(described)
-
-
-def test_a_calibration_that_could_not_be_written_is_repeated_exactly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The accepted round is repeated, and no further one follows."""
-    described, camera = endless()
-    rule = StoppingRule(lambda model: 0.0 if model.record["samples"] > 1000 else 1.0, "step", "a step")
-
-    def full(*arguments: object) -> None:
-        raise MachineError(f"{arguments[0]}: could not be written")
-
-    with monkeypatch.context() as patched:
-        patched.setattr("ommatid.scenes.model_file.write", full)
-        with pytest.raises(MachineError):
-            cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, rule)
-    found, _ = cached_model(tmp_path / "model.npz", Setup(described, camera), no_progress, rule)
-    whole, _ = cached_model(tmp_path / "whole.npz", Setup(described, camera), no_progress, rule)
-    assert len(whole.record["auto"]["tried"]) > 1
-    assert found.record["auto"] == whole.record["auto"]
-    np.testing.assert_array_equal(found.matrix.data, whole.matrix.data)
 
 
 @pytest.mark.slow

@@ -48,12 +48,6 @@ def test_no_two_sources_of_a_grid_reach_one_sensor_pixel() -> None:
         assert (lit == 1).all(), "every pixel of f is lit once"
 
 
-def test_rows_sum_to_the_reading_of_a_uniform_target() -> None:
-    described = small()
-    found = point_sources.responses_from_points(Setup.from_scene(described))
-    np.testing.assert_allclose(found.matrix.sum(axis=1), 1, atol=2e-6)
-
-
 def test_a_source_assigned_to_the_wrong_pixel_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     described = small()
     camera = derive(described)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -137,23 +136,3 @@ def test_checkpoints_are_written_regularly(tmp_path: Path, monkeypatch: pytest.M
         one.offer(lambda: {"done": np.array(1)})
         assert Checkpoint(tmp_path / "result", "mine").state()["done"] == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_large_checkpoints_take_a_small_share_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state that takes 3 s to write is written again only when 50 times as much time is over."""
-    now, writes = [0.0], list[float]()
-
-    def write(path: Path, fill: object) -> None:
-        del path, fill
-        writes.append(now[0])
-        now[0] += 3.0
-
-    monkeypatch.setattr(checkpoint, "monotonic", lambda: now[0])
-    monkeypatch.setattr(checkpoint, "write_whole", write)
-    kept = Checkpoint(tmp_path / "result", "mine")
-    while now[0] < 1000:
-        now[0] += 1.0
-        kept.offer(dict)
-    assert writes[0] == pytest.approx(31)
-    assert all(later - earlier >= 3 / checkpoint.SHARE for earlier, later in pairwise(writes))
-    assert 3.0 * len(writes) <= 2 * checkpoint.SHARE * now[0]

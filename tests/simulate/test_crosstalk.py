@@ -114,23 +114,6 @@ def test_electrons_and_weights_of_rays_count_every_lens(pitch: str) -> None:
         assert np.ptp(gained) > 0.5, "far lenses do not"
 
 
-def test_far_neighbours_of_a_small_target_dim_it() -> None:
-    """At a pitch of 0.5 mm they look past 31 pixels: H is the walled one times the own lens's share of the light."""
-    needs(FAST)
-    wide = {"walls": False, "wavelength": "none", "lens_pitch": "0.5 mm"}
-    described, camera = with_optics({"aperture": "0.02 mm"}, wide, SMALL, (31, 31), calibration=TRANSPORT)
-    model = rendered_model(Setup(described, camera))
-    share = np.asarray(model.matrix.sum(axis=1)).ravel()
-    for sub, pixels in zip(camera.sub_imagers, camera.slices(), strict=True):
-        away = [np.hypot(sub.patch[0] - other.lens[0], sub.patch[1] - other.lens[1]) for other in camera.sub_imagers]
-        light = [(1 + (distance / sub.depth) ** 2) ** -2 for distance in away]
-        own = (1 + (np.hypot(sub.patch[0] - sub.lens[0], sub.patch[1] - sub.lens[1]) / sub.depth) ** 2) ** -2
-        assert share[pixels].mean() == pytest.approx(own / sum(light), rel=1e-2)
-    dimmed = ideal_matrix(with_optics({"aperture": "0.02 mm"}, wide | {"walls": True}, SMALL, (31, 31))[1])
-    difference = (model.matrix - dimmed.multiply(share[:, None])).toarray()
-    assert np.abs(difference).max() < 0.1 * float((dimmed.max() * share).max())
-
-
 def test_walls_are_said_and_what_is_unclear_without_them_refused() -> None:
     described, camera = with_optics({"aperture": "0.1 mm"}, {})
     assert "light through neighbouring lenses" in [effect.what for effect in skipped_effects(described, camera)]

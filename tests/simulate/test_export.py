@@ -7,9 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.exr import read_picture
 from ommatid.scenes.formats.picture import load
@@ -50,10 +48,3 @@ def test_mitsubas_own_command_renders_the_same(tmp_path: Path) -> None:
         assert rendered.shape == pixels
         # 4096 stratified samples of steps of at most 255 err by 255 / 4096^(3/4) = 0.5 at most.
         np.testing.assert_allclose(rendered, ideal[slices[number]].reshape(pixels), atol=0.5)
-
-
-def test_the_file_name_must_end_in_xml(tmp_path: Path) -> None:
-    described = scene()
-    with pytest.raises(InputError, match=r"\.xml"):
-        export(Setup.from_scene(described), tmp_path / "camera.json")
-    assert not list(tmp_path.iterdir())

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.view import K1, MAGNIFICATION, ROTATION, misaligned, scales
@@ -155,19 +154,6 @@ def test_traced_rays_of_a_misaligned_camera(method: str, tmp_path: Path) -> None
     assert abs(again.matrix - model.matrix).max() == 0
     np.testing.assert_array_equal(again.error_variance(image), stated)
     assert again.record == model.record
-
-
-def test_a_file_of_other_numbers_is_refused(tmp_path: Path) -> None:
-    needs("llvm_ad_mono")
-    calibration = {"samples": 64, "method": "transport", "fit": "auto"}
-    described, cam = with_optics({}, MOVED, FEW, calibration=calibration)
-    path = tmp_path / "model.npz"
-    model_file.write(path, calibrate(Setup(described, cam)))
-    content = dict(np.load(path))
-    content["views.A.numbers"] = content["views.A.numbers"] + 1e-9
-    np.savez(path, **content)
-    with pytest.raises(InputError, match="checksum"):
-        model_file.read(path)
 
 
 def test_distortion_is_the_types() -> None:

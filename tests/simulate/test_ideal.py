@@ -65,11 +65,6 @@ def test_overlaps_are_shares(ratio: Fraction, pixels: int, start: Fraction) -> N
     np.testing.assert_allclose(covered[inside], 1, rtol=1e-12)
 
 
-def test_a_uniform_target_reads_its_own_value() -> None:
-    matrix = ideal_matrix(camera())
-    np.testing.assert_allclose(matrix @ np.full(361, 42.0), 42.0, rtol=1e-14)
-
-
 def test_a_ramp_reads_its_value_at_the_footprints_centre() -> None:
     """A linear image averaged over a symmetric footprint is its value at the middle."""
     one = camera()

@@ -18,13 +18,11 @@ from ommatid.scenes.optics.diffraction import pattern
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses import sharpness
 from ommatid.simulate.render import render
 from ommatid.simulate.renderer.plugins import export
 from ommatid.simulate.sensors import response
 
-from ..conftest import Command
 from ..examples import THREE, Lenses, mean_weights, needs, scene
 
 BIPLANE = [
@@ -124,53 +122,10 @@ def test_lenses_without_a_closed_form_are_calibrated() -> None:
     assert 0.9 < model.matrix.sum(axis=1).max() < pattern(0.0).encircled
 
 
-def test_omitted_lens_types_do_not_move_the_others() -> None:
-    """A model of a camera without them does not match the stack."""
-    described = built({"distortion": [0.05, 0.0]})
-    camera = derive(described)
-    some, kept = camera.restrict(("B",))
-    assert [sub.lens for sub in some.sub_imagers] == [sub.lens for sub in camera.sub_imagers if sub.type.name == "B"]
-    assert abs(ideal_matrix(some) - ideal_matrix(camera)[kept]).max() == 0
-    alone = derive(
-        described.model_copy(
-            update={"camera": described.camera.model_copy(update={"lens": described.camera.lens[1:2]})}
-        )
-    )
-    assert alone.describe() != some.describe()
-    pinholes = derive(scene(lenses=THREE))
-    assert pinholes.restrict(("B",))[0].describe() == derive(scene(lenses=THREE)).restrict(("B",))[0].describe()
-
-
 def test_only_pinholes_can_be_exported(tmp_path: Path) -> None:
     described = built({"aperture": "0.4 mm"})
     with pytest.raises(InputError, match="cannot be exported"):
         export(Setup.from_scene(described), tmp_path / "lens.xml")
-
-
-@pytest.mark.parametrize(
-    ("told", "words"),
-    [
-        (
-            'camera.lens.I.surfaces=[{radius="-1 mm", thickness="0.1 mm", index=1.5, semi_diameter="0.1 mm"}, '
-            '{semi_diameter="0.1 mm"}]',
-            "expected a converging lens",
-        ),
-        ("camera.lens.I.distortion=[-0.9, 0]", "folds"),
-        ("calibration.method=transport", "needs Mitsuba's fast backend"),
-        ('camera.tolerance.rotation="1 deg"', "need Mitsuba's fast backend"),
-    ],
-)
-def test_unsuitable_lenses_are_refused_before_any_file_is_written(
-    told: str, words: str, here: Path, ommatid: Command
-) -> None:
-    """The tiny scene renders on the slow backend. One sentence, which names the scene file."""
-    for command in (("run", "tiny.toml", "-o", "out"), ("calibrate", "tiny.toml", "-o", "h.npz")):
-        ended = ommatid(*command, "--set", told)
-        assert ended.code == 2
-        assert words in ended.err
-        assert "tiny.toml" in ended.err
-        assert len(ended.err.strip().splitlines()) == 1
-    assert [path.name for path in here.iterdir()] == ["tiny.toml"]
 
 
 def test_a_corner_without_light_has_no_spot_size() -> None:

@@ -12,22 +12,19 @@ import numpy as np
 import pytest
 from scipy import sparse, stats
 
-from ommatid.scenes.formats.picture import load
 from ommatid.scenes.optics.blur import blur_of
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.ray_transport import one_pass, responses_from_rays
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
-from ommatid.simulate.render import light
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose
 from ommatid.simulate.renderer.worlds.placement import MILLIMETRES_AT_ORIGIN
 from ommatid.simulate.sampling.passes import Plan
 
-from ..examples import OPTICS, TWO, assert_student, familywise, needs, with_optics
+from ..examples import OPTICS, familywise, needs, with_optics
 from .world_files import distance_to_target
 
 SAMPLES = 2**14
-DIFFRACTS = {"wavelength": "550 nm", "lens_pitch": "1 mm"}
 FEWEST = 25  # rays expected in an entry, above which their number is normal
 RAYS = {"wavelength": "none"}
 WAVES = {"0.1 waves": 266.67, "0.3 waves": 108.11, "1 wave": 35.088, "3 waves": 11.976}  # focus, mm, at 550 nm
@@ -122,15 +119,3 @@ def test_the_statistic_detects_another_camera(kind: str) -> None:
     _, pinholes = with_optics(*OPTICS["pinhole"])
     found = scores(ideal_matrix(pinholes), true_matrix(camera), SAMPLES)
     assert np.abs(found).max() > 2 * stats.norm.isf(familywise(found.size) / 2)
-
-
-@pytest.mark.parametrize("kind", ["out of focus", "diffraction", "distortion", "misaligned"])
-def test_rendered_sub_images_of_a_photograph(kind: str) -> None:
-    """The rendering, with the picture's edge and the black around it, is H f."""
-    needs("llvm_ad_mono")
-    tables: dict[str, Any] = {"render": {"samples": 4096, "complete": True}}
-    described, camera = with_optics(*CLOSED[kind], TWO, **tables)
-    image = load(described)
-    rendered = light(Setup(described, camera, image))
-    difference = rendered.mean - true_matrix(camera) @ image.ravel()
-    assert_student(difference, rendered.variance, rendered.passes)

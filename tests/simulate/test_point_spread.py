@@ -89,13 +89,6 @@ def test_strehl_ratio_of_defocus(waves: float) -> None:
     assert strehl_ratio(defocused(waves)) == pytest.approx(np.sinc(waves) ** 2, abs=1e-9)
 
 
-@pytest.mark.parametrize("waves", [1.0, 1.5, 2.7])
-def test_the_middle_of_a_defocused_point(waves: float) -> None:
-    """From one wave on the middle is no longer the brightest point."""
-    middle = relative_intensity(defocused(waves), np.zeros(1), np.zeros(1))
-    assert middle[0] == pytest.approx(np.sinc(waves) ** 2, abs=1e-9)
-
-
 @pytest.mark.parametrize("waves", [0.1, 0.3, 1.0, 3.0])
 def test_transfer_of_a_defocused_pupil(waves: float) -> None:
     """Hopkins (1955), by direct autocorrelation."""

@@ -175,16 +175,6 @@ def test_a_lens_that_lets_no_light_through_is_refused() -> None:
         exit_disk(shut, 1.2, 0.3)
 
 
-def test_a_small_lens_collects_its_area_over_the_square_of_the_distance() -> None:
-    """pi / 4 (A / d)^2, and cos^4 of the angle beside the axis."""
-    one = lens([10.0, -10.0], [1e-3], [1.5, 1.0], 0.3)
-    depth = one.focal_length
-    disk = exit_disk(one, depth, 5.0)
-    assert solid_angle(one, disk, depth) == pytest.approx(pi / 4 * (0.6 / depth) ** 2, rel=0.01)
-    cosine = depth / np.hypot(depth, 5.0)
-    assert solid_angle(one, disk, depth, 3.0, 4.0) / solid_angle(one, disk, depth) == pytest.approx(cosine**4, rel=0.01)
-
-
 @pytest.mark.parametrize("sine", [0.2, 0.7, 0.95])
 def test_on_the_axis_a_wide_cone_gives_pi_times_its_sine_squared(sine: float) -> None:
     """The result does not depend on the optics in front: here a stop behind a lens that blocks no rays."""
@@ -249,45 +239,6 @@ def test_numpy_and_dr_jit_agree_to_float32() -> None:
         np.testing.assert_allclose(found[:, edge], expected[:, edge], atol=1e-6)
 
 
-class Fixed:
-    """A sampler that always gives the same points of the unit square."""
-
-    def __init__(self, points: Array) -> None:
-        self.points = points
-
-    def next_2d(self) -> Any:
-        import mitsuba as mi
-
-        return mi.Point2f(*(np.float32(row) for row in self.points))
-
-
-def test_the_renderer_s_rays_are_the_traced_ones() -> None:
-    """From the middle and the rim of the disk: where the map of the square onto it needs no formula."""
-    needs("llvm_ad_mono")
-    from ommatid.simulate.renderer.variant import activate
-
-    activate("llvm_ad_mono")
-    import mitsuba as mi
-
-    from ommatid.simulate.renderer.real_lens import RealLens
-
-    camera = derive(read(GALLERY / "planoconvex.toml"))
-    kind = camera.types[0]
-    one, depth = prescription_of(camera, kind), camera.depth(kind)
-    square = np.array([[0.5, 0.75, 0.5, 1.0], [0.5, 0.5, 0.25, 0.5]])
-    x, y = np.array([0.01, 0.0, -0.01, 0.0]), np.array([0.0, 0.01, 0.0, 0.0])
-    renderer = RealLens(camera, kind)
-    at_x, at_y = (mi.Float(np.float32(axis)) for axis in (x, y))
-    start, way, weight = renderer.emit(at_x, at_y, mi.Float(depth), Fixed(square), (0.0, 0.0))
-    place, direction, light = trace(
-        path(one, exit_disk_of(camera, kind, one)), x, y, 2 * square[0] - 1, 2 * square[1] - 1, depth
-    )
-    np.testing.assert_allclose([np.array(start[0]), np.array(start[1])], place, atol=1e-6)
-    np.testing.assert_allclose([np.array(part) for part in way], direction, atol=1e-6)
-    np.testing.assert_allclose(np.array(weight), light, atol=1e-6)
-    assert list(light > 0) == [True, True, True, False]  # the disk is a little wider than the pupil
-
-
 def test_a_thin_real_lens_diffracts_as_a_thin_lens() -> None:
     """H in closed form by traced waves against that of the thin lens, by other formulas."""
     rows = [
@@ -299,17 +250,6 @@ def test_a_thin_real_lens_diffracts_as_a_thin_lens() -> None:
     thin = replace(real, optics=LensOptics(aperture=0.15 * camera.focal_length(real) / 2))
     found, expected = (ideal_matrix(replace(camera, types=(kind,))).toarray() for kind in (real, thin))
     np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
-
-
-def test_the_reach_is_the_farthest_corner_of_a_patch() -> None:
-    """Type I of the tile: patches of 5 x 5 pixels of 6 um, so a little more than their own half diagonal."""
-    camera = camera_with(BICONVEX)
-    kind = camera.types[0]
-    far, least, largest = reach(camera, kind)
-    assert least == largest == camera.depth(kind)
-    half = 2.5 * camera.pixel_pitch
-    offsets = [np.abs(np.subtract(sub.patch, sub.lens)) for sub in camera.sub_imagers if sub.type == kind]
-    assert far == pytest.approx(max(float(np.hypot(*(offset + half))) for offset in offsets))
 
 
 def test_a_camera_s_disk_serves_sensors_that_stand_askew() -> None:

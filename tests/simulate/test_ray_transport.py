@@ -56,14 +56,6 @@ def test_the_scalar_backend_is_refused_with_a_remedy() -> None:
             light(setup)
 
 
-def test_progress_ends_at_one() -> None:
-    needs("llvm_ad_mono")
-    fractions: list[float] = []
-    responses_from_rays(Setup(*with_optics({}, {}, calibration={"samples": 16})), fractions.append)
-    assert fractions == sorted(fractions)
-    assert fractions[-1] == pytest.approx(1.0)
-
-
 def test_pixels_in_blocks_give_the_same_picture_with_other_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """If memory does not hold all rays at once: both methods still agree, and blocks have different seeds."""
     needs("llvm_ad_mono")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse, stats
 
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.ray_transport import responses_from_rays
 from ommatid.simulate.ideal import ideal_matrix
@@ -71,19 +69,6 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
 
 
-@pytest.mark.parametrize("kind", ["waves with coma"])
-def test_half_of_the_diffraction_is_seen(kind: str) -> None:
-    """The same statistic between two cameras: light of twice the wavelength is another one."""
-    surfaces, wavelength, more = CASES[kind]
-    camera = setup_of(surfaces, wavelength, **more).camera
-    found = scores(ideal_matrix(with_wavelength(camera, 1.1e-3)), ideal_matrix(camera), SAMPLES)
-    assert np.abs(found).max() > 2 * stats.norm.isf(familywise(found.size) / 2)
-
-
-def with_wavelength(camera: Camera, wavelength: float) -> Camera:
-    return replace(camera, wavelength=wavelength)
-
-
 def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> None:
     """By brute force: densities at points of the target around one pixel's mean, times the overlaps."""
     camera = setup_of(BENT, "550 nm").camera
@@ -133,23 +118,6 @@ def test_rays_that_follow_the_distance_of_what_they_meet(kind: str) -> None:
     matrix = sparse.csr_array(found[:, :-1] / weights.sum(axis=1)[:, None])
     found = scores(matrix, ideal_matrix(camera), 4 * SAMPLES)
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
-
-
-@pytest.mark.slow
-def test_several_wavelengths(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Traced H is the closed form, which is the mean of those of the wavelengths with their glass."""
-    needs("llvm_ad_mono")
-    glass = [{**FLAT[0], "index": None, "glass": "N-SF11"}, {**FLAT[1], "radius": "-1.6 mm"}]
-    glass[0] = {key: value for key, value in glass[0].items() if value is not None}
-    setup = setup_of(glass, "550 nm")
-    monkeypatch.setattr(Camera, "wavelengths", property(lambda _: ((4.5e-4, 0.3), (6.5e-4, 0.7))))
-    traced, expected = responses_from_rays(setup), ideal_matrix(setup.camera)
-    found = scores(traced.matrix, expected, traced.passes * traced.samples)
-    assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
-    assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
-    monkeypatch.setattr(Camera, "wavelengths", property(lambda _: ((4.5e-4, 1.0),)))
-    blue = scores(ideal_matrix(replace(setup.camera, detail=2)), expected, 64 * SAMPLES)
-    assert np.abs(blue).max() > 2 * stats.norm.isf(familywise(blue.size) / 2)
 
 
 def test_rows_add_up_to_the_light_that_the_target_sends() -> None:

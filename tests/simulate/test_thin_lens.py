@@ -52,12 +52,6 @@ def test_the_thin_lens_equation(slope: float, one: float, other: float) -> None:
     assert one + 150.0 * ways[0] == pytest.approx(150.0 * slope, abs=1e-9), "and with the ray through the centre"
 
 
-def test_parallel_light_meets_in_the_focal_point() -> None:
-    """From the focal plane rays leave parallel, and to it they come from far away."""
-    for place in (-1.0, 0.0, 2.0):
-        assert thin_lens.through_thin_lens(0.1, place, 25.0, 25.0) == pytest.approx(0.1)
-
-
 def test_the_disk_of_defocus() -> None:
     """A lens focused on s shows a point of a screen at Z as a disk of A |1 - Z / s|: similar triangles."""
     aperture, s, screen, d = 2.0, 400.0, 500.0, 3.0

@@ -1,9 +1,8 @@
-"""Light lost by reflection against Fresnel's equations for every ray; openings that would overlap are refused."""
+"""Light lost by reflection against Fresnel's equations by hand; openings that would overlap are refused."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from math import asin, atan2, cos, sin, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -34,55 +33,6 @@ def gallery(name: str) -> Camera:
 def first_lens(name: str) -> Prescription:
     camera = gallery(name)
     return prescription_of(camera, camera.types[0])
-
-
-def unpolarised(before: float, behind: float, incidence: float) -> float:
-    """Mean reflectance of both polarisations at an angle of incidence, in the form with angles of Fresnel."""
-    if before == behind:
-        return 0.0
-    if incidence < 1e-6:
-        return ((before - behind) / (before + behind)) ** 2
-    refracted = asin(before * sin(incidence) / behind)
-    difference, total = incidence - refracted, incidence + refracted
-    return (sin(difference) / sin(total)) ** 2 / 2 * (1 + (cos(total) / cos(difference)) ** 2)
-
-
-def transmitted(lens: Prescription, height: float, slope: float) -> float | None:
-    """Trace a meridional ray from in front of a lens of spheres by angles; None where a rim stops it."""
-    angle, passed, position = atan2(slope, 1.0), 1.0, 0.0
-    for number, radius in enumerate(lens.radius):
-        before, behind = lens.index_before[number], lens.index[number]
-        vertex = lens.vertices[number]
-        height += (vertex - position) * np.tan(angle)
-        position = vertex
-        normal = 0.0
-        if np.isfinite(radius):
-            along, up = cos(angle), sin(angle)
-            half = along * radius - up * height
-            run = (height**2) / (half + np.copysign(sqrt(half**2 - height**2), radius))
-            position, height = position + run * along, height + run * up
-            normal = asin(-height / radius)
-        if abs(height) > lens.semi_diameter[number]:
-            return None
-        incidence = angle - normal
-        passed *= 1 - unpolarised(before, behind, abs(incidence))
-        angle = normal + asin(before * sin(incidence) / behind)
-    return passed
-
-
-@pytest.mark.parametrize("name", ["doublet", "planoconvex"])
-@pytest.mark.parametrize("field", [0.0, 0.03])
-def test_rays_at_every_height_lose_what_the_axis_loses(name: str, field: float) -> None:
-    """The mean over the meridional rays of a bundle from afar, by polarisation and incidence, to 1e-4."""
-    lens = first_lens(name)
-    widest = float(lens.entrance_pupil.radius)
-    middle = -field * float(lens.entrance_pupil.position)
-    heights = np.linspace(-widest, widest, 41)
-    shares = [(transmitted(lens, middle + height, field), abs(height)) for height in heights]  # rings of the pupil
-    seen = [(share, weight) for share, weight in shares if share is not None]
-    assert len(seen) > 36
-    mean = float(np.average([share for share, _ in seen], weights=[weight for _, weight in seen]))
-    assert transmission(lens) == pytest.approx(mean, abs=1e-4)
 
 
 def test_the_gallery_s_lenses_lose_what_fresnel_s_equations_say() -> None:

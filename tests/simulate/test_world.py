@@ -257,15 +257,10 @@ def shape_at(change: str, value: str) -> str:
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        ("<shape", "is not valid XML"),
-        ('<shape type="egg"/>', "a plugin that Mitsuba ships, got type 'egg'"),
         ('<shape type="sphere"><float name="weight" value="1"/></shape>', "unreferenced property"),
-        ('<shape type="obj"><string name="filename" value="none.obj"/></shape>', "none.obj"),
         ('<shape type="sphere"/>', "has no emitter"),
         (shape_at("translate", "1e400"), "finite positions, got shape 'far' from -1, -1, inf to"),
-        (shape_at("translate", "-inf"), "finite positions, got shape 'far'"),
         (shape_at("scale", "nan"), "finite positions, got shape 'far' from -1, -1, nan to"),
-        (shape_at("scale", "1e308"), "finite positions, got shape 'far'"),
         ('<emitter type="constant"/><integrator type="ptracer"/>', "does not follow rays from a camera"),
     ],
 )

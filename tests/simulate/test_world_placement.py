@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.world import MILLIMETRES, WorldTable
 from ommatid.simulate.ground_truth import Truth, truth
@@ -49,12 +49,6 @@ def lit_room(millimetres: float) -> str:
     return f'{wall}<shape type="sphere">{ball}</shape>{bulb}{PATHS}'
 
 
-def with_aperture(described: Scene) -> Scene:
-    data = described.plain()
-    data["camera"]["lens"][0] |= {"aperture": "0.2 mm", "focus": "700 mm"}
-    return parse(data, Path("test.toml"))
-
-
 def assert_same(one: FloatArray, other: FloatArray, rays: int) -> None:
     """Assert that readings of 0 to 255 are those of the same rays, of which rounding may put two across an edge."""
     assert np.abs(one - other).max() <= 2 * 255 / rays
@@ -77,16 +71,6 @@ def test_a_world_reads_the_same_in_millimetres_and_inches(tmp_path: Path) -> Non
     assert_same(other.mean, rendering.mean, 256)
     assert_same(known.image, exact.image, exact.samples)
     np.testing.assert_allclose(known.depth, exact.depth, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_the_blur_behind_an_aperture_is_the_same_in_millimetres_and_metres(tmp_path: Path) -> None:
-    needs(FAST)
-    in_millimetres, in_metres = (
-        light(Setup.from_scene(with_aperture(in_unit(tmp_path, unit, FAST)))).mean for unit in ("mm", "m")
-    )
-    assert np.ptp(in_millimetres) > 20
-    assert_same(in_millimetres, in_metres, 256)
 
 
 def moved(shape: str, mirrored: bool) -> str:

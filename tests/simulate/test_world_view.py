@@ -10,14 +10,13 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from ommatid.analysis.depth_error import disparity
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import parse, write
 from ommatid.scenes.setup import Setup
 from ommatid.simulate import world_view as module
 from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.render import render
-from ommatid.simulate.world_view import WorldView, check_world, displacement, views, world_view
+from ommatid.simulate.world_view import WorldView, check_world, views, world_view
 
 from ..conftest import Command
 from ..examples import VARIANTS, needs
@@ -47,15 +46,6 @@ def test_views_are_spread_evenly_over_the_pixels_of_every_sub_imager() -> None:
         np.testing.assert_allclose(start, np.tile([*sub.lens, 0], (16, 1)))
         height, width = (float(sub.type.ratio) * count * camera.target_pitch for count in sub.type.pixels)
         np.testing.assert_allclose(np.ptp(seen, axis=0), [0.75 * width, 0.75 * height, 0])
-
-
-def test_the_displacement_is_that_between_opposite_lenses() -> None:
-    """Of four lenses in a square, along each axis, root two times the root mean square that `disparity` yields."""
-    camera = three_types((12, 12), ((1, [2, 2], [11, 11]),))
-    for depth in (3.0, 700.0, 1e5):
-        expected = 2**0.5 * float(disparity(camera, depth)["A"])
-        assert displacement(camera, depth) == pytest.approx([expected] * 2, rel=1e-12)
-    assert not displacement(camera, camera.distance).any()
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -169,21 +159,6 @@ def lit(radiance: float) -> str:
     return f'{DIFFUSE}<shape type="rectangle"><transform name="to_world">{place}</transform>{glow(radiance)}</shape>'
 
 
-def test_twice_the_light_is_the_same_picture(tmp_path: Path) -> None:
-    """A factor of two is exact in binary numbers: every digit of white doubles, and none of the picture changes."""
-    setups = [fine(tmp_path_of(tmp_path, name), lit(radiance), "scalar_rgb") for name, radiance in (("a", 3), ("b", 6))]
-    whites = [world_view(setup).white for setup in setups]
-    assert whites[1] == 2 * whites[0]
-    dim, bright = (render(setup).values for setup in setups)
-    assert 100 < np.median(dim) < 256
-    np.testing.assert_array_equal(dim, bright)
-
-
-def tmp_path_of(folder: Path, name: str) -> Path:
-    (folder / name).mkdir()
-    return folder / name
-
-
 def test_white_does_not_depend_on_threads_but_on_the_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     needs(FAST)
     threads, whites = dr.thread_count(), list[float]()
@@ -213,20 +188,6 @@ def test_the_picture_before_a_world_has_no_part_in_white(tmp_path: Path) -> None
     setup = Setup(described, camera)
     assert world_view(setup).white == pytest.approx(0.5, rel=1e-5)
     np.testing.assert_allclose(truth(setup).image, setup.image, rtol=1e-4, atol=0.01)
-
-
-@pytest.mark.parametrize("command", ["run", "render", "show"])
-def test_a_world_in_metres_ends_with_2_before_anything_is_written(here: Path, ommatid: Command, command: str) -> None:
-    described, _ = world(here, rectangle(0.02, 0.02, 0, 0, 1, glow(1)), variant="scalar_rgb")
-    write(here / "metres.toml", described)
-    before = sorted(path.name for path in here.iterdir())
-    output = [] if command == "show" else ["-o", "out"]
-    ended = ommatid(command, "metres.toml", *output)
-    assert (ended.code, ended.out) == (2, "")
-    assert len(ended.err.splitlines()) == 1
-    assert "meet a surface, expected half or more" in ended.err
-    assert "set world.unit = 'm' if the file is in m" in ended.err
-    assert sorted(path.name for path in here.iterdir()) == before
 
 
 def test_show_prints_what_the_camera_sees(here: Path, ommatid: Command) -> None:

@@ -18,22 +18,18 @@ from ..exact_rationals import rational_answer, relative_error
 REFUSED = -1.0  # in place of an error
 EACH, FEW = 334, 12  # problems of every family: 5,010 of the long form
 # Those whose measurements without noise, or whose digits, float64 cannot tell apart.
-MOST_REFUSED = {
-    "nearly equal rows, noise-free": 1.0,
-    "contradiction": 0.65,
-    "singular prior": 0.6,
-    "denormal noise": 0.6,
-}
+MOST_REFUSED = {"nearly equal rows, noise-free": 1.0, "contradiction": 0.65, "singular prior": 0.5}
 
 
 @pytest.mark.parametrize("each", [FEW, pytest.param(EACH, marks=pytest.mark.slow)])
 def test_no_random_problem_is_silently_wrong(each: int) -> None:
-    """Every one is right to its stated bound, or refused; of most families two in three are answered."""
+    """Every one is right to its stated bound, or refused; few families refuse half, within 3 standard errors."""
     for family in FAMILIES:
         outcomes = [assess(family, seed) for seed in range(each)]
         assert [outcome for outcome in outcomes if outcome.outcome == SILENT] == []
         refused = sum(outcome.outcome == "refused" for outcome in outcomes) / each
-        assert refused <= MOST_REFUSED.get(family, 0.45), family
+        share = MOST_REFUSED.get(family, 0.45)
+        assert refused <= share + 3 * (share * (1 - share) / each) ** 0.5, family
 
 
 def test_a_bound_that_is_small_by_chance_does_not_count() -> None:

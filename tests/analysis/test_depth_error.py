@@ -89,19 +89,6 @@ def test_a_world_without_surfaces_has_one_bin() -> None:
     assert rows([depth_bin])[0][0] == "no surface"
 
 
-def test_maps_of_different_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match="maps of one shape"):
-        error_by_depth(CAMERA, np.ones((3, 3)), np.ones((3, 2)), np.ones((3, 3)))
-
-
-def test_the_table_says_what_was_measured() -> None:
-    depth, error, variance = maps()
-    lines = rows(error_by_depth(CAMERA, depth, error, variance))
-    assert lines[0][0].endswith("mm")
-    assert "disparity" in lines[0][1]
-    assert len(lines) == 11
-
-
 @pytest.mark.parametrize("distance", [None, np.nan, 3200.3])
 def test_a_figure_is_drawn(tmp_path: Path, distance: float | None) -> None:
     depth, error, variance = maps()

@@ -110,13 +110,6 @@ def test_other_keys_of_the_estimator_are_obeyed(keys: dict[str, Any], message: s
         restore(*recorded(misaligned(estimator={"misalignment": "robust", **keys})))
 
 
-def test_a_calibrated_h_is_refused() -> None:
-    stack, model, truth = recorded(misaligned("fit"))
-    calibrated = replace(model, record={**model.record, "method": "points"})
-    with pytest.raises(InputError, match="starts from H as designed, got a calibrated one"):
-        restore(stack, calibrated, truth)
-
-
 def test_an_impossible_study_is_refused_before_it_starts() -> None:
     for models, lens, words in (
         (["ideal", "fitted"], {"aperture": "0.4 mm", "focus": "600 mm"}, "serves pinholes and thin lenses in focus"),

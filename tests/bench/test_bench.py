@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import special, stats
+from scipy import special
 
 from ommatid.bench.bench import measure, rows
 from ommatid.bench.cells import (
@@ -57,32 +57,6 @@ def test_the_slope_of_a_power_law_is_found_with_its_standard_error() -> None:
     unbiased = 2 * np.exp(-special.digamma(2))
     spread = np.log(samples).var() * samples.size
     assert fit.deviation == pytest.approx(0.05 * (unbiased * np.pi / (8 + np.pi) / spread) ** 0.5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("power", [-0.5, -0.75, -1.0])
-def test_slopes_are_right_within_their_standard_error(power: float) -> None:
-    """400 fits to errors of 5 seeds with a scatter of 5 %: the scores follow Student's t with about 24 degrees.
-
-    The shrunk variances of 6 points with 4 degrees of freedom each have about 24; Student's deviation is then 1.04.
-    """
-    rng = np.random.default_rng(3)
-    samples = np.array([16, 64, 256, 1024, 4096, 16384])
-    scores: list[float] = []
-    for _ in range(400):
-        drawn = 7.0 * samples[:, None] ** power * np.exp(rng.normal(0, 0.05, (6, 5)))
-        cells = [
-            cell(samples=int(count), error=Quantiles.of(list(errors)), scatter=float(np.std(np.log(errors), ddof=1)))
-            for count, errors in zip(samples, drawn, strict=True)
-        ]
-        fit = slope(cells)
-        assert fit is not None
-        scores.append((fit.value - power) / fit.deviation)
-    # Bounds of 4 standard errors of mean and deviation, and the binomial bound of the same significance.
-    assert np.mean(scores) == pytest.approx(0, abs=4 / 400**0.5)
-    assert np.std(scores) == pytest.approx(1.04, abs=4 * 1.04 / 800**0.5)
-    outside = int(np.sum(np.abs(scores) > 3))
-    assert outside <= stats.binom.isf(stats.norm.sf(4), 400, 2 * stats.t.sf(3, 24))
 
 
 def test_too_few_points_have_no_slope() -> None:
@@ -222,13 +196,6 @@ def test_a_table_that_is_read_is_the_one_that_was_written(
     assert row["mse_high"] == ("" if measured.mse is None else str(measured.mse.high))
 
 
-def test_a_single_cell_is_drawn(tmp_path: Path) -> None:
-    """Matplotlib's limits of a logarithmic axis coincide around some single values, such as this one."""
-    single = cell("reconstruct", way="covariance", error=exactly(1e-10), seconds=exactly(0.023146497000197996))
-    write_figures(tmp_path, bench_table(derive(scene()), [single]))
-    assert (tmp_path / "reconstruct.png").is_file()
-
-
 def test_an_adaptive_cell_without_error_leaves_the_scale_to_the_others(tmp_path: Path) -> None:
     cells = [cell(samples=count, error=exactly(count**-0.5)) for count in (4, 16, 64)]
     cells.append(cell(samples=18, setting=AUTO, error=exactly(1e-12)))
@@ -347,15 +314,6 @@ def test_the_command_writes_its_table_and_repeats_nothing(ommatid: Command, here
     assert dict(rows(table))["cells"]
     other = ommatid("bench", "tiny.toml", "-o", "out", "--set", "noise.variance=1")
     assert (other.code, "another scene" in other.err) == (2, True)
-
-
-@pytest.mark.usefixtures("here")
-def test_a_tiny_budget_still_ends_in_a_table(ommatid: Command) -> None:
-    ended = ommatid("bench", "tiny.toml", "-o", "out", "--seconds", "1", "--json")
-    assert ended.code == 0, ended.err
-    document = json.loads(ended.out)
-    assert len(document["left_out"]) > len(document["cells"])
-    assert document["recommended"]["why"]
 
 
 def test_scenes_that_cannot_be_measured_are_refused(ommatid: Command, here: Path) -> None:

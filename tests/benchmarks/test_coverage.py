@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 from math import comb
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.reconstruct.method_choice import choose_method
-from ommatid.scenes.camera import derive
-from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.estimation import Sampler
-from ommatid.scenes.tables.gallery import gallery_names
-from ommatid.simulate.validation import check_scene
-
-from ..examples import GALLERY, needs
+from ..examples import needs
 from .coverage import command
 from .coverage.cell import Cell
 from .coverage.cells import CELLS
@@ -77,35 +68,6 @@ def test_predictions_that_few_samples_make_too_small_are_not_trusted() -> None:
     assert len(succeeded) == len(runs)
     assert np.mean([run.mse / run.promised for run in succeeded]) > 1.2
     assert not any(run.trusted for run in succeeded)
-
-
-def test_the_cells_span_what_the_table_is_to_cover_in_six_hours() -> None:
-    assert len(BY_NAME) == len(CELLS) <= 60
-    assert sum(cell.seconds * cell.seeds for cell in CELLS) < 6 * 3600
-    assert {cell.scene for cell in CELLS} == set(gallery_names())
-    scenes = [cell.described(0) for cell in CELLS]
-    assert {scene.render.sampler for scene in scenes} == set(get_args(Sampler))
-    assert {scene.calibration.method for scene in scenes} == {"ideal", "points", "transport"}
-    assert "geometry" in {scene.calibration.fit for scene in scenes}
-    assert {len(scene.camera.lens) for scene in scenes} >= {1, 2, 3}
-    sizes = {derive(scene).rows for scene in scenes}
-    assert (min(sizes), max(sizes)) == (19, 479)
-
-
-@pytest.mark.slow
-def test_every_cell_has_a_method_and_can_be_rendered() -> None:
-    needs("llvm_ad_mono")
-    for cell in CELLS:
-        scene = cell.described(0)
-        setup = Setup.from_scene(scene)
-        check_scene(setup)
-        choose_method(scene, setup.camera, setup.has_structured_matrix)
-
-
-def test_cells_of_fewer_samples_than_the_scene_asks_for_are_known() -> None:
-    few = {cell.name for cell in CELLS if cell.has_few_samples}
-    assert {"tile19-transport-64", "photo-119-flat-256", "tile19-bright-transport-1024"} <= few
-    assert not few & {"tile19-transport-4096", "photo-119-transport-896", "tile19-ideal", "tile19-points-4096"}
 
 
 def test_runs_differ_in_their_seeds_and_cells_do_too() -> None:
@@ -168,13 +130,6 @@ def test_a_journal_keeps_the_last_result_of_every_run_and_an_unfinished_line_cos
     assert left.get(1) != run_of(1, 1.5)
 
 
-def test_the_definition_of_a_cell_is_the_same_in_every_checkout(tmp_path: Path) -> None:
-    shutil.copytree(GALLERY, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
-    for name in gallery_names():
-        here, there = (Cell("a cell", scene, (), 1).definition for scene in (name, str(tmp_path / f"{name}.toml")))
-        assert here == there
-
-
 def test_results_of_another_definition_of_a_cell_do_not_count(tmp_path: Path) -> None:
     append(tmp_path, CELL, run_of(0, 1.0))
     other = Cell(CELL.name, CELL.scene, (*CELL.changes, "noise.variance=1e-3"), CELL.seconds)
@@ -200,25 +155,3 @@ def test_a_second_start_runs_what_is_missing_or_failed(
     assert capsys.readouterr().out == printed
     assert f"| {CELL.name} | 4 | 0.500 ± 0.000 | 1.000 ± 0.000 | 4 of 4 |" in printed
     assert started == [0, 2, 3]
-
-
-def test_the_cells_that_fail_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for number in range(20):
-        append(tmp_path, CELL, run_of(number, 3.0 if number < 3 else 1.0, trusted=number > 0))
-        append(tmp_path, BY_NAME["tile19-transport-64"], run_of(number, 1.0))
-    command.command(["-o", str(tmp_path), "--table"])
-    printed = capsys.readouterr().out
-    assert f"in 1 of 2 cells: {CELL.name} (17 of 20 inside, 1 of 20 red)." in printed
-    assert "| tile19-transport-64 † | 20 |" in printed
-
-
-def test_a_run_that_cannot_be_made_is_recorded_as_failed() -> None:
-    result = measured_run(Cell("failing", "tile19", ("target.origin=[5000, 0]",), 1), 0)
-    assert isinstance(result, Failure)
-    assert result.error.startswith("InputError: ")
-    assert "leaves the picture" in result.error
-
-
-def test_an_unknown_cell_is_refused() -> None:
-    with pytest.raises(SystemExit, match="'tile20' is not a cell"):
-        command.command(["--cells", "tile20"])

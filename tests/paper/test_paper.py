@@ -14,8 +14,8 @@ import pytest
 from scipy import stats
 
 from ommatid.paper import claims, paper
-from ommatid.paper.claims import NO, QUALIFIED, YES, photograph_claims, tile_claims
-from ommatid.paper.photographs import Photograph, TileCrops, crop_tiles, load, measure, seeds, simulate_trials
+from ommatid.paper.claims import NO, QUALIFIED, YES, tile_claims
+from ommatid.paper.photographs import crop_tiles, load, measure, seeds
 from ommatid.paper.tile_errors import THREE, TWICE, TWO, PaperTile, TileError, Tiles, inner, tile, tiles
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -158,18 +158,6 @@ def test_maps_show_the_tile_upright(written: Written, computed: Tiles) -> None:
 
 
 @pytest.mark.slow
-def test_sweeps_are_drawn_as_they_are_written(written: Written) -> None:
-    for name, side in (("fig2", 19), ("fig4", 35)):
-        rows = written.rows(f"{name}.csv")
-        assert len(rows) == 3 * 4 * 33
-        for axes, column in zip(written.figures[name].axes, ("mse", "trimmed_mse"), strict=True):
-            drawn = np.array([line.get_ydata() for line in axes.lines])
-            np.testing.assert_allclose(drawn.ravel(), [float(row[column]) for row in rows], rtol=1e-12)
-            assert axes.get_xscale() == axes.get_yscale() == "log"
-            assert str(side) in axes.get_title()
-
-
-@pytest.mark.slow
 def test_figure_7_is_drawn_as_it_is_written(written: Written) -> None:
     rows = written.rows("fig7.csv")
     tiles_at = [f"tile_{row}_{column}" for row, column in written.description["picture"]["places"]]
@@ -309,21 +297,6 @@ def test_claims_fail_on_swapped_tiles(computed: Tiles) -> None:
         assert [holds for claim, holds in verdicts.items() if claim.startswith(beginning)] == [NO]
 
 
-@pytest.mark.slow
-def test_the_claim_on_trimming_fails_on_swapped_tiles(computed: Tiles) -> None:
-    swapped = {**computed, (19, TWO): computed[19, THREE], (19, THREE): computed[19, TWO]}
-    (claim,) = [claim for claim in tile_claims(swapped) if claim.claim.startswith("three types: trimming the 19")]
-    assert (claim.holds, claim.remark) == (NO, "does not hold: it removes 43.2% with three types and 33.7% with two")
-
-
-@pytest.mark.slow
-def test_the_claim_on_joined_tiles_fails_where_the_whole_is_another(computed: Tiles) -> None:
-    whole = computed[35, TWO]
-    other = replace(whole, form=replace(whole.form, values=whole.form.values * 1.01))
-    (claim,) = [claim for claim in tile_claims({**computed, (35, TWO): other}) if claim.claim.startswith("joining")]
-    assert claim.holds == NO
-
-
 def test_crossing_and_knee_of_lines() -> None:
     first, second = (
         TileError(np.array([9.0, 11.0]), np.array([1.0, 1.0])),
@@ -378,22 +351,6 @@ def test_noise_is_repeatable_and_independent() -> None:
     np.testing.assert_array_equal(fewer.from_noise, trials.from_noise[:, :2])
     for other in (seeds(6, 1), seeds(7, 0)):
         assert not np.intersect1d(measure(shown, images, noises, other).from_noise, trials.from_noise).size
-
-
-@pytest.mark.slow
-def test_images_wider_than_the_prior_fail_the_claim_on_photographs(computed: Tiles) -> None:
-    """Twice the prior's deviation: worse than predicted where the prior decides."""
-    shown = computed[35, THREE]
-    images = 127.5 + 2 * (from_prior(shown, 6, 8) - 127.5)
-    photograph = simulate_trials(shown, "prior", TileCrops(images, ((0, 0),) * 6), 0)
-    assert photograph_claims(photograph)[1].holds == NO
-    assert photograph_claims(broken_quantisation(photograph))[0].holds == NO
-
-
-def broken_quantisation(photograph: Photograph) -> Photograph:
-    return replace(
-        photograph, quantised=replace(photograph.quantised, from_noise=1.2 * photograph.quantised.from_noise)
-    )
 
 
 @pytest.mark.parametrize("shape", [(70, 105), (105, 70), (35, 210), (210, 35), (71, 300)])

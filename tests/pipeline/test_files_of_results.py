@@ -66,12 +66,6 @@ def test_a_reconstruction_removes_what_an_earlier_run_left_in_its_folder(
     assert (kept / "scene.toml").read_text(encoding="utf-8") == TINY, "a scene that no run wrote stays"
 
 
-def test_a_reconstruction_keeps_the_scene_of_its_stack(kept: Path, finished: Path, ommatid: Command) -> None:
-    before = (kept / "scene.toml").read_bytes()
-    assert ommatid("reconstruct", finished / "stack.exr", finished / "model.npz", "-o", kept, "-q").code == 0
-    assert (kept / "scene.toml").read_bytes() == before
-
-
 def test_a_new_estimate_alone_removes_its_old_formats(finished: Path, here: Path, ommatid: Command) -> None:
     command = "reconstruct", finished / "stack.exr", finished / "model.npz", "-o", "a.exr", "-q"
     assert ommatid(*command, "--format", "npy,tiff16").code == 0
@@ -183,15 +177,6 @@ def test_an_estimate_replaces_no_file_that_shows_something_else(finished: Path, 
         assert (ended.code, content(here)) == (2, before)
         assert f"{name}: would be replaced" in ended.err
         (here / name).unlink()
-
-
-def test_frames_replace_no_file_that_shows_something_else(finished: Path, here: Path, ommatid: Command) -> None:
-    stacks = [shutil.copy(finished / "stack.exr", here / f"{name}.exr") for name in "ab"]
-    (here / "film").mkdir()
-    np.save("film/b.npy", np.zeros((12, 12), np.float32))
-    ended = ommatid("reconstruct", *stacks, finished / "model.npz", "-o", "film", "--format", "npy")
-    assert (ended.code, names(here / "film")) == (2, {"b.npy"})
-    assert "b.npy: would be replaced" in ended.err
 
 
 # --- H as designed instead of the camera's

@@ -15,7 +15,6 @@ from ommatid.analysis import held_out
 from ommatid.page.data import read_run
 from ommatid.page.document import page
 from ommatid.reconstruct.output import run_json
-from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stack_file
 
 from ..conftest import Command
@@ -62,12 +61,6 @@ def test_python_and_the_command_yield_the_same_numbers(kept: Path, ommatid: Comm
     assert [entry.z for entry in check.sub_imagers] == [sub["z"] for sub in found["sub_imagers"]]
 
 
-def test_the_keys_of_other_tables_cannot_be_set(kept: Path, ommatid: Command) -> None:
-    ended = ommatid("check", kept / "stack.exr", kept / "model.npz", "--set", "noise.variance=1")
-    assert ended.code == 2
-    assert "already recorded" in ended.err
-
-
 def test_a_run_stores_its_check_and_the_page_shows_it(altered: Path, ommatid: Command) -> None:
     original = run_json.read(altered)
     assert original.held_out is not None
@@ -104,9 +97,3 @@ def test_without_others_the_table_says_that_nothing_was_checked(kept: Path) -> N
     assert report.verdict.trusted is None
     assert held_out.rows(report)[0][1].startswith("not checked: fewer than two sub-imagers")
     assert json.loads(report.model_dump_json())["p_value"] is None
-
-
-def test_a_stack_of_another_camera_is_refused(kept: Path) -> None:
-    other = interface.calibrate(interface.read_scene("tile19", set="calibration.method=ideal"))
-    with pytest.raises(InputError, match="do not belong together"):
-        interface.check(interface.read_stack(kept / "stack.exr"), other)

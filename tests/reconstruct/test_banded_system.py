@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import leaves_null_space
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.problem import gram
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
@@ -82,26 +80,3 @@ def test_a_null_space_of_every_frame(lenses: Lenses, leaves: bool) -> None:
     small = np.linalg.matrix_rank(ideal_matrix(camera((19, 19), lenses)).toarray()) if leaves else 0
     assert leaves_null_space(seen) is leaves
     assert small < 19**2
-
-
-@pytest.mark.slow
-def test_what_tiles_cost() -> None:
-    scene = described((47, 47), TWO, noise={"variance": NOISE}, tiles={"size": 21, "overlap": 5})
-    stack, image = recorded(scene, np.random.default_rng(1))
-    tiles, frame = restored(stack, image, "tiles"), restored(stack, image, "frame")
-    stated = float(tiles.solver.why.partition("factor of ")[2].split()[0])
-    middle = slice(13, 34)
-    cost = [r.expected.variance.reshape(47, 47)[middle, middle].mean() for r in (tiles, frame)]
-    assert stated == pytest.approx(cost[0] / cost[1], rel=0.25), "twelve pixels of 441"
-    three = described((47, 47), THREE, noise={"variance": NOISE}, tiles={"size": 35, "overlap": 8})
-    assert "cost" not in restored(*recorded(three, np.random.default_rng(1)), "tiles").solver.why
-
-
-@pytest.mark.parametrize("density", [0.01, 0.6])
-def test_products_of_dense_and_of_sparse_matrices(density: float) -> None:
-    rng = np.random.default_rng(0)
-    matrix = sparse.csr_array(rng.normal(size=(200, 150)) * (rng.random((200, 150)) < density))
-    weights = rng.random(200)
-    expected = np.einsum("mi,m,mj->ij", matrix.toarray(), weights, matrix.toarray())
-    np.testing.assert_allclose(gram(matrix, weights), expected, atol=1e-10)
-    np.testing.assert_allclose(gram(matrix), matrix.toarray().T @ matrix.toarray(), atol=1e-10)

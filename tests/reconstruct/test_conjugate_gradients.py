@@ -7,7 +7,7 @@ import pytest
 from scipy import fft, linalg
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem, Solution
-from ommatid.reconstruct.prior import lag_distances, spectrum_of
+from ommatid.reconstruct.prior import spectrum_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.optics.boxes import BoxFootprints
@@ -100,28 +100,8 @@ def test_a_prior_that_is_diagonal_under_the_cosine_transform(table: PriorTable) 
     assert largest_error(solution, expected, linalg.inv(dense)) <= solution.bound <= 0.01
 
 
-def test_inside_the_frame_the_cosine_prior_is_the_stationary_one() -> None:
-    """Reflections at the edges add exp(-32 / 3) of the variance at the middle, 0.02 of 900."""
-    shape = (48, 40)
-    table = PriorTable(kind="exponential", variance=900.0, correlation_length="3 mm")  # type: ignore[arg-type]
-    spectrum = np.asarray(spectrum_of(table, shape, 1.0))
-    unit = np.zeros(shape)
-    unit[24, 20] = 1.0
-    row = fft.idctn(spectrum * fft.dctn(unit, 2, norm="ortho"), 2, norm="ortho")
-    lags = 900 * np.exp(-lag_distances(shape) / 3)
-    for vertical, horizontal in ((0, 0), (3, 0), (0, -5), (7, 4)):
-        expected = lags[abs(vertical), abs(horizontal)]
-        assert row[24 + vertical, 20 + horizontal] == pytest.approx(expected, abs=0.02)
-
-
 def test_an_accuracy_that_is_not_reached_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ommatid.reconstruct.frame.conjugate_gradients.MAX_STEPS", 3)
     system = ideal_system((60, 55), 1e4, TWO)
     with pytest.raises(InputError, match=r"after 3 steps, expected 0\.01; set estimator\.method = 'tiles'"):
         system.solve(np.random.default_rng(0).normal(size=system.camera.unknowns))
-
-
-def test_the_solution_for_zero_is_zero() -> None:
-    solution = ideal_system((40, 40), 1.0).solve(np.zeros(1600))
-    assert (solution.steps, solution.bound) == (0, 0.0)
-    assert not solution.image.any()

@@ -97,25 +97,6 @@ def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str, shape: tup
 
 
 @pytest.mark.slow
-def test_shares_of_the_error_are_unbiased(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mean over 12 seeds is the dense answer, within 4 standard errors."""
-    scene, truth = wide(SHAPE, noise=NOISE), drawn()
-    stack = recorded(scene, truth, VARIANCE)
-    stack = replace(stack, variance=1e-3 * np.random.default_rng(1).uniform(1, 3, stack.values.size))
-    model = ideal_model(scene, derive(scene))
-    dense = restored_by("information", stack, model, None)
-    settings = scene.estimator.model_copy(update={"method": "frame"})
-    framed = replace(stack, scene=scene.model_copy(update={"estimator": settings}))
-    budgets: list[dict[str, float]] = []
-    for seed in range(12):
-        monkeypatch.setattr("ommatid.reconstruct.frame.frame_method.SEED", seed)
-        budgets.append(restore(framed, model).budget())
-    for name in ("noise", "rendering"):
-        values = [budget[name] for budget in budgets]
-        assert np.mean(values) == pytest.approx(dense.budget()[name], abs=4 * float(np.std(values)) / 12**0.5)
-
-
-@pytest.mark.slow
 def test_dead_and_saturated_pixels() -> None:
     scene, truth = wide(SHAPE, noise={"variance": 1e-2, "saturation": 180.0}), drawn(2)
     stack = recorded(scene, truth, 1e-2)
@@ -141,26 +122,6 @@ def test_a_prior_of_correlated_pixels() -> None:
     assert np.abs(ratio[12:-12, 12:-12] - 1).max() < 0.01
 
 
-@pytest.mark.slow
-def test_a_fitted_prior_on_a_frame() -> None:
-    """A smooth image with much noise has a fifth of the error under a fitted prior, inside its interval."""
-    rough = np.random.default_rng(0).normal(size=SHAPE)
-    smooth = sum(np.roll(rough, (i, j), (0, 1)) for i in range(-3, 4) for j in range(-3, 4)) * 6
-    truth = 127.5 + np.asarray(smooth).ravel()
-    results: list[Reconstruction] = []
-    for kind in ("independent", "fit"):
-        scene = wide(SHAPE, noise={"variance": 4.0}, prior={"kind": kind}, estimator={"method": "frame"})
-        results.append(restore(recorded(scene, truth, 4.0), ideal_model(scene, derive(scene)), truth))
-    paper, fitted = results
-    assert fitted.fit is not None
-    assert not fitted.fit.doubtful
-    assert fitted.error is not None
-    assert paper.error is not None
-    assert fitted.error.mse < 0.2 * paper.error.mse
-    assert fitted.interval is not None
-    assert fitted.interval.low < fitted.error.mse < fitted.interval.high
-
-
 def test_the_prediction_of_a_frame_is_that_of_the_dense_problem() -> None:
     scene = wide(SMALL, noise={"variance": 1e-2}, estimator={"method": "frame"})
     camera = derive(scene)
@@ -171,18 +132,6 @@ def test_the_prediction_of_a_frame_is_that_of_the_dense_problem() -> None:
     assert prediction.trimmed_mse == pytest.approx(dense.trimmed_mse, rel=1e-3)
     assert prediction.degrees_of_freedom == pytest.approx(dense.expected.degrees_of_freedom, rel=1e-6)
     assert (prediction.rank, prediction.null_space, prediction.condition) == (None, None, None)
-
-
-@pytest.mark.slow
-def test_a_prediction_with_expected_noise_but_no_actual_noise() -> None:
-    scene = wide(SHAPE, noise={"variance": 0.0}, estimator={"method": "frame", "noise_variance": 1e-2})
-    camera = derive(scene)
-    model = ideal_model(scene, camera)
-    prediction = predict_frame(choose_method(scene, camera, exact=True), model, 0.0)
-    noise_free = replace(recorded(scene, drawn(), 0.0), scene=scene.model_copy(update={"noise": None}))
-    dense = restored_by("information", noise_free, model, None)
-    assert prediction.mse == pytest.approx(dense.expected.mse, rel=1e-3)
-    assert dense.budget()["noise"] == 0
 
 
 @pytest.mark.slow

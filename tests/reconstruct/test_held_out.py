@@ -28,7 +28,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import render
 
-from ..examples import GALLERY, THREE, TWO, familywise, scene
+from ..examples import GALLERY, THREE, familywise, scene
 from ..frames import P0, recorded, wide
 
 SMALL = (("1/3", [3, 3], [3, 3]), ("1/4", [4, 4], [2, 2]))
@@ -113,22 +113,6 @@ def test_the_two_factorisations_agree_within_the_precision_that_they_state(
         np.testing.assert_allclose(second.precision, first.precision, rtol=module.PRECISION)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lenses", [THREE, TWO, THREE[:1]], ids=["three", "two", "one"])
-def test_whitened_errors_of_each_sub_imager_are_standard_normal_over_draws(lenses: Any) -> None:
-    """Mean and mean square of 50 draws, two-sided, at a significance of 1 % for all sub-imagers together."""
-    draws = 50
-    camera = derive(scene(lenses=lenses))
-    problem = Problem(ideal_matrix(camera), independent(127.5, P0, 361), np.full(camera.measurements, 1e-2))
-    blocks = blocks_of(camera)
-    errors = [block_errors(problem, drawn(problem, seed), blocks) for seed in range(draws)]
-    limit = familywise(4 * len(blocks))
-    for index in range(len(blocks)):
-        z = np.concatenate([draw[index].whitened for draw in errors])
-        assert abs(z.sum()) / z.size**0.5 < stats.norm.isf(limit)
-        assert stats.chi2.isf(1 - limit, z.size) < z @ z < stats.chi2.isf(limit, z.size)
-
-
 def test_probabilities_are_right_beyond_the_range_of_float64() -> None:
     """For 2 a degrees of freedom, a an integer, the tail is exp(-x) times the sum of x^k / k! for k < a."""
     for half, value in [(1, 1.0), (5, 30.0), (12, 2e3), (50, 1e6), (8, 1e8), (3000, 3300.0), (3000, 1e5)]:
@@ -179,16 +163,6 @@ def test_a_sub_imager_moved_by_a_twentieth_of_a_pixel_is_the_one_that_is_named(i
     assert wrong.rms_error is not None
     assert wrong.expected_rms is not None
     assert wrong.rms_error > 2 * wrong.expected_rms
-
-
-@pytest.mark.slow
-def test_a_moved_sub_imager_is_named_on_a_photograph() -> None:
-    described = read(GALLERY / "tile19.toml")
-    camera = derive(described)
-    check = checked(described, moved(camera, [30], 0.05), load(described).ravel(), fitted=True)
-    assert names(check) == [camera.sub_imagers[30].name]
-    assert check.prior.fitted
-    assert check.prior.kind == "exponential"
 
 
 def test_several_wrong_sub_imagers_are_named_and_no_other() -> None:
@@ -266,16 +240,6 @@ def test_a_frame_is_checked_in_windows_stored_or_not() -> None:
     assert [entry.chi_squared for entry in again.sub_imagers] == pytest.approx(
         [entry.chi_squared for entry in check.sub_imagers], rel=1e-6
     )
-
-
-@pytest.mark.slow
-def test_a_frame_whose_h_is_a_guess_is_not_to_be_trusted_and_one_wrong_sub_imager_is_named() -> None:
-    described, camera = frame()
-    guess = checked(described, moved(camera, list(range(50)), 0.3), draw(camera))
-    assert not guess.verdict.trusted
-    assert not guess.explained
-    one = checked(described, moved(camera, [12], 0.3), draw(camera))
-    assert names(one) == [camera.sub_imagers[12].name]
 
 
 # --- edges of the domain

@@ -12,28 +12,24 @@ from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.errors import InputError
 
-from ..benchmarks.nasty import FAMILIES, SILENT, assess, nearly_equal_exact, nearly_equal_noisy
+from ..benchmarks.nasty import FAMILIES, SILENT, assess
 from ..exact_rationals import rational_answer, relative_error
 
 REFUSED = -1.0  # in place of an error
 EACH, FEW = 334, 12  # problems of every family: 5,010 of the long form
 # Those whose measurements without noise, or whose digits, float64 cannot tell apart.
-MOST_REFUSED = {
-    "nearly equal rows, noise-free": 1.0,
-    "contradiction": 0.65,
-    "singular prior": 0.6,
-    "denormal noise": 0.6,
-}
+MOST_REFUSED = {"nearly equal rows, noise-free": 1.0, "contradiction": 0.65, "singular prior": 0.5}
 
 
 @pytest.mark.parametrize("each", [FEW, pytest.param(EACH, marks=pytest.mark.slow)])
 def test_no_random_problem_is_silently_wrong(each: int) -> None:
-    """Every one is right to its stated bound, or refused; of most families two in three are answered."""
+    """Every one is right to its stated bound, or refused; few families refuse half, within 3 standard errors."""
     for family in FAMILIES:
         outcomes = [assess(family, seed) for seed in range(each)]
         assert [outcome for outcome in outcomes if outcome.outcome == SILENT] == []
         refused = sum(outcome.outcome == "refused" for outcome in outcomes) / each
-        assert refused <= MOST_REFUSED.get(family, 0.45), family
+        share = MOST_REFUSED.get(family, 0.45)
+        assert refused <= share + 3 * (share * (1 - share) / each) ** 0.5, family
 
 
 def test_a_bound_that_is_small_by_chance_does_not_count() -> None:
@@ -43,18 +39,6 @@ def test_a_bound_that_is_small_by_chance_does_not_count() -> None:
     noise = np.array([7.4696738971771692e-15, 1.4598793799778568e-22])
     recorded = np.array([-2111.8053177040797, -2111.805317724425])
     assert _excess(Problem(sparse.csr_array(matrix), prior, noise), recorded) <= 1
-    excesses = [_excess(nasty.problem, nasty.recorded) for nasty in map(nearly_equal_noisy, _generators(20))]
-    assert max(excesses) <= 1
-    assert sum(excess > REFUSED for excess in excesses) >= 15  # most are answered
-
-
-def test_rows_without_noise_that_differ_in_the_last_bit_are_answered_rightly_or_refused() -> None:
-    drawn = map(nearly_equal_exact, _generators(30))
-    assert max(_excess(nasty.problem, nasty.recorded) for nasty in drawn) <= 1
-
-
-def _generators(count: int) -> list[np.random.Generator]:
-    return [np.random.default_rng(seed) for seed in range(count)]
 
 
 def _excess(problem: Problem, recorded: np.ndarray) -> float:

@@ -4,26 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import fft
 
-from ommatid.reconstruct.frame.preconditioner import BoxMeans, is_sliding, preconditioner_for
+from ommatid.reconstruct.frame.preconditioner import is_sliding, preconditioner_for
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import Lenses, camera
-from ..frames import FITTED, P0, frame_camera, precision
-
-
-@pytest.mark.parametrize("width", [1, 2, 3, 5, 7])
-def test_antisymmetrically_continued_means_are_diagonal_under_the_sine_transform(width: int) -> None:
-    means = BoxMeans(width, 0, 40, 40)
-    waves = fft.idst(np.eye(40), 2, axis=0, norm="ortho")
-    np.testing.assert_allclose(means.mirrored_gram.toarray() @ waves, waves * means.transfer, atol=1e-13)
-
-
-def test_the_gram_matrix_is_that_of_the_averages() -> None:
-    means = BoxMeans(3, 2, 17, 19)
-    averages = np.array([[1 / 3 if start <= i < start + 3 else 0.0 for i in range(19)] for start in range(2, 15)])
-    np.testing.assert_allclose(means.gram.toarray(), averages.T @ averages, atol=1e-15)
+from ..frames import P0, frame_camera, precision
 
 
 @pytest.mark.parametrize(
@@ -55,16 +41,6 @@ def test_it_is_nearly_the_inverse(shape: tuple[int, int], noise: float) -> None:
     assert (energy_again <= energy * (1 + rounding)).all()
 
 
-def test_the_sine_transform_alone_bounds_the_precision() -> None:
-    """K <= M: the terms mirrored at the edges only add information."""
-    frame = frame_camera((31, 34))
-    preconditioner = preconditioner_for(frame, (100.0,) * 3, 1 / P0)
-    dense = precision(ideal_matrix(frame), np.full(frame.measurements, 100.0), 1 / P0)
-    waves = np.kron(*(fft.idst(np.eye(size), 2, axis=0, norm="ortho") for size in (31, 34)))
-    mirrored = waves @ (preconditioner.spectrum.ravel()[:, None] * waves.T)
-    assert np.linalg.eigvalsh(mirrored - dense).min() > -1e-9
-
-
 @pytest.mark.parametrize(
     ("lens", "expected"),
     [
@@ -80,7 +56,3 @@ def test_which_lens_types_are_shift_invariant(lens: Lenses, expected: bool) -> N
     if not expected:
         with pytest.raises(ValueError, match="lens type 'A' does not see every box"):
             preconditioner_for(frame, (1.0,), 1.0)
-
-
-def test_fitted_lens_types_are_shift_invariant() -> None:
-    assert all(is_sliding(lens_type) for lens_type in frame_camera((64, 64), FITTED).types)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from ommatid.reconstruct.measured_error import measure_error, trimmed_mean
-from ommatid.reconstruct.prediction import observability, predict
+from ommatid.reconstruct.prediction import predict
 from ommatid.reconstruct.prior import independent
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import read
@@ -49,9 +48,6 @@ def test_reference_values_of_extended_precision(
     [
         ("tile19", (), 1e-4, 1e-2, 0.0330911224, 1e-8),
         ("tile19", ("I", "II"), 1e-4, 1e-2, 484.191545, 1e-8),
-        ("tile19", (), 1e-2, 1.0, 35.5841883, 1e-8),
-        ("tile19", ("I", "II"), 1e-2, 1.0, 589.811609, 1e-8),
-        ("tile19", ("I", "I"), 1e-2, 1e-4, 2058.5, 2.5e-5),
         ("tile19", ("I", "II"), 1e-2, 1e-4, 489.606, 2.5e-5),
         ("tile19", (), 1e-2, 1e-4, 2.79766, 2.5e-5),
         pytest.param("tile35", (), 1.0, 1.0, 139.233, 2.5e-5, marks=pytest.mark.slow),
@@ -70,15 +66,6 @@ def test_reference_values_where_the_expectation_is_wrong(
         assert prediction.trimmed_mse == pytest.approx(1.85623, rel=5e-6)
 
 
-def test_every_stable_form_predicts_the_same() -> None:
-    camera = derive(read(GALLERY / "tile19.toml", (), ("I", "II")))
-    matrix, prior = ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361)
-    for form in ("square-root-information", "svd", "dual"):
-        prediction = predict(matrix, prior, 1e-6, EstimatorTable.model_validate({"method": form}), (19, 19))
-        assert prediction.mse == pytest.approx(484.100274, rel=3e-9)
-        assert prediction.method == form
-
-
 @pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I",)])
 @pytest.mark.parametrize("noise", [1e-6, 1.0])
 def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> None:
@@ -94,36 +81,6 @@ def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> Non
     assert prediction.rank == np.linalg.matrix_rank(matrix.toarray(), tol=1e-9)
     seen = values[: prediction.rank]
     assert prediction.condition == pytest.approx(seen[0] / seen[-1], rel=1e-6)
-
-
-@pytest.mark.parametrize("lenses", [(), ("I", "II"), ("I", "I")])
-def test_without_noise_the_error_is_the_null_space(lenses: tuple[str, ...]) -> None:
-    camera = derive(read(GALLERY / "tile19.toml", (), lenses))
-    prediction = predict(
-        ideal_matrix(camera), independent(PRIOR.mean, PRIOR.variance, 361), 0.0, EstimatorTable(), (19, 19)
-    )
-    assert prediction.null_space is not None
-    assert prediction.mse == pytest.approx(PRIOR.variance * prediction.null_space / 361, rel=1e-9, abs=1e-12)
-
-
-def test_the_papers_claims_that_two_and_one_type_are_worse() -> None:
-    mse = {}
-    for lenses in ((), ("I", "II"), ("I", "I")):
-        camera = derive(read(GALLERY / "tile19.toml", (), lenses))
-        matrix = ideal_matrix(camera)
-        prior = independent(PRIOR.mean, PRIOR.variance, 361)
-        for noise in (1e-6, 1e-2):
-            mse[len(set(lenses)), noise] = predict(matrix, prior, noise, EstimatorTable(), (19, 19)).mse
-    assert mse[1, 1e-6] == pytest.approx(mse[1, 1e-2], rel=1e-3), "the null space keeps one type from improving"
-    assert mse[2, 1e-2] < mse[1, 1e-2] / 4
-    assert mse[2, 1e-6] > 0.95 * mse[2, 1e-2]
-    assert mse[0, 1e-2] < mse[2, 1e-2] / 100
-    assert mse[0, 1e-6] < 1e-3 * mse[0, 1e-2]
-
-
-def test_the_identity_has_full_rank() -> None:
-    seen = observability(sparse.csr_array(np.eye(5)))
-    assert (seen.rank, seen.null_space, seen.condition) == (5, 0, pytest.approx(1))
 
 
 def test_measures_of_error() -> None:

@@ -22,7 +22,7 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..frames import P0, blurred, precision, recorded, wide
+from ..frames import P0, precision, recorded, wide
 
 SHAPE = (37, 34)
 VARIANCE = 1e-2
@@ -137,38 +137,6 @@ def test_other_conditions_compute_the_error_bars_again(change: str) -> None:
     assert np.abs(shared.expected.variance / restore(first, model).expected.variance - 1).max() > SAME_NOISE / 2
     bound = (shared.solver.bound or 0.0) + (alone.solver.bound or 0.0)
     assert np.abs((shared.estimate - alone.estimate) / np.sqrt(alone.expected.variance)).max() <= bound
-
-
-def test_an_uncertain_h_whose_noise_depends_on_the_image() -> None:
-    scene, _ = described((19, 17))
-    model, true = blurred(scene, 3e-3)
-    prepared = Prepared(model)
-    for seed in range(2):
-        stack = recorded(scene, drawn(seed, (19, 17)), VARIANCE, seed, true)
-        shared, alone = restore(stack, model, prepared=prepared), restore(stack, model)
-        assert shared.result.noise_difference is None
-        np.testing.assert_allclose(shared.expected.variance, alone.expected.variance, rtol=1e-3)
-        bound = (shared.solver.bound or 0.0) + (alone.solver.bound or 0.0)
-        assert np.abs((shared.estimate - alone.estimate) / np.sqrt(alone.expected.variance)).max() <= bound
-
-
-def test_another_model_shares_nothing() -> None:
-    scene, model = described((19, 17))
-    other = ideal_model(scene, derive(scene))
-    prepared = Prepared(model)
-    first, second = frames(scene, 2)
-    restore(first, model, prepared=prepared)
-    assert restore(second, other, prepared=prepared).result.noise_difference is None
-
-
-def test_the_least_difference() -> None:
-    values = np.array([1.0, 2.0, 0.0])
-    assert relative_difference(values, values.copy()) == 0
-    assert relative_difference(values, np.array([1.0, 2.5, 0.0])) == pytest.approx(0.25)
-    assert relative_difference(values, np.array([0.8, 2.0, 0.0])) == pytest.approx(0.25)
-    assert relative_difference(values, np.array([1.0, 2.0, 1e-9])) == np.inf
-    assert relative_difference(values, values[:2]) == np.inf
-    assert relative_difference(np.broadcast_to(1.0, 9), np.broadcast_to(1.1, 9)) == pytest.approx(0.1)
 
 
 @hypothesis.given(st.integers(0, 10**6), st.floats(1e-3, 0.5), st.booleans())

@@ -169,15 +169,6 @@ def test_dead_pixels_from_files(kept: Path, ommatid: Command) -> None:
     assert report["diagnostics"]["pixels_used"] == report["measurements"] - 1
 
 
-def test_chi_squared_of_the_residual_detects_a_wrong_noise() -> None:
-    right = restored(scene(lenses=THREE, noise=SENSOR))
-    assert right.residual is not None
-    assert abs(right.residual.chi_squared - right.residual.expected) < 4 * right.residual.deviation
-    wrong = restored(scene(lenses=THREE, noise=SENSOR, estimator={"noise_variance": 0.25}))
-    assert wrong.residual is not None
-    assert wrong.residual.chi_squared > wrong.residual.expected + 10 * wrong.residual.deviation
-
-
 @pytest.mark.slow
 def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     """On a photograph the error falls below a third, the noise is fitted, and both are in the table."""
@@ -199,23 +190,6 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     assert noise_alone.fit is not None
     assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.spread[0])
     assert noise_alone.prior.kind == "independent"
-
-
-@pytest.mark.parametrize(
-    "prior",
-    [
-        {"kind": "exponential", "correlation_length": "40 mm"},
-        pytest.param({"kind": "power", "exponent": 2.0}, marks=pytest.mark.slow),
-    ],
-)
-def test_correlated_priors_help_on_photographs(prior: dict[str, object]) -> None:
-    paper = restored(scene(lenses=THREE, noise=SENSOR))
-    smooth = restored(scene(lenses=THREE, noise=SENSOR, prior=prior))
-    assert paper.error is not None
-    assert smooth.error is not None
-    assert smooth.error.mse < paper.error.mse / 1.5
-    assert smooth.interval is not None
-    assert smooth.interval.low < smooth.error.mse < smooth.interval.high
 
 
 def test_the_mean_of_a_region() -> None:

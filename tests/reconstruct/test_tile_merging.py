@@ -8,9 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from ommatid.reconstruct.estimator.certificate import exact_variances
-from ommatid.reconstruct.estimator.estimate import estimate
-from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.reconstruct.forms.square_root import Indices
 from ommatid.reconstruct.methods.tile_merging import (
     Posterior,
@@ -26,10 +23,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.stability.exact_answer import exact_answer
 
-from ..examples import Lenses, camera, posterior_covariance
-from ..frames import FITTED
+from ..examples import Lenses, camera
 
-TILE = (19, 19)
 SMALL: Lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
 DEVIATION = 5461.25**0.5
 
@@ -68,32 +63,6 @@ def assert_same(first: Posterior, second: Posterior, tolerance: float) -> None:
     assert (difference <= tolerance * np.outer(deviation, deviation)).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lens_types", "columns", "noise", "error"),
-    [
-        (2, 38, 1e-6, 1e-11),
-        (3, 38, 1e-2, 1e-12),
-        (3, 57, 1e-6, 1e-11),
-        (2, 57, 1e-6, 1e-11),
-    ],
-)
-def test_a_row_of_tiles_is_the_estimate_of_the_frame(lens_types: int, columns: int, noise: float, error: float) -> None:
-    """With two lens types H has a null space. `error` is five times what the module states or more."""
-    problem, recorded = frame((19, columns), FITTED[:lens_types], noise)
-    merged = merge_tiles(problem, recorded, disjoint_tiles((19, columns), TILE))
-    direct = estimate(problem, recorded, "svd")
-    assert direct.solver.bound is not None
-    assert direct.solver.bound < error / 100
-    assert merged.mean == pytest.approx(direct.image, rel=0, abs=error * DEVIATION)
-    pixels = np.random.default_rng(1).choice(problem.unknowns, 100, replace=False)
-    variance, uncertainty = exact_variances(direct.form, ExactResiduals(problem), pixels)
-    assert (uncertainty < 1e-20 * variance).all()
-    assert merged.variance[pixels] == pytest.approx(variance, rel=1e-12)
-    ends = [0, problem.unknowns - 1]
-    assert merged.covariance[:, ends] == pytest.approx(posterior_covariance(direct.form, ends), rel=0, abs=1e-10)
-
-
 @pytest.mark.parametrize("noise", [1e-2, 1e-6])
 def test_small_tiles_in_exact_arithmetic(noise: float) -> None:
     """Two 7 x 6 tiles, and four of 4 x 6 and 3 x 6 that meet in a corner."""
@@ -129,29 +98,6 @@ def test_merging_never_raises_a_variance_and_one_tile_is_the_whole(seed: int) ->
     assert_same(merge_tiles(problem, recorded, tiles), whole, 1e-9)
     for tile in tiles:
         assert (whole.variance[tile] <= tile_posterior(problem, recorded, tile).variance * (1 + 1e-12)).all()
-
-
-@pytest.mark.slow
-def test_any_order_of_whole_tiles() -> None:
-    problem, recorded = frame((19, 57), FITTED, 1e-6)
-    tiles = disjoint_tiles((19, 57), TILE)
-    left, middle, right = (tile_posterior(problem, recorded, tile) for tile in tiles)
-    right_first = merge_posteriors(left, merge_posteriors(right, middle, problem, recorded), problem, recorded)
-    assert_same(right_first, merge_tiles(problem, recorded, tiles), 1e-9)
-    apart = merge_posteriors(left, right, problem, recorded)  # no measurement couples them
-    np.testing.assert_array_equal(apart.variance[apart.pixels % 57 < 19], left.variance)
-
-
-@pytest.mark.slow
-def test_errors_of_merged_tiles_agree_with_their_covariance() -> None:
-    """200 images drawn from the prior: e^T C^-1 e is chi squared with n degrees of freedom, within 3 deviations."""
-    problem, _ = frame((7, 12), SMALL, 1.0)
-    rng, draws, total, tiles = np.random.default_rng(3), 200, 0.0, disjoint_tiles((7, 12), (7, 6))
-    for _ in range(draws):
-        image = 127.5 + DEVIATION * rng.normal(size=84)
-        merged = merge_tiles(problem, problem.matrix @ image + rng.normal(size=problem.measurements), tiles)
-        total += float(np.square(np.linalg.solve(merged.root, image - merged.mean)).sum())
-    assert abs(total - 84 * draws) < 3 * (2 * 84 * draws) ** 0.5
 
 
 def test_dead_pixels_of_other_tiles_and_repeated_rows_have_no_effect() -> None:

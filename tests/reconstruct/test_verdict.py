@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -20,14 +19,14 @@ from ommatid.reconstruct.output.run_json import VerdictReport
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.reconstruct.verdict.residual_parts import WhitenedResidual, regions, residual_parts
-from ommatid.reconstruct.verdict.residual_power import ResidualInputs, ResidualPower
+from ommatid.reconstruct.verdict.residual_power import ResidualPower
 from ommatid.reconstruct.verdict.verdict import error_p_value, excesses
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..examples import THREE, camera, familywise, random_problem, scene, tile_problem
+from ..examples import THREE, camera, random_problem, scene, tile_problem
 from ..frames import FITTED, P0, recorded, wide
 
 NOISE = 1e-2
@@ -53,20 +52,6 @@ def test_the_leverage_is_the_diagonal_of_h_a(correlated: bool, shape: tuple[int,
     assert expected_error(form, {}, np.array([1])).leverage is None, "of some pixels only"
 
 
-def test_squares_of_the_residual_over_draws_of_the_prior_are_the_expected_ones() -> None:
-    """Each of M means of 4000 squares, within its standard error at a familywise significance of 1 %."""
-    problem, draws = random_problem(1, 9, 6, correlated=True), 4000
-    form, rng = information(problem), np.random.default_rng(2)
-    leverage = expected_error(form, {"noise": problem.noise_variance}).leverage
-    assert leverage is not None
-    images = problem.prior.root @ rng.normal(size=(6, draws))
-    noise = np.sqrt(problem.noise_variance)[:, None] * rng.normal(size=(9, draws))
-    deviations = problem.matrix @ images + noise
-    residuals = deviations - problem.matrix @ form.gain(deviations)
-    means = np.mean(residuals**2 / problem.noise_variance[:, None], axis=1) / (1 - leverage)
-    assert np.abs(means - 1).max() < stats.norm.isf(familywise(9) / 2) * (2 / draws) ** 0.5
-
-
 @pytest.mark.parametrize("factor", [1.0, 0.3, 4.0])
 def test_the_expected_squares_with_another_noise_and_for_a_known_image(factor: float) -> None:
     """Sums over all measurements against traces of explicit matrices; those of random draws within 5 deviations."""
@@ -89,11 +74,6 @@ def test_the_expected_squares_with_another_noise_and_for_a_known_image(factor: f
         assert abs(found.sum() - np.trace(whitened)) < 5 * deviation
     if factor == 1.0:
         assert power.prior == pytest.approx(1 - np.diagonal(gain), rel=1e-9), "exact"
-
-
-def columns(inputs: ResidualInputs, form: Any) -> Iterator[FloatArray]:
-    block = inputs.block()
-    yield from (block - form.problem.matrix @ form.gain(block)).T
 
 
 @pytest.mark.parametrize("method", ["frame", "tiles"])
@@ -286,12 +266,3 @@ def test_the_noise_that_is_known_counts_not_the_one_that_the_estimator_assumes()
     """Eq. 5 takes the known noise whatever the estimator expects, so its error bars hold."""
     for assumed in (1e-4, 1.0):
         assert verdict(stack_of(estimator={"noise_variance": assumed}), drawn_image()).trusted
-
-
-@pytest.mark.parametrize("spread", [1e-3, 0.3, 1.0, 5.0])
-def test_the_p_value_is_that_of_the_interval(spread: float) -> None:
-    """At either end of the interval it is that of its level, however wide the interval."""
-    whole = interval(50.0, (50.0 * spread) ** 2, 10)
-    assert error_p_value(whole.high, whole) == pytest.approx(0.005)
-    if whole.low > 0:
-        assert error_p_value(whole.low, whole) == pytest.approx(0.005)

@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from ommatid.reconstruct.estimator.estimate import FORMS, estimate
+from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_matrix
@@ -25,6 +24,7 @@ from ommatid.stability.cases import CHANGES, LENSES, StabilityCase, extreme_case
 from ommatid.stability.exact_answer import exact_answer
 from ommatid.stability.stability import AUTO, DIGITS, FEWER, REFUSED, RIGHT, SILENT, assess
 
+from ..exact_rationals import rational_answer
 from ..examples import GALLERY
 
 MATRICES = {
@@ -33,28 +33,6 @@ MATRICES = {
 SWEEP = [case for _, _, case in noise_sweep(MATRICES)]
 EXTREMES = list(extreme_cases(MATRICES))
 ALLOWED = {"solve": {RIGHT}, "solve or refuse": {RIGHT, REFUSED}, "refuse": {REFUSED}}
-
-
-def rational_answer(problem: Problem, g: FloatArray) -> tuple[list[Fraction], list[Fraction]]:
-    """Image and variances in rationals by sequential updates, which share no formula with the exact answer."""
-    image = [Fraction(value) for value in problem.prior.mean.tolist()]
-    roots = [Fraction(value) for value in problem.prior.root.tolist()]
-    count = len(image)
-    covariance = [[roots[i] ** 2 if i == j else Fraction(0) for j in range(count)] for i in range(count)]
-    for row, reading, noise in zip(
-        problem.matrix.toarray().tolist(), g.tolist(), problem.noise_variance.tolist(), strict=True
-    ):
-        h = [Fraction(value) for value in row]
-        direction = [sum((line[j] * h[j] for j in range(count)), Fraction(0)) for line in covariance]
-        innovation = sum((a * b for a, b in zip(h, direction, strict=True)), Fraction(noise))
-        if innovation == 0:
-            continue
-        residual = Fraction(reading) - sum((a * b for a, b in zip(h, image, strict=True)), Fraction(0))
-        image = [value + step * residual / innovation for value, step in zip(image, direction, strict=True)]
-        covariance = [
-            [covariance[i][j] - direction[i] * direction[j] / innovation for j in range(count)] for i in range(count)
-        ]
-    return image, [covariance[i][i] for i in range(count)]
 
 
 def small_problem(seed: int) -> tuple[Problem, FloatArray]:
@@ -115,10 +93,12 @@ def case_of(problem: Problem, g: FloatArray) -> StabilityCase:
 def test_the_exact_answer_is_the_rational_one(seed: int) -> None:
     problem, g = small_problem(seed)
     answer = exact_answer(problem, g)
-    if answer.contradiction > 0:  # the rounding of g without noise: sequential updates would depend on their order
+    if answer.contradiction > 0:  # the rounding of g without noise: the answer would depend on the order of rows
         return
-    image, variance = rational_answer(problem, g)
-    for exact, rational in ((answer.image, image), (answer.variance, variance)):
+    rationals = rational_answer(problem, g)
+    prior = zip(problem.prior.mean.tolist(), problem.prior.root.tolist(), rationals.coefficients, strict=True)
+    image = [Fraction(mean) + Fraction(root) * coefficient for mean, root, coefficient in prior]
+    for exact, rational in ((answer.image, image), (answer.variance, rationals.variance)):
         largest = max(abs(value) for value in rational)
         for high, low, value in zip(exact.high.tolist(), exact.low.tolist(), rational, strict=True):
             assert abs(Fraction(high) + Fraction(low) - value) <= Fraction(1, 10**25) * largest
@@ -145,20 +125,6 @@ def test_graded_problems_have_no_silent_loss(seed: int) -> None:
     assert assess(case_of(problem, g), method, exact_answer(problem, g)).verdict != SILENT
 
 
-@pytest.mark.slow
-def test_most_small_problems_are_solved() -> None:
-    """Refusing all problems would pass the tests above; at least 180 of 200 have to be solved."""
-    solved = 0
-    for seed in range(200):
-        problem, g = small_problem(seed)
-        try:
-            estimate(problem, g)
-        except InputError:
-            continue
-        solved += 1
-    assert solved >= 180
-
-
 @pytest.mark.parametrize("cases", [SWEEP[18:21:2], pytest.param(SWEEP, marks=pytest.mark.slow)], ids=["few", "all"])
 def test_every_noise_variance_with_every_form(cases: list[StabilityCase]) -> None:
     """`auto` has nine digits in the estimate and every variance; no form has fewer digits than it states."""
@@ -177,17 +143,6 @@ def test_every_extreme_case_is_right_or_refused(cases: list[StabilityCase]) -> N
         outcome = assess(case, AUTO, answer)
         assert outcome.verdict in ALLOWED[case.required], outcome
         assert "\n" not in outcome.reason
-
-
-@pytest.mark.slow
-def test_no_form_has_a_silent_loss_on_the_hardest_cases() -> None:
-    """Cases for which `auto` takes the most robust forms: every other form refuses or states its error."""
-    words = ("1e-12 to 1e12, noise 1e-12", "beside", "no noise")
-    hardest = [case for case in EXTREMES if any(word in case.name for word in words)]
-    assert len(hardest) >= 9
-    for case in hardest:
-        answer = exact_answer(case.problem, case.recorded)
-        assert SILENT not in {assess(case, form, answer).verdict for form in FORMS}
 
 
 def test_an_error_of_one_in_a_million_is_a_silent_loss() -> None:

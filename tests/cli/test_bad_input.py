@@ -267,13 +267,6 @@ def test_a_withdrawn_option_names_what_replaces_it(here: Path, ommatid: Command)
     assert [path.name for path in here.iterdir()] == ["tiny.toml"]
 
 
-def test_the_pickled_file_would_run_code_if_it_were_loaded(here: Path, kept: Path) -> None:
-    pickled(here)
-    with np.load(kept / "model.npz", allow_pickle=True) as archive:
-        assert archive["data"].size == 1
-    assert (here / "unpickled").exists()
-
-
 def test_a_stack_and_a_model_of_different_cameras_are_refused(here: Path, kept: Path, ommatid: Command) -> None:
     for changed, key in (
         ("camera.lens.I.array=[2,2]", "camera.lens.I"),

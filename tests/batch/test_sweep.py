@@ -69,15 +69,10 @@ def test_wrong_sweeps_are_refused_before_any_work(here: Path, ommatid: Command) 
     for options, message in (
         (["noise.variance"], "expected KEY=VALUE,VALUE,..."),
         (["noise.variance="], "without an empty value"),
-        (["noise.variance=1,,2"], "without an empty value"),
-        (["=1,2"], "expected KEY=VALUE"),
         (["noise.variance=1,1"], "got '1' twice"),
         (["noise.variance=1", "noise.variance=2"], "--sweep noise.variance=2: expected every key once, got it twice"),
         (["noise.varience=1,2"], "unknown key 'noise.varience'; the nearest known key is 'noise.variance'"),
-        (["noice.variance=1,2"], "unknown key 'noice'"),
         (["camera.lens.II.pixels=[2,2]"], "no lens type is called 'II'; there are 'I'"),
-        (["camera.lens.I.pixles=[2,2]"], "unknown key 'camera.lens.I.pixles'"),
-        (["noise.variance.x=1"], "noise.variance.x"),
     ):
         words = (part for option in options for part in ("--sweep", option))
         ended = ommatid("predict", "tiny.toml", "-o", "out", *words)

@@ -508,6 +508,13 @@ def test_the_sentence_compares_measured_and_expected_error(
     assert sentence in words.sentence(described(**error))
 
 
+def test_the_sentence_states_the_gain_over_a_single_sub_image() -> None:
+    baseline = {"sub_imager": "I.00.01", "mse": 40.0, "psnr": 32.1, "ssim": 0.5}
+    known = {"mse": 4.0, "psnr": 42.1, "baseline": baseline}
+    assert "10.0 dB better than the best single sub-image, I.00.01" in words.sentence(described(**known, gain=10.0))
+    assert "3.0 dB worse than" in words.sentence(described(**known, gain=-3.0))
+
+
 def test_without_trust_the_sentence_says_nothing_of_the_gain() -> None:
     baseline = {"sub_imager": "I.00.01", "mse": 40.0, "psnr": 32.1, "ssim": 0.5}
     report = described(mse=9.0, expected_given_truth=INTERVAL, baseline=baseline, gain=6.5)

@@ -107,6 +107,14 @@ def test_a_shift_is_measured_in_the_unit_of_its_quantity(before: Done) -> None:
     assert interval == "interval 0.5 (relative) at error.expected_given_truth.high"
 
 
+def test_numbers_that_are_none_and_other_shapes_are_beyond_every_finite_tolerance(before: Done) -> None:
+    broken = TRUTH + NOISE[1]
+    broken[0, 0] = np.nan
+    assert compared(before, within={"estimate": 1e9}, estimate=broken).startswith("estimate inf")
+    assert compared(before, within={"H": 1e9}, H=sparse.csr_array(np.eye(41, 30))).startswith("H inf")
+    assert compared(before, within={"stack": 1e9}, readings=TRUTH[:3]).startswith("stack inf")
+
+
 def test_another_verdict_is_noticed_in_every_kind_of_comparison(before: Done) -> None:
     change: dict[str, Any] = {"report": {"verdict.trusted": False}}
     assert "verdict" in compared(before, **change)

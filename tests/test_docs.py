@@ -202,17 +202,6 @@ def execute(block: Block, namespace: dict[str, Any]) -> None:
                 assert agree(printed_line, stated_line), f"printed: {printed_line}, stated: {stated_line}"
 
 
-@pytest.mark.parametrize(
-    ("printed", "expected"),
-    [
-        *(("2.7925345 361", True), ("2.7934999 361", True), ("2.7935345 361", False)),
-        *(("2.7905345 361", False), ("2.793 362", False), ("2.793 m", False)),
-    ],
-)
-def test_outputs_are_compared_to_the_stated_digits(printed: str, expected: bool) -> None:
-    assert agree(printed, "2.793 361") is expected
-
-
 def parse_toml(block: Block) -> None:
     """Parse a TOML block as a scene, or as a part of tile19 that replaces the tables of that scene."""
     data = tomllib.loads(block.text)
@@ -269,14 +258,8 @@ def is_documented(key: str, keys: set[str]) -> bool:
     return key in keys or any(key.startswith(f"{parent}.") and parent in keys for parent in DOCUMENTED_AS_ONE)
 
 
-def test_undocumented_files_and_keys_are_reported(finished: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(finished, tmp_path / "run")
-    assert undocumented(folder) == []
-    (folder / "extra.png").touch()
-    document = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    document["error"]["another"] = 1
-    (folder / "run.json").write_text(json.dumps(document), encoding="utf-8")
-    assert undocumented(folder) == ["extra.png", "error.another"]
+def test_files_and_keys_of_a_run_are_documented(finished: Path) -> None:
+    assert undocumented(finished) == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

@@ -27,7 +27,7 @@ from .benchmarks import f_numbers
 from .conftest import Command, shell
 from .documentation import DOCS, PAGES, Block, blocks, page_name, text_of
 from .examples import GALLERY
-from .printed_figures import check_figures, is_printed, stated_figures, unchecked_decimals
+from .printed_figures import check_figures, is_printed, unchecked_decimals
 
 STARTER = str(GALLERY / "starter.toml")
 needs_fast_backend = pytest.mark.skipif(bool(unusable_reason("llvm_ad_mono")), reason="needs the fast backend")
@@ -391,20 +391,3 @@ def test_every_decimal_number_of_a_page_is_checked() -> None:
     assert not left, "check them with check_figures in the test of the command that prints them"
     superfluous = {place for place in NOT_PRINTED if place[1] is not None and place not in found}
     assert (superfluous, whole - {name for name, _ in found}) == (set(), set()), "exceptions for no decimal number"
-
-
-def test_a_wrong_figure_is_reported() -> None:
-    sentence = "it is {} for `tile19`"
-    assert stated_figures("noise.md", sentence) == ("280",)
-    check_figures("noise.md", sentence, 279.78)
-    for value in (279.4, 281.0):
-        with pytest.raises(AssertionError, match="states 280"):
-            check_figures("noise.md", sentence, value)
-
-
-def test_outputs_are_compared_without_frames_and_times() -> None:
-    printed = "┌──────┬──────┐\n│ rank │ 3481 │\n│ time │ 3 s  │\n│ error │ 1.286 per │\n│      │ pixel │\n└──┘"
-    assert is_printed("rank   3481\ntime 12.5 s\nerror  1.286 per pixel", printed)
-    assert not is_printed("rank   3482", printed)
-    assert not is_printed("error  1.285 per pixel", printed)
-    assert not is_printed("error  1.286 per pixel\nrank 3481", printed), "another order"

@@ -155,13 +155,6 @@ def test_a_run_is_not_repeated(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.image, second.image)
 
 
-def test_a_prediction_is_that_of_the_reference() -> None:
-    predicted = ommatid.predict(ommatid.read_scene("tile19", set="noise.variance=1e-6", lens="I, II"), rays=False)
-    assert predicted.mse == pytest.approx(484.100, rel=1e-5)  # six digits, of the reference
-    assert predicted.rank == 329
-    assert ommatid.predict("tile19", rays=False).unknowns == 361
-
-
 def test_maps_have_the_shape_of_the_target(result: ommatid.Result) -> None:
     assert result.image.shape == result.deviation.shape == (19, 19)
     assert result.truth is not None
@@ -184,13 +177,6 @@ def test_samples_are_chosen_for_the_stack_where_there_is_one() -> None:
     recorded = ommatid.render(chosen)
     records = [ommatid.calibrate(chosen, known).record["fingerprint"] for known in (recorded, None)]
     assert records[0] != records[1]
-
-
-def test_a_report_is_one_page_with_the_error(result: ommatid.Result, tmp_path: Path) -> None:
-    page = result.report(tmp_path / "report.html")
-    text = page.read_text(encoding="utf-8")
-    assert text.rstrip().endswith("</html>")
-    assert "The paper&#39;s 19 x 19 tile" in text or "The paper's 19 x 19 tile" in text
 
 
 # --- H as an operator
@@ -260,14 +246,6 @@ def test_everything_shows_itself(
     np.testing.assert_array_equal(pictures(shown[0]._repr_html_())[0], ommatid.target_image(scene))
 
 
-def test_a_title_is_text_and_a_picture_that_is_gone_is_said(tmp_path: Path) -> None:
-    shown: Any = ommatid.read_scene("tile19", set=["title=<b>bold</b>", f"target.image={tmp_path / 'gone.png'}"])
-    html = shown._repr_html_()
-    assert "&lt;b&gt;bold&lt;/b&gt;" in html
-    assert "there is no picture" in html
-    assert pictures(html) == []
-
-
 # --- errors
 
 
@@ -309,12 +287,6 @@ def test_a_truth_that_is_none_is_said(stack: ommatid.Stack, model: ommatid.Model
     for truth, words in wrong:
         with pytest.raises(ommatid.InputError, match=f"truth: {words}"):
             ommatid.reconstruct(stack, model, truth)
-
-
-def test_a_run_with_another_estimate_is_said(kept: Path) -> None:
-    (kept / "estimate.exr").write_bytes((kept / "stack.exr").read_bytes())
-    with pytest.raises(ommatid.InputError, match=r"estimate\.exr: expected the estimate and its variance"):
-        ommatid.read_result(kept)
 
 
 @pytest.fixture(name="ommatid_command")

@@ -9,9 +9,7 @@ import sys
 import warnings
 from pathlib import Path
 
-import pytest
-
-from .modules import LINKED, ROOT, circles, existing, imports, modules, tree
+from .modules import LINKED, ROOT, circles, imports, modules, tree
 
 RENDERER = {"mitsuba", "drjit"}
 DEEPEST = 38  # modules in a chain of imports
@@ -118,11 +116,6 @@ def _texts(path: Path) -> list[str | bytes]:
         elif isinstance(node, ast.Constant) and isinstance(node.value, str | bytes) and id(node) not in docstrings:
             texts.append(node.value)
     return texts
-
-
-def test_names_of_modules_that_do_not_exist_are_errors() -> None:
-    with pytest.raises(ModuleNotFoundError):
-        existing("ommatid.scenes.camera", "ommatid.scenes.no_such_module")
 
 
 def test_packages_export_nothing() -> None:

@@ -29,13 +29,6 @@ def test_a_run_removes_the_temporary_files_of_a_killed_one(kept: Path, ommatid: 
     assert {path.name for path in kept.iterdir()} == FILES
 
 
-def test_a_folder_named_as_a_temporary_file_stays(kept: Path, ommatid: Command) -> None:
-    (kept / ".stack.exr.partial.npz").mkdir()
-    ended = ommatid("render", "tiny.toml", "-o", "out", "--force")
-    assert (ended.code, ended.err) == (0, "render: done, out/tiny/stack.exr\n")
-    assert (kept / ".stack.exr.partial.npz").is_dir()
-
-
 # --- the number of processes
 
 

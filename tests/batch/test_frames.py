@@ -123,16 +123,6 @@ def test_other_options_make_every_frame_again(film: Path, tmp_path: Path, ommati
         assert "up to date" not in ended.err
 
 
-def test_two_stacks_of_one_name_are_refused(film: Path, tmp_path: Path, ommatid: Command) -> None:
-    other = tmp_path / "f0.exr"
-    other.write_bytes((film / "f1.exr").read_bytes())
-    ended = ommatid("reconstruct", film / "f0.exr", other, film / "model.npz", "-o", tmp_path / "out")
-    assert ended.code == 2
-    assert "expected stacks of different names, got two 'f0'" in ended.err
-    assert str(other) in ended.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_frame_of_another_camera_is_refused_before_anything_is_written(
     film: Path, tmp_path: Path, ommatid: Command
 ) -> None:

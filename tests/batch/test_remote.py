@@ -26,7 +26,6 @@ from ommatid.pipeline.stages import open_scene, results, run
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.renderer.world import files
 
 from ..conftest import TINY, Command
 from ..runs import assert_same_content, content
@@ -90,26 +89,11 @@ def test_messages_about_a_world_name_the_users_files(deep: Path, here: Path) -> 
     assert f"world.file: {here / 'places' / 'world.xml'}" in str(outcome.error)
 
 
-def test_the_files_of_a_world_keep_their_places(deep: Path, tmp_path: Path) -> None:
-    package = packed_world(open_scene(deep, OUTSIDE_TOO).scene)
-    assert package.contents.keys() == {"places/world.xml", "places/wall.xml", "pictures/wall.png"}
-    assert unpacked_world(package, tmp_path / "copy") == tmp_path / "copy" / "places" / "world.xml"
-    for name, written in package.contents.items():
-        assert (tmp_path / "copy" / name).read_bytes() == (deep.parent / name).read_bytes() == written
-
-
 def test_a_file_with_an_absolute_name_is_refused(deep: Path, here: Path) -> None:
     picture = here / "pictures" / "wall.png"
     (here / "places" / "wall.xml").write_text(WALL.format(picture=picture), encoding="utf-8")
     with pytest.raises(InputError, match=r"deep\.toml: world\.file: names .*wall\.png, which other machines"):
         packed_world(open_scene(deep, OUTSIDE_TOO).scene)
-
-
-def test_the_file_of_a_spectrum_belongs_to_its_world(deep: Path, here: Path) -> None:
-    lamp = '<emitter type="constant"><spectrum name="radiance" filename="lamp.spd"/></emitter>'
-    (here / "places" / "wall.xml").write_text(f'<scene version="3.0.0">{lamp}</scene>', encoding="utf-8")
-    (here / "places" / "lamp.spd").write_text("400 1\n700 1\n", encoding="utf-8")
-    assert [path.name for path in files(open_scene(deep, OUTSIDE_TOO).scene)] == ["world.xml", "wall.xml", "lamp.spd"]
 
 
 OUTSIDE = ("../x", "a/../../x", "/elsewhere/x", "..", "", "a/b/../../../x")

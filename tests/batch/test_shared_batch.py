@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import threading
@@ -24,7 +23,7 @@ from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 
 from ..conftest import TINY, Command, Ended, interpreter, shell
-from ..runs import FILES, assert_same_content, content, numbers, without
+from ..runs import FILES, assert_same_content, content, numbers
 
 SEEDS = (1, 2, 3)
 
@@ -86,35 +85,6 @@ def test_a_batch_gives_the_same_files_wherever_it_is_done(
 
 
 @pytest.mark.slow
-def test_a_batch_on_processes_imports_no_dask(here: Path) -> None:
-    scenes = write_scenes(here)
-    ended = shell("render", *scenes, "-o", "out", "--workers", "2", cwd=here, before=without("distributed"))
-    assert ended.code == 0, ended.err
-
-
-@pytest.mark.slow
-def test_results_that_are_up_to_date_here_are_not_made_again_on_a_cluster(
-    scenes: list[str], here: Path, address: str, alone: tuple[Path, Ended], ommatid: Command
-) -> None:
-    shutil.copytree(alone[0], here / "out")
-    (here / "out" / "seed2" / "model.npz").unlink()
-    made = [path for path in (here / "out").glob("*/*") if path.name not in ("scene.toml", "truth.exr")]
-    before = {path: path.stat().st_mtime_ns for path in made}
-    ended = ommatid("run", *scenes, "-o", "out", "--scheduler", address)
-    stages = [line for line in ended.err.splitlines() if "up to date" not in line]
-    report = Path("out") / "seed2" / "report.html"
-    assert stages == ["calibrate: done", "reconstruct: done", f"report: done, {report}"]
-    changed = {path for path in before if path.stat().st_mtime_ns != before[path]}
-    # The new model differs from the old one in the time that it took. So do run.json, the fingerprint in estimate.exr,
-    # and the page; the pictures are the same, and are not sent.
-    assert {path.relative_to(here / "out").parts for path in changed} == {
-        ("seed2", "estimate.exr"),
-        ("seed2", "run.json"),
-        ("seed2", "report.html"),
-    }
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("options", [["--workers", "2"], ON_A_CLUSTER])
 def test_failures_of_scenes_are_independent_and_their_messages_the_same(
     options: list[str], here: Path, scenes: list[str], request: pytest.FixtureRequest, ommatid: Command
@@ -135,16 +105,6 @@ def test_failures_of_scenes_are_independent_and_their_messages_the_same(
     assert sorted(messages[0]) == sorted(messages[1])
     assert [document.get("exit_code", 0) for document in json.loads(shared.out)] == [0, 2, 2, 2, 0]
     assert [document["scene"] for document in json.loads(shared.out)] == list(batch[1:-1])
-
-
-@pytest.mark.slow
-def test_renderings_can_be_shared(scenes: list[str], here: Path, address: str, ommatid: Command) -> None:
-    ended = ommatid("render", *scenes, "-o", "out", "--scheduler", address, "--json")
-    assert ended.code == 0, ended.err
-    for document, scene in zip(json.loads(ended.out), scenes, strict=True):
-        folder = here / "out" / Path(scene).stem
-        assert document["file"] == str(Path("out") / folder.name / "stack.exr")
-        assert {path.name for path in folder.iterdir()} == {"scene.toml", "truth.exr", "stack.exr"}
 
 
 # --- commands that are stopped
@@ -235,19 +195,6 @@ def test_ctrl_c_that_a_callback_drops_is_noticed(here: Path, scenes: list[str]) 
     assert "Exception ignored in: <function slow" in messages, "the callback dropped nothing"
     assert messages.endswith(STOPPED)
     assert command.returncode == 1
-
-
-@pytest.mark.slow
-def test_workers_end_when_the_command_is_killed(here: Path) -> None:
-    for name in ("one", "two"):
-        (here / f"{name}.toml").write_text(LONG, encoding="utf-8")
-    with started("run", "one.toml", "two.toml", "-o", "out", "--workers", "2") as command:
-        for name in ("one", "two"):
-            wait_for(here / "out" / name / "stack.exr")
-        children = psutil.Process(command.pid).children(recursive=True)
-        command.kill()
-    assert len(children) >= 2
-    assert psutil.wait_procs(children, timeout=30)[1] == []
 
 
 # --- scenes sent to another machine

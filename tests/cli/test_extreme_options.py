@@ -67,11 +67,3 @@ def test_combinations_of_a_sweep_are_counted_before_they_are_made() -> None:
         sweep_axes([f"noise.variance={values},7"])
     assert len(str(refusal.value)) <= 300
     assert len(members([Path("s.toml")], axes[:1], Path("out"))) == 2000
-
-
-def test_arguments_that_are_not_utf_8_are_refused(here: Path, ommatid: Command) -> None:
-    for arguments in (("show", "\udcff.toml"), ("run", "tiny.toml", "-o", "o\udcff"), ("\udce4",)):
-        ended = ommatid(*arguments)
-        assert (ended.code, ended.out) == (2, "")
-        assert "expected names and values in UTF-8, got" in ended.err
-    assert [path.name for path in here.iterdir()] == ["tiny.toml"]

@@ -5,8 +5,6 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import pytest
-
 from ..conftest import Command
 
 STARTS = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
@@ -53,20 +51,3 @@ def test_show_draws_the_camera(here: Path, ommatid: Command) -> None:
     assert figures(here, "camera") == {".svg", ".pdf"}
     assert "camera.svg: written" in ended.err
     assert "lens pitch" in (here / "camera.svg").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--figure", "camera.gif"), "--figure camera.gif: expected a file that ends in .png, .svg, .pdf"),
-        (("--figure", "none/camera.png"), "none/camera.png: the folder none does not exist"),
-        (("--figure", "a.png", "--figure-format", "eps"), "--figure-format eps: expected some of png, svg, pdf"),
-    ],
-)
-def test_wrong_files_of_a_drawing_are_refused(
-    options: tuple[str, ...], message: str, here: Path, ommatid: Command
-) -> None:
-    ended = ommatid("show", "tiny.toml", *options)
-    assert (ended.code, ended.out) == (2, "")
-    assert ended.err.startswith(f"ommatid: {message}")
-    assert sorted(path.name for path in here.iterdir()) == ["tiny.toml"]

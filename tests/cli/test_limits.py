@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import struct
-import warnings
 import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from ommatid.runtime.errors import InputError, shortened, shortened_repr
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory, free_memory
 from ommatid.scenes import camera, model_file, scene
-from ommatid.scenes.formats import exr, lens_file, npz, picture_file
-from ommatid.scenes.hardware import frames
+from ommatid.scenes.formats import lens_file, npz, picture_file
 from ommatid.scenes.optics.blur import blur_of
 
 from ..conftest import TINY, Command, shell
@@ -99,23 +96,6 @@ def test_impossible_file_names_are_refused(tmp_path: Path) -> None:
                 read(tmp_path, f'{key}="{name}"')
 
 
-def test_messages_stay_short(tmp_path: Path) -> None:
-    assert len(shortened_repr({"a" * 1000: ["b" * 1000] * 1000})) < 700
-    assert shortened("a") == "a"
-    assert len(shortened("a" * 1000)) < 100
-    long = "x" * 9000
-    changes = (f"{long}=1", "title=[" + "1," * 9000 + "]", f"prior.kind={long}", f"render.samples={long}", long)
-    for change in changes:
-        with pytest.raises(InputError) as refused:
-            read(tmp_path, change)
-        assert len(str(refused.value)) < 600
-    named = [f"--set camera.lens.{'x' * 999}.step=1"]
-    data = {"camera": {"lens": [{"name": "n" * 999 + str(number)} for number in range(99)]}}
-    with pytest.raises(InputError, match="89 more") as refused:
-        scene.with_changes(data, tmp_path, [named[0].removeprefix("--set ")], ())
-    assert len(str(refused.value)) < 2500
-
-
 def test_a_blur_that_cannot_be_computed_is_refused() -> None:
     lens = example().camera.lens[0]
     for update in ({"aperture": 1e4, "focus": 1.0}, {"aperture": 1e-3}):
@@ -126,20 +106,6 @@ def test_a_blur_that_cannot_be_computed_is_refused() -> None:
 
 
 # Files
-
-
-@pytest.mark.slow
-def test_many_pages_need_the_memory_of_their_own_number_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import tifffile
-
-    tifffile.imwrite(tmp_path / "a.tif", np.zeros((40, 1000, 1000), np.uint16), photometric="minisblack")
-    monkeypatch.setattr(
-        "ommatid.runtime.memory.free_memory", lambda: 110 * 10**6
-    )  # two bytes a number; one page as floats
-    assert len(frames.pictures_of(tmp_path / "a.tif", "images")) == 40
-    monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 100 * 10**6)
-    with pytest.raises(InputError, match=r"a.tif: to read it needs 0.104 GB of memory, 0.1 GB are free"):
-        frames.pictures_of(tmp_path / "a.tif", "images")
 
 
 def npy_of(shape: str, kind: str = "<f8") -> bytes:
@@ -161,18 +127,6 @@ def test_an_array_smaller_than_its_header_states_is_refused(tmp_path: Path) -> N
         model_file.read(tmp_path / "a.npz")
 
 
-def test_headers_of_old_versions_are_read_without_a_warning(tmp_path: Path) -> None:
-    (tmp_path / "a.npy").write_bytes(npy_of("(2L, 4L)"))  # as Python 2 wrote them
-    assert picture_file.decode(tmp_path / "a.npy", "here").shape == (2, 4)
-    (tmp_path / "a.npy").write_bytes(npy_of("(8,)", "|a8"))  # NumPy 2.5 reads it no more, and says so by itself
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            assert npz.array(tmp_path / "a.npy").shape == (8,)
-        except ValueError:
-            assert np.lib.NumpyVersion(np.__version__) >= "2.5.0"
-
-
 def png_of(rows: int, columns: int) -> bytes:
     """Return a PNG file whose header states a size, with almost no pixels."""
 
@@ -189,27 +143,6 @@ def test_a_picture_beyond_the_memory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(png_of(10**6, 10**6))
     with pytest.raises(InputError, match=r"here: .*a.png: to read it needs 2.4e\+04 GB of memory, .* GB are free"):
         picture_file.decode(tmp_path / "a.png", "here")
-
-
-@pytest.mark.slow
-def test_a_large_picture_is_read_without_a_warning(tmp_path: Path) -> None:
-    from PIL import Image
-
-    limit = Image.MAX_IMAGE_PIXELS
-    pixels = np.zeros((9500, 9500), np.uint8)  # from 89 million pixels on Pillow warns
-    pixels[3, 5] = 7
-    Image.fromarray(pixels).save(tmp_path / "a.png", compress_level=1)
-    decoded = picture_file.decode(tmp_path / "a.png", "here")
-    assert (decoded.shape, int(decoded[3, 5]), int(decoded.sum())) == ((9500, 9500), 7, 7)
-    assert limit == Image.MAX_IMAGE_PIXELS
-
-
-@pytest.mark.slow
-def test_an_exr_picture_beyond_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    exr.write(tmp_path / "a.exr", [exr.Part("one", {"Y": np.zeros((4000, 4000), np.float32)}, {})])
-    monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 10**8)
-    with pytest.raises(InputError, match=r"a.exr: to read it needs 0.128 GB of memory, 0.1 GB are free"):
-        exr.read(tmp_path / "a.exr")
 
 
 # Memory

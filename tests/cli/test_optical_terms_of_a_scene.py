@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-import ommatid as interface
 from ommatid.scenes.scene import read
 
 from ..conftest import Command
@@ -48,12 +47,6 @@ def test_show_prints_the_terms_and_warns_of_what_is_left_out(phone: str, ommatid
     assert shown["camera"]["lenses"] == 50
 
 
-def test_lenses_of_f_4_leave_the_stated_null_space(phone: str) -> None:
-    lenses = [f"camera.lens.{name}.f_number=4" for name in COARSE]
-    prediction = interface.predict(interface.read_scene(phone, set=["noise.bits=11", *lenses]), rays=False)
-    assert f"a null space of {prediction.null_space} of {prediction.unknowns} dimensions" in text_of(PAGE)
-
-
 @pytest.mark.parametrize("command", [("run", "-o", "out"), ("render", "-o", "out"), ("export", "-o", "out.xml")])
 def test_a_scene_without_a_picture_is_not_rendered(command: tuple[str, ...], phone: str, ommatid: Command) -> None:
     ended = ommatid(command[0], phone, *command[1:])
@@ -61,11 +54,3 @@ def test_a_scene_without_a_picture_is_not_rendered(command: tuple[str, ...], pho
     assert "target.image is absent, so there is nothing to render; name a picture" in ended.err
     assert not Path("out").exists()
     assert not Path("out.xml").exists()
-
-
-def test_a_sweep_of_predictions_and_a_design_need_no_picture(phone: str, ommatid: Command) -> None:
-    swept = ommatid("predict", phone, "--no-rays", "--sweep", "noise.bits=10,11", "--json")
-    errors = [row["mse"] for row in json.loads(swept.out)]
-    assert errors == pytest.approx([1.456, 0.3642], rel=1e-3)
-    ranked = ommatid("design", phone, "--lens", "I", "--candidates", "1/2", "--json")
-    assert json.loads(ranked.out)["candidates"][0]["expected"]["mse"] < json.loads(ranked.out)["before"]["mse"]

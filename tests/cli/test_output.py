@@ -69,20 +69,6 @@ def test_the_error_of_a_grey_level_is_a_grey_level() -> None:
 # --- help, version, completion
 
 
-def test_the_version_is_that_of_the_package(ommatid: Command) -> None:
-    from importlib.metadata import version
-
-    assert ommatid("--version").out == f"ommatid {version('ommatid')}\n"
-
-
-@pytest.mark.parametrize("command", [(), ("run",), ("reconstruct",), ("init",)])
-def test_a_bare_call_prints_the_help(command: tuple[str, ...], ommatid: Command) -> None:
-    ended = ommatid(*command)
-    assert (ended.code, ended.out) == (2, "")
-    assert ended.err.startswith("Usage: ")
-    assert "Missing" not in ended.err
-
-
 def test_commands_and_scenes_of_the_gallery_are_completed(ommatid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("_OMMATID_COMPLETE", "complete_bash")
     for words, number, expected in (
@@ -176,17 +162,6 @@ def test_what_is_lost_of_a_picture_is_said_in_one_warning(
         assert ended.code == 0, ended.err
         assert [words in line for line in ended.err.splitlines()] == ([True] if words else [])
         assert all(line.startswith("warning: ") for line in ended.err.splitlines())
-
-
-def test_colours_of_recorded_frames_are_said_to_be_lost(here: Path, ommatid: Command) -> None:
-    assert here.is_dir()
-    for shape, name in (((3, 3, 3), "colour"), ((3, 3), "grey")):
-        Path(name).mkdir()
-        for number in range(9):
-            save(f"{name}/{number}.png", np.full(shape, 9, np.uint8))
-        ended = ommatid("import", "tiny.toml", name, "-o", f"{name}.exr")
-        assert ended.code == 0, ended.err
-        assert ("warning: colour/0.png is a colour picture" in ended.err) == (name == "colour")
 
 
 def test_files_named_by_set_are_relative_to_the_current_folder(here: Path, ommatid: Command) -> None:

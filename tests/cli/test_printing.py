@@ -83,7 +83,6 @@ def test_a_hostile_title_is_printed_harmlessly(ommatid: Command) -> None:
 
 @pytest.mark.usefixtures("scene")
 def test_hostile_arguments_are_refused_harmlessly(here: Path, ommatid: Command) -> None:
-    """One text; the family of texts in tests/fuzz has many."""
     text = hostile(0).replace("\x00", "")
     name = file_name(0)
     for arguments in (

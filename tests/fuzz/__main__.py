@@ -16,8 +16,7 @@ from pathlib import Path
 from ..conftest import TINY, shell
 from .campaign import campaign, command_for
 from .families import FAMILIES, inputs_of
-from .family import SCENE, FileType
-from .sandbox import prepare
+from .family import SCENE
 from .verdicts import REFUSED, UNCHANGED, VALID
 from .worker import Result
 
@@ -49,7 +48,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kind", choices=sorted(FAMILIES), help="only this family")
     parser.add_argument("--only", type=int, metavar="NUMBER", help="only this input of --kind")
-    parser.add_argument("--keep", type=Path, metavar="FILE", help="write the damaged input of --only to this file")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--journal", type=Path, help="file of the results of families that have ended")
     options = parser.parse_args()
@@ -57,8 +55,6 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         finished = finished_run(Path(folder))
         if options.only is not None:
-            if options.keep is not None:
-                options.keep.write_bytes(_input(names[0], options.seed, options.only, finished))
             print(*campaign({names[0]: [options.only]}, options.seed, finished), sep="\n")
             return
         numbers = inputs_of(names, options.inputs) if options.kind is None else {names[0]: range(options.inputs)}
@@ -79,15 +75,6 @@ def _journal(path: Path | None) -> list[Result]:
     if path is None or not path.exists():
         return []
     return [Result(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
-def _input(name: str, seed: int, number: int, finished: Path) -> bytes:
-    file_type = FAMILIES[name]
-    if not isinstance(file_type, FileType):
-        raise SystemExit(f"{name}: makes command lines, --keep is for contents of files")
-    with tempfile.TemporaryDirectory() as folder:
-        prepare(Path(folder), finished)
-        return file_type.input(seed, number, file_type.originals(Path(folder)))[1]
 
 
 def _print(results: dict[str, list[Result]], seed: int) -> None:

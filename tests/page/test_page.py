@@ -10,7 +10,6 @@ import gzip
 import json
 import re
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -33,30 +32,24 @@ from ommatid.page.document import page, page_of
 from ommatid.page.panels import error_groups, point_response, sensor, time_curves
 from ommatid.reconstruct.measured_error import best_single_sub_image
 from ommatid.reconstruct.output.run_json import (
-    DepthBin,
     DiagnosticsReport,
     ErrorReport,
     MoreTime,
     RunReport,
-    StudyCase,
     TimeReport,
     VerdictReport,
 )
-from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats import exr
 from ommatid.scenes.hardware import frames
 from ommatid.scenes.hardware.frames import AcquisitionSettings
-from ommatid.scenes.recording import Recording
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.sensor import SensorTable
 from ommatid.simulate.ideal import ideal_matrix, matrix_as_designed
 
 from ..bench.tables import bench_table, cell, exactly
-from ..conftest import Command
 from ..examples import familywise, scene
-from .runs import F, letter_run, record, synthetic
+from .runs import F, letter_run, synthetic
 
 VOID = {"meta", "link", "img", "input", "br"}
 SENSOR = {"illuminance": "100 lx", "exposure": "10 ms"}
@@ -274,24 +267,6 @@ def test_without_the_truth_a_page_has_no_comparison(tmp_path: Path) -> None:
     assert "chart-transfer" in text
 
 
-def test_a_sensor_image_shows_digital_numbers(run: data.Run) -> None:
-    digital = np.arange(run.stack.values.size, dtype=np.float64)
-    ones = np.ones_like(digital)
-    recording = Recording(SensorTable.model_validate(SENSOR), digital, ones, ones, ones)
-    shown = sensor.mosaic(replace(run.stack, recording=recording))
-    assert shown.unit == "digital number (DN)"
-    assert shown.patches[0].image[0, 0] == shown.patches[0].image.size - 1, "its last pixel is at the top left"
-
-
-def test_of_too_many_sub_imagers_the_central_ones_are_shown() -> None:
-    described = scene((60, 60), (("1/2", [50, 50], [2, 2]),))
-    stack, _ = record(described, np.zeros((60, 60)))
-    shown = sensor.mosaic(stack)
-    assert (shown.count, len(shown.patches)) == (2500, 44 * 44)
-    assert min(patch.k for patch in shown.patches) == 3
-    assert max(patch.k for patch in shown.patches) == 46
-
-
 @pytest.mark.parametrize("shape", [(200, 600), pytest.param((512, 512), marks=pytest.mark.slow)])
 def test_a_large_frame_is_reduced_to_means_and_fits(shape: tuple[int, int], run: data.Run) -> None:
     frame = synthetic(run, shape)
@@ -317,22 +292,6 @@ def test_means_over_blocks_keep_the_sum(image: NDArray[np.float32], block: int) 
     total = float((means * np.outer(heights, widths)).sum(dtype=np.float64))
     # Every mean is rounded to float32; the smallest of its numbers is 1.4e-45.
     assert total == pytest.approx(float(image.sum(dtype=np.float64)), rel=2**-23, abs=1e-40)
-
-
-def test_means_over_blocks_leave_out_missing_values() -> None:
-    image = np.array([[1, np.nan, np.nan], [3, np.nan, np.nan]])
-    np.testing.assert_array_equal(data.reduced(image, 2), [[2, np.nan]])
-
-
-def test_a_study_and_the_error_against_distance_have_tables(run: data.Run) -> None:
-    case = StudyCase(model="ideal", mse=3.0, predicted=1.0, expected=1.0, low=0.5, high=2.0, seconds=1.0)
-    far = DepthBin(nearest=900.0, farthest=950.0, pixels=7, rms_error=4.0, expected_deviation=0.5, rms_disparity=0.1,
-                   rms_disparity_by_type={})  # fmt: skip
-    text = html_of(run, study=(case,), depth=(far,))
-    assert "OUTSIDE 0.5 to 2" in text
-    assert "error 4 rms in 7 pixels" in text
-    reader = parsed(text)
-    assert (reader.open, reader.mismatched) == ([], [])
 
 
 def test_a_page_shows_the_run_time_and_the_effect_of_more_samples(run: data.Run) -> None:
@@ -477,13 +436,6 @@ def test_an_ideal_h_is_shown_without_a_comparison(run: data.Run) -> None:
         np.testing.assert_allclose(one.maps["measured"], other.maps["measured"], rtol=1e-14)
 
 
-def test_a_point_spread_function_without_a_closed_form_is_shown_alone(finished: Path) -> None:
-    def no_closed_form(sub: Any) -> Any:
-        raise InputError(f"{sub.name}: has no closed form")
-
-    assert "has no closed form for this camera" in page(data.read_run(finished), no_closed_form, None, "0")
-
-
 def bench(camera: Camera) -> BenchTable:
     """A bench table with three renderings, an estimate, and a calibration without a known error."""
     cells = [cell(samples=n, seconds=exactly(0.1 * n), mse=exactly(1 / n)) for n in (1, 2, 4)]
@@ -573,20 +525,6 @@ def test_without_trust_the_sentence_says_nothing_of_the_gain() -> None:
     assert "resolve this first" in words.sentence(wrong)
 
 
-def test_the_sentence_names_missing_measurements() -> None:
-    report = described()
-    unused = report.diagnostics.model_copy(update={"pixels_used": 0, "resolution": None})
-    assert "not an image" in words.sentence(report.with_changes(diagnostics=unused))
-
-
-def test_spurious_information_is_reported_before_the_numbers(finished: Path, html: str) -> None:
-    verdict = data.read_run(finished).report.verdict
-    assert verdict is not None
-    assert not verdict.trusted, "one lens type leaves pixels undetermined"
-    assert 0 < html.index("adds spurious information") < html.index("<main")
-    assert html.index('class="banner not-to-be-trusted"') < html.index('class="keys"')
-
-
 # --- folders without a complete run
 
 
@@ -605,13 +543,6 @@ def test_a_page_of_a_folder_shows_what_is_there(finished: Path, tmp_path: Path) 
         assert "no finished run: there is no verdict" in text
 
 
-def test_a_page_of_a_complete_run_is_its_report(finished: Path, tmp_path: Path) -> None:
-    assert "Verdict" in page_of(finished)
-    assert 'id="next"' in page_of(finished)
-    with pytest.raises(InputError, match=r"expected stack\.exr, model\.npz or estimate\.exr"):
-        page_of(tmp_path)
-
-
 def test_next_steps_are_those_of_a_trusted_run(run: data.Run, finished: Path) -> None:
     text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()))
     assert "null space of H, 97 % of the predicted MSE; neither samples nor less noise reduce it" in text, (
@@ -628,15 +559,6 @@ def test_next_steps_are_those_of_a_trusted_run(run: data.Run, finished: Path) ->
     assert "instead of" not in untrusted.split('id="next"')[1].split("</section>")[0]
 
 
-def test_a_page_names_its_scene_file_command_and_seeds(run: data.Run) -> None:
-    text = html_of(run, command=("ommatid", "run", "a<b.toml"), date="2031-02-03T04:05:06+00:00", host="lab7")
-    assert "<code>ommatid run a&lt;b.toml</code>" in text
-    assert "2031-02-03T04:05:06+00:00" in text
-    assert "lab7" in text
-    assert "pixel_pitch = " in text
-    assert ">seed<" in text
-
-
 # --- pages that are up to date
 
 
@@ -650,14 +572,6 @@ def test_a_page_is_rewritten_only_if_its_content_changes(finished: Path, tmp_pat
     write(folder, bench(data.read_run(folder).stack.camera))
     assert cached_page(folder, None)
     assert 'id="chart-effort"' in (folder / "report.html").read_text(encoding="utf-8")
-
-
-def test_a_folder_without_a_run_is_refused(finished: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(finished, tmp_path / "run")
-    for content in ("{", "[]", "{}"):
-        (folder / "run.json").write_text(content, encoding="utf-8")
-        with pytest.raises(InputError, match=r"run\.json: expected the results of a run"):
-            cached_page(folder, None)
 
 
 # --- batches
@@ -712,12 +626,3 @@ def test_an_index_of_a_sweep_shows_its_values_errors_and_figure(finished: Path, 
     for damaged in ("{}", "[{}]", "nothing"):
         (tmp_path / "sweep.json").write_text(damaged, encoding="utf-8")
         assert batch_index.read_sweep(tmp_path / "sweep.json") is None
-
-
-def test_a_page_that_is_up_to_date_is_not_made_again(
-    kept: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert kept.is_dir()
-    assert ommatid("run", "tiny.toml", "-o", "out").code == 0
-    monkeypatch.setitem(sys.modules, "ommatid.page.document", None)
-    assert ommatid("run", "tiny.toml", "-o", "out").code == 0

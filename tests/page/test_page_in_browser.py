@@ -14,15 +14,13 @@ import pytest
 from playwright.sync_api import Browser, CDPSession, ConsoleMessage, Error, Locator, Page, Request, sync_playwright
 from skimage import io
 
-from ommatid.page import batch_index
 from ommatid.page.data import Run
 from ommatid.page.document import page as page_of
-from ommatid.page.document import page_of as page_of_folder
 from ommatid.page.panels import sensor
 from ommatid.runtime.arrays import FloatArray
 from ommatid.simulate.ideal import matrix_as_designed
 
-from .runs import F, letter_run, synthetic
+from .runs import F, letter_run
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = [
@@ -35,7 +33,6 @@ FLAGS = [
     "--disable-sync",
 ]
 TIMEOUT = 30_000  # milliseconds, enough for a busy machine
-MAPS = ("truth", "single", "estimate", "error", "deviation")
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium here; `make browser` installs Debian's")
 
@@ -184,23 +181,6 @@ def test_errors_are_the_difference_of_two_maps(letter: Path, run: Run, shown: Op
     strong = np.abs(error) > 0.3 * limit
     assert strong.any()
     np.testing.assert_array_equal((colours[..., 0] > colours[..., 2])[strong], error[strong] > 0)  # red or blue
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("width", "height", "screens"), [(390, 844, 5), (1280, 800, 3)])
-def test_what_matters_fits_a_few_screens_with_large_images(
-    width: int, height: int, screens: int, letter: Path, shown: Opened
-) -> None:
-    with shown(letter, width=width, height=height, touch=width < 700) as page:
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        assert page.evaluate("document.querySelector('.folds').getBoundingClientRect().top") <= screens * height
-        outside = page.evaluate("""() => [...document.querySelectorAll("figure, canvas")]
-            .filter(figure => figure.getBoundingClientRect().right > innerWidth).length""")
-        assert outside == 0
-        widths = [box["width"] for name in (*MAPS, "compare") if (box := canvas(page, name).bounding_box())]
-        assert len(widths) == 6
-        assert min(widths) >= 400 if width == 1280 else max(widths) >= 350
-        assert page.locator("details[open]").count() == 0
 
 
 @pytest.mark.slow
@@ -385,23 +365,6 @@ def test_the_pointer_identifies_sub_images(letter: Path, run: Run, shown: Opened
         assert not page.locator('.read[data-group="packed"]').inner_text().strip()
 
 
-@pytest.mark.slow
-def test_a_lens_type_is_chosen_and_drawn(letter: Path, shown: Opened) -> None:
-    with shown(letter) as page:
-        first, second = canvas(page, "response-A-measured"), canvas(page, "response-B-measured")
-        assert not first.is_visible(), "it is folded"
-        page.locator("#response summary").click()
-        assert first.is_visible()
-        page.locator("#lens").select_option("B")
-        assert second.is_visible()
-        assert not first.is_visible()
-        colours = second.evaluate("""canvas => {
-            const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-            return new Set(Array.from({ length: data.length / 4 }, (_, index) => data[4 * index])).size;
-        }""")
-        assert colours > 1
-
-
 # --- print
 
 
@@ -421,46 +384,3 @@ def test_print_is_light_and_without_tools(dark: bool, letter: Path, shown: Opene
 
 
 # --- other pages
-
-
-@pytest.mark.slow
-def test_a_calibrated_run_is_shown_without_errors(finished: Path, shown: Opened) -> None:
-    with shown(finished / "report.html") as page:
-        assert page.locator("h1").inner_text() == "Tiny"
-        page.locator("#response summary").click()
-        assert canvas(page, "response-I-difference").is_visible()
-
-
-@pytest.mark.slow
-def test_folders_without_a_run_are_shown(finished: Path, tmp_path: Path, shown: Opened) -> None:
-    for name in ("stack.exr", "estimate.exr"):
-        shutil.copy(finished / name, tmp_path)
-    path = tmp_path / "report.html"
-    path.write_text(page_of_folder(tmp_path), encoding="utf-8")
-    with shown(path) as page:
-        assert canvas(page, "estimate").is_visible()
-        page.locator("#sensor summary").click()
-        assert canvas(page, "packed").is_visible()
-
-
-@pytest.mark.slow
-def test_a_large_frame_is_drawn(run: Run, tmp_path: Path, shown: Opened) -> None:
-    path = tmp_path / "report.html"
-    path.write_text(page_of(synthetic(run, (512, 512)), None, None, "0"), encoding="utf-8")
-    assert path.stat().st_size < 3_000_000
-    with shown(path) as page:
-        page.mouse.move(*position(page, "estimate", 255.5, 127.5))  # of 256 x 256 blocks
-        assert page.locator("form.pixel [name=row]").input_value() in ("510", "511")
-
-
-@pytest.mark.slow
-def test_a_batch_is_shown(finished: Path, tmp_path: Path, shown: Opened) -> None:
-    for name in ("a", "b"):
-        shutil.copytree(finished, tmp_path / name)
-    batch_index.cached_index(tmp_path, {tmp_path / "a": "", tmp_path / "b": "", tmp_path / "c": "c.toml: is not there"})
-    for width in (390, 1600):
-        with shown(tmp_path / "index.html", width=width, program=False) as page:
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-            assert page.locator("#chart-scenes .dots").count() == 2
-            assert page.locator(".scenes img").first.evaluate("image => image.naturalWidth") == 12
-            assert page.get_by_role("link", name="Tiny").first.get_attribute("href") == "a/report.html"

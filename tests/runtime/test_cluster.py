@@ -147,29 +147,13 @@ def silent(connection: socket.socket) -> None:
     del connection
 
 
-def closing(connection: socket.socket) -> None:
-    connection.close()
-
-
 def http(connection: socket.socket) -> None:
     connection.sendall(b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n")
     connection.close()
 
 
-def huge(connection: socket.socket) -> None:
-    connection.sendall((1 << 40).to_bytes(8, "little") * 100)
-
-
-def endless(connection: socket.socket) -> None:
-    with suppress(OSError):
-        while True:
-            connection.sendall((10**6).to_bytes(8, "little") * 10_000)
-
-
 @pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize(
-    "behaviour", [http, *(pytest.param(one, marks=pytest.mark.slow) for one in (silent, closing, huge, endless))]
-)
+@pytest.mark.parametrize("behaviour", [http, pytest.param(silent, marks=pytest.mark.slow)])
 def test_another_server_is_refused_in_one_sentence(behaviour: Callable[[socket.socket], None]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         connections: list[socket.socket] = []

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
-from threading import Thread
 
 import pytest
 
@@ -107,19 +105,3 @@ def test_names_as_long_as_the_file_system_takes_are_written_and_cleared(tmp_path
     files.clear_abandoned(tmp_path)
     assert [left.name for left in tmp_path.iterdir()] == [name]
     assert path.read_bytes() == b"whole"
-
-
-def test_long_names_that_differ_have_temporary_files_that_differ() -> None:
-    first, second = (files.short_name(letter + "x" * 250) for letter in "ab")
-    assert first != second
-    assert max(map(len, (first, second))) < 100
-
-
-def test_a_fifo_named_like_a_temporary_file_is_not_waited_for(tmp_path: Path) -> None:
-    for name in ("result.json", "other"):
-        os.mkfifo(tmp_path / f".0123abcd{files.PART}{name}")
-    work = Thread(target=lambda: (files.write_text(tmp_path / "result.json", "{}"), files.clear_abandoned(tmp_path)))
-    work.daemon = True
-    work.start()
-    work.join(20)
-    assert not work.is_alive()

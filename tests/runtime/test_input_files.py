@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.input_files import check_unique_keys, open_input, parse_json, read_bytes, read_text, real_path
+from ommatid.runtime.input_files import check_unique_keys, open_input, parse_json, read_bytes, read_text
 
 from ..modules import modules
 
@@ -87,26 +87,12 @@ def test_large_files_are_refused_before_they_are_read(tmp_path: Path) -> None:
         read_bytes(path, 4)
 
 
-def test_links_in_a_circle_have_a_path(tmp_path: Path) -> None:
-    (tmp_path / "a").symlink_to("b")
-    (tmp_path / "b").symlink_to("a")
-    assert real_path(tmp_path / "a" / "c").is_absolute()
-    with pytest.raises(OSError, match="symbolic links"):
-        read_bytes(tmp_path / "a")
-
-
 def test_a_key_that_stands_twice_is_refused() -> None:
     document = '[{"c": 1}, {"b": {"c": 1.5, "d": 2, "c": 1e400}}]'
     with pytest.raises(ValueError, match="expected each key of a table once, got 'c' twice"):
         parse_json(document)
     with pytest.raises(InputError, match=r"^run\.json: expected each key of a table once, got 'c' twice; delete it"):
         check_unique_keys(Path("run.json"), document.encode())
-
-
-def test_other_documents_pass() -> None:
-    document = b'{"a": [1, 2.5, null, {"a": NaN}], "b": ' + b"9" * 5000 + b"}"
-    check_unique_keys(Path("run.json"), document)
-    assert parse_json('{"a": [1, {"a": "x"}]}') == {"a": [1, {"a": "x"}]}
 
 
 def test_a_refused_input_does_not_stay_open(tmp_path: Path) -> None:

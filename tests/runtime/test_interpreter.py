@@ -108,23 +108,11 @@ def test_the_current_folder_is_left_under_all_its_names(tmp_path: Path, monkeypa
     assert import_path() == [f"{tmp_path}/gone", str(tmp_path), str(ROOT)]
 
 
-def test_in_a_checkout_the_program_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(sys, "path", [str(ROOT), "/usr/lib"])
-    assert import_path() == ["/usr/lib", str(ROOT)]
-
-
 @pytest.mark.slow
 def test_settings_in_the_current_folder_are_ignored(hostile: Path) -> None:
     code = "import matplotlib, numba; print(matplotlib.rcParams['font.size'], numba.config.CACHE_DIR or '-')"
     assert run(python_command(code), hostile) == "10.0 -\n"
     assert set(SETTINGS) == CONFIGURATIONS
-
-
-@pytest.mark.slow
-def test_a_notebook_keeps_its_path_and_its_settings(hostile: Path) -> None:
-    code = "import os, sys; before = [*sys.path], os.path.exists; import ommatid; from ommatid import Scene; "
-    assert run([sys.executable, "-Pc", f"{code}print(before == (sys.path, os.path.exists))"], hostile) == "True\n"
 
 
 def test_figures_do_not_depend_on_settings(tmp_path: Path) -> None:

@@ -58,22 +58,6 @@ def test_a_cache_that_the_user_names_is_kept(bare: Path, monkeypatch: pytest.Mon
     assert named() == {"MPLCONFIGDIR": str(bare)}
 
 
-def test_a_user_without_a_home(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Containers may run under a number that no user has."""
-    monkeypatch.delenv("HOME", raising=False)
-    monkeypatch.setattr(os, "getuid", lambda: 3_999_999_999)
-    with library_caches.library_caches():
-        assert {"DRJIT_CACHE_DIR", "MPLCONFIGDIR"} <= set(named())
-    assert list(bare.iterdir()) == []
-
-
-def test_nothing_is_named_without_a_temporary_folder(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", NO_HOME)
-    monkeypatch.setattr("tempfile.tempdir", str(bare / "missing"))
-    with library_caches.library_caches():
-        assert named() == {}
-
-
 def test_functions_are_compiled_where_no_machine_code_can_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("numba.core.caching.CompileResultCacheImpl._locator_classes", [])
     assert compiled(lambda x: 2 * x + 1)(3) == 7

@@ -76,13 +76,6 @@ def test_a_link_is_replaced_and_its_target_stays(tmp_path: Path) -> None:
     )
 
 
-def test_a_link_to_a_device_is_not_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "result.json"
-    path.symlink_to("/dev/null")
-    with pytest.raises(InputError, match="got a device"):
-        check_output(path)
-
-
 def test_nothing_is_written_among_devices() -> None:
     for path in ("/dev/null", "/dev/a.npz", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "/sys/a.npz"):
         with pytest.raises(InputError, match=r"expected|would"):

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ommatid.runtime.errors import InputError, MachineError, named, naming_source, shortened, shortened_repr
+from ommatid.runtime.errors import InputError, naming_source, shortened, shortened_repr
 from ommatid.runtime.execution.library_warnings import library_warnings
 from ommatid.runtime.files import write_csv
 from ommatid.runtime.printable import LONGEST, LONGEST_SENTENCE, printable, printable_lines, printable_sentence
@@ -77,22 +77,12 @@ def test_values_are_shortened_in_messages(value: object) -> None:
     assert not bad(shortened_repr(value))
 
 
-def test_few_names_of_a_list_are_said() -> None:
-    assert named("abc") == "a, b, c"
-    assert named([]) == "none"
-    assert named(f"n{i}" for i in range(1000)).endswith("n9, 990 more")
-
-
 def test_a_message_names_its_file_once() -> None:
     source = Path("evil\x1b[31m\u202e.toml")
     for message in (f"{source}: wrong", "wrong"):
         with pytest.raises(InputError) as raised, naming_source(source):
             raise InputError(message)
         assert str(raised.value) == "evil\\x1b[31m\\u202e.toml: wrong"
-
-
-def test_failures_of_the_machine_are_printable() -> None:
-    assert str(MachineError("a\x1b[2J\nb")) == "a\\x1b[2J b"
 
 
 @pytest.mark.filterwarnings("default")

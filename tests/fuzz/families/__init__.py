@@ -1,4 +1,4 @@
-"""Families of hostile inputs: contents of files, options, names, texts, and files of other kinds."""
+"""Families of hostile inputs: contents of files, options, names, and files of other kinds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from .names import NAMES
 from .options import OPTIONS
 from .pictures import PICTURES
 from .special_files import SPECIAL_FILES
-from .texts import TEXTS
 from .worlds import RENDERED, WORLDS
 
 FAMILIES: dict[str, FileType | CommandFamily] = {
@@ -21,7 +20,7 @@ FAMILIES: dict[str, FileType | CommandFamily] = {
     for family in (
         *FILE_TYPES.values(),
         *(*PICTURES, *ARCHIVES, *WORLDS),
-        *(*RENDERED, *DOCUMENTS, *TEXTS, *OPTIONS, *NAMES, *SPECIAL_FILES),
+        *(*RENDERED, *DOCUMENTS, *OPTIONS, *NAMES, *SPECIAL_FILES),
     )
 }
 

@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.scenes import camera, scene
+from ommatid.scenes import scene
 from ommatid.scenes.formats import picture
-from ommatid.scenes.hardware import frames
 
 from ..damage import damaged, damaged_near
 from ..family import SCENE, FileType
@@ -248,41 +247,6 @@ def read_picture(path: Path) -> Pixels:
     return Pixels(picture.load(described))
 
 
-def frame_png(rng: Random, _: bytes) -> bytes:
-    """Return a frame of counts of 1 to 16 bits as PNG; as many as the pixel can hold are taken as they are."""
-    colour = rng.choice((GREY, GREY, RGB))
-    depth = rng.choice(DEPTHS[colour])
-    numbers = np.random.default_rng(rng.randrange(1 << 32))
-    values = numbers.integers(0, 1 << depth, (400, 400, CHANNELS[colour]))
-    data = zlib.compress(_rows_of_png(rng, values, depth), 1)
-    content = SIGNATURE + _header(400, 400, depth, colour) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-    counts = values[..., 0].astype(float) if colour == GREY else values @ LUMINANCE
-    return _perhaps_damaged(rng, content, Pixels(counts), PNG_MARKS)
-
-
-def frame_expected(content: bytes) -> Pixels | None:
-    """Return the counts that must be cut from a frame."""
-    whole = expected(content)
-    return None if whole is None else Pixels(_cut(whole.values))
-
-
-def _cut(counts: Any) -> Any:
-    derived = camera.derive(scene.read(Path(SCENE)))
-    settings = frames.AcquisitionSettings(origin=(0, 0))
-    np.save("counts.npy", counts)
-    try:
-        return frames.read_frames(derived, [Path("counts.npy")], settings, mosaics=True).numbers
-    finally:
-        Path("counts.npy").unlink()
-
-
-def read_frame(path: Path) -> Pixels:
-    """Read a frame of the tiny camera's sensor."""
-    derived = camera.derive(scene.read(path.with_name(SCENE)))
-    settings = frames.AcquisitionSettings(origin=(0, 0))
-    return Pixels(frames.read_frames(derived, [path], settings, mosaics=True).numbers)
-
-
 def _one(make: Callable[[Random, bytes], bytes]) -> Callable[[Path], list[bytes]]:
     """Return an original: the first harmless content that is made."""
 
@@ -294,19 +258,8 @@ def _one(make: Callable[[Random, bytes], bytes]) -> Callable[[Path], list[bytes]
 
 
 SHOW = ("show", SCENE, "--json", "--set", "target.image={file}", "--set", "target.origin=", "--set", "target.shape=")
-IMPORT = ("import", SCENE, "{file}", "-o", "new.exr", "--origin", "0,0", "--json")
 PICTURES = (
     FileType("picture, kinds of PNG", "k.png", _one(png), png, read_picture, SHOW, expected=expected),
     FileType("picture, kinds of JPEG", "k.jpg", _one(jpeg), jpeg, read_picture, SHOW, expected=expected),
     FileType("picture, kinds of TIFF", "k.tif", _one(tiff), tiff, read_picture, SHOW, expected=expected),
-    FileType(
-        "frames, kinds of PNG",
-        "k.png",
-        _one(frame_png),
-        frame_png,
-        read_frame,
-        IMPORT,
-        expected=frame_expected,
-        share=0.5,
-    ),
 )

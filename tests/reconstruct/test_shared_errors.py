@@ -63,7 +63,7 @@ class ShiftedModel(Model):
         blocks = [
             np.column_stack([change[part] for change in self.changes(image.ravel())]) for part in self.camera.slices()
         ]
-        return sparse.csc_array(sparse.block_diag(blocks, format="csc"))
+        return sparse.csc_array(sparse.block_diag([sparse.csc_array(block) for block in blocks]))
 
     def error_variance(self, image: FloatArray) -> FloatArray:
         """Diagonal of L L^T, (M,)."""

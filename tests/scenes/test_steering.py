@@ -62,6 +62,16 @@ def by_counting(camera: Camera) -> FloatArray:
     return np.array(rows)
 
 
+def test_pixels_seen_by_a_rotated_window_are_those_whose_whole_light_is_in_h() -> None:
+    data = scene((20, 18), (("1/3", [1, 1], [5, 2]),)).plain()
+    data["camera"]["lens"][0]["sub_imager"] = [{"at": [0, 0], "rotation": "20 deg"}]
+    camera = derive(parse(data, Path("test.toml")))
+    share = np.asarray(ideal_matrix(camera).sum(axis=0)) * 3**2  # of each pixel of f
+    whole = (share > 1 - 1e-9).reshape(camera.shape)
+    assert 40 < whole.sum() < share.sum() == pytest.approx(5 * 2 * 3**2)
+    np.testing.assert_array_equal(camera.types_seeing(), whole)
+
+
 def test_h_is_that_of_counted_cells() -> None:
     camera = derive(windows())
     counted = by_counting(camera)

@@ -61,7 +61,7 @@ STARTER = """
 import os, sys
 import mitsuba, numba, scipy.linalg, skimage.metrics, matplotlib.backends.backend_agg
 import ommatid.pipeline.stages, ommatid.analysis.depth_error, ommatid.analysis.study, ommatid.batch.sweep_table
-import ommatid.reconstruct.output.figures, ommatid.reconstruct.output.run_json, ommatid.reconstruct.output.result_files
+import ommatid.reconstruct.output.run_json, ommatid.reconstruct.output.result_files
 from ommatid.cli import app
 for line in sys.stdin:
     number = os.fork()
@@ -146,6 +146,7 @@ def run(
     starter.stdin.write(" ".join((str(here), *command)) + "\n")
     starter.stdin.flush()
     while not (here / "number").exists():
+        assert starter.poll() is None, "the process that starts commands has ended"
         time.sleep(0.001)
     process = int((here / "number").read_text(encoding="ascii"))
     if kill is not None:

@@ -1,7 +1,7 @@
 """Run the same scenes with two checkouts, and say of each whether a number moved.
 
     python -m tests.reference BEFORE AFTER
-    python -m tests.reference main . --cases tile19,photo --keep /tmp/reference
+    python -m tests.reference main . --cases tile19,photo --keep kept
     python -m tests.reference main . --within estimate=0.01 deviation=0.01 H=1e-3 numbers=0.01 interval=0.01 record=inf
     python -m tests.reference main . --statistical
 

@@ -69,7 +69,7 @@ EVERYTHING = Variation(
 def run(variation: Variation, base: Path, options: Sequence[str] = ()) -> Path:
     """Run the tiny scene below `base`, and return the folder of its result. Raises CalledProcessError if it fails."""
     folder = base / variation.folder
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "tiny.toml").write_text(TINY, encoding="utf-8")
     words = [*interpreter(variation.before), "run", "tiny.toml", "-o", "out", *options]
     command = ["sh", "-c", f'{variation.shell} exec "$@"', "sh", *words]

@@ -15,12 +15,12 @@ from ommatid.reconstruct.forms.form import Form
 from ommatid.reconstruct.prior import Prior, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.pose import Misalignment
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
-from ommatid.simulate.sampling.seeds import sampler_seeds
 
 if TYPE_CHECKING:  # a test asserts that scenes of pinholes load no module of lenses
     from ommatid.simulate.renderer.renderer import Renderer

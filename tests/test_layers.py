@@ -54,6 +54,21 @@ def test_only_one_module_imports_openexr() -> None:
     assert [name for name in modules() if "OpenEXR" in imports(name)] == ["ommatid.scenes.formats.exr"]
 
 
+def test_only_one_module_begins_streams_of_random_numbers() -> None:
+    """All others ask it for the stream of a purpose, and name NumPy's generators in types alone."""
+    home = "ommatid.runtime.streams"
+    for module, path in modules().items():
+        if module == home:
+            continue
+        assert not imports(module) & {"random", "numpy.random"}, module
+        nodes = list(ast.walk(tree(path)))
+        named = {ast.unparse(node) for node in nodes if isinstance(node, ast.Attribute)}
+        assert not {name for name in named if name.startswith("np.random.")} - {"np.random.Generator"}, module
+        assert "np.random.Generator" not in {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}
+        names = {node.id for node in nodes if isinstance(node, ast.Name)}
+        assert not {name for name in names if name.isupper() and "SEED" in name}, f"{module}: a private seed"
+
+
 def test_no_modules_import_one_another_in_a_circle() -> None:
     assert circles() == []
 

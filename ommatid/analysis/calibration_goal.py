@@ -15,6 +15,7 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -22,7 +23,6 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 
-SEED = 20260408  # of an image of white noise, different from those of data, calibration and the other analyses
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
 TINY = float(np.finfo(np.float64).tiny)
 TABLES = ("prior", "estimator", "tiles", "noise", "sensor")  # on which the expected error depends
@@ -67,7 +67,7 @@ def for_prior(setup: Setup) -> StoppingRule:
             used &= np.diff(model.stored.indptr) > 0
         model = model_of_f(model, camera, prior)
         from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
-        random = np.random.default_rng(SEED).normal(size=model.unknowns)
+        random = probe(Purpose.GOAL).normal(size=model.unknowns)
         shared = model.error_variance(prior.mean + prior.variance**0.5 * random)
         from_model = from_model if shared is None else from_model + shared
         causes = {"noise": noise[used], "calibration": from_model[used], **independent_detail(model, used)}
@@ -104,7 +104,7 @@ def _negligible_bound(stack: Stack, model: Model) -> float | None:
     used = usable_pixels(stack, model).used
     others = total_variance(known_noise(stack))[used]
     uncertain = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))
-    shared = model.error_variance(WHITE * np.random.default_rng(SEED).random(model.unknowns))
+    shared = model.error_variance(WHITE * probe(Purpose.GOAL_BOUND).random(model.unknowns))
     uncertain = uncertain if shared is None else uncertain + shared
     relative = uncertain[used] / np.maximum(others, TINY)
     if not relative.size or float(relative.max()) <= NEGLIGIBLE:

@@ -15,6 +15,7 @@ from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.prior import prior_of, spectrum_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import Purpose, derived_seed, stream
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
@@ -29,11 +30,9 @@ from ommatid.simulate.calibration.entries import explains
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 from ommatid.simulate.render import exposed
 from ommatid.simulate.sampling.passes import rounding_variance
-from ommatid.simulate.sampling.seeds import repeat_seed
 
 from .calibration_goal import for_stack
 
-ERRORS = 1  # stream of the errors of H
 Assumptions = tuple[str, ...]
 
 
@@ -77,7 +76,7 @@ def predicted_recording(setup: Setup) -> PredictedRecording:
     image = _prior_draw(setup) if truth is None else truth
     camera = _camera(setup)
     variance, said_of_light = _rendering_variance(setup, camera, image)
-    rng = np.random.default_rng(setup.scene.render.seed)
+    rng = stream(setup.scene.render.seed, Purpose.PREDICTED_LIGHT)
     light = camera.model.forward(image)
     light = light + rng.normal(size=light.size) * np.sqrt(variance)
     light = np.maximum(light, 0.0) if setup.scene.sensor is not None else light
@@ -109,14 +108,14 @@ def known_image(setup: Setup) -> tuple[FloatArray | None, Assumptions]:
 
 def _with_own_seed(setup: Setup) -> Setup:
     render = setup.scene.render
-    render = render.model_copy(update={"seed": repeat_seed(render.seed, "prediction", 0)})
+    render = render.model_copy(update={"seed": derived_seed(render.seed, Purpose.PREDICTION)})
     return replace(setup, scene=with_tables(setup.scene, render=render))
 
 
 def _prior_draw(setup: Setup) -> FloatArray:
     """Return an image drawn from the prior, (N,); of a prior that is to be fitted, with independent pixels."""
     scene, camera = setup.scene, setup.camera
-    random = np.random.default_rng(scene.render.seed + 1).normal(size=camera.unknowns)
+    random = stream(scene.render.seed, Purpose.PREDICTED_IMAGE).normal(size=camera.unknowns)
     table = scene.prior
     if table.kind in ("independent", "fit"):
         image = table.variance**0.5 * random
@@ -173,7 +172,7 @@ def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Ass
     true = camera.model.matrix
     model = uncertain.around(true)
     model = replace(model, record={**model.record, "method": setup.scene.calibration.method})
-    rng = np.random.default_rng([setup.scene.render.seed, ERRORS])
+    rng = stream(setup.scene.render.seed, Purpose.PREDICTED_ERRORS)
     if setup.scene.calibration.samples != "auto":
         return pilot.with_errors(model, rng), ()
     adds = for_stack(stack).added_error(model)

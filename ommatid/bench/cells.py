@@ -19,6 +19,7 @@ from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -29,7 +30,6 @@ from ommatid.simulate.adaptive_render import AdaptiveRendering, check_noise_targ
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.render import Rendering
 from ommatid.simulate.renderer.variant import PREFERENCE, release, unusable_reason
-from ommatid.simulate.sampling.seeds import repeat_seed
 
 from . import reference
 from .precision import ExactSolution, SolverSetting, exact_solution, solver_settings
@@ -157,7 +157,7 @@ class Subject:
 
     def seed(self, name: str, repeat: int) -> int:
         """Return the seed of the rays of a cell's repeat."""
-        return repeat_seed(self.scene.render.seed, name, repeat)
+        return derived_seed(self.scene.render.seed, Purpose.REPEAT, name, repeat)
 
     def stack(self, repeat: int) -> Stack:
         """Return exact light, recorded with the noise of a repeat."""

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -23,7 +24,6 @@ from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 from ommatid.simulate.render import Rendering, exposed, light
 from ommatid.simulate.sampling.passes import FEWEST_PASSES, Plan, plan
 from ommatid.simulate.sampling.samplers import fitting
-from ommatid.simulate.sampling.seeds import repeat_seed
 
 Samples = int | Literal["auto"]
 
@@ -59,7 +59,7 @@ def reference(setup: Setup) -> Reference:
             model = exact_model(setup.resolved, camera, true_matrix(setup.simulated), "true")
         return Reference(model, model.forward(image), np.zeros(camera.measurements), "the closed form")
     samples = min(SAMPLE_RATIO * MOST_SAMPLES, MOST_RAYS // camera.measurements)
-    seed = repeat_seed(scene.render.seed, "right", 0)
+    seed = derived_seed(scene.render.seed, Purpose.REPEAT, "right", 0)
     many = with_calibration(scene, "transport", "multijitter", "auto", samples, seed)
     model = calibrate(replace(setup, scene=many))
     description = f"a reference of {model.record['samples']} samples"

@@ -8,21 +8,19 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.runtime.files import write_csv
 from ommatid.runtime.outputs.kinds import check_output
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.streams import Purpose, stream
 
 from . import figures
 from .claims import PAPER, Claim, error_claims, photograph_claims, rank_claims, tile_claims
-from .photographs import PHOTOGRAPH, Photograph, TileCrops, Trials, crop_tiles, load, seeds, simulate_trials
+from .photographs import PHOTOGRAPH, Photograph, TileCrops, Trials, crop_tiles, load, simulate_trials
 from .tile_errors import ACTUAL, COMBINATIONS, SIDES, THREE, PaperTile, Tiles, distortion, sweep, tiles
 
 SIDE = 35  # of the photograph's tiles
-FRACTIONS = 3  # number of the experiment whose seed draws the fractions of pixels
 MAP_NOISE = 1e-4  # variance
 DISTORTION_SIDE, DISTORTION_NOISE = 19, 1e-2  # of the figure of distortion: side of the tile, variance of the maps
 CLAIMS = "claims.csv"
@@ -45,7 +43,7 @@ def write_paper(
     Raises InputError for an unsuitable image or folder, MachineError where it cannot be written.
     """
     started = perf_counter()
-    crops = crop_tiles(load(image), SIDE, image, np.random.default_rng(seeds(seed, FRACTIONS)(0, 0)))
+    crops = crop_tiles(load(image), SIDE, image, stream(seed, Purpose.FRACTIONS))
     with occupied(folder):
         for name in FILES:
             check_output(folder / name, Path(image))

@@ -7,7 +7,6 @@ as storing took away, is added to each pixel.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.scenes import scene
 from ommatid.scenes.formats import picture
 from ommatid.scenes.tables.gallery import GALLERY
@@ -118,25 +118,24 @@ def simulate_trials(tile: PaperTile, name: str, crops: TileCrops, seed: int) -> 
     return Photograph(
         name,
         crops,
-        measure(tile, crops.images, noisy, seeds(seed, 0)),
-        measure(tile, crops.images, fine, seeds(seed, 1)),
-        measure(tile, crops.images.round(), fine[BITS.index(WHOLE_BITS) :], seeds(seed, 2)),
+        measure(tile, crops.images, noisy, seed, 0),
+        measure(tile, crops.images, fine, seed, 1),
+        measure(tile, crops.images.round(), fine[BITS.index(WHOLE_BITS) :], seed, 2),
     )
 
 
-def measure(
-    tile: PaperTile, images: FloatArray, noises: tuple[NoiseTable, ...], seed_of: Callable[[int, int], int]
-) -> Trials:
+def measure(tile: PaperTile, images: FloatArray, noises: tuple[NoiseTable, ...], seed: int, experiment: int) -> Trials:
     """Record (T, N) images at every level of noise, and reconstruct them by an estimator that expects that noise.
 
-    seed_of : from the indices of a level and an image to the seed of its noise
+    seed, experiment : from which the noise of every level and image follows
     """
     camera, matrix, mean = tile.camera, tile.form.problem.matrix, tile.form.problem.prior.mean
     light: FloatArray = np.asarray(matrix @ images.T)
     before = np.asarray(matrix @ mean)[:, None]
 
     def recorded(image: int, level: int) -> FloatArray:
-        return expose(light[:, image], noises[level], generators(camera, seed_of(level, image)), camera.slices())
+        own = derived_seed(seed, Purpose.PAPER, experiment, level, image)
+        return expose(light[:, image], noises[level], generators(camera, own), camera.slices())
 
     rows: list[tuple[FloatArray, float, FloatArray, float, float]] = []
     for level, noise in enumerate(noises):
@@ -157,13 +156,3 @@ def _spread(values: FloatArray) -> float:
     # |A v|^2 is a sum of independent squares with the weights (s / (1 + s^2))^2 = w: mean sum w, variance 2 sum w^2.
     weights = np.square(values / (1 + values**2))
     return float(np.sqrt(2 * np.square(weights).sum()) / weights.sum())
-
-
-def seeds(seed: int, experiment: int) -> Callable[[int, int], int]:
-    """Return a function that gives every level of noise and every tile of an experiment a separate seed."""
-
-    def seed_of(level: int, image: int) -> int:
-        sequence = np.random.SeedSequence(seed, spawn_key=(experiment, level, image))
-        return int(sequence.generate_state(1, np.uint64)[0])
-
-    return seed_of

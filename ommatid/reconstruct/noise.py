@@ -21,6 +21,7 @@ from scipy import fft, special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.model import Model
 from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
@@ -36,7 +37,6 @@ Noise = dict[str, FloatArray]  # variances by cause
 SATURATION = "saturation"  # in the error budget
 SHARED = "shared calibration"  # by errors of few numbers of H, which many measurements share; "calibration" in budgets
 SHARED_NOTABLE = 1e-3  # of the other noise of a measurement, below which SHARED is left out
-SEED = 20260406  # of an image of the prior, different from those of data, calibration and the other analyses
 CERTAIN = (
     "rendering",
     "calibration",
@@ -135,7 +135,7 @@ def _shared_noise_of_prior(model: Model, usable: UsablePixels, prior: PriorTable
     if model.error_variance(np.full(camera.unknowns, prior.mean)) is None:
         return {}
     spectrum = spectrum_of(prior, camera.shape, camera.target_pitch, camera.detail)
-    random = np.random.default_rng(SEED).normal(size=camera.shape)
+    random = probe(Purpose.SHARED_PRIOR).normal(size=camera.shape)
     drawn = spectrum**0.5 * random
     if not isinstance(spectrum, float):
         drawn = np.asarray(fft.idctn(drawn, 2, norm="ortho"))

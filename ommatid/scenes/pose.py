@@ -7,13 +7,13 @@ y; the image on the sensor is upside down, so that sub-images are upright.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from math import cos, sin
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.streams import Purpose, stream
 
 from .camera import Camera
 from .lens_type import LensType, SubImager
@@ -74,8 +74,7 @@ def misalignments(camera: Camera) -> tuple[Misalignment, ...]:
 
 
 def _draw(tolerance: ToleranceTable, sub: SubImager) -> Misalignment:
-    key = zlib.crc32(f"tolerance {sub.type.name}".encode()), sub.k, sub.l
-    rng = np.random.default_rng(np.random.SeedSequence(tolerance.seed, spawn_key=key))
+    rng = stream(tolerance.seed, Purpose.TOLERANCE, sub.type.name, sub.k, sub.l)
     x, y, about_x, about_y, rotation, focal_length = (float(number) for number in rng.standard_normal(6))
     position, tilt = tolerance.position or 0.0, tolerance.tilt or 0.0
     return Misalignment(

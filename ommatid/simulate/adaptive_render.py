@@ -28,6 +28,7 @@ import numpy as np
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.recording import expected_recording_of, flat_values
 from ommatid.scenes.scene import Scene
@@ -51,7 +52,6 @@ from .sampling.passes import (
     samples_within,
 )
 from .sampling.samplers import LEAPS, expected_exponent, measured_exponent, next_samples
-from .sampling.seeds import sampler_seeds
 from .world_view import rendered_world
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for

@@ -6,7 +6,6 @@ rendered with the same integrator as the sub-images, with separate seeds, and wi
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import cached, digest, fingerprint
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.runtime.versions import versions
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.formats.picture import write_truth
@@ -56,12 +56,12 @@ def truth(setup: Setup) -> Truth:
     variant, work = choose(scene.render.variant), _plan(setup)
     renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
-    start = int(np.random.SeedSequence(scene.render.seed, spawn_key=(zlib.crc32(b"truth"),)).generate_state(1)[0])
+    seeds = [sampler_seeds(scene.render.seed, "truth", number, work.passes + 1) for number in range(work.passes + 1)]
     tally = Tally(camera.unknowns)
-    for number in range(work.passes):
+    for seed in seeds[:-1]:
         (group,) = renderer.groups
-        tally.add(renderer.expose(group, work.samples, lambda _, number=number: (start + number) % 2**32)[0])
-    points = renderer.depths(ideal_camera(camera, FINER), start)
+        tally.add(renderer.expose(group, work.samples, seed)[0])
+    points = renderer.depths(ideal_camera(camera, FINER), seeds[-1](0))
     depth = np.median(points.reshape(camera.rows, FINER, camera.columns, FINER), axis=(1, 3))
     return Truth(
         image=tally.mean.reshape(camera.shape),

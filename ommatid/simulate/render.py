@@ -17,6 +17,7 @@ from scipy import ndimage
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
 from ommatid.scenes.camera import Camera
@@ -32,7 +33,6 @@ from .renderer.renderer import Renderer
 from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint, State, open_checkpoint
 from .sampling.passes import OverPasses, Plan, Tally, plan, rounding_variance
-from .sampling.seeds import sampler_seeds
 from .world_view import rendered_world
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle

@@ -9,24 +9,19 @@ another exposure.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import Purpose, stream
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.recording import ROUNDING, Recording, dark_electrons, flat_values
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.sensor import NoiseTable, SensorTable
-
-from .sampling.seeds import noise_generator
-
-Purpose = Literal["dark signal", "response", "exposure", "dark frames", "flat frames"]
 
 MOST_READINGS = 400_000  # of the frames of a sub-imager that are drawn one by one
 CHUNK = 2**18  # readings that are drawn at once
@@ -48,21 +43,17 @@ def record(
     digital, dark, flat = (np.empty(camera.measurements) for _ in range(3))
     for sub, rows in zip(camera.sub_imagers, camera.slices(), strict=True):
         pixels = _pixels(sensor, camera, sub, response[rows], shot)
-        digital[rows] = pixels.readings(light[rows], generator(seed, "exposure", sub), 1)[0]
-        dark[rows] = pixels.mean_of_frames(np.zeros(response[rows].size), generator(seed, "dark frames", sub))
-        flat[rows] = pixels.mean_of_frames(level[rows], generator(seed, "flat frames", sub))
+        digital[rows] = pixels.readings(light[rows], generator(seed, Purpose.EXPOSURE, sub), 1)[0]
+        dark[rows] = pixels.mean_of_frames(np.zeros(response[rows].size), generator(seed, Purpose.DARK_FRAMES, sub))
+        flat[rows] = pixels.mean_of_frames(level[rows], generator(seed, Purpose.FLAT_FRAMES, sub))
     # In the precision of the file, so that a stack is the same before and after it was stored.
     dark, flat = (mean.astype(np.float32).astype(np.float64) for mean in (dark, flat))
     return Recording(sensor, digital, dark, flat, level)
 
 
 def generator(seed: int, purpose: Purpose, sub: SubImager) -> np.random.Generator:
-    """Return the stream of a sub-imager for one purpose.
-
-    Names of lens types hold no blank, so that no stream of `seeds.noise_generator` has the same key.
-    """
-    key = zlib.crc32(f"{purpose} {sub.type.name}".encode()), sub.k, sub.l
-    return np.random.Generator(np.random.PCG64DXSM(np.random.SeedSequence(seed, spawn_key=key)))
+    """Return the stream of a sub-imager for one purpose."""
+    return stream(seed, purpose, sub.type.name, sub.k, sub.l)
 
 
 @dataclass(frozen=True)
@@ -116,8 +107,8 @@ class _Pixels:
 
 def _pixels(sensor: SensorTable, camera: Camera, sub: SubImager, response: FloatArray, shot: bool) -> _Pixels:
     seed = 0 if camera.tolerance is None else camera.tolerance.seed
-    offset = generator(seed, "dark signal", sub).normal(0.0, sensor.dsnu, response.size)
-    relative = generator(seed, "response", sub).normal(0.0, sensor.prnu, response.size)
+    offset = generator(seed, Purpose.DARK_SIGNAL, sub).normal(0.0, sensor.dsnu, response.size)
+    relative = generator(seed, Purpose.RESPONSE, sub).normal(0.0, sensor.prnu, response.size)
     return _Pixels(sensor, offset, response * np.maximum(1 + relative, 0.0), shot)
 
 
@@ -150,7 +141,7 @@ def expose(light: FloatArray, noise: NoiseTable, rngs: list[np.random.Generator]
 
 def generators(camera: Camera, seed: int) -> list[np.random.Generator]:
     """Return one generator per sub-imager, independent of the other lens types of the camera."""
-    return [noise_generator(seed, sub.type.name, sub.k, sub.l) for sub in camera.sub_imagers]
+    return [generator(seed, Purpose.NOISE, sub) for sub in camera.sub_imagers]
 
 
 def response(setup: Setup) -> FloatArray:

@@ -6,7 +6,6 @@ unit, or one beside the camera, before anything is rendered.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -18,6 +17,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import fingerprint
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
@@ -263,12 +263,8 @@ def _without_picture(scene: Scene) -> Any:
 
 def _brightest(renderer: Any, seed: int) -> float:
     """Return the radiance that all but the brightest pixels of a coarse picture stay below; 0 if there is no light."""
-    first = int(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(b"white"),)).generate_state(1)[0])
     (group,) = renderer.groups
-
-    def seeds(sensor: int) -> int:
-        return (first + sensor) % 2**32
-
+    seeds = sampler_seeds(seed, "white", 0, 1)
     radiance = renderer.expose(group, SAMPLES, seeds)[0] / WHITE  # where a radiance of 1 is white
     white = float(np.percentile(radiance, BRIGHT))
     return white if 0 < white < np.inf else 0.0

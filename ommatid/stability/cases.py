@@ -16,6 +16,7 @@ from scipy import sparse
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import Purpose, probe
 
 Matrices = Mapping[str, sparse.csr_array]
 Requirement = Literal["solve", "solve or refuse", "refuse"]
@@ -75,7 +76,7 @@ def extreme_cases(matrices: Matrices) -> Iterator[StabilityCase]:
 
 def draw_recorded(matrix: sparse.csr_array, prior: Prior, noise_variance: FloatArray) -> FloatArray:
     """Return measurements, (M,), of an image drawn from the prior, with the expected noise."""
-    rng = np.random.default_rng(0)
+    rng = probe(Purpose.STABILITY_RECORDED)
     image = prior.mean + prior.apply_root(rng.normal(size=prior.dimension))
     return matrix @ image + np.sqrt(noise_variance) * rng.normal(size=matrix.shape[0])
 
@@ -127,7 +128,7 @@ def _priors(matrices: Matrices) -> Iterator[StabilityCase]:
 
 def _matrices(matrices: Matrices) -> Iterator[StabilityCase]:
     three, two = matrices["three"], matrices["two"]
-    rng = np.random.default_rng(5)
+    rng = probe(Purpose.STABILITY_MATRICES)
     rows, columns = 10 ** rng.uniform(-12, 12, three.shape[0]), 10 ** rng.uniform(-12, 12, SIDE**2)
     scattered = 10 ** rng.uniform(-12, 12, three.shape)
     zero_rows, unseen = two.toarray(), three.toarray()

@@ -15,7 +15,7 @@ from scipy import stats
 
 from ommatid.paper import claims, paper
 from ommatid.paper.claims import NO, QUALIFIED, YES, tile_claims
-from ommatid.paper.photographs import crop_tiles, load, measure, seeds
+from ommatid.paper.photographs import crop_tiles, load, measure
 from ommatid.paper.tile_errors import THREE, TWICE, TWO, PaperTile, TileError, Tiles, inner, tile, tiles
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -318,7 +318,7 @@ def test_images_from_the_prior_err_as_predicted() -> None:
     """The error's covariance has the eigenvalues P0 / (1 + s^2): mean and variance of its squared length follow."""
     shown, count = small(TWO), 200
     noises = tuple(NoiseTable(variance=variance) for variance in (1e-6, 1e-3, 1.0, 100.0))
-    trials = measure(shown, from_prior(shown, count, 1), noises, seeds(3, 0))
+    trials = measure(shown, from_prior(shown, count, 1), noises, 3, 0)
     for level, noise in enumerate(noises):
         eigenvalues = 5461.25 / (1 + shown.form.values**2 / noise.variance)
         spread = np.sqrt(2 * np.sum(eigenvalues**2)) / 361
@@ -330,7 +330,7 @@ def test_images_from_the_prior_err_as_predicted() -> None:
 def test_the_noise_alone_errs_as_predicted() -> None:
     shown, count = small(THREE), 200
     noises = (NoiseTable(variance=1e-4), NoiseTable(variance=1.0), *(NoiseTable(bits=bits) for bits in (4, 8, 12)))
-    trials = measure(shown, from_prior(shown, count, 2), noises, seeds(4, 0))
+    trials = measure(shown, from_prior(shown, count, 2), noises, 4, 0)
     limit = stats.norm.isf(familywise(len(noises)) / 2)
     z = (trials.from_noise.mean(axis=1) / trials.noise_part - 1) / (trials.spread / np.sqrt(count))
     assert np.abs(z).max() < limit
@@ -345,12 +345,12 @@ def test_the_noise_alone_errs_as_predicted() -> None:
 def test_noise_is_repeatable_and_independent() -> None:
     shown, noises = small(THREE), (NoiseTable(variance=1e-2),) * 2
     images = np.tile(from_prior(shown, 1, 5), (3, 1))
-    trials = measure(shown, images, noises, seeds(6, 0))
+    trials = measure(shown, images, noises, 6, 0)
     assert np.unique(trials.measured).size == 6, "equal images and levels have different noise"
-    fewer = measure(shown, images[:2], noises, seeds(6, 0))
+    fewer = measure(shown, images[:2], noises, 6, 0)
     np.testing.assert_array_equal(fewer.from_noise, trials.from_noise[:, :2])
-    for other in (seeds(6, 1), seeds(7, 0)):
-        assert not np.intersect1d(measure(shown, images, noises, other).from_noise, trials.from_noise).size
+    for other in ((6, 1), (7, 0)):
+        assert not np.intersect1d(measure(shown, images, noises, *other).from_noise, trials.from_noise).size
 
 
 @pytest.mark.parametrize("shape", [(70, 105), (105, 70), (35, 210), (210, 35), (71, 300)])

@@ -17,6 +17,7 @@ from ommatid.reconstruct.methods.method import total_variance
 from ommatid.reconstruct.noise import known_noise, usable_pixels
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import Purpose
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.recording import Recording, expected_recording
@@ -188,7 +189,7 @@ def test_the_fixed_pattern_belongs_to_the_camera_and_the_rest_to_the_exposure() 
 
 def test_all_streams_differ() -> None:
     subs = field(4, 2).sub_imagers
-    purposes: list[sensors.Purpose] = ["dark signal", "response", "exposure", "dark frames", "flat frames"]
+    purposes = (Purpose.DARK_SIGNAL, Purpose.RESPONSE, Purpose.EXPOSURE, Purpose.DARK_FRAMES, Purpose.FLAT_FRAMES)
     drawn = {sensors.generator(seed, what, sub).random() for seed in (0, 1) for what in purposes for sub in subs}
     assert len(drawn) == 2 * 5 * 2
     plain = exposed(

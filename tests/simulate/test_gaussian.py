@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 from ommatid.scenes.tables.sensor import NoiseTable
-from ommatid.simulate.sampling.seeds import Purpose, noise_generator, sampler_seeds
 from ommatid.simulate.sensors import expose, generators, quantise
 
 from ..examples import THREE, camera
@@ -48,24 +47,3 @@ def test_a_sub_imagers_noise_does_not_depend_on_its_neighbours() -> None:
     np.testing.assert_array_equal(whole[: one.measurements], alone)
     others = expose(np.zeros(one.measurements), noise, generators(one, 6), one.slices())
     assert abs(np.corrcoef(alone, others)[0, 1]) < 4 / 225**0.5
-
-
-def test_samplers_never_share_a_seed() -> None:
-    """Within a scene by construction; and not after a scalar variant has multiplied them by a film's area either."""
-    purposes: list[tuple[Purpose, int]] = [("data", 16), ("calibration", 24)]
-    for area in (25, 64 * 64):
-        seeds = [
-            sampler_seeds(3, purpose, number, passes)(sensor) * area % 2**32
-            for purpose, passes in purposes
-            for number in range(passes)
-            for sensor in range(50)
-        ]
-        assert len(set(seeds)) == len(seeds)
-    assert sampler_seeds(3, "data", 0, 16)(0) != sampler_seeds(4, "data", 0, 16)(0)
-
-
-def test_noise_streams_differ_in_every_part_of_their_name() -> None:
-    first = noise_generator(0, "I", 0, 1).random(4)
-    for other in (noise_generator(1, "I", 0, 1), noise_generator(0, "II", 0, 1), noise_generator(0, "I", 1, 0)):
-        assert not np.array_equal(first, other.random(4))
-    np.testing.assert_array_equal(first, noise_generator(0, "I", 0, 1).random(4))

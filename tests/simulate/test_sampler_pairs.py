@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.sampling.samplers import fitting
-from ommatid.simulate.sampling.seeds import sampler_seeds
 
 from ..examples import needs
 

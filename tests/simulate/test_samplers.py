@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.optics.boxes import overlap
@@ -21,7 +22,6 @@ from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.sampling.passes import plan
 from ommatid.simulate.sampling.samplers import corners, filling, fitting, law
-from ommatid.simulate.sampling.seeds import sampler_seeds
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, needs, scene
 

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.adaptive_render import render_until
@@ -17,7 +18,6 @@ from ommatid.simulate.renderer.draws import DIMENSIONS, SobolDraws, sobol_points
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.sampling.passes import Plan, power_of_two_plan
-from ommatid.simulate.sampling.seeds import sampler_seeds
 
 from ..examples import needs, with_optics
 

@@ -27,6 +27,7 @@ from scipy import fft, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.processors import processors
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -39,7 +40,6 @@ VALUES = 2**24  # of the patches that are transformed at once
 MAX_WORLD = 32_000  # pixels of the world, and
 MAX_MEASUREMENTS = 1_500  # measurements, up to which the exact moments take seconds
 CAUSE = "detail"  # in the error budget
-SEED = 20260405  # of random detail, different from those of data, calibration and the other analyses
 DRAWS = 4
 
 
@@ -187,7 +187,7 @@ class DetailedModel(Model):
         total = float(variance.sum())
         if self.world is None or len(self.fine.batches) < 2 or not total:
             return variance
-        rng, scatter, power = np.random.default_rng(SEED), 0.0, 0.0
+        rng, scatter, power = probe(Purpose.DETAIL_SCATTER), 0.0, 0.0
         average = averaging(self.camera.shape, self.camera.detail)
         for _ in range(DRAWS):
             world = self.world.draw(rng)
@@ -227,7 +227,7 @@ class DetailedModel(Model):
         """A draw of what the prior leaves open given f: (pixels of the world,)."""
         if self.world is None:
             return np.zeros(self.fine.unknowns)
-        world = self.world.draw(np.random.default_rng(SEED + 1))
+        world = self.world.draw(probe(Purpose.DETAIL))
         return world - self.interpolation @ (averaging(self.camera.shape, self.camera.detail) @ world)
 
     @property

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import Purpose, probe
 
 from ..forms.form import Form
 from .residuals import DoubleDouble, ExactResiduals, as_exact, column_dots, exact
@@ -65,7 +66,7 @@ def sampled_pixels(variance: FloatArray, prior: FloatArray) -> Indices:
         return np.arange(variance.size)
     ratio = np.divide(variance, prior, out=np.ones_like(variance), where=prior > 0)
     extremes = [variance.argmin(), variance.argmax(), ratio.argmin(), ratio.argmax()]
-    others = np.random.default_rng(2).choice(variance.size, SAMPLE - len(extremes), replace=False)
+    others = probe(Purpose.CHECKED_PIXELS).choice(variance.size, SAMPLE - len(extremes), replace=False)
     return np.concatenate([extremes, others])
 
 
@@ -162,7 +163,7 @@ def variance_error(form: Form, residuals: ExactResiduals) -> float:
         error = np.where(zero, 0.0, np.abs(variance[pixels] - accurate) + uncertainty)
         largest = worst(relative(error, accurate))
         if count > ALL_CHECKED:
-            signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, 1))
+            signs = probe(Purpose.VARIANCE_SIGNS).choice([-1.0, 1.0], (count, 1))
             no_data = exact(np.zeros((form.problem.measurements, 1)))
             largest = max(largest, worst(refine(form, residuals, prior.apply_root_transposed(signs), no_data).first))
     return SAFETY * largest + last_digit(variance)
@@ -264,7 +265,7 @@ class _Certifier:
         self, residuals: Residuals, rounding: Residuals, draws: int = 1
     ) -> tuple[FloatArray, FloatArray]:
         """Twice the solution for the residuals and their rounding errors with random signs: |u|, and u p - l q."""
-        rng = np.random.default_rng(0)
+        rng = probe(Purpose.ROUNDING_SIGNS)
         signs = [[rng.choice([-1.0, 1.0], part.shape) for part in rounding] for _ in range(draws)]
         sides = [residuals, *((rounding[0] * p, rounding[1] * q) for p, q in signs)]
         solved = [(self.form.solve(p, q), p, q) for p, q in sides]
@@ -275,7 +276,7 @@ class _Certifier:
     @cached_property
     def trusted(self) -> tuple[bool, bool]:
         """True if the form reproduces a random u and l: with l in noise-free measurements only; with l in all."""
-        problem, rng = self.system.problem, np.random.default_rng(1)
+        problem, rng = self.system.problem, probe(Purpose.REPRODUCTION)
         u = exact(rng.normal(size=(problem.prior.dimension, 2 * PROBES)))
         noisy = problem.noise_variance > 0
         scale = np.where(noisy, problem.deviation, self.system.signal)[:, None]
@@ -296,7 +297,7 @@ class _Certifier:
         With c = u they record 0 first, then what H L u' gives for another u', while those with noise record anything: a
         form that drops one of two nearly equal rows for one with noise meets 0 with both, and not this.
         """
-        other = np.random.default_rng(3)
+        other = probe(Purpose.NOISE_FREE)
         zero = np.zeros((self.system.problem.measurements, u.shape[1]))
         seen = self.system.forward(exact(other.normal(size=u.shape)))
         signal = np.where(self.system.problem.noise_variance > 0, self.system.signal, 0.0)
@@ -361,7 +362,7 @@ def estimate_rounding(form: Form, u: FloatArray, multipliers: FloatArray) -> flo
         return 0.0
     with np.errstate(all="ignore"):
         pull = float(norms((deviation * (problem.matrix.T @ multipliers))[:, None])[0])
-        signs = np.random.default_rng(4).choice([-1.0, 1.0], (problem.unknowns, DRAWS))
+        signs = probe(Purpose.PRIOR_ROUNDING).choice([-1.0, 1.0], (problem.unknowns, DRAWS))
         change = problem.prior.rounding * pull * deviation[:, None] * signs
         change -= form.gain(problem.matrix @ change)
         whitened = np.divide(change, deviation[:, None], out=np.zeros_like(change), where=deviation[:, None] > 0)

@@ -22,6 +22,7 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.processors import processors
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 
 from ..methods.method import EstimationTask, is_uniform
@@ -55,7 +56,6 @@ from .window_variances import (
 
 Pixels = NDArray[np.intp]
 
-SEED = 20260401  # of the pixels, different from those of data and calibration
 SPACING = 80  # rows or columns between two pixels of a set, at least
 MOST = 200  # pixels of a set
 TRIALS = 2000  # random pixels that are tried for it
@@ -122,7 +122,7 @@ def check_map(
 
     local : False where errors are correlated over any distance, so that pixels are taken one at a time
     """
-    rng = np.random.default_rng(SEED)
+    rng = probe(Purpose.ERROR_MAP)
     ratios: list[FloatArray] = []
     many = variance.size > MANY
     for number in range((1 if many else SETS) if local else (FEW_SINGLE if many else SINGLE)):

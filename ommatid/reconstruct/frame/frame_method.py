@@ -14,6 +14,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import (
@@ -34,7 +35,6 @@ from .error_map import MANY, ErrorMap, MapCheck
 from .preconditioner import is_sliding
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
-SEED = 20260401  # of random images of the error analysis, different from those of data and calibration
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
 SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
 ERRORS = "errors"  # name of a FrameError among what frames share
@@ -207,7 +207,7 @@ class FrameMethod(Method):
 
     def _parts(self, noise: dict[str, FloatArray], mean: float) -> dict[str, float]:
         """Share of each cause of noise in the mean of Eq. 5; they add up to `mean`."""
-        rng = np.random.default_rng(SEED + 1)
+        rng = probe(Purpose.ERROR_PARTS)
         parts: dict[str, float] = {}
         uniform: tuple[float, float] | None = None  # a uniform variance and its part
         for name, values in noise.items():
@@ -230,7 +230,7 @@ class FrameMethod(Method):
         system, count = self.system, deviation.size
         bias = self._solve(system.apply_prior_precision(deviation))
         along = self._noise_part(self._solve(bias), actual)
-        random = np.random.default_rng(SEED + 2).normal(size=count)
+        random = probe(Purpose.ERROR_INTERVAL).normal(size=count)
         gain = self._transposed_gain(self._solve(random))
         back = self._solve(system.right_hand_side(self.task.on_all_measurements(actual * gain, 0.0)))
         noisy = count * sum(expected.parts.values())

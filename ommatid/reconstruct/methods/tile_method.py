@@ -20,6 +20,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import digest
 from ommatid.runtime.processors import one_thread, processors
+from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, interval
 from ..frame.conjugate_gradients import Indices, banded_cholesky, shorter_side_first
@@ -47,7 +48,6 @@ from .tile_solver import (
 TILES = 3  # sides of the window, in tiles
 PIXELS = 12  # whose variances are compared
 NOTABLE = 1.1  # factor that is worth saying
-SEED = 20261122
 RESIDUAL = 1e-3  # relative: the error of the solution is about 5 times as large
 MAX_STEPS = 1000  # reached only where lens types leave pixels undetermined
 MAX_TILES = 256  # in one task
@@ -89,7 +89,7 @@ def words(cost: float | None) -> str:
 
 
 def _middle_pixels(shape: tuple[int, int], size: int) -> Indices:
-    rng = np.random.default_rng(SEED)
+    rng = probe(Purpose.TILE_COST)
     row, column = (
         rng.integers((length - min(size, length)) // 2, (length + min(size, length)) // 2, PIXELS) for length in shape
     )

@@ -19,12 +19,12 @@ import numpy as np
 from scipy import ndimage, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
 from ..verdict.residual_power import ResidualPower
 
-SEED = 20260404  # of the random image for what the measurements do not show
 NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is averaged for the map
 GROUP_SIZE = 200  # fewest measurements over which a leverage is averaged
 MOST_GROUPS = 24  # per lens type
@@ -156,7 +156,7 @@ def with_attenuation(
 
     image : (N,) with the contrast of the true one;  truth : (N,), or None;  actual : (measurements used,) variances
     """
-    task, rng, root = method.task, np.random.default_rng(SEED), np.sqrt(actual)
+    task, rng, root = method.task, probe(Purpose.ATTENUATION), np.sqrt(actual)
     white = rng.normal(size=root.size)
     noise = operators.gain(root * white)
     attenuation = Attenuation.of(method, operators, [white], [noise], root)

@@ -16,12 +16,12 @@ import numpy as np
 from scipy import fft, ndimage
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.model import Model
 
 from ..methods.method import EstimationTask, Method, PosteriorOperators, total_variance
 from .attenuation import FIRST_ORDER, Attenuation
 
-SEED = 20260403  # of random images and noise, different from those of the other analyses
 BINS = 12  # of frequency
 FEWEST_WAVES = 8  # in a bin
 SIGNAL = 0.5  # excess over the noise, relative, from which a bin is determined
@@ -53,7 +53,7 @@ def true_contrast(method: Method, operators: PosteriorOperators, by_cause: dict[
     by_cause : (measurements used,) noise variances, with those that the uncertainty of H adds as "calibration"
     """
     task, actual = method.task, total_variance(by_cause)
-    rng, waves = np.random.default_rng(SEED), Waves(task.shape)
+    rng, waves = probe(Purpose.CONTRAST), Waves(task.shape)
     root = np.sqrt(actual)
     whites = _white_noise(task, rng)
     noise = tuple(operators.gain(root * white) for white in whites)
@@ -80,7 +80,7 @@ def without_noise(method: Method, operators: PosteriorOperators, actual: FloatAr
     actual : (measurements used,) noise variances
     """
     task, waves = method.task, Waves(method.task.shape)
-    rng, root = np.random.default_rng(SEED), np.sqrt(actual)
+    rng, root = probe(Purpose.CONTRAST), np.sqrt(actual)
     noise = tuple(operators.gain(root * white) for white in _white_noise(task, rng))
     deviation = method.image - task.prior.mean
     excess, determined = _excess(waves, deviation, noise)

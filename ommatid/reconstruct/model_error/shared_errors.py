@@ -19,6 +19,7 @@ import numpy as np
 from scipy import ndimage, sparse
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 
@@ -27,7 +28,6 @@ from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOper
 from ..prior import spectrum_of
 from ..verdict.residual_power import ResidualPower, SharedResidual, squared_trace
 
-SEED = 20260407  # of random combinations, different from those of data, calibration and the other analyses
 FEW_PIXELS, FEW_COLUMNS = 4000, 1000  # up to which every column is taken
 DRAWS, FEW_DRAWS = 12, 4  # of combinations, otherwise
 MANY = 250_000  # pixels above which a combination takes long and few are enough
@@ -80,7 +80,7 @@ class SharedErrors:
         along = float(np.square(self.images @ bias).sum())
         combined = self.images
         if len(combined) > CROSS_DRAWS:
-            weights = np.random.default_rng(SEED + 1).normal(size=(CROSS_DRAWS, len(combined)))
+            weights = probe(Purpose.SHARED_PRODUCTS).normal(size=(CROSS_DRAWS, len(combined)))
             combined = weights @ combined / CROSS_DRAWS**0.5
         across = sum(
             float(actual @ np.square(operators.weigh(task.observe(operators.posterior(image))))) for image in combined
@@ -111,7 +111,7 @@ def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: Fl
     if exact and directions is not None:
         readings: FloatArray = directions.T.toarray()
     else:
-        rng, variance = np.random.default_rng(SEED), model.error_variance(image)
+        rng, variance = probe(Purpose.SHARED_ERRORS), model.error_variance(image)
         share = 0.0 if variance is None else float(np.mean(variance[used] / task.expected_noise))
         count = FEW_DRAWS if model.unknowns > MANY or share < SMALL else DRAWS
         draws: list[FloatArray] = []
@@ -221,7 +221,7 @@ def _with_residuals(
 
 def _as_independent(task: EstimationTask, operators: PosteriorOperators) -> FloatArray:
     """Return the mean squares of whitened residuals of independent errors with the same variances."""
-    rng, root = np.random.default_rng(SEED + 2), np.sqrt(task.shared_variance)
+    rng, root = probe(Purpose.SHARED_INDEPENDENT), np.sqrt(task.shared_variance)
     total = np.zeros(root.size)
     for _ in range(DRAWS):
         draw = root * rng.normal(size=root.size)

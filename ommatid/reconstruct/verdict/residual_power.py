@@ -15,8 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
-
-SEED = 20260402  # of random images and noise, different from those of data, calibration and error analysis
+from ommatid.runtime.streams import Purpose, probe
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,7 @@ class ResidualInputs:
 
     def columns(self) -> Iterator[FloatArray]:
         """Yield the inputs, (M,) each: the known image, noises, then images; those that are needed."""
-        rng = np.random.default_rng(SEED)
+        rng = probe(Purpose.RESIDUAL)
         if self.deviation is not None:
             yield self.observe(self.deviation)
         if self.deviation is not None or self.leverage is None:

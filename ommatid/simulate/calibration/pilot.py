@@ -16,6 +16,7 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import MachineError
+from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
@@ -25,7 +26,6 @@ from ommatid.scenes.shrinkage import shrink_variances
 from ..renderer.variant import choose, unusable_reason
 from ..sampling.passes import BATCHES, MOST_SAMPLES, Plan, cells_of, on_grid, plan
 from ..sampling.samplers import expected_exponent, fitting
-from ..sampling.seeds import repeat_seed
 from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model
 from .point_sources import Plans
@@ -139,7 +139,7 @@ def setup_of_pilot(setup: Setup, **calibration: Any) -> Setup:
     scene = setup.scene
     changed = scene.calibration.model_copy(update={"method": "transport", **calibration})
     render = scene.render.model_copy(
-        update={"seed": repeat_seed(scene.render.seed, "pilot", 0), "variant": _fast_variant(scene.render.variant)}
+        update={"seed": derived_seed(scene.render.seed, Purpose.PILOT), "variant": _fast_variant(scene.render.variant)}
     )
     return replace(setup, scene=with_tables(scene, calibration=changed, render=render))
 

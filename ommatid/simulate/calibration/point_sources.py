@@ -22,6 +22,7 @@ from scipy import sparse
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import MachineError
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.setup import Setup
@@ -29,7 +30,6 @@ from ommatid.scenes.setup import Setup
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint, State
 from ..sampling.passes import BATCHES, OverPasses, Plan, Tally, plan
-from ..sampling.seeds import sampler_seeds
 
 if TYPE_CHECKING:
     from ..renderer.renderer import Renderer

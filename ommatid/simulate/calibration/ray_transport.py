@@ -16,11 +16,11 @@ from scipy import sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.library_caches import compiled
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import check_transport_variant, choose
 from ..sampling.passes import BATCHES, Plan, plan
-from ..sampling.seeds import sampler_seeds
 from .point_sources import Part, Plans, Responses, Subsets, joined_parts, on_all_rows
 
 if TYPE_CHECKING:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernels import KernelFootprints, basis
 from ommatid.scenes.lens_type import LensType
@@ -58,7 +59,7 @@ def error_directions(chart: Chart, candidate: Candidate, parts: Components) -> t
 
 def _draws(chart: Chart, candidate: Candidate) -> FloatArray:
     """Return coefficients of the kernels' errors: (draws, C, P)."""
-    rng, count = np.random.default_rng(0), len(chart.batches)
+    rng, count = probe(Purpose.KERNEL_ERRORS), len(chart.batches)
     x = basis(chart.field, candidate.degree)
     entries = np.zeros((DRAWS, chart.inside.shape[1], x.shape[1]))
     for batch in chart.batches:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sampling.seeds import seed_of_draw
+from ommatid.runtime.streams import draw_seed
 
 DIMENSIONS = 8  # of the points; what a ray draws beyond them is independent
 BITS = 32
@@ -59,7 +59,7 @@ class ReseededSampler:
     def reseeded(self) -> Any:
         """Return Mitsuba's sampler with the next seed."""
         self._draws += 1
-        self._sampler.seed(seed_of_draw(self._seed, self._draws), self._lanes)
+        self._sampler.seed(draw_seed(self._seed, self._draws), self._lanes)
         return self._sampler
 
 

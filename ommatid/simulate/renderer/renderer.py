@@ -18,6 +18,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.streams import block_seed
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
@@ -26,7 +27,6 @@ from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting
-from ..sampling.seeds import seed_of
 from .draws import Grid
 from .plugins import black, depths, scene_of, stock_sensors, target_of
 from .variant import activate, check_fast_variant
@@ -182,7 +182,7 @@ class Renderer:
         generator, subset = self._generators[group], pixels + (rows.start - self.rows(group).start)
         parts, start = list[FloatArray](), generator.sobol_rays if sobol else generator.rays
         for block in generator.blocks(work.total, pixels.size):
-            rays = start(work.samples, seed_of(seed(0), block.start), block, work.passes, subset)
+            rays = start(work.samples, block_seed(seed(0), block.start), block, work.passes, subset)
             parts.append(self._readings(group, rays).reshape(-1, work.passes).T)
         return np.concatenate(parts, axis=1)
 
@@ -210,7 +210,7 @@ class Renderer:
         self, group: str, samples: int, seed: Callable[[int], int], block: slice, subset: IntArray | None
     ) -> Rays:
         first = seed(list(self.groups).index(group))
-        return self._generators[group].rays(samples, seed_of(first, block.start), block, subset=subset)
+        return self._generators[group].rays(samples, block_seed(first, block.start), block, subset=subset)
 
     def _readings(self, group: str, rays: Rays) -> FloatArray:
         """Return the readings of the pixels of these rays: (pixels of the block,)."""

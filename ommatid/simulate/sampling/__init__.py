@@ -1,1 +1,1 @@
-"""Samplers, passes, seeds and checkpoints of renderings."""
+"""Samplers, passes and checkpoints of renderings."""

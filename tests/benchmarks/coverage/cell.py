@@ -10,8 +10,8 @@ import numpy as np
 from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import fingerprint
+from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.scenes.scene import Scene, read, with_tables
-from ommatid.simulate.sampling.seeds import repeat_seed
 
 SEEDS = 20
 DRAWN, MISALIGNED = "image drawn from the prior", "misalignment"  # purposes of seeds besides the scene's own
@@ -83,14 +83,16 @@ class Cell:
 
         A camera with tolerances is another draw of them in every run, since the error bars count them as random.
         """
-        changes = [*self.base, *self.changes, f"render.seed={repeat_seed(0, self.name, number)}"]
+        changes = [*self.base, *self.changes, f"render.seed={derived_seed(0, Purpose.REPEAT, self.name, number)}"]
         if read(Path(self.scene), self.changes).camera.tolerance is not None:
-            changes.append(f"camera.tolerance.seed={repeat_seed(0, f'{MISALIGNED}, {self.name}', number)}")
+            changes.append(
+                f"camera.tolerance.seed={derived_seed(0, Purpose.REPEAT, f'{MISALIGNED}, {self.name}', number)}"
+            )
         return read(Path(self.scene), changes, self.lenses)
 
     def drawn_image(self, scene: Scene, shape: tuple[int, int], number: int) -> FloatArray:
         """Return the image of run `number` drawn from the scene's prior, `shape`, in the renderer's precision."""
         prior = prior_of(scene.prior, shape, scene.target.pixel_pitch)
-        rng = np.random.default_rng(repeat_seed(0, f"{DRAWN}, {self.name}", number))
+        rng = np.random.default_rng(derived_seed(0, Purpose.REPEAT, f"{DRAWN}, {self.name}", number))
         image = prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
         return image.astype(np.float32).astype(np.float64).reshape(shape)

@@ -1,7 +1,8 @@
 """Traced H against H in closed form, entry by entry: defocus, diffraction, distortion, misalignment.
 
-With independent samples an entry is a share of n rays, with the variance H (1 - H) / n: the statistic is normal with a
-known standard error, not one estimated from the data. Entries that few rays meet are summed.
+With independent samples an entry is a share of n rays, whose number is binomial: the statistic is the normal number of
+the same tail, since at five standard errors the binomial law of few rays is far from normal. Entries that few rays meet
+are summed.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from scipy import sparse, stats
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.optics.blur import blur_of
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.ray_transport import one_pass, responses_from_rays
@@ -25,7 +27,7 @@ from ..examples import OPTICS, familywise, needs, with_optics
 from .world_files import distance_to_target
 
 SAMPLES = 2**14
-FEWEST = 25  # rays expected in an entry, above which their number is normal
+FEWEST = 25  # rays expected in an entry that is compared by itself
 RAYS = {"wavelength": "none"}
 WAVES = {"0.1 waves": 266.67, "0.3 waves": 108.11, "1 wave": 35.088, "3 waves": 11.976}  # focus, mm, at 550 nm
 CLOSED = OPTICS | {
@@ -40,16 +42,17 @@ CLOSED = OPTICS | {
 }
 
 
-def scores(found: sparse.csr_array, expected: sparse.csr_array, rays: int) -> np.ndarray:
+def scores(found: sparse.csr_array, expected: sparse.csr_array, rays: int) -> FloatArray:
     """Return the deviation of each entry in standard errors, and of each row's sum over its rare entries."""
     dense, known = found.toarray(), expected.toarray()
     rare = known * rays < FEWEST
-    many = ~rare
-    each = (dense[many] - known[many]) / np.sqrt(known[many] * (1 - known[many]) / rays)
     ours, theirs = (np.where(rare, matrix, 0.0).sum(axis=1) for matrix in (dense, known))
     enough = theirs * rays >= FEWEST
-    together = (ours[enough] - theirs[enough]) / np.sqrt(theirs[enough] * (1 - theirs[enough]) / rays)
-    return np.concatenate([each, together])
+    shares, means = np.concatenate([dense[~rare], ours[enough]]), np.concatenate([known[~rare], theirs[enough]])
+    # The binomial law made continuous: the distribution function of k successes is a beta function of k + 1/2.
+    counts = shares * rays
+    law = stats.beta(counts + 0.5, np.maximum(rays - counts, 0.0) + 0.5)
+    return np.where(shares > means, stats.norm.isf(law.cdf(means)), -stats.norm.isf(law.sf(means)))
 
 
 @pytest.mark.parametrize("kind", CLOSED)

@@ -76,19 +76,21 @@ class Attenuation:
         """Return the attenuation of a method's estimate.
 
         noise : A of `root` times each of `whites`, whose products show the diagonal of H A (Hutchinson 1990), on
-            average over measurements of a lens type of about the same leverage
+            average over measurements of a lens type of about the same leverage. They are divided by the squares of
+            `whites`, since leverages near 1 would else be lost in the scatter of these.
         """
         task = method.task
         inverse = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0)
         products = [inverse * white * task.observe(image) for white, image in zip(whites, noise, strict=True)]
-        leverage = np.mean(products, axis=0)
+        leverage, power = np.mean(products, axis=0), np.mean(np.square(whites), axis=0)
         share, likely = np.empty_like(leverage), _likely_leverage(task)
         used = np.flatnonzero(task.used)
         for part in task.model.camera.type_slices():
             rows = np.flatnonzero((used >= part.start) & (used < part.stop))
             groups = max(1, min(rows.size // GROUP_SIZE, MOST_GROUPS))
             for group in np.array_split(rows[np.argsort(likely[rows])], groups):
-                share[group] = np.clip(1 - leverage[group].mean(), 0.0, 1.0) if group.size else 1.0
+                seen = leverage[group].sum() / power[group].sum() if group.size else 0.0
+                share[group] = np.clip(1 - seen, 0.0, 1.0)
         return cls(task.model.error_halves, operators, task.used, share)
 
     def halves(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -17,15 +17,15 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.model import Model
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
-from tests.examples import THREE, scene
+from tests.examples import THREE, Lenses, scene
 
 BATCHES, SPREAD = 8, 0.02
 NOISE = 1e-2
 DRAWS = 24
 
 
-def _exact() -> Model:
-    described = scene(lenses=THREE, noise={"variance": NOISE})
+def _exact(lenses: Lenses = THREE) -> Model:
+    described = scene(lenses=lenses, noise={"variance": NOISE})
     model = ideal_model(described, derive(described))
     return replace(model, stored=ideal_matrix(model.camera))
 
@@ -96,6 +96,22 @@ def test_the_attenuation_is_that_of_dense_matrices() -> None:
         dense = [error.toarray() for error in errors]
         total = sum((error.T @ (share / noise * (error @ image)) for error in dense), np.zeros(361))
         np.testing.assert_allclose(half, posterior @ total, rtol=1e-6, atol=1e-8)
+
+
+def test_one_draw_shows_leverages_near_one() -> None:
+    """Of a lens type that sees fewer measurements than pixels: the mean of 1 - (H A)_ii, which is far below 1."""
+    exact, rng = _exact(THREE[:1]), np.random.default_rng(9)
+    image = 127.5 + 60 * rng.normal(size=361)
+    model = _measured(exact, rng)
+    noise = NOISE + model.variance_from_model(image)
+    method = _method(model, exact.matrix @ image, noise)
+    h = model.matrix.toarray()
+    inverse = np.linalg.inv(h @ h.T * model.scene.prior.variance + np.diag(noise))
+    share = float(np.mean(noise * np.diagonal(inverse)))
+    assert share < 0.05
+    found = np.array([_attenuation(method, noise, rng).residual_share.mean() for _ in range(DRAWS)])
+    scatter = (2 / noise.size) ** 0.5  # of the mean square of the draw
+    assert np.square(found - share).mean() ** 0.5 < 0.1 * scatter
 
 
 @pytest.mark.slow

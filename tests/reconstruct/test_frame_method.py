@@ -111,8 +111,12 @@ def test_dead_and_saturated_pixels() -> None:
 
 @pytest.mark.parametrize(
     ("prior", "shape"),
-    [({"kind": "exponential", "correlation_length": "25 mm"}, (35, 35)), ({"kind": "power"}, (24, 21))],
-    ids=["exponential", "power"],
+    [
+        pytest.param({"kind": "exponential", "correlation_length": "25 mm"}, (35, 35), marks=pytest.mark.slow),
+        ({"kind": "exponential", "correlation_length": "25 mm"}, (24, 21)),
+        ({"kind": "power"}, (24, 21)),
+    ],
+    ids=["exponential, large", "exponential", "power"],
 )
 def test_a_prior_of_correlated_pixels_is_that_of_the_dense_problem(
     prior: dict[str, Any], shape: tuple[int, int]

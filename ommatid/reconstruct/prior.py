@@ -96,9 +96,9 @@ def prior_of(table: estimation.PriorTable, shape: tuple[int, int], pitch: float,
     Raises InputError for kind "fit", which needs a stack.
     """
     spectrum = spectrum_of(table, shape, pitch, detail)
-    if isinstance(spectrum, float):
-        return independent(table.mean, spectrum, shape[0] * shape[1])
-    return _reflected(table.mean, spectrum)
+    if isinstance(spectrum, np.ndarray):
+        return _reflected(table.mean, spectrum)
+    return independent(table.mean, spectrum, shape[0] * shape[1])
 
 
 def spectrum_of(
@@ -149,9 +149,10 @@ def _along_columns(lags: FloatArray) -> FloatArray:
     size = lags.shape[-1]
     tapered = np.zeros((lags.shape[0], size + 1))
     tapered[:, :size] = lags * (size - np.arange(size)) / size
-    sums = np.asarray(fft.dct(tapered, 1))[:, :size]
+    sums: FloatArray = np.asarray(fft.dct(tapered, 1), dtype=np.float64)[:, :size]
     if size > 1:
-        sums[:, 1:] -= np.asarray(fft.dst(lags[:, 1:], 1)) / (size * np.sin(np.pi * np.arange(1, size) / size))
+        sines = np.sin(np.linspace(0, np.pi, size, endpoint=False)[1:])
+        sums[:, 1:] -= np.asarray(fft.dst(lags[:, 1:], 1), dtype=np.float64) / (size * sines)
     return sums
 
 
@@ -197,15 +198,15 @@ def coloured(spectrum: float | FloatArray, white: FloatArray) -> FloatArray:
 
 def cosine_waves(size: int) -> FloatArray:
     """Return the waves of the orthonormal DCT-II as columns: (size, size)."""
-    return np.asarray(fft.idct(np.eye(size), 2, axis=0, norm="ortho"))
+    return np.asarray(fft.idct(np.eye(size), 2, axis=0, norm="ortho"), dtype=np.float64)
 
 
 def reflecting_root(spectrum: FloatArray) -> FloatArray:
     """Return L = C^T diag(s)^1/2, (N, N), a column for each wave."""
     vertical, horizontal = (cosine_waves(size) for size in spectrum.shape)
-    root = np.kron(vertical, horizontal)
-    root *= np.sqrt(spectrum).ravel()
-    return root
+    root = vertical[:, None, :, None] * horizontal[None, :, None, :]
+    root *= np.sqrt(spectrum)
+    return root.reshape(spectrum.size, spectrum.size)
 
 
 def covariance_root(covariance: FloatArray) -> FloatArray:

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
-from ommatid.reconstruct.prior import prior_of, spectrum_of
+from ommatid.reconstruct.prior import coloured, spectrum_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, derived_seed, stream
@@ -115,18 +114,10 @@ def _with_own_seed(setup: Setup) -> Setup:
 def _prior_draw(setup: Setup) -> FloatArray:
     """Return an image drawn from the prior, (N,); of a prior that is to be fitted, with independent pixels."""
     scene, camera = setup.scene, setup.camera
-    random = stream(scene.render.seed, Purpose.PREDICTED_IMAGE).normal(size=camera.unknowns)
+    random = stream(scene.render.seed, Purpose.PREDICTED_IMAGE).normal(size=camera.shape)
     table = scene.prior
-    if table.kind in ("independent", "fit"):
-        image = table.variance**0.5 * random
-    elif camera.unknowns <= MAX_DENSE_PIXELS:
-        image = prior_of(table, camera.shape, camera.target_pitch).apply_root(random)
-    else:
-        from scipy import fft
-
-        waves = np.sqrt(spectrum_of(table, camera.shape, camera.target_pitch)) * random.reshape(camera.shape)
-        image = np.asarray(fft.idctn(waves, 2, norm="ortho")).ravel()
-    image = image + table.mean
+    spectrum = table.variance if table.kind == "fit" else spectrum_of(table, camera.shape, camera.target_pitch)
+    image = table.mean + coloured(spectrum, random).ravel()
     return np.maximum(image, 0.0) if scene.sensor is not None else image
 
 

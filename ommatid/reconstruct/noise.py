@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import fft, special
+from scipy import special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
@@ -30,7 +30,7 @@ from ommatid.scenes.tables.estimation import PriorTable
 from .detail.detailed_model import CAUSE as DETAIL
 from .fitting.prior_fit import PriorFit
 from .methods.method import is_uniform, total_variance
-from .prior import spectrum_of
+from .prior import coloured, spectrum_of
 
 Noise = dict[str, FloatArray]  # variances by cause
 
@@ -135,10 +135,7 @@ def _shared_noise_of_prior(model: Model, usable: UsablePixels, prior: PriorTable
     if model.error_variance(np.full(camera.unknowns, prior.mean)) is None:
         return {}
     spectrum = spectrum_of(prior, camera.shape, camera.target_pitch, camera.detail)
-    random = probe(Purpose.SHARED_PRIOR).normal(size=camera.shape)
-    drawn = spectrum**0.5 * random
-    if not isinstance(spectrum, float):
-        drawn = np.asarray(fft.idctn(drawn, 2, norm="ortho"))
+    drawn = coloured(spectrum, probe(Purpose.SHARED_PRIOR).normal(size=camera.shape))
     variance = model.error_variance(prior.mean + drawn.ravel())
     if variance is None:
         return {}

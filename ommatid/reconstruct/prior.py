@@ -1,6 +1,18 @@
 """Prior of an image: its mean f0 and covariance P0 = L L^T.
 
 Only the root L is used, so P0 may be singular (known pixels) or tiny; no inverse of it is needed.
+
+Correlated pixels have reflecting edges: the image is continued by its mirror image about a line half a pixel beyond its
+outermost pixels. Then P0 = C^T diag(s) C with the orthonormal DCT-II C along both axes and a spectrum s > 0: the cosine
+waves are independent. Dense problems, frames and worlds finer than f have the same s, whose mean is the variance of a
+pixel, averaged over the image:
+
+    exponential   s_k = c_k^T E c_k,   E = variance exp(-distance / length),   c_k the k-th wave
+    power         s_k proportional to |w_k|^-a,   w_k = pi (row / rows, column / columns);   w_0 as the lowest other
+
+The first gives each wave the variance that it has where E is the covariance. That is the spectral density of E, the sum
+of (1 / length^2 + |w + 2 pi m|^2)^(-3/2) over all aliases m times a constant, averaged over the width of the wave in
+frequency. So s is positive, and of all reflecting priors this one is the closest to E by relative entropy.
 """
 
 from __future__ import annotations
@@ -9,15 +21,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import fft, linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables import estimation
 
 EPS = float(np.finfo(np.float64).eps)
-ROUNDING = 4 * EPS  # of an entry of P0, and of its Cholesky factor
-LEAST_POWER = 1e-12  # relative to the largest; periodic continuation of a covariance may have negative eigenvalues
+ROUNDING = 16 * EPS  # of an entry of L L^T, by those of the waves
 DEFAULT_EXPONENT = 2.0  # of the power-law spectrum
 NEEDS_FIT = "prior.kind 'fit' takes a recorded stack; set another kind to predict without one"
 
@@ -74,8 +85,8 @@ def independent(mean: float, variance: float, unknowns: int) -> Prior:
 
 
 def exponential(mean: float, variance: float, shape: tuple[int, int], length: float) -> Prior:
-    """Return the isotropic prior P0 = variance exp(-distance / length); `length` in pixels."""
-    return _stationary(mean, shape, variance * np.exp(-lag_distances(shape) / length))
+    """Return the isotropic prior nearest to the covariance variance exp(-distance / length); `length` in pixels."""
+    return _reflected(mean, variance * exponential_spectrum(shape, length))
 
 
 def prior_of(table: estimation.PriorTable, shape: tuple[int, int], pitch: float, detail: int = 1) -> Prior:
@@ -84,74 +95,118 @@ def prior_of(table: estimation.PriorTable, shape: tuple[int, int], pitch: float,
     detail : a correlated prior is that of a world so many times finer, of which the image is the average
     Raises InputError for kind "fit", which needs a stack.
     """
-    if table.kind == "independent":
-        return independent(table.mean, table.variance, shape[0] * shape[1])
-    return _stationary(table.mean, shape, _image_lags(table, shape, pitch, detail))
+    spectrum = spectrum_of(table, shape, pitch, detail)
+    if isinstance(spectrum, np.ndarray):
+        return _reflected(table.mean, spectrum)
+    return independent(table.mean, spectrum, shape[0] * shape[1])
 
 
 def spectrum_of(
     table: estimation.PriorTable, shape: tuple[int, int], pitch: float, detail: int = 1
 ) -> float | FloatArray:
-    """Return the diagonal form of P0: the variance of independent pixels, else its spectrum under the DCT-II.
+    """Return the variance of independent pixels, else s, the eigenvalues of P0 under the DCT-II: (rows, columns).
 
-    Arguments as of `prior_of`. The DCT reflects the image at its edges. Inside, this prior equals the stationary one
-    of `prior_of`; within a correlation length of an edge the variance is larger. Raises InputError for kind "fit",
-    which needs a stack.
+    Arguments as of `prior_of`. Raises InputError for kind "fit", which needs a stack.
     """
     if table.kind == "independent":
         return table.variance
-    lags = _image_lags(table, shape, pitch, detail)
-    spectrum: FloatArray = np.fft.fft2(lags).real[: shape[0], : shape[1]]
-    return np.maximum(spectrum, LEAST_POWER * float(spectrum.max()))
-
-
-def covariance_lags(table: estimation.PriorTable, shape: tuple[int, int], pitch: float) -> FloatArray:
-    """Return the covariance at every lag, (2 rows, 2 columns), of a correlated prior; index -1 is a lag of -1.
-
-    Raises InputError for kind "fit", which needs a stack, ValueError for independent pixels.
-    """
-    if table.kind == "exponential" and table.correlation_length is not None:
-        return table.variance * np.exp(-lag_distances(shape) * pitch / table.correlation_length)
-    if table.kind == "power":
-        return table.variance * _power_correlation(shape, table.exponent)
-    if table.kind == "independent":
-        raise ValueError("expected a correlated prior, got one of independent pixels")
-    raise InputError(NEEDS_FIT)
-
-
-def averaged_lags(lags: FloatArray, detail: int) -> FloatArray:
-    """Return the covariance at every lag of averages over detail x detail pixels: A P A^T for box averages A.
-
-    lags : (2 detail rows, 2 detail columns) of the pixels that are averaged; the result is (2 rows, 2 columns)
-    """
-    if detail == 1:
-        return lags
-    waves = np.fft.rfft2(lags)
-    for axis, size in enumerate(lags.shape):
-        frequency = np.fft.fftfreq(size) if axis == 0 else np.fft.rfftfreq(size)
-        box = np.exp(-2j * np.pi * np.outer(frequency, np.arange(detail))).mean(axis=1)
-        waves *= np.expand_dims(np.square(np.abs(box)), 1 - axis)
-    return np.ascontiguousarray(np.fft.irfft2(waves, s=lags.shape)[::detail, ::detail])
-
-
-def _image_lags(table: estimation.PriorTable, shape: tuple[int, int], pitch: float, detail: int) -> FloatArray:
     fine = shape[0] * detail, shape[1] * detail
-    return averaged_lags(covariance_lags(table, fine, pitch / detail), detail)
+    if table.kind == "exponential" and table.correlation_length is not None:
+        spectrum = exponential_spectrum(fine, table.correlation_length * detail / pitch)
+    elif table.kind == "power":
+        spectrum = _power_spectrum(fine, DEFAULT_EXPONENT if table.exponent is None else table.exponent)
+    else:
+        raise InputError(NEEDS_FIT)
+    return table.variance * averaged_spectrum(spectrum, detail)
+
+
+def exponential_spectrum(shape: tuple[int, int], length: float) -> FloatArray:
+    """Return s, (rows, columns), of variance 1; `length` in pixels."""
+    # The constant 1 is a multiple of the first wave; without it long correlations leave no small differences.
+    spectrum = wave_variances(np.expm1(-lag_distances(shape) / length))
+    spectrum[0, 0] += spectrum.size
+    return spectrum
 
 
 def lag_distances(shape: tuple[int, int]) -> FloatArray:
-    """Return the distance in pixels of every lag, (2 rows, 2 columns); index -1 is a lag of -1 (periodic)."""
-    row_lags, column_lags = (np.minimum(np.arange(2 * size), 2 * size - np.arange(2 * size)) for size in shape)
-    return np.hypot(row_lags[:, None], column_lags[None, :])
+    """Return the distance in pixels of every lag from 0: (rows, columns)."""
+    return np.hypot(np.arange(shape[0])[:, None], np.arange(shape[1])[None, :])
 
 
-def stationary_matrix(lags: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return the (N, N) matrix over pairs of pixels of a function of the lag, (2 rows, 2 columns)."""
-    rows, columns = shape
-    row_lags = np.subtract.outer(np.arange(rows), np.arange(rows)) % (2 * rows)
-    column_lags = np.subtract.outer(np.arange(columns), np.arange(columns)) % (2 * columns)
-    table = lags[row_lags[:, None, :, None], column_lags[None, :, None, :]]
-    return np.ascontiguousarray(table.reshape(rows * columns, rows * columns))
+def wave_variances(lags: FloatArray) -> FloatArray:
+    """Return c_k^T E c_k of every cosine wave, (rows, columns), of a stationary covariance E.
+
+    lags : (rows, columns) of E, an even function of the lag along either axis
+    """
+    return _along_columns(_along_columns(lags).T).T
+
+
+def _along_columns(lags: FloatArray) -> FloatArray:
+    """Return sums over all pairs of places of c_k(i) c_k(j) E(i - j) along the last axis.
+
+    The waves at a lag d share (n - d) cos(pi k d / n) / n, and less by sin(pi k d / n) / (n sin(pi k / n)) for k > 0.
+    """
+    size = lags.shape[-1]
+    tapered = np.zeros((lags.shape[0], size + 1))
+    tapered[:, :size] = lags * (size - np.arange(size)) / size
+    sums: FloatArray = np.asarray(fft.dct(tapered, 1), dtype=np.float64)[:, :size]
+    if size > 1:
+        sines = np.sin(np.linspace(0, np.pi, size, endpoint=False)[1:])
+        sums[:, 1:] -= np.asarray(fft.dst(lags[:, 1:], 1), dtype=np.float64) / (size * sines)
+    return sums
+
+
+def _power_spectrum(shape: tuple[int, int], exponent: float) -> FloatArray:
+    """Return s, (rows, columns), of variance 1."""
+    vertical, horizontal = (np.arange(size) / size for size in shape)
+    frequency = np.hypot(vertical[:, None], horizontal[None, :])
+    frequency[0, 0] = 1 / max(shape)
+    spectrum = (frequency * max(shape)) ** -exponent
+    return spectrum / spectrum.mean()
+
+
+def averaged_spectrum(spectrum: FloatArray, detail: int) -> FloatArray:
+    """Return the spectrum of averages over detail x detail pixels, (rows, columns): A P A^T for box averages A.
+
+    spectrum : (detail rows, detail columns) of the pixels that are averaged
+    """
+    if detail == 1:
+        return spectrum
+    vertical, horizontal = (_bands(size // detail, detail) for size in spectrum.shape)
+    return np.asarray(vertical @ (horizontal @ spectrum.T).T)
+
+
+def _bands(size: int, detail: int) -> sparse.csr_array:
+    """Return the power of each fine wave in each wave of averages over `detail` pixels: (size, detail size)."""
+    fine = np.arange(1, size * detail)
+    angle = np.pi * fine / (2 * size)
+    power = np.square(np.sin(angle) / (detail * np.sin(angle / detail))) / detail
+    alias = np.minimum(fine % (2 * size), -fine % (2 * size))
+    power[alias == 0] *= 2  # the constant wave is normalised otherwise
+    power, alias = np.append(power, 1 / detail), np.append(alias, 0)
+    seen = alias < size
+    places = alias[seen], np.append(fine, 0)[seen]
+    return sparse.csr_array((power[seen], places), shape=(size, size * detail))
+
+
+def coloured(spectrum: float | FloatArray, white: FloatArray) -> FloatArray:
+    """Return images of the covariance P0, less their mean, from white noise: (..., rows, columns)."""
+    if isinstance(spectrum, float):
+        return spectrum**0.5 * white
+    return np.asarray(fft.idctn(np.sqrt(spectrum) * white, 2, axes=(-2, -1), norm="ortho"))
+
+
+def cosine_waves(size: int) -> FloatArray:
+    """Return the waves of the orthonormal DCT-II as columns: (size, size)."""
+    return np.asarray(fft.idct(np.eye(size), 2, axis=0, norm="ortho"), dtype=np.float64)
+
+
+def reflecting_root(spectrum: FloatArray) -> FloatArray:
+    """Return L = C^T diag(s)^1/2, (N, N), a column for each wave."""
+    vertical, horizontal = (cosine_waves(size) for size in spectrum.shape)
+    root = vertical[:, None, :, None] * horizontal[None, :, None, :]
+    root *= np.sqrt(spectrum)
+    return root.reshape(spectrum.size, spectrum.size)
 
 
 def covariance_root(covariance: FloatArray) -> FloatArray:
@@ -163,27 +218,8 @@ def covariance_root(covariance: FloatArray) -> FloatArray:
         return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _stationary(mean: float, shape: tuple[int, int], lags: FloatArray) -> Prior:
-    covariance = stationary_matrix(lags, shape)
-    root = covariance_root(covariance)
-    rounding = ROUNDING if np.array_equal(root, np.tril(root)) else _defect(root, covariance)
-    return Prior(np.full(shape[0] * shape[1], mean), root, rounding)
-
-
-def _defect(root: FloatArray, covariance: FloatArray) -> float:
-    """Return the largest error of L L^T by rounding, relative to the standard deviations, and that of P0 itself."""
-    deviation = np.sqrt(np.diagonal(covariance))
-    error = np.abs(root @ root.T - covariance) / (deviation[:, None] * deviation)
-    return ROUNDING + min(float(error.max(initial=0.0)), deviation.size * EPS)
-
-
-def _power_correlation(shape: tuple[int, int], exponent: float | None) -> FloatArray:
-    """Return the correlation at every lag, (2 rows, 2 columns), of a power-law spectrum; twice the size avoids wrap."""
-    row_frequency, column_frequency = np.fft.fftfreq(2 * shape[0]), np.fft.fftfreq(2 * shape[1])
-    frequency = np.hypot(row_frequency[:, None], column_frequency[None, :])
-    frequency[0, 0] = frequency[frequency > 0].min()  # the mean gets the power of the lowest frequency
-    lags = np.fft.ifft2(frequency ** -(DEFAULT_EXPONENT if exponent is None else exponent)).real
-    return lags / lags[0, 0]
+def _reflected(mean: float, spectrum: FloatArray) -> Prior:
+    return Prior(np.full(spectrum.size, mean), reflecting_root(spectrum), ROUNDING)
 
 
 def _scale_rows(root: FloatArray, values: FloatArray) -> FloatArray:

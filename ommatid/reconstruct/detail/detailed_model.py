@@ -66,7 +66,7 @@ def local_interpolation(prior: WorldPrior, window: WorldPrior) -> sparse.csr_arr
 
 
 def unexplained_variance(prior: WorldPrior, fine: sparse.csr_array, coarse: sparse.csr_array) -> FloatArray:
-    """Return z^T P z with z = h - A^T g of every measurement: (M,).
+    """Return z^T P z with z = h - A^T g of every measurement, as if P were the same everywhere: (M,).
 
     fine : rows h of H on the world's grid;  coarse : rows g of G on f's
     """
@@ -75,7 +75,8 @@ def unexplained_variance(prior: WorldPrior, fine: sparse.csr_array, coarse: spar
     variance = np.zeros(fine.shape[0])
     for batch in _batches(left, prior.fine_shape):
         shape = batch.rows * 2, batch.columns * 2
-        spectrum = fft.rfft2(_central_lags(prior.lags, shape)).real
+        places = (np.minimum(np.arange(size), size - np.arange(size)) for size in shape)
+        spectrum = fft.rfft2(prior.lags((batch.rows + 1, batch.columns + 1))[np.ix_(*places)]).real
         patches = np.zeros((batch.measurements.size, *shape))
         patches[batch.number, batch.row, batch.column] = batch.values
         power = np.square(np.abs(fft.rfft2(patches, workers=processors())))
@@ -129,15 +130,6 @@ def _batches(matrix: sparse.csr_array, shape: tuple[int, int]) -> Iterator[_Batc
             column[entries] - np.repeat(left[chosen], sizes),
             matrix.data[entries],
         )
-
-
-def _central_lags(lags: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return the table of lags for patches of half of `shape`, from that of a larger image or a smaller one."""
-    rows, columns = (
-        np.where(np.arange(size) < size // 2, np.arange(size), np.arange(size) - size) % known
-        for size, known in zip(shape, lags.shape, strict=True)
-    )
-    return lags[rows[:, None], columns[None, :]]
 
 
 @dataclass(frozen=True)

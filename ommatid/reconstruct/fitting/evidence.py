@@ -20,7 +20,7 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..prior import Prior, lag_distances, stationary_matrix
+from ..prior import Prior, exponential_spectrum, lag_distances, reflecting_root, wave_variances
 from ..problem import gram
 
 OUTSIDE = 1e-6  # share of a measurement's footprint that may lie outside its tile
@@ -31,7 +31,7 @@ class Evidence:
     """Measurements, and the known parts of their covariance.
 
     residual : (M,) r = g - H f0;  known_noise : (M,), the part of Rv that is not to be fitted
-    prior : P0 where it is known; None where P0 = variance exp(-distance / length) is to be fitted
+    prior : P0 where it is known; None where variance and length of an exponential prior are to be fitted
     noise_known : True if `known_noise` is all of Rv
     """
 
@@ -53,12 +53,7 @@ class Evidence:
 
     def _score_by_pixels(self, logarithms: FloatArray) -> tuple[float, FloatArray]:
         parameters, noise = self._parameters(logarithms)
-        if self.prior is None:
-            correlation, derivative = self._correlation(parameters[1])
-            unit, variance = np.asarray(linalg.cholesky(correlation, lower=True, check_finite=False)), parameters[0]
-        else:
-            unit, variance, derivative = _dense(self.prior.root), 1.0, None
-        root = variance**0.5 * unit
+        root = self._root(parameters)
         inner: FloatArray = root.T @ (self._normal_matrix(1 / noise) @ root)
         inner[np.diag_indices_from(inner)] += 1.0
         factor = np.asarray(linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)), True
@@ -68,7 +63,9 @@ class Evidence:
         determinant = float(np.log(noise).sum() + 2 * np.log(np.diagonal(factor[0])).sum())
         value = 0.5 * (determinant + float(noise @ multipliers**2 + u @ u))
         inverse = np.asarray(linalg.cho_solve(factor, np.eye(u.size), check_finite=False))
-        slope = [] if derivative is None else _prior_slope(unit, derivative, inverse, u)
+        # H^T C^-1 H = L^-T (I - G) L^-1 and H^T C^-1 r = L^-T u with G = `inverse`, so no large numbers cancel.
+        left = 1 - np.diagonal(inverse) - np.square(u)
+        slope = [0.5 * float(change @ left) for change in self._changes(parameters)]
         if not self.noise_known:
             trace = float(np.sum(self._normal_matrix(noise**-2) * (root @ inverse @ root.T)))
             squares = float(multipliers @ multipliers)
@@ -78,20 +75,14 @@ class Evidence:
     def _score_by_measurements(self, logarithms: FloatArray) -> tuple[float, FloatArray]:
         """Return the same from C itself, the smaller matrix where measurements are fewer than pixels."""
         parameters, noise = self._parameters(logarithms)
-        if self.prior is None:
-            parts = [parameters[0] * self._observed(matrix) for matrix in self._correlation(parameters[1])]
-        else:
-            root = self.matrix @ _dense(self.prior.root)
-            parts = [root @ root.T]
-        covariance = parts[0] + np.diag(noise)
+        root = self.matrix @ self._root(parameters)
+        covariance = root @ root.T + np.diag(noise)
         factor = np.asarray(linalg.cholesky(covariance, lower=True, check_finite=False)), True
         multipliers: FloatArray = np.asarray(linalg.cho_solve(factor, self.residual, check_finite=False))
         value = float(np.log(np.diagonal(factor[0])).sum()) + 0.5 * float(self.residual @ multipliers)
         inverse = np.asarray(linalg.cho_solve(factor, np.eye(noise.size), check_finite=False))
-        changes = [] if self.prior is not None else parts
-        slope = [
-            0.5 * (float(np.sum(inverse * change)) - float(multipliers @ change @ multipliers)) for change in changes
-        ]
+        traces = np.einsum("ij,ij->j", root, inverse @ root) - np.square(root.T @ multipliers)
+        slope = [0.5 * float(change @ traces) for change in self._changes(parameters)]
         if not self.noise_known:
             slope.append(0.5 * parameters[-1] * (float(np.trace(inverse)) - float(multipliers @ multipliers)))
         return value, np.array(slope)
@@ -101,9 +92,19 @@ class Evidence:
         parameters = [exp(value) for value in logarithms]
         return parameters, self.known_noise + (0.0 if self.noise_known else parameters[-1])
 
-    def _observed(self, covariance: FloatArray) -> FloatArray:
-        """Return H P H^T: (M, M)."""
-        return np.asarray(self.matrix @ (self.matrix @ covariance).T)
+    def _root(self, parameters: list[float]) -> FloatArray:
+        """Return L: (N, N)."""
+        if self.prior is not None:
+            return np.diag(self.prior.root) if self.prior.independent else self.prior.root
+        return reflecting_root(parameters[0] * exponential_spectrum(self.shape, parameters[1]))
+
+    def _changes(self, parameters: list[float]) -> list[FloatArray]:
+        """Return derivatives of the logarithm of each wave's variance, (N,), by those of variance and length."""
+        if self.prior is not None:
+            return []
+        lags = lag_distances(self.shape) / parameters[1]
+        change = wave_variances(lags * np.exp(-lags)) / exponential_spectrum(self.shape, parameters[1])
+        return [np.ones(change.size), change.ravel()]
 
     def blocks(self, side: int) -> list[Evidence]:
         """Cut into tiles of at most `side` x `side` pixels, each with the measurements that see it alone."""
@@ -125,25 +126,6 @@ class Evidence:
         matrix = sparse.csr_array(self.matrix[whole][:, pixels])
         return Evidence(matrix, self.residual[whole], self.known_noise[whole], shape, prior, self.noise_known)
 
-    def _correlation(self, length: float) -> tuple[FloatArray, FloatArray]:
-        """Return P1 = exp(-distance / length) and its derivative by the logarithm of the length: (N, N) each."""
-        lags = lag_distances(self.shape) / length
-        return stationary_matrix(np.exp(-lags), self.shape), stationary_matrix(lags * np.exp(-lags), self.shape)
-
     def _normal_matrix(self, weights: FloatArray) -> FloatArray:
         """Return H^T diag(weights) H: (N, N)."""
         return gram(self.matrix, weights)
-
-
-def _dense(root: FloatArray) -> FloatArray:
-    return np.diag(root) if root.ndim == 1 else root
-
-
-def _prior_slope(unit: FloatArray, derivative: FloatArray, inverse: FloatArray, u: FloatArray) -> list[float]:
-    """Return derivatives by the logarithms of variance and length; inverse : G = (I + B^T B)^-1."""
-    # H^T C^-1 H = L^-T (I - G) L^-1 and H^T C^-1 r = L^-T u, so no large numbers cancel.
-    left = np.asarray(linalg.solve_triangular(unit, derivative, lower=True, check_finite=False))
-    inside = np.asarray(linalg.solve_triangular(unit, left.T, lower=True, check_finite=False))
-    by_variance = u.size - float(np.trace(inverse)) - float(u @ u)
-    by_length = float(np.trace(inside)) - float(np.sum(inverse * inside)) - float(u @ inside @ u)
-    return [0.5 * by_variance, 0.5 * by_length]

@@ -19,7 +19,7 @@ from ommatid.scenes.tables import estimation
 
 from ..expected_error import ExpectedError, Interval
 from ..output.run_json import SolverReport
-from ..prior import Prior, prior_of, spectrum_of
+from ..prior import Prior, coloured, prior_of, spectrum_of
 from ..verdict.residual_power import ResidualPower
 from .prepared import Conditions, Prepared
 
@@ -122,12 +122,8 @@ class EstimationTask:
         return float(np.sum(spectrum * np.square(waves)))
 
     def draw_deviation(self, rng: np.random.Generator) -> FloatArray:
-        """Draw an image from the assumed prior, less its mean: (N,). Correlated pixels are reflected at the edges."""
-        spectrum = spectrum_of(self.prior, self.shape, *self._scale)
-        noise = rng.normal(size=self.shape)
-        if isinstance(spectrum, float):
-            return spectrum**0.5 * noise.ravel()
-        return np.asarray(fft.idctn(np.sqrt(spectrum) * noise, 2, norm="ortho")).ravel()
+        """Draw an image from the assumed prior, less its mean: (N,)."""
+        return coloured(spectrum_of(self.prior, self.shape, *self._scale), rng.normal(size=self.shape)).ravel()
 
     def observe(self, image: FloatArray) -> FloatArray:
         """Return H f of the used measurements: (N,) to (measurements used,)."""

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from ommatid.reconstruct.frame.sliding import SlidingCamera, sliding_camera
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.model import Model
+from ommatid.scenes.model import Model, designed_observation
+from ommatid.scenes.observation import Observation
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
@@ -32,6 +34,29 @@ def wide(shape: tuple[int, int], lenses: Lenses = FITTED, **tables: Any) -> Scen
 def frame_camera(shape: tuple[int, int], lenses: Lenses = FITTED) -> Camera:
     """The camera of such a scene."""
     return derive(wide(shape, lenses))
+
+
+def with_apertures(described: Scene, aperture: float = 1.0) -> Scene:
+    """The same scene with thin lenses of an aperture in mm, which diffract."""
+    lenses = [lens.model_copy(update={"aperture": aperture}) for lens in described.camera.lens]
+    return described.model_copy(update={"camera": described.camera.model_copy(update={"lens": tuple(lenses)})})
+
+
+def diffracting(shape: tuple[int, int], lenses: Lenses = FITTED, aperture: float = 1.0) -> Camera:
+    """A camera of thin lenses in focus, which diffract."""
+    return derive(with_apertures(wide(shape, lenses), aperture))
+
+
+def observed(camera: Camera) -> Observation:
+    """H as designed, by boxes and kernels."""
+    observation = designed_observation(camera)
+    assert observation is not None
+    return observation
+
+
+def sliding(camera: Camera, weights: tuple[float, ...], prior: float) -> SlidingCamera:
+    """The shift-invariant camera that this one is."""
+    return sliding_camera(observed(camera), weights, prior)
 
 
 def precision(matrix: sparse.csr_array, weights: FloatArray, prior: float) -> FloatArray:

@@ -95,7 +95,7 @@ def error_window(stack: Stack, model: Model, estimate: FloatArray, report: RunRe
     if why_none(stack.scene):
         return None
     rows, columns = (_window(size, *stack.camera.shape) for size in stack.camera.shape)
-    inside = model.measurements_inside(rows, columns)
+    inside = model.windowed.measurements_inside(rows, columns)
     noise = _noise(stack, model, estimate, report)[inside]
     known = np.isfinite(stack.values[inside]) & np.isfinite(noise)
     if not known.any():
@@ -106,7 +106,7 @@ def error_window(stack: Stack, model: Model, estimate: FloatArray, report: RunRe
     variance = float(prior.variance.mean())
     if variance <= 0:
         return None
-    whitened = model.submatrix(rows, columns)[np.flatnonzero(known)].toarray()
+    whitened = model.windowed.submatrix(rows, columns)[np.flatnonzero(known)].toarray()
     variances = np.maximum(noise[known], LEAST_NOISE * variance)
     whitened /= np.sqrt(variances)[:, None]
     information = whitened.T @ whitened

@@ -131,9 +131,9 @@ def of_sub_image(model: Model, window: ErrorWindow, name: str) -> tuple[Transfer
     index = next((index for index, sub in enumerate(camera.sub_imagers) if sub.name == name), None)
     if index is None:
         return None
-    part, inside = camera.slices()[index], model.measurements_inside(window.rows, window.columns)
+    part, inside = camera.slices()[index], model.windowed.measurements_inside(window.rows, window.columns)
     chosen = np.flatnonzero((inside >= part.start) & (inside < part.stop))
-    footprints = model.submatrix(window.rows, window.columns)[chosen].toarray().reshape(-1, *window.size)
+    footprints = model.windowed.submatrix(window.rows, window.columns)[chosen].toarray().reshape(-1, *window.size)
     sums = footprints.sum(axis=(1, 2))
     footprints = footprints[sums > 0] / sums[sums > 0, None, None]
     if not footprints.size:

@@ -15,7 +15,7 @@ from ommatid.reconstruct.assumptions import Assumptions, assumptions_for, with_f
 from ommatid.reconstruct.detail.detail_method import DetailMethod
 from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
 from ommatid.reconstruct.measured_error import TRIM, trimmed_mean
-from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS, METHODS, MethodChoice
+from ommatid.reconstruct.method_choice import METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import Execution, MethodResult
 from ommatid.reconstruct.misalignment.robust_noise import (
@@ -30,6 +30,7 @@ from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.restore import BUDGET, truth_for
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.optics.negligible import assumptions
 from ommatid.scenes.scene import with_tables
@@ -112,7 +113,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
     if mismatch is not None:
         budget[mismatch.cause] = float(mismatch.variance.mean())
     seen = None
-    if camera.unknowns <= MAX_DENSE_PIXELS and outcome.choice.method != "robust":
+    if camera.unknowns <= MOST_DENSE and outcome.choice.method != "robust":
         of_pixels = model_of_f(recording.certain, camera, PriorTable())
         seen = observability(of_pixels.matrix[outcome.assumed.usable.used])
     return Prediction(

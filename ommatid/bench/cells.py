@@ -15,12 +15,12 @@ import numpy as np
 
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.assumptions import method_for
-from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -175,7 +175,7 @@ class Subject:
     @property
     def is_large(self) -> bool:
         """True if the solver is a frame or tiles, which are slow for a different noise variance in every pixel."""
-        return self.camera.unknowns > MAX_DENSE_PIXELS
+        return self.camera.unknowns > MOST_DENSE
 
     def rendering_mse(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
         """Return the mean squared error of the image from a rendering and exact H, normalised."""

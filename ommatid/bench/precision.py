@@ -15,8 +15,6 @@ import numpy as np
 from ommatid.reconstruct.estimator.estimate import FORMS, estimate, needed_memory
 from ommatid.reconstruct.forms.form import NotSolvableError
 from ommatid.reconstruct.frame.frame_method import FrameMethod
-from ommatid.reconstruct.frame.preconditioner import is_sliding
-from ommatid.reconstruct.method_choice import MAX_DENSE_PIXELS
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
@@ -24,6 +22,7 @@ from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import free_memory
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.tables.estimation import TilesTable
 
 from .table import ALONE
@@ -57,7 +56,7 @@ class ExactSolution:
 
 def is_dense(task: EstimationTask) -> bool:
     """Return True if a single dense problem is small enough."""
-    return task.model.unknowns <= MAX_DENSE_PIXELS
+    return task.model.unknowns <= MOST_DENSE
 
 
 def exact_solution(task: EstimationTask, deviation: FloatArray | None = None) -> ExactSolution:
@@ -76,10 +75,9 @@ def exact_solution(task: EstimationTask, deviation: FloatArray | None = None) ->
 def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tuple[str, str]]]:
     """Return the settings that can be measured for this task, and those that cannot, with the reason."""
     measurable, left_out = _form_settings(task), list[tuple[str, str]]()
-    sliding = all(is_sliding(lens_type) for lens_type in task.model.camera.types)
-    has_frame = sliding and bool((task.expected_noise > 0).all())
+    has_frame = task.model.camera.is_sliding and bool((task.expected_noise > 0).all())
     if not is_dense(task):
-        left_out.append(("dense forms", f"{task.model.unknowns} pixels, and the limit is {MAX_DENSE_PIXELS}"))
+        left_out.append(("dense forms", f"{task.model.unknowns} pixels, and the limit is {MOST_DENSE}"))
         if not has_frame:
             why = "too many pixels for a dense form, and a frame does not apply: there is no exact solution"
             return [], [("reconstruct", why)]

@@ -120,7 +120,8 @@ class ObservedStack:
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:
     """Return True if H is applied without being stored; methods for misalignment start from H as designed."""
     trusted = stack.scene.estimator.misalignment == "trust"
-    return (model.has_boxes if trusted else model.is_exact) and not stack.camera.has_detail
+    applied = model.has_boxes or model.stored is None
+    return (applied if trusted else model.is_exact) and not stack.camera.has_detail
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import free_memory
 from ommatid.runtime.processors import processors
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
 
 from .detail.detail_method import DetailMethod
@@ -17,14 +18,12 @@ from .estimator.estimate import needed_memory
 from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
 from .frame.error_map import window_memory
 from .frame.frame_method import FrameMethod
-from .frame.preconditioner import is_sliding
 from .methods.dense_method import DenseMethod
 from .methods.method import Method
 from .methods.tile_method import TileMethod
 from .misalignment.misaligned_methods import AlignedMethod, RobustMethod
 
 PROGRAM_MEMORY = 300_000_000  # bytes, of the program itself and its libraries
-MAX_DENSE_PIXELS = 4000  # up to which the dense problem, exact and with every form, takes seconds
 TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on average; 0.17 where types see all edges
 
 METHODS: dict[str, type[Method]] = {
@@ -75,21 +74,27 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
     """Return methods in the order of preference, and why the first one is."""
     estimator = scene.estimator
     noiseless = estimator.noise_variance == 0 or (estimator.noise_variance is None and exact and not _has_noise(scene))
+    if exact and not camera.has_box_footprints:
+        if estimator.method not in ("auto", "frame"):
+            raise InputError(
+                f"{scene.source}: estimator.method '{estimator.method}' takes H with its entries, and blurred lenses"
+                f" have too many for {camera.unknowns} pixels; set it to 'auto' or 'frame'"
+            )
+        return ["frame"], "kernels of the lens types apply H"
     if estimator.method in ("tiles", "frame"):
         return [estimator.method], "asked for"
     if estimator.method != "auto":
         return ["dense"], f"the {estimator.method} form was asked for"
-    if camera.unknowns <= MAX_DENSE_PIXELS:
+    if camera.unknowns <= MOST_DENSE:
         return ["dense", "tiles"], f"{camera.unknowns} pixels are few"
     if noiseless:
         return ["tiles"], "measurements without noise need a dense form"
     if estimator.accuracy >= TILE_ACCURACY:
         return ["tiles"], f"tiles reach an accuracy of {estimator.accuracy:g} posterior standard deviations"
-    sliding = all(is_sliding(lens_type) for lens_type in camera.types)
     independent = scene.prior.kind == "independent"
-    if sliding and independent and leaves_null_space(camera) and not serves(camera, independent):
+    if camera.is_sliding and independent and leaves_null_space(camera) and not serves(camera, independent):
         return ["tiles"], "the lens types leave a null space, and the pixels are too many for a frame's error bars"
-    if sliding:
+    if camera.is_sliding:
         return ["frame", "tiles"], f"{camera.unknowns} pixels, and every lens type sees the same everywhere"
     if serves(camera, independent):
         return ["frame", "tiles"], f"{camera.unknowns} pixels, whose lens types do not see the same everywhere"
@@ -102,8 +107,8 @@ def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Meth
     key = f"{scene.source}: estimator.misalignment '{method}'"
     if camera.tolerance is None:
         raise InputError(f"{key} needs to know what may be misaligned, got no [camera.tolerance]; add one")
-    if camera.unknowns > MAX_DENSE_PIXELS:
-        raise InputError(f"{key} serves up to {MAX_DENSE_PIXELS} pixels of f, got {camera.unknowns}; crop the target")
+    if camera.unknowns > MOST_DENSE:
+        raise InputError(f"{key} serves up to {MOST_DENSE} pixels of f, got {camera.unknowns}; crop the target")
     if camera.detail > 1:
         raise InputError(f"{key} takes a world made of f's pixels, got target.detail {camera.detail}; remove it")
     if not (camera.has_box_footprints and camera.has_sharp_footprints):

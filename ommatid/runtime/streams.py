@@ -56,6 +56,7 @@ class Purpose(IntEnum):
     ERROR_PARTS = 51
     ERROR_INTERVAL = 52
     TILE_COST = 53
+    PRECONDITIONER = 54  # trial of one
     RESIDUAL = 60
     CONTRAST = 61
     ATTENUATION = 62

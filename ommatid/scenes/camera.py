@@ -20,6 +20,7 @@ from ommatid.runtime.arrays import BoolArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
+from .constants import MOST_DENSE
 from .formats.picture import target_shape
 from .layout import check_overlap, check_sensor, whole_pixels, with_steering
 from .lens_type import LensOptics, LensType, SubImager, adjacent_slices, check_counts
@@ -131,8 +132,35 @@ class Camera:
     @property
     def has_box_footprints(self) -> bool:
         """True if the designed H averages f over boxes: without distortion, rotation and blur, and with walls."""
-        bent = (lens.optics.distortion is not None or self.is_blurred(lens) or lens.is_rotated for lens in self.types)
-        return self.walls and not any(bent)
+        return all(self.has_boxes(lens_type) for lens_type in self.types)
+
+    def has_boxes(self, lens_type: LensType) -> bool:
+        """True if the designed H of a lens type averages f over boxes."""
+        bent = lens_type.optics.distortion is not None or lens_type.is_rotated
+        return self.walls and not (bent or self.is_blurred(lens_type))
+
+    def has_kernel(self, lens_type: LensType) -> bool:
+        """True if the designed H of a lens type is a few kernels: a blurred thin lens that sees every m x m box."""
+        blurred = self.is_blurred(lens_type) and lens_type.optics.surfaces is None
+        bent = lens_type.optics.distortion is not None or lens_type.is_rotated
+        return self.walls and blurred and not bent and lens_type.is_sliding
+
+    @property
+    def is_sliding(self) -> bool:
+        """True if the camera is shift-invariant except at the edges and for what varies over a lens's field."""
+        return all(lens_type.is_sliding for lens_type in self.types)
+
+    @property
+    def may_be_applied(self) -> bool:
+        """True if the estimator takes the designed H without its entries: boxes, or kernels of large frames."""
+        if self.has_detail or self.has_box_footprints:
+            return not self.has_detail
+        return self.needs_no_entries and self.is_sliding and self.unknowns > MOST_DENSE
+
+    @property
+    def needs_no_entries(self) -> bool:
+        """True if the designed H is applied by boxes and kernels alone."""
+        return all(self.has_boxes(lens_type) or self.has_kernel(lens_type) for lens_type in self.types)
 
     def is_blurred(self, lens_type: LensType) -> bool:
         """True if a point of the target is imaged as more than a point: by surfaces, defocus or diffraction."""

@@ -160,6 +160,12 @@ class LensType:
         )
 
     @property
+    def is_sliding(self) -> bool:
+        """True if its sensor pixels are all the averages over m x m boxes inside its field: it is shift-invariant."""
+        whole = self.ratio.denominator == 1 and self.array == (int(self.ratio), int(self.ratio))
+        return whole and not self.steered and self.step == (1, 1)
+
+    @property
     def covers_whole_pixels(self) -> bool:
         """True if footprints of pinholes are whole pixels of f."""
         ends = [number for part in self.on_grids for number in (*part.origin, *part.step, part.ratio)]

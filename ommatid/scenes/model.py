@@ -1,16 +1,14 @@
 """The observation model g = H f + v: a sparse H with the variance of its every entry (Wood et al., Eq. 1).
 
 H is (M, N): a row per sensor pixel in the order of measurements, a column per pixel of f, row by row. The H of a large
-frame with box footprints, ideal or calibrated, is not stored but applied from the geometry.
+frame that boxes and kernels describe, ideal or calibrated, is not stored but applied by these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
-from math import ceil
 from typing import Any
 
 import numpy as np
@@ -21,19 +19,22 @@ from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
 from .camera import Camera
+from .constants import MOST_DENSE
 from .fitted.fitted_matrix import FittedMatrix, gradient
-from .optics.boxes import MOST_STORED, BoxFootprints
+from .observation import Entries, Observation, ObservationPart
+from .optics.boxes import Box, designed_box
 from .scene import Scene
 from .shrinkage import shrunk_by_contrast
 
 RECORDED = "recorded points"  # method of a model whose every entry was measured by itself
 ROUNDED = 1e-6  # deviation of the sum of a row, about 1, that is float32's rounding
 FEWEST_BATCHES = 4  # that have two halves with a variance each
+MOST_STORED = 2**24  # entries of H; more are computed from boxes and kernels each time
 
 
 @dataclass(frozen=True)
 class Model:
-    """H as `stored` (CSR, float64), or None where `boxes` applies it; `variance` of each stored entry.
+    """H as `stored` (CSR, float64), or None where boxes and kernels apply it; `variance` of each stored entry.
 
     batches : (B, nnz) deviations of B independent estimates of the entries from their mean `stored`; B is 0 without
         uncertainty
@@ -59,43 +60,60 @@ class Model:
         return self.stored
 
     def to_sparse(self) -> sparse.csr_array:
-        """H as a matrix with entries, (M, N), also where it is applied without them."""
-        return self.boxes.submatrix(*map(slice, (0, 0), self.camera.shape)) if self.stored is None else self.stored
+        """H as a matrix with entries, (M, N), also where it is applied without them. Raises InputError if too large."""
+        return self.observation.to_sparse()
+
+    @cached_property
+    def observation(self) -> Observation:
+        """H as it is stored, or else by its boxes and kernels."""
+        if self.stored is not None:
+            return Observation(self.camera.shape, (Entries(self.stored, self.camera.shape),))
+        if self.structure is None:
+            raise TypeError("expected entries of an H that boxes and kernels do not describe")
+        return self.structure
+
+    @cached_property
+    def structure(self) -> Observation | None:
+        """H by boxes and kernels: as calibrated by few numbers, or as designed; None where these do not describe it."""
+        if self.fitted is not None:
+            return self.fitted.observation
+        return designed_observation(self.camera) if self.record["method"] == "ideal" else None
+
+    @property
+    def applied(self) -> Observation:
+        """The representation of H that is applied fastest: averages over boxes are faster than a matrix."""
+        return self.observation if self.structure is None else self.structure
+
+    @cached_property
+    def alike(self) -> Observation:
+        """H by boxes and kernels, or that of the design in its place where it has them: to precondition with."""
+        return self.structure or designed_observation(self.camera) or self.observation
+
+    @property
+    def windowed(self) -> Observation:
+        """The representation of H that windows are cut out of."""
+        return self.applied if self.has_boxes else self.observation
 
     @property
     def entries(self) -> int:
         """Number of entries of H, stored or not."""
-        return self.boxes.entries if self.stored is None else int(self.stored.nnz)
+        return self.observation.entries
 
     @property
     def is_exact(self) -> bool:
-        """True if H is that of an ideal camera with box footprints, so that `boxes` applies it."""
+        """True if H is that of an ideal camera with box footprints."""
         designed = self.record["method"] == "ideal" if self.fitted is None else self.fitted.is_as_designed
         return designed and self.camera.has_box_footprints
 
     @property
     def has_boxes(self) -> bool:
-        """True if `boxes` applies H: it is ideal, or calibrated with box footprints."""
-        return self.stored is None or self.is_exact or (self.fitted is not None and self.fitted.is_boxes)
+        """True if boxes apply H: it is ideal, or calibrated with box footprints."""
+        return self.structure is not None and all(isinstance(part, Box) for part in self.structure.parts)
 
     @property
     def is_nearly_designed(self) -> bool:
         """True if H is the ideal one with box footprints, or differs from it too little to change an error map."""
         return self.is_exact or (self.fitted is not None and self.fitted.is_nearly_designed)
-
-    @cached_property
-    def boxes(self) -> BoxFootprints:
-        """H with box footprints: as calibrated, or else as designed, for any camera."""
-        if self.fitted is not None and self.fitted.is_boxes:
-            return self.fitted.boxes
-        return BoxFootprints(self.camera)
-
-    @property
-    def without_entries(self) -> Model:
-        """The same H, applied by `boxes` alone where that serves: averages over boxes are faster than a matrix."""
-        if not self.has_boxes or self.stored is None:
-            return self
-        return replace(self, stored=None, variance=np.zeros(0), batches=np.zeros((0, 0), np.float32))
 
     @property
     def measurements(self) -> int:
@@ -109,9 +127,7 @@ class Model:
 
     def forward(self, image: FloatArray) -> FloatArray:
         """H f: (N,) or (rows, columns) to (M,)."""
-        if self.stored is None:
-            return self.boxes.forward(image)
-        return self.stored @ np.asarray(image, dtype=np.float64).ravel()
+        return self.observation.forward(image)
 
     def light(self, image: FloatArray) -> FloatArray:
         """Expected light on every sensor pixel for an image: (N,) to (M,)."""
@@ -119,8 +135,7 @@ class Model:
 
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """H^T g: (M,) to (N,)."""
-        stored = self.stored
-        return self.boxes.adjoint(measurements) if stored is None else stored.T @ np.asarray(measurements, np.float64)
+        return self.observation.adjoint(measurements)
 
     def as_linear_operator(self) -> LinearOperator:
         """Return H as a SciPy linear operator, (M, N), for iterative solvers; H need not be stored."""
@@ -130,35 +145,6 @@ class Model:
             rmatvec=lambda measurements: self.adjoint(measurements.ravel()),
             dtype=np.float64,
         )
-
-    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
-        """Indices of the measurements that see nothing outside a window of f: (m,)."""
-        if self.has_boxes:
-            return self.boxes.measurements_inside(rows, columns)
-        return rows_inside(self._extents, rows, columns)
-
-    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
-        """H from a window of f to the measurements that see nothing outside it: (m, pixels of the window)."""
-        if self.has_boxes:
-            return self.boxes.submatrix(rows, columns)
-        inside = self.matrix[self.measurements_inside(rows, columns)]
-        return on_window(inside, self.camera.columns, rows, columns)
-
-    def signature(self, rows: slice, columns: slice) -> Hashable:
-        """A key that is equal for two windows only if their submatrices are equal."""
-        return self.boxes.signature(rows, columns) if self.has_boxes else (rows.start, columns.start)
-
-    @property
-    def reach(self) -> int:
-        """Largest number of rows or of columns of f that a measurement spans."""
-        if self.stored is None:
-            return max(ceil(lens_type.ratio) + (1 if self.is_exact else 2) for lens_type in self.camera.types)
-        top, bottom, left, right = self._extents
-        return int(max((bottom - top).max(), (right - left).max())) + 1
-
-    @cached_property
-    def _extents(self) -> Extents:
-        return row_extents(self.matrix, self.camera.columns)
 
     def restrict(self, names: tuple[str, ...]) -> Model:
         """The model of only the named lens types, in its own order. Raises InputError for an unknown name."""
@@ -300,37 +286,28 @@ class Model:
         return np.bincount(self._rows, weights=entries, minlength=self.measurements).astype(np.float64)
 
 
-EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
-Extents = tuple[IntArray, IntArray, IntArray, IntArray]
+def designed_observation(camera: Camera) -> Observation | None:
+    """Return H as designed by boxes and kernels, None where it has entries."""
+    if not camera.needs_no_entries:
+        return None
+    parts: list[ObservationPart] = []
+    for lens_type in camera.types:
+        if camera.has_boxes(lens_type):
+            parts += [designed_box(camera.shape, part) for part in lens_type.on_grids]
+        else:
+            from .optics.blur import kernels
+
+            parts.append(kernels(camera, lens_type))
+    return Observation(camera.shape, tuple(parts))
 
 
-def row_extents(matrix: sparse.csr_array, columns: int) -> Extents:
-    """Return the first and last row, first and last column of f that each row of H sees, (M,) each; EMPTY if none."""
-    row, column = np.divmod(matrix.indices.astype(np.int64), columns)
-    nonempty = np.diff(matrix.indptr) > 0
-    starts = matrix.indptr[:-1][nonempty]
-    found = [np.full(nonempty.size, EMPTY) for _ in range(4)]
-    for extent, (values, extreme) in zip(found, product((row, column), (np.minimum, np.maximum)), strict=True):
-        extent[nonempty] = extreme.reduceat(values, starts)
-    top, bottom, left, right = found
-    return top, bottom, left, right
-
-
-def rows_inside(seen: Extents, rows: slice, columns: slice) -> IntArray:
-    """Return the indices of the rows of H that see nothing outside a window of f: (m,)."""
-    top, bottom, left, right = seen
-    return np.flatnonzero((top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop))
-
-
-def on_window(matrix: sparse.csr_array, width: int, rows: slice, columns: slice) -> sparse.csr_array:
-    """Return rows of H that see nothing outside a window, (m, N), on the window: (m, pixels of the window).
-
-    width : columns of f
-    """
-    row, column = np.divmod(matrix.indices, width)
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    indices = (row - rows.start) * shape[1] + column - columns.start
-    return sparse.csr_array((matrix.data, indices, matrix.indptr), shape=(matrix.shape[0], shape[0] * shape[1]))
+def is_applied(camera: Camera, structure: Observation | None) -> bool:
+    """Return True if an H of this structure is applied by it alone, since its entries are many and none are needed."""
+    if structure is None:
+        return False
+    if camera.has_box_footprints:
+        return structure.entries > MOST_STORED
+    return camera.unknowns > MOST_DENSE and camera.is_sliding
 
 
 @dataclass(frozen=True)
@@ -345,11 +322,9 @@ class MeasuredRows:
 def fitted_model(
     scene: Scene, camera: Camera, fitted: FittedMatrix, rest: MeasuredRows | None, record: dict[str, Any]
 ) -> Model:
-    """Return the model; H with box footprints is stored only while it is small."""
+    """Return the model; H by boxes and kernels is stored only while it is small."""
     if rest is None:
-        entries = None
-        if not fitted.is_boxes or fitted.boxes.entries <= MOST_STORED:
-            entries = fitted.to_sparse()
+        entries = None if is_applied(camera, fitted.observation) else fitted.to_sparse()
         count = 0 if entries is None else int(entries.nnz)
         return Model(scene, camera, entries, np.zeros(count), np.zeros((0, count), np.float32), record, fitted=fitted)
     explained = fitted.to_sparse()

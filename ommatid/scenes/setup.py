@@ -80,11 +80,11 @@ class Setup:
         return self.scene.calibration.method == "ideal" and camera.has_box_footprints and not camera.has_detail
 
     @property
-    def may_have_boxes(self) -> bool:
-        """True if the estimator's H is ideal or may follow from views, so that it need not be stored."""
+    def may_be_applied(self) -> bool:
+        """True if boxes and kernels apply the estimator's H: it is ideal or may follow from views, and not stored."""
         camera, calibration = self.camera, self.scene.calibration
-        fits = calibration.method == "ideal" or calibration.fit != "none"
-        return fits and camera.has_box_footprints and not camera.has_detail
+        fits = calibration.method == "ideal" or (calibration.fit != "none" and camera.has_box_footprints)
+        return fits and camera.may_be_applied
 
     @property
     def has_closed_form(self) -> bool:

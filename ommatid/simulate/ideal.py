@@ -17,8 +17,8 @@ from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType, SubImager
-from ommatid.scenes.model import Model
-from ommatid.scenes.optics.boxes import MOST_STORED, BoxFootprints, overlap
+from ommatid.scenes.model import Model, designed_observation, is_applied
+from ommatid.scenes.optics.boxes import overlap
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
 
@@ -95,9 +95,9 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
 
 
 def ideal_model(scene: Scene, camera: Camera) -> Model:
-    """Return the ideal H as a model without uncertainty; with box footprints it is stored only while it is small."""
-    stored = not camera.has_box_footprints or BoxFootprints(camera).entries <= MOST_STORED
-    return exact_model(scene, camera, ideal_matrix(camera) if stored else None, "ideal")
+    """Return the ideal H as a model without uncertainty; by boxes and kernels it is stored only while it is small."""
+    applied = is_applied(camera, designed_observation(camera))
+    return exact_model(scene, camera, None if applied else ideal_matrix(camera), "ideal")
 
 
 def exact_model(scene: Scene, camera: Camera, matrix: sparse.csr_array | None, method: str) -> Model:

@@ -44,7 +44,7 @@ def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
     scene, camera, world = setup.scene, setup.calibrated.camera, setup.world.camera
     rendering = SENSOR * camera.measurements + TARGET * world.unknowns
     check_memory(rendering, "rendering", "make target.shape or the lens arrays smaller")
-    if not calibrates or setup.may_have_boxes:
+    if not calibrates or setup.may_be_applied:
         return
     entries = [
         lens_type.measurements * min(_visible_pixels(camera, lens_type), camera.unknowns) for lens_type in camera.types

@@ -16,7 +16,7 @@ from scipy import linalg, sparse
 from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY, FrameSystem, Solution
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.optics.boxes import BoxFootprints
+from ommatid.scenes.optics.boxes import boxes_as_designed
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_matrix
 
@@ -38,7 +38,7 @@ class Whole:
         """Draw a frame of size x size pixels."""
         camera, rng = whole_camera(size), np.random.default_rng(seed)
         image = rng.normal(MEAN, VARIANCE**0.5, camera.unknowns)
-        readings = BoxFootprints(camera).forward(image)
+        readings = boxes_as_designed(camera).forward(image)
         readings += rng.normal(0, NOISE**0.5, readings.size)
         return Whole(camera, image, readings)
 
@@ -50,7 +50,7 @@ class Whole:
     def frame(self) -> FrameSystem:
         """Return the frame's solver without any preparation."""
         weights = np.broadcast_to(1 / NOISE, self.camera.measurements)
-        return FrameSystem(self.camera, BoxFootprints(self.camera), weights, 1 / VARIANCE)
+        return FrameSystem(boxes_as_designed(self.camera), weights, 1 / VARIANCE)
 
     def estimate(self, accuracy: float = ACCURACY) -> Solution:
         """Return f^ - f0, computed without preparation."""

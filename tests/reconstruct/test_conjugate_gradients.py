@@ -10,19 +10,18 @@ from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem, Solution
 from ommatid.reconstruct.prior import spectrum_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import Lenses
-from ..frames import FITTED, P0, blurred, frame_camera, precision, wide
+from ..frames import FITTED, P0, blurred, frame_camera, observed, precision, wide
 
 TWO: Lenses = FITTED[:2]
 
 
 def ideal_system(shape: tuple[int, int], weight: float, lenses: Lenses = FITTED) -> FrameSystem:
     camera = frame_camera(shape, lenses)
-    return FrameSystem(camera, BoxFootprints(camera), np.full(camera.measurements, weight), 1 / P0)
+    return FrameSystem(observed(camera), np.full(camera.measurements, weight), 1 / P0)
 
 
 def largest_error(solution: Solution, expected: FloatArray, covariance: FloatArray) -> float:
@@ -45,11 +44,11 @@ def test_the_error_of_every_pixel_is_below_the_bound(
     """With and without a null space, with and without pixels outside the field of some lens types."""
     for noise in noises:
         system = ideal_system(shape, 1 / noise, lenses)
-        matrix, rng = ideal_matrix(system.camera), np.random.default_rng(3)
+        matrix, rng = ideal_matrix(frame_camera(shape, lenses)), np.random.default_rng(3)
         dense = precision(matrix, system.weights, 1 / P0)
         covariance = linalg.inv(dense)
-        truth = rng.normal(0, P0**0.5, system.camera.unknowns)
-        right = system.right_hand_side(matrix @ truth + rng.normal(0, noise**0.5, system.camera.measurements))
+        truth = rng.normal(0, P0**0.5, system.observation.unknowns)
+        right = system.right_hand_side(matrix @ truth + rng.normal(0, noise**0.5, system.observation.measurements))
         expected = linalg.solve(dense, right, assume_a="pos")
         rounding = 1e-4 if noise < 1e-5 else 0.0  # of the dense solution: its condition is P0 / noise = 5e9
         for accuracy in (0.3, 0.01):
@@ -65,7 +64,7 @@ def test_the_bound_holds_for_uneven_h_and_noise(seed: int) -> None:
     rng = np.random.default_rng(seed)
     weights = 10 ** rng.uniform(0, 2, model.measurements)
     weights[rng.choice(model.measurements, 100, replace=False)] = 0.0
-    system = FrameSystem(model.camera, model, weights, 1 / P0)
+    system = FrameSystem(model.observation, weights, 1 / P0, alike=observed(model.camera))
     dense = precision(model.matrix, weights, 1 / P0)
     right = system.right_hand_side(model.forward(rng.normal(0, P0**0.5, model.unknowns)))
     solution = system.solve(right)
@@ -86,7 +85,7 @@ def test_a_prior_that_is_diagonal_under_the_cosine_transform(table: PriorTable) 
     shape = (33, 30)
     camera = frame_camera(shape)
     spectrum = np.asarray(spectrum_of(table, shape, 1.0))
-    system = FrameSystem(camera, BoxFootprints(camera), np.full(camera.measurements, 100.0), 1 / spectrum)
+    system = FrameSystem(observed(camera), np.full(camera.measurements, 100.0), 1 / spectrum)
     waves = np.kron(*(np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape))
     prior = waves.T @ ((1 / spectrum.ravel())[:, None] * waves)
     dense = precision(ideal_matrix(camera), system.weights, 0.0) + prior
@@ -104,4 +103,4 @@ def test_an_accuracy_that_is_not_reached_is_refused(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("ommatid.reconstruct.frame.conjugate_gradients.MAX_STEPS", 3)
     system = ideal_system((60, 55), 1e4, TWO)
     with pytest.raises(InputError, match=r"after 3 steps, expected 0\.01; set estimator\.method = 'tiles'"):
-        system.solve(np.random.default_rng(0).normal(size=system.camera.unknowns))
+        system.solve(np.random.default_rng(0).normal(size=system.observation.unknowns))

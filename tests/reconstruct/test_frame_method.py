@@ -19,9 +19,9 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
-from ommatid.simulate.ideal import ideal_model
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..frames import FITTED, P0, blurred, recorded, wide
+from ..frames import FITTED, P0, blurred, recorded, wide, with_apertures
 
 ROOT = Path(__file__).parents[2]
 SHAPE = (52, 47)
@@ -125,6 +125,49 @@ def test_a_prior_of_correlated_pixels_is_that_of_the_dense_problem(
     dense, frame = both(recorded(scene, truth, 1.0), ideal_model(scene, derive(scene)), truth)
     assert np.abs(difference(frame, dense)).max() < 1e-3
     np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=1e-3)
+
+
+def test_lenses_that_diffract() -> None:
+    """Kernels wider than the frame, by the dense problem: the image, error bars at every pixel, and the interval."""
+    shape = 33, 31
+    scene, truth = with_apertures(wide(shape, noise=NOISE)), drawn(1, shape)
+    camera = derive(scene)
+    dense, frame = both(recorded(scene, truth, VARIANCE), ideal_model(scene, camera), truth)
+    assert np.abs(difference(frame, dense)).max() < 1e-4
+    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=1e-6)
+    assert dense.interval is not None
+    assert frame.interval is not None
+    assert frame.interval.mse == pytest.approx(dense.interval.mse, rel=1e-3)
+    assert frame.verdict.trusted
+
+
+@pytest.mark.slow
+def test_error_bars_of_two_types_of_lenses() -> None:
+    """Errors of a null space reach from edge to edge; small frames of two lengths give their variances to 3 % here."""
+    shape = 51, 48
+    scene, truth = with_apertures(wide(shape, FITTED[:2], noise=NOISE)), drawn(1, shape)
+    dense, frame = both(recorded(scene, truth, VARIANCE), ideal_model(scene, derive(scene)), truth)
+    assert np.abs(difference(frame, dense)).max() < 1e-4
+    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=0.03)
+    assert frame.solver.variance_bound < 0.03
+
+
+def test_large_cameras_of_lenses_are_applied_without_entries() -> None:
+    """More than 4000 pixels behind lenses that diffract: no entries, the frame alone, other methods refused."""
+    scene = with_apertures(wide((59, 119), FITTED, noise=NOISE, calibration={"method": "ideal"}))
+    camera = derive(scene)
+    model = ideal_model(scene, camera)
+    assert model.stored is None
+    assert camera.may_be_applied
+    assert choose_method(scene, camera, camera.may_be_applied).method == "frame"
+    tiles = scene.model_copy(update={"estimator": scene.estimator.model_copy(update={"method": "tiles"})})
+    with pytest.raises(InputError, match="blurred lenses have too many for 7021 pixels; set it to 'auto' or 'frame'"):
+        choose_method(tiles, camera, camera.may_be_applied)
+    truth = drawn(2, camera.shape)
+    done = restore(recorded(scene, truth, VARIANCE, matrix=ideal_matrix(camera)), model, truth)
+    assert done.verdict.trusted
+    assert done.interval is not None
+    assert done.interval.low < float(np.mean((done.estimate - truth) ** 2)) < done.interval.high
 
 
 def test_the_prediction_of_a_frame_is_that_of_the_dense_problem() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ommatid.reconstruct.frame.preconditioner import preconditioner_for
 from ommatid.reconstruct.frame.variance_map import NearlyEven, interior_variance
 from ommatid.reconstruct.frame.window_variances import (
     box_stencil,
@@ -14,7 +13,7 @@ from ommatid.reconstruct.frame.window_variances import (
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 
-from ..frames import P0, frame_camera
+from ..frames import P0, frame_camera, sliding
 
 SHAPE = (101, 97)
 FAR = (slice(28, -28), slice(28, -28))
@@ -30,7 +29,7 @@ def uneven(camera: Camera, more: float, share: float) -> FloatArray:
 
 def nearly_even(camera: Camera, weights: FloatArray) -> NearlyEven:
     means = tuple(float(weights[part].mean()) for part in camera.type_slices())
-    return NearlyEven(camera, preconditioner_for(camera, means, 1 / P0))
+    return NearlyEven(camera, sliding(camera, means, 1 / P0))
 
 
 @pytest.mark.parametrize(

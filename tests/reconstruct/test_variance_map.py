@@ -7,16 +7,14 @@ import pytest
 from scipy import linalg, sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
-from ommatid.reconstruct.frame.preconditioner import preconditioner_for
 from ommatid.reconstruct.frame.variance_map import (
     posterior_variance,
     sliding_variance_map,
 )
 from ommatid.reconstruct.frame.window_variances import pixel_numbers, stencil_variances, stored_stencil
-from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..frames import P0, blurred, frame_camera, precision, wide
+from ..frames import P0, blurred, frame_camera, observed, precision, sliding, wide
 
 STATED = 1e-3  # relative accuracy of the maps
 
@@ -28,8 +26,8 @@ STATED = 1e-3  # relative accuracy of the maps
 def test_the_map_has_the_stated_accuracy(shape: tuple[int, int], noise: float) -> None:
     """At corners, at edges, near them and in the middle, with and without pixels outside some lens types' field."""
     camera = frame_camera(shape)
-    variance = posterior_variance(preconditioner_for(camera, (1 / noise,) * 3, 1 / P0))
-    system = FrameSystem(camera, BoxFootprints(camera), np.full(camera.measurements, 1 / noise), 1 / P0)
+    variance = posterior_variance(sliding(camera, (1 / noise,) * 3, 1 / P0))
+    system = FrameSystem(observed(camera), np.full(camera.measurements, 1 / noise), 1 / P0)
     rows, columns = shape
     for row, column in (
         *((0, 0), (0, 50), (1, 2), (rows - 1, 5), (rows - 2, columns - 3), (4, 60), (rows // 2, columns - 1)),
@@ -45,8 +43,8 @@ def test_the_map_has_the_stated_accuracy(shape: tuple[int, int], noise: float) -
 def test_actual_noise_that_differs_from_the_expected_one(actual: tuple[float, float, float]) -> None:
     """Eq. 5 by finite differences of step 1e-4 against dense matrices, on a frame that strips cover entirely."""
     camera = frame_camera((38, 35))
-    preconditioner = preconditioner_for(camera, (100.0,) * 3, 1 / P0)
-    variances = sliding_variance_map(preconditioner, actual, posterior_variance)
+    system = sliding(camera, (100.0,) * 3, 1 / P0)
+    variances = sliding_variance_map(system, actual, posterior_variance)
     matrix = ideal_matrix(camera)
     covariance = linalg.inv(precision(matrix, np.full(camera.measurements, 100.0), 1 / P0))
     noise = np.concatenate(
@@ -66,6 +64,6 @@ def test_any_h_and_any_noise() -> None:
     model, _ = blurred(wide(shape, (("1/4", [2, 3], "fit"), ("1/3", [3, 3], "fit"))), 0.004)
     weights = 10 ** np.random.default_rng(1).uniform(1, 2, model.measurements)
     pixels = pixel_numbers(shape, slice(0, shape[0]), slice(0, shape[1]))
-    stencil = stored_stencil(sparse.csc_array(model.matrix), weights, 1 / P0, pixels, model.reach - 1)
+    stencil = stored_stencil(sparse.csc_array(model.matrix), weights, 1 / P0, pixels, model.windowed.reach - 1)
     dense = precision(model.matrix, weights, 1 / P0)
     np.testing.assert_allclose(stencil_variances(stencil).ravel(), np.diagonal(linalg.inv(dense)), rtol=1e-8)

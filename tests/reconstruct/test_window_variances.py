@@ -10,7 +10,6 @@ from scipy import linalg
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.error_map import ExactVariances, check_map
-from ommatid.reconstruct.frame.preconditioner import preconditioner_for
 from ommatid.reconstruct.frame.variance_map import interior_variance
 from ommatid.reconstruct.frame.window_variances import (
     EvenNoise,
@@ -21,10 +20,9 @@ from ommatid.reconstruct.frame.window_variances import (
 )
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.optics.boxes import BoxFootprints
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..frames import P0, frame_camera, precision
+from ..frames import P0, frame_camera, observed, precision, sliding
 
 SMALL = (47, 41)
 WIDE = (79, 73)
@@ -52,9 +50,7 @@ def test_windows_are_the_whole_frame_to_the_stated_accuracy(
     source = partial(box_stencil, camera, weights, 1 / P0)
     exact = stencil_variances(source(slice(0, WIDE[0]), slice(0, WIDE[1])))
     means = tuple(float(weights[part].mean()) for part in camera.type_slices())
-    even = EvenNoise(
-        even_couplings([3, 5, 4], means, 1 / P0, 4), interior_variance(preconditioner_for(camera, means, 1 / P0))
-    )
+    even = EvenNoise(even_couplings([3, 5, 4], means, 1 / P0, 4), interior_variance(sliding(camera, means, 1 / P0)))
     variance = frame_variances(source, WIDE, 15, even)
     np.testing.assert_allclose(variance, exact, rtol=pixel)
     assert variance.mean() == pytest.approx(exact.mean(), rel=mean)
@@ -71,7 +67,7 @@ def test_one_solution_measures_the_variances_of_distant_pixels(as_expected: bool
     covariance = linalg.inv(precision(matrix, weights, 1 / P0))
     gain = covariance @ (matrix.T.toarray() * weights)
     error = np.square(covariance).sum(axis=1) / P0 + np.square(gain) @ actual
-    system = FrameSystem(camera, BoxFootprints(camera), weights, 1 / P0)
+    system = FrameSystem(observed(camera), weights, 1 / P0)
     exact = ExactVariances(system, None if as_expected else weights**2 * actual, 0.01)
     posterior = np.ascontiguousarray(np.diagonal(covariance))
     assert check_map(error, posterior, SMALL, exact, local=True).worst < 2e-3

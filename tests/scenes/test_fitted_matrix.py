@@ -80,19 +80,20 @@ def test_it_is_applied_without_entries_as_with_them() -> None:
     cam, rng = camera((70, 61), ODD), np.random.default_rng(0)
     numbers = np.array([0.3, -1.7, 0.01, 0.0, 0.0])
     fitted = with_numbers(cam, numbers)
-    assert fitted.is_boxes
+    observation = fitted.observation
+    assert observation is not None
     assert not fitted.is_as_designed
     assert not fitted.is_nearly_designed
     assert with_numbers(cam, numbers / 50).is_nearly_designed
     stored, f, g = fitted.to_sparse(), rng.normal(size=cam.unknowns), rng.normal(size=cam.measurements)
-    np.testing.assert_allclose(fitted.boxes.forward(f), stored @ f, atol=1e-12)
-    np.testing.assert_allclose(fitted.boxes.adjoint(g), stored.T @ g, atol=1e-12)
+    np.testing.assert_allclose(observation.forward(f), stored @ f, atol=1e-12)
+    np.testing.assert_allclose(observation.adjoint(g), stored.T @ g, atol=1e-12)
     window = slice(5, 40), slice(3, 30)
-    rows = fitted.boxes.measurements_inside(*window)
+    rows = observation.measurements_inside(*window)
     inside = stored[rows].toarray().reshape(-1, 70, 61)
     assert inside[:, window[0], window[1]].sum() == pytest.approx(inside.sum(), rel=1e-12)
     np.testing.assert_allclose(
-        fitted.boxes.submatrix(*window).toarray(), inside[:, window[0], window[1]].reshape(rows.size, -1), atol=1e-12
+        observation.submatrix(*window).toarray(), inside[:, window[0], window[1]].reshape(rows.size, -1), atol=1e-12
     )
 
 
@@ -115,12 +116,12 @@ def test_the_errors_of_numbers_are_differences_of_h() -> None:
     cam, rng = camera((23, 23), (("1/3", [2, 2], [5, 5]),)), np.random.default_rng(1)
     own = np.diag([1.0, 1.0, 0.0, 0.0, 0.0])[:, :2]
     fitted, f = with_numbers(cam, np.zeros(COUNT), own), rng.normal(127, 50, cam.unknowns)
-    gradients = tuple(fitted.boxes.forward(each) for each in gradient(f, cam.shape))
+    gradients = tuple(fitted.to_sparse() @ each for each in gradient(f, cam.shape))
     directions = fitted.directions(f, (gradients[0], gradients[1])).toarray()
     assert directions.shape == (cam.measurements, 8)
     for axis in (ROW, COLUMN):
         step = 1e-3 * (np.arange(COUNT) == axis)
-        ahead, behind = (with_numbers(cam, sign * step).boxes.forward(f) for sign in (1, -1))
+        ahead, behind = (with_numbers(cam, sign * step).to_sparse() @ f for sign in (1, -1))
         expected = (ahead - behind) / 2e-3
         for sub, place in zip(range(4), cam.slices(), strict=True):
             np.testing.assert_allclose(directions[place, 2 * sub + axis], expected[place], atol=1e-8)
@@ -137,7 +138,7 @@ def test_rotation_and_distortion_need_entries() -> None:
     cam = camera((23, 23), ODD)
     for number in (ROTATION, K1):
         fitted = with_numbers(cam, 1e-3 * (np.arange(COUNT) == number))
-        assert not fitted.is_boxes
+        assert fitted.observation is None
         sub, place = cam.sub_imagers[1], cam.slices()[1]
         exact = entries(cam, sub, designed(sub) + 1e-3 * (np.arange(COUNT) == number))
         assert abs(fitted.to_sparse()[place] - exact).max() == 0

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ommatid.scenes.fitted import kernels as module
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
-from ommatid.scenes.optics import boxes
+from ommatid.scenes.observation import Observation
+from ommatid.scenes.optics.boxes import designed_box
 from ommatid.simulate.ideal import ideal_matrix
-from tests.examples import camera
+from tests.examples import THREE, camera
 
 CAMERA = camera()
 
@@ -58,22 +58,7 @@ def test_the_field_is_measured_from_the_lens_s_axis() -> None:
     assert np.abs(field).max() == pytest.approx(places.scale * CAMERA.target_pitch)
 
 
-@pytest.mark.slow
-def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(boxes, "ROWS_AT_ONCE", 3)
-    footprints, image = random_kernels(2), np.random.default_rng(3).normal(size=CAMERA.shape)
-    results: list[bytes] = []
-    for threads in (1, 4):
-        monkeypatch.setattr(boxes, "processors", lambda threads=threads: threads)
-        results.append(footprints.error_directions(image).toarray().tobytes())
-    assert results[0] == results[1]
-
-
-@pytest.mark.parametrize("widest_sum", [0, 1000], ids=["transforms", "sums"])
-def test_directions_of_the_error_are_what_changed_kernels_read(
-    widest_sum: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "WIDE", widest_sum)
+def test_directions_of_the_error_are_what_changed_kernels_read() -> None:
     image = np.random.default_rng(4).normal(size=CAMERA.shape)
     for margin in (0, 2, 18):
         footprints = random_kernels(margin)
@@ -82,6 +67,41 @@ def test_directions_of_the_error_are_what_changed_kernels_read(
         for column, coefficients in zip(directions.T, footprints.error_coefficients, strict=True):
             changed = replace(footprints, kernels=footprints.error_kernels, coefficients=coefficients)
             assert column == pytest.approx(changed.to_sparse() @ image.ravel(), abs=1e-11)
+
+
+@pytest.mark.parametrize("margin", [0, 2, 18])
+def test_it_is_applied_as_its_entries_are(margin: int) -> None:
+    """Forwards, backwards, on windows, and by the readings of one pixel."""
+    part, rng = random_kernels(margin), np.random.default_rng(5)
+    applied, matrix = Observation(CAMERA.shape, (part,)), part.to_sparse()
+    image, readings = rng.normal(size=CAMERA.unknowns), rng.normal(size=part.measurements)
+    np.testing.assert_allclose(applied.forward(image), matrix @ image, atol=1e-10)
+    np.testing.assert_allclose(applied.adjoint(readings), matrix.T @ readings, atol=1e-10)
+    rows, columns = slice(2, 17), slice(1, 19)
+    inside = applied.measurements_inside(rows, columns)
+    dense = matrix[inside].toarray().reshape(-1, *CAMERA.shape)
+    window = dense[:, rows, columns]
+    assert np.abs(dense).sum() == pytest.approx(np.abs(window).sum(), rel=1e-12)
+    expected = window.reshape(inside.size, 15 * 18)
+    np.testing.assert_allclose(applied.submatrix(rows, columns).toarray(), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("margin", [0, 3])
+def test_information_of_a_box_as_a_kernel(margin: int) -> None:
+    """Far from the edges and in strips along them, by the cosine transform of kernels and of intervals."""
+    frame = camera((40, 44), tuple((magnification, array, "fit") for magnification, array, _ in THREE))
+    for lens_type in frame.types:
+        size = int(lens_type.ratio)
+        kernel = np.pad(np.full((size, size), float(size) ** -2), margin)[None]
+        part = KernelFootprints(
+            KernelPlaces(frame, lens_type, margin), 0, kernel, np.ones((1, 1)), kernel[:0], np.zeros((0, 0, 1))
+        )
+        box = designed_box(frame.shape, lens_type)
+        np.testing.assert_allclose(part.information(), box.information(), atol=1e-12)
+        for axis, strip in ((0, slice(0, 6)), (0, slice(34, 40)), (1, slice(0, 6)), (1, slice(38, 44))):
+            np.testing.assert_allclose(
+                part.edge_information(axis, strip), box.edge_information(axis, strip), atol=1e-12
+            )
 
 
 def test_kernels_are_read_as_they_were_described() -> None:

@@ -156,6 +156,11 @@ class DetailedModel(Model):
         """False: G has no box footprints."""
         return False
 
+    @cached_property
+    def structure(self) -> None:
+        """None: G has entries."""
+        return None
+
     def light(self, image: FloatArray) -> FloatArray:
         """Return the expected light on every sensor pixel given f: (N,) to (M,)."""
         return self.forward(image) + self.offset
@@ -272,21 +277,15 @@ def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
     return _local(model, camera, prior, world, WorldPrior.of(prior, sides, camera.target_pitch, camera.detail))
 
 
-def _fine_matrix(model: Model) -> sparse.csr_array:
-    if model.stored is not None:
-        return model.stored
-    return model.boxes.submatrix(slice(0, model.camera.rows), slice(0, model.camera.columns))
-
-
 def _without_detail(model: Model, camera: Camera, mean: float) -> DetailedModel:
     expansion = repetition(camera.shape, camera.detail)
     zeros = np.zeros(model.measurements)
-    matrix = sparse.csr_array(_fine_matrix(model) @ expansion)
+    matrix = sparse.csr_array(model.to_sparse() @ expansion)
     return _detailed(model, camera, mean, matrix, expansion, np.zeros(model.unknowns), None, zeros, None)
 
 
 def _exact(model: Model, camera: Camera, mean: float, world: WorldPrior) -> DetailedModel:
-    fine = _fine_matrix(model)
+    fine = model.to_sparse()
     gain: FloatArray = fine @ world.interpolation
     spread = world.apply(np.asarray(fine.T.toarray(), dtype=np.float64))
     left: FloatArray = fine @ spread - gain @ (averaging(camera.shape, camera.detail) @ spread)
@@ -297,7 +296,7 @@ def _exact(model: Model, camera: Camera, mean: float, world: WorldPrior) -> Deta
 
 
 def _local(model: Model, camera: Camera, prior: PriorTable, world: WorldPrior, window: WorldPrior) -> DetailedModel:
-    fine, interpolation = _fine_matrix(model), local_interpolation(world, window)
+    fine, interpolation = model.to_sparse(), local_interpolation(world, window)
     matrix = sparse.csr_array(fine @ interpolation)
     variance = unexplained_variance(world, fine, matrix)
     middle = tuple(slice(n // 2 * camera.detail, (n // 2 + 1) * camera.detail) for n in window.shape)
@@ -317,7 +316,7 @@ def _detailed(
     variance: FloatArray,
     covariance: FloatArray | None,
 ) -> DetailedModel:
-    fine = _fine_matrix(model)
+    fine = model.to_sparse()
     offset: FloatArray = fine @ np.full(fine.shape[1], mean) - matrix @ np.full(matrix.shape[1], mean)
     entries: dict[str, Any] = {"variance": np.zeros(matrix.nnz), "batches": np.zeros((0, matrix.nnz), np.float32)}
     if model.variance.any():

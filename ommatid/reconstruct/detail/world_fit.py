@@ -129,8 +129,8 @@ def world_evidence(task: EstimationTask) -> WorldEvidence:
         raise InputError(
             f"a fit of the prior or the noise takes {MIN_MEASUREMENTS} measurements or more, got {inside.size}"
         )
-    kept = np.isin(model.fine.measurements_inside(rows, columns), inside)
-    matrix = sparse.csr_array(model.fine.submatrix(rows, columns)[kept])
+    kept = np.isin(model.fine.windowed.measurements_inside(rows, columns), inside)
+    matrix = sparse.csr_array(model.fine.windowed.submatrix(rows, columns)[kept])
     residual = task.recorded[inside] + model.offset[inside] - model.fine.matrix[inside] @ _mean(model, task)
     deviation = np.sqrt(task.on_all_measurements(task.expected_noise, 1.0)[inside])
     whitened = sparse.csr_array(sparse.diags_array(1 / deviation) @ matrix)
@@ -154,7 +154,7 @@ def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slic
             slice((size - min(side, size)) // 2 * detail, ((size - min(side, size)) // 2 + min(side, size)) * detail)
             for size in task.shape
         )
-        inside = fine.measurements_inside(rows, columns)
+        inside = fine.windowed.measurements_inside(rows, columns)
         inside = inside[task.used[inside]]
         if inside.size < MIN_MEASUREMENTS and wider is not None:
             rows, columns, inside = wider

@@ -4,20 +4,20 @@
 
 Conjugate gradients need no matrix. Iteration stops when the error of every pixel is below a fraction of its posterior
 standard deviation. With the residual r = b - K x, the Cauchy-Schwarz inequality gives
-|x_i - x*_i| <= sqrt(C_ii) sqrt(r^T K^-1 r) for every pixel i. Since K >= P0^-1, r^T K^-1 r is at most |r|^2 over the
-least eigenvalue of P0^-1, for any H.
+|x_i - x*_i| <= sqrt(C_ii) sqrt(r^T K^-1 r) for every pixel i. Since K >= P0^-1, r^T K^-1 r is at most r^T P0 r, for
+any H.
 
 With independent pixels K couples only pixels that one sensor pixel sees, so that its Cholesky factor has a band as wide
 as a few lines of the frame. Factorised, it serves frames of some ten thousand pixels whatever the lens types leave
-open; conjugate gradients with a shift-invariant preconditioner serve larger ones.
+open; conjugate gradients with a preconditioner serve larger ones, and kernels of any width.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,12 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.processors import one_thread
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.observation import Observation
 
-from ..methods.method import EstimationTask, PosteriorOperators
-from .preconditioner import WORKERS, Preconditioner, is_sliding, preconditioner_for
+from ..methods.method import EstimationTask, PosteriorOperators, is_uniform
+from .reflected import WORKERS, Preconditioner
 
 Indices = NDArray[np.intp]
 
@@ -41,22 +43,12 @@ MAX_STARTS = 3  # each from the recomputed residual
 SAFETY = 0.5  # of the least eigenvalue of P K, which the Lanczos matrix overestimates
 MOST_WORK = 1.2e11  # pixels times the square of the band: a minute or two with the error bars
 MAX_REFINEMENTS = 4
+TRIAL_STEPS = 10  # with each of two preconditioners, where noise is uneven
+LEAST_LOCAL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 
 class NotReachedError(InputError):
     """Conjugate gradients do not reach the requested accuracy."""
-
-
-class Observation(Protocol):
-    """Any representation of H."""
-
-    def forward(self, image: FloatArray) -> FloatArray:
-        """Apply H: (N,) to (M,)."""
-        ...
-
-    def adjoint(self, measurements: FloatArray) -> FloatArray:
-        """Apply H^T: (M,) to (N,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -78,19 +70,20 @@ class FrameSystem:
 
     weights : (M,) 1 / Rv, 0 for sensor pixels that are not used
     prior : 1 / P0 of independent pixels, or 1 / its spectrum, (rows, columns), under the DCT-II
+    alike : boxes and kernels that are like `observation`, for the preconditioner; None: that itself
     similar : the preconditioner of the same prior and similar weights, None to make one of these
     """
 
-    camera: Camera
     observation: Observation
     weights: FloatArray
     prior: float | FloatArray
+    alike: Observation | None = field(default=None, kw_only=True)
     similar: Preconditioner | None = field(default=None, kw_only=True)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
-        return self.camera.rows, self.camera.columns
+        return self.observation.shape
 
     def apply(self, image: FloatArray) -> FloatArray:
         """Return K f: (N,) to (N,)."""
@@ -112,13 +105,39 @@ class FrameSystem:
 
     @cached_property
     def preconditioner(self) -> Preconditioner:
-        """P: the shift-invariant camera with the mean weight of each lens type."""
-        return preconditioner_for(self.camera, self.mean_weights, self.prior) if self.similar is None else self.similar
+        """P of the mean weights, or scaled by the local ones where noise is uneven and that takes fewer steps."""
+        if self.similar is not None:
+            return self.similar
+        even = Preconditioner(self._alike, self.mean_weights, self.prior)
+        if all(is_uniform(self.weights[part]) for part in self._alike.slices):
+            return even
+        means = np.repeat(even.weights, [part.stop - part.start for part in self._alike.slices])
+        local, average = self.observation.adjoint(self.weights), self.observation.adjoint(means)
+        relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
+        scaled = replace(even, scale=np.sqrt(np.maximum(relative, LEAST_LOCAL)).reshape(self.shape))
+        return min((even, scaled), key=self._after_trial)
+
+    def _after_trial(self, candidate: Preconditioner) -> float:
+        """Return the bound that a few steps with a preconditioner reach."""
+        right = self.apply(probe(Purpose.PRECONDITIONER).normal(size=self.observation.unknowns))
+        return replace(self, similar=candidate)._steps(right, TRIAL_STEPS)
+
+    def _steps(self, right: FloatArray, count: int) -> float:
+        image, lanczos = np.zeros_like(right), _Lanczos()
+        with one_thread():
+            for residual in self._residuals(image, right.copy(), lanczos):
+                if lanczos.count == count:
+                    return self._bound(residual)
+        return np.inf
+
+    @property
+    def _alike(self) -> Observation:
+        return self.observation if self.alike is None else self.alike
 
     @property
     def mean_weights(self) -> tuple[float, ...]:
-        """Mean weight of each lens type."""
-        return tuple(float(self.weights[part].mean()) for part in self.camera.type_slices())
+        """Mean weight of each lens type, or of each sub-imager where these are parts of H."""
+        return tuple(float(self.weights[part].mean()) for part in self._alike.slices)
 
     def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.
@@ -144,30 +163,42 @@ class FrameSystem:
         self, start: FloatArray, start_residual: FloatArray, accuracy: float, before: _Lanczos, progress: Progress
     ) -> tuple[FloatArray, _Lanczos]:
         """Run conjugate gradients from `start` until the recursive residual meets the bound."""
-        image, residual, lanczos = start.copy(), start_residual.copy(), _Lanczos()
-        first = bound = self._bound(residual)
-        direction = self._precondition(residual) if bound > accuracy else residual
-        energy = float(residual @ direction)
-        while bound > accuracy:
+        image, lanczos = start.copy(), _Lanczos()
+        first = self._bound(start_residual)
+        for residual in self._residuals(image, start_residual.copy(), lanczos):
+            bound = self._bound(residual)
+            if lanczos.count:
+                progress(min(1.0, float(np.log(first / bound) / np.log(first / accuracy)) if bound > 0 else 1.0))
+            if bound <= accuracy:
+                break
             if lanczos.count >= MAX_STEPS or not np.isfinite(bound):
                 raise NotReachedError(_not_reached(bound, lanczos.count, accuracy))
-            product = self.apply(direction)
-            length = energy / float(direction @ product)
-            image += length * direction
-            residual -= length * product
-            bound = self._bound(residual)
-            conditioned = self._precondition(residual)
-            previous, energy = energy, max(float(residual @ conditioned), 0.0)
-            lanczos.add(length, energy / previous)
-            direction *= energy / previous
-            direction += conditioned
-            progress(min(1.0, float(np.log(first / bound) / np.log(first / accuracy)) if bound > 0 else 1.0))
         return image, lanczos if lanczos.count else before
 
+    def _residuals(self, image: FloatArray, residual: FloatArray, lanczos: _Lanczos) -> Iterator[FloatArray]:
+        """Yield the residual before each step of conjugate gradients, which change `image` and `residual`."""
+        direction, energy = None, 1.0
+        while True:
+            yield residual
+            conditioned = self._precondition(residual)
+            previous, energy = energy, max(float(residual @ conditioned), 0.0)
+            if direction is None:
+                direction = conditioned
+            else:
+                lanczos.ratios.append(energy / previous)
+                direction *= energy / previous
+                direction += conditioned
+            product = self.apply(direction)
+            lanczos.lengths.append(energy / float(direction @ product))
+            image += lanczos.lengths[-1] * direction
+            residual -= lanczos.lengths[-1] * product
+
     def _bound(self, residual: FloatArray) -> float:
-        """Upper bound on sqrt(r^T K^-1 r) from the least eigenvalue of P0^-1."""
-        least = self.prior if isinstance(self.prior, float) else float(np.min(self.prior))
-        return (float(residual @ residual) / least) ** 0.5
+        """Upper bound on sqrt(r^T K^-1 r): sqrt(r^T P0 r)."""
+        if isinstance(self.prior, float):
+            return (float(residual @ residual) / self.prior) ** 0.5
+        waves = np.asarray(fft.dctn(residual.reshape(self.shape), 2, norm="ortho", workers=WORKERS))
+        return float(np.sum(np.square(waves) / self.prior)) ** 0.5
 
     def _precondition(self, image: FloatArray) -> FloatArray:
         return self.preconditioner.solve(image.reshape(self.shape)).ravel()
@@ -205,11 +236,6 @@ class _Lanczos:
         self.lengths: list[float] = []
         self.ratios: list[float] = []
 
-    def add(self, length: float, ratio: float) -> None:
-        """Add a step: its length and the ratio of the energies after and before it."""
-        self.lengths.append(length)
-        self.ratios.append(ratio)
-
     @property
     def count(self) -> int:
         return len(self.lengths)
@@ -223,10 +249,10 @@ class _Lanczos:
         return self._eigenvalue(self.count - 1)
 
     def _eigenvalue(self, index: int) -> float:
-        lengths, ratios = np.array(self.lengths), np.array(self.ratios)
+        lengths, ratios = np.array(self.lengths), np.array(self.ratios[: self.count - 1])
         diagonal = 1 / lengths
-        diagonal[1:] += ratios[:-1] / lengths[:-1]
-        beside = np.sqrt(ratios[:-1]) / lengths[:-1]
+        diagonal[1:] += ratios / lengths[:-1]
+        beside = np.sqrt(ratios) / lengths[:-1]
         return float(linalg.eigvalsh_tridiagonal(diagonal, beside, select="i", select_range=(index, index))[0])
 
 
@@ -291,10 +317,9 @@ def banded_cholesky(precision: sparse.csr_array, order: Indices) -> FloatArray:
 
 def serves(camera: Camera, independent: bool) -> bool:
     """Return True where K of a frame is factorised: a null space or another array, few pixels, independent in P0."""
-    sliding = all(is_sliding(lens_type) for lens_type in camera.types)
     if not camera.has_sharp_footprints:  # a blurred footprint may be as wide as the frame
         return False
-    return independent and band_work(camera) <= MOST_WORK and not (sliding and not leaves_null_space(camera))
+    return independent and band_work(camera) <= MOST_WORK and not (camera.is_sliding and not leaves_null_space(camera))
 
 
 def band_work(camera: Camera) -> float:

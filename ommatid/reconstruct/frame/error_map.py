@@ -1,8 +1,9 @@
 """The expected error (Eq. 5) of every pixel of a frame, by the way that its noise, its prior and its lens types allow.
 
-Even noise and an ideal H are served by the transfer function, any other noise and H by windows side by side, lens types
-that leave a null space by one sweep over the frame. A correlated prior takes the maps of even noise at several levels,
-between which each pixel finds that of the measurements near it.
+Even noise and an ideal H of boxes are served by the transfer function, any other noise and H of boxes by windows side
+by side, lens types that leave a null space by one sweep over the frame. A correlated prior and kernels take the maps of
+even noise from a small frame with the same edges, at several levels, between which each pixel finds that of the
+measurements near it.
 
 The error of a map is measured at random pixels by exact solutions of the frame's own system. With x = C z, z random
 signs at pixels k far from one another and 0 elsewhere, z_k x_k is C_kk: what the others add falls with the distance as
@@ -27,16 +28,15 @@ from ommatid.scenes.camera import Camera
 
 from ..methods.method import EstimationTask, is_uniform
 from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, leaves_null_space
-from .preconditioner import Preconditioner, is_sliding
+from .sliding import SlidingCamera, is_sliding, sliding_camera
 from .variance_map import (
     LARGEST_GAP,
     NearlyEven,
+    SmallFrames,
     VarianceMap,
     interior_variance,
     posterior_variance,
     sliding_variance_map,
-    small_posterior_variance,
-    small_shape,
     unseen_corners,
     variance_map,
 )
@@ -61,6 +61,7 @@ MOST = 200  # pixels of a set
 TRIALS = 2000  # random pixels that are tried for it
 EDGE = 4  # pixels: how near the edges the first of a set lie
 SETS = 2  # of few pixels; one of many
+EDGES = 4  # sets of frames so small that a set has a pixel or two
 SINGLE = 6  # pixels where errors are correlated over any distance, and each needs a solution of its own
 FEW_SINGLE = 2  # of many pixels
 MANY = 250_000
@@ -124,9 +125,9 @@ def check_map(
     """
     rng = probe(Purpose.ERROR_MAP)
     ratios: list[FloatArray] = []
-    many = variance.size > MANY
-    for number in range((1 if many else SETS) if local else (FEW_SINGLE if many else SINGLE)):
-        pixels = spread_pixels(shape, rng, edges=local or bool(number % 2))
+    many, few = variance.size > MANY, max(shape) < 2 * SPACING  # so few that sets have a pixel or two
+    for number in range((1 if many else EDGES if few else SETS) if local else (FEW_SINGLE if many else SINGLE)):
+        pixels = spread_pixels(shape, rng, edges=local or bool(number % 2), first=number)
         if not local:
             pixels = pixels[:1]
         ratios.append(variance[pixels] / exact.at(pixels, posterior, rng) - 1)
@@ -137,12 +138,15 @@ def check_map(
     return MapCheck(worst, min(worst, abs(float(ratio.mean())) + 2 * float(ratio.std()) / ratio.size**0.5))
 
 
-def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bool) -> Pixels:
-    """Return random pixels of a frame that lie SPACING rows or columns apart, (n,); with `edges` some lie near them."""
+def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bool, first: int = 0) -> Pixels:
+    """Return random pixels of a frame that lie SPACING rows or columns apart, (n,); with `edges` some lie near them.
+
+    first : number of the edge that the first pixel lies near
+    """
     rows, columns = shape
     trials = np.stack([rng.integers(rows, size=TRIALS), rng.integers(columns, size=TRIALS)], axis=1)
     for number in range(4 if edges else 0):
-        axis, end = divmod(number, 2)
+        axis, end = divmod((first + number) % 4, 2)
         near = int(rng.integers(min(EDGE, shape[axis])))
         trials[number, axis] = shape[axis] - 1 - near if end else near
     chosen = [trials[0]]
@@ -157,19 +161,29 @@ class ErrorMap:
     """Maps of the expected error of a frame whose estimator is `system`.
 
     actual : (measurements used,) noise;  halo : of windows, in boxes of the widest lens type
+    extrapolated : True for maps of small frames that take the length of the frame into account
     """
 
     task: EstimationTask
     system: FrameSystem
     actual: FloatArray
     halo: int
+    extrapolated: bool = False
 
     @classmethod
     def of(cls, task: EstimationTask, system: FrameSystem, actual: FloatArray) -> tuple[ErrorMap, MapCheck]:
-        """Return the maps and their error at random pixels; with a long halo where that of a short one is too large."""
+        """Return the maps and their error at random pixels.
+
+        Where that is too large, with a long halo, or the better one of two laws of the length of the frame.
+        """
         maps = cls(task, system, actual, HALO if task.model.unknowns <= MANY else SHORT_HALO)
         check = maps.checked()
-        if not maps.has_windows or (check.worst <= WORST and check.mean <= MEAN):
+        if check.worst <= WORST and check.mean <= MEAN:
+            return maps, check
+        if maps.has_small_frames and check.worst > WORST:
+            other = replace(maps, extrapolated=True)
+            return min((maps, check), (other, other.checked()), key=lambda found: found[1].worst)
+        if not maps.has_windows:
             return maps, check
         longer = replace(maps, halo=LONG_HALO)
         return longer, longer.checked()
@@ -182,24 +196,38 @@ class ErrorMap:
     @property
     def has_windows(self) -> bool:
         """True if the maps come from windows."""
-        return not isinstance(self.system, BandedSystem) and isinstance(self.system.prior, float) and not self.is_even
+        return not isinstance(self.system, BandedSystem) and self._is_local and not self.is_even
+
+    @property
+    def has_small_frames(self) -> bool:
+        """True if the maps come from small frames."""
+        return not isinstance(self.system, BandedSystem) and not self._is_local
+
+    @property
+    def _is_local(self) -> bool:
+        """True if pixels are independent and H averages over boxes, so that K couples near pixels only."""
+        return isinstance(self.system.prior, float) and self._has_boxes
+
+    @cached_property
+    def _has_boxes(self) -> bool:
+        return self.task.model.camera.has_sharp_footprints
 
     @cached_property
     def maps(self) -> VarianceMap:
         """Variances of all pixels."""
         if isinstance(self.system, BandedSystem):
             return self._perturbed_map(self._swept)
-        if not isinstance(self.system.prior, float):
+        if not self._is_local:
             return self._even_map() if self.is_even else self._interpolated_map()
         return self._with_corners(self._even_map() if self.is_even else self._perturbed_map(self._windows))
 
     def _with_corners(self, variances: VarianceMap) -> VarianceMap:
         """Replace the variances of corner pixels that some lens types do not see by exact solutions."""
-        if not all(is_sliding(lens_type) for lens_type in self.task.model.camera.types):
+        if not self._is_sliding:
             return variances
         parts = [np.array(part) for part in (variances.posterior, variances.missing, variances.noisy)]
         noise = self.system.weights**2 * self.task.on_all_measurements(self.actual, 0.0)
-        for corner in unseen_corners(self.system.preconditioner):
+        for corner in unseen_corners(self._sliding):
             unit = np.zeros(self.task.shape)
             unit[corner] = 1.0
             solved = self.system.solve(unit.ravel(), self.task.settings.accuracy).image
@@ -219,6 +247,17 @@ class ErrorMap:
         return check_map(self.variance, self.maps.posterior.ravel(), self.task.shape, exact, local=local)
 
     @cached_property
+    def _is_sliding(self) -> bool:
+        return is_sliding(self.task.model.alike, self.task.model.camera.types)
+
+    @cached_property
+    def _sliding(self) -> SlidingCamera:
+        """The shift-invariant camera like this one, with the mean weight of each lens type."""
+        slices = self.task.model.camera.type_slices()
+        means = tuple(float(self.system.weights[part].mean()) for part in slices)
+        return sliding_camera(self.task.model.alike, means, self.system.prior)
+
+    @cached_property
     def as_expected(self) -> bool:
         """True if the actual noise is that which the estimator expects."""
         return np.allclose(self.actual, self.task.expected_noise, rtol=1e-12)
@@ -226,7 +265,9 @@ class ErrorMap:
     @cached_property
     def is_even(self) -> bool:
         """True if H is as designed, or nearly so, and both expected and actual noise are even over each lens type."""
-        if not (self.task.model.is_nearly_designed and self.task.complete):
+        if self._has_boxes and not self.task.model.is_nearly_designed:
+            return False
+        if not self.task.complete:
             return False
         slices = self.task.model.camera.type_slices()
         return all(_even(values[part]) for values in (self.task.expected_noise, self.actual) for part in slices)
@@ -256,14 +297,14 @@ class ErrorMap:
         matrix = self.task.model.matrix
         information = matrix.T @ sparse.csr_array(matrix.multiply(weights[:, None]))
         precision = sparse.csr_array(information + prior * sparse.eye_array(matrix.shape[1], format="csr"))
-        return whole_variances(precision, self.task.shape, self.task.model.reach - 1)
+        return whole_variances(precision, self.task.shape, self.task.model.windowed.reach - 1)
 
     def _windows(self, weights: FloatArray, prior: float) -> FloatArray:
         """Variances from windows for any H of shift-invariant lens types."""
         model = self.task.model
         widths = [ceil(lens_type.ratio) for lens_type in model.camera.types]
         halo = self.halo * max(widths)
-        reach = max(widths) - 1 if model.is_nearly_designed else model.reach - 1
+        reach = max(widths) - 1 if model.is_nearly_designed else model.windowed.reach - 1
 
         def source(rows: slice, columns: slice) -> Stencil:
             if model.is_nearly_designed:
@@ -272,9 +313,9 @@ class ErrorMap:
             return stored_stencil(self._by_pixel, weights, prior, pixels, reach)
 
         even, known = None, None
-        if all(is_sliding(lens_type) for lens_type in model.camera.types) and reach >= max(widths) - 1:
+        if self._is_sliding and reach >= max(widths) - 1:
             means = tuple(float(weights[part].mean()) for part in model.camera.type_slices())
-            system = replace(self.system.preconditioner, weights=means, prior=prior)
+            system = replace(self._sliding, weights=means, prior=prior)
             even = EvenNoise(even_couplings(widths, means, prior, reach), interior_variance(system))
             if self._needs_window is not None:
                 known = NearlyEven(model.camera, system).variances(weights)
@@ -286,23 +327,32 @@ class ErrorMap:
         """Pixels whose noise is too uneven for a correction of the even map, (rows, columns); None: all."""
         if not (self.task.model.is_exact and self.task.complete and self.as_expected):
             return None
-        return NearlyEven(self.task.model.camera, self.system.preconditioner).gap(self.system.weights) > LARGEST_GAP
+        return NearlyEven(self.task.model.camera, self._sliding).gap(self.system.weights) > LARGEST_GAP
 
     @cached_property
     def _by_pixel(self) -> sparse.csc_array:
-        return sparse.csc_array(self.task.model.matrix)
+        return sparse.csc_array(self.task.model.to_sparse())
 
     def _even_map(self, scale: float = 1.0) -> VarianceMap:
         """Variances of noise that is even over each lens type, with all weights times `scale`.
 
         Of noise that is not even the means are those of the weights, and of the actual noise with squared weights.
         """
-        system = self.system.preconditioner
-        weights = tuple(scale * weight for weight in system.weights)
+        weights = tuple(scale * weight for weight in self._sliding.weights)
         actual = tuple(
             ratio / weight if weight else 0.0 for ratio, weight in zip(self._mean_ratios, weights, strict=True)
         )
-        return sliding_variance_map(replace(system, weights=weights), actual, self._posterior_variance)
+        posterior = posterior_variance if self._is_local else self._from_small_frames
+        return sliding_variance_map(replace(self._sliding, weights=weights), actual, posterior)
+
+    def _from_small_frames(self, system: SlidingCamera) -> FloatArray:
+        """Return the diagonal of K^-1, (rows, columns), of weights and a prior that are multiples of the system's."""
+        by_prior = float(np.ravel(system.prior)[0]) / float(np.ravel(self._sliding.prior)[0])
+        return self._small_frames.variance(system.weights, by_prior, extrapolated=self.extrapolated)
+
+    @cached_property
+    def _small_frames(self) -> SmallFrames:
+        return SmallFrames(self._sliding, self.task.precision_on)
 
     @cached_property
     def _mean_ratios(self) -> tuple[float, ...]:
@@ -340,18 +390,12 @@ class ErrorMap:
         """Weights of the measurements of each pixel relative to the means of their types: (N,)."""
         means = np.empty(self.task.model.measurements)
         slices = self.task.model.camera.type_slices()
-        for part, weight in zip(slices, self.system.preconditioner.weights, strict=True):
+        for part, weight in zip(slices, self._sliding.weights, strict=True):
             means[part] = weight
         adjoint = self.system.observation.adjoint
         local, average = adjoint(self.system.weights), adjoint(means)
         relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
         return np.maximum(relative, LEAST_LEVEL)
-
-    def _posterior_variance(self, system: Preconditioner) -> FloatArray:
-        if not isinstance(system.prior, np.ndarray):
-            return posterior_variance(system)
-        change = float(system.prior.flat[0]) / float(np.ravel(self.system.prior)[0])
-        return small_posterior_variance(system, change * np.array(self.task.precision_on(small_shape(system.shape))))
 
 
 def window_memory(camera: Camera) -> int:

@@ -32,7 +32,6 @@ from ..output.run_json import SolverReport
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .conjugate_gradients import BandedSystem, FrameSystem, Solution, posterior_operators, serves
 from .error_map import MANY, ErrorMap, MapCheck
-from .preconditioner import is_sliding
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
@@ -61,7 +60,7 @@ class FrameMethod(Method):
         super().__init__(task, execution)
         self._banded = serves(task.model.camera, task.prior.kind == "independent")
         for lens_type in task.model.camera.types:
-            if not (self._banded or is_sliding(lens_type)):
+            if not (self._banded or lens_type.is_sliding):
                 raise InputError(
                     f"estimator.method 'frame': lens type '{lens_type.name}' is no array of m x m sub-imagers with"
                     " step 1 and magnification 1/m, and the frame is too large for another solver, or its prior"
@@ -80,11 +79,11 @@ class FrameMethod(Method):
             weights = np.broadcast_to(1 / task.expected_noise[:1], task.expected_noise.shape)
         else:
             weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
-        camera, prior, observation = task.model.camera, task.precision_on(task.shape), task.model.without_entries
+        prior, observation = task.precision_on(task.shape), task.model.applied
         if self._banded:
-            banded = BandedSystem(camera, observation, weights, prior, task.model.matrix)
+            banded = BandedSystem(observation, weights, prior, task.model.matrix)
             return self.shared("system", self.conditions(), lambda: banded)[0]
-        system = FrameSystem(camera, observation, weights, prior)
+        system = FrameSystem(observation, weights, prior, alike=task.model.alike)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
         similar, difference = self.shared("preconditioner", conditions, lambda: system.preconditioner, SIMILAR)
@@ -146,8 +145,6 @@ class FrameMethod(Method):
     def _frame_error(self, noise: dict[str, FloatArray], actual: FloatArray) -> FrameError:
         """Return the expected error, which depends on the noise and not on what is recorded."""
         task, system = self.task, self.system
-        if system.similar is not None:  # maps take the mean weights from the preconditioner
-            system = replace(system, similar=None)
         errors, check = ErrorMap.of(task, system, actual)
         variances, variance = errors.maps, errors.variance
         self.execution.progress(0.7)

@@ -33,13 +33,15 @@ from ommatid.runtime.processors import one_thread, processors
 from ommatid.scenes.camera import Camera
 
 from ..forms.cholesky import factorise_positive
-from .preconditioner import BoxMeans, Preconditioner
+from .sliding import SlidingCamera
 from .window_variances import box_image, inverse_diagonal
 
 FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
 DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
 STEP = 1e-4  # relative step of a finite difference, and the largest relative error it causes
 SIDE = 44  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
+SHORT = 32  # pixels along one axis of another, from which the effect of the length follows
+LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one is at least
 GRID = 128  # pixels of the periodic frame on which shares are computed
 REACH = 32  # pixels beyond which a measurement has no share
 SLAB = 480  # rows that are transformed together
@@ -69,7 +71,7 @@ def variance_map(perturbed: Callable[[float, float], FloatArray], *, noise_as_ex
 
 
 def sliding_variance_map(
-    system: Preconditioner, actual: tuple[float, ...], posterior: Callable[[Preconditioner], FloatArray]
+    system: SlidingCamera, actual: tuple[float, ...], posterior: Callable[[SlidingCamera], FloatArray]
 ) -> VarianceMap:
     """Return the map of a shift-invariant camera whose lens types have the actual noise variances `actual`."""
     ratios = [weight * variance for weight, variance in zip(system.weights, actual, strict=True)]
@@ -85,7 +87,7 @@ def sliding_variance_map(
     return variances if as_expected else replace(variances, noisy=largest * variances.noisy)
 
 
-def posterior_variance(system: Preconditioner) -> FloatArray:
+def posterior_variance(system: SlidingCamera) -> FloatArray:
     """Return the diagonal of K^-1 for independent pixels: (rows, columns)."""
     # Pixels beyond a strip count as known, so at a corner the larger of two variances is the more accurate one.
     border = np.zeros(system.shape)
@@ -102,7 +104,7 @@ def posterior_variance(system: Preconditioner) -> FloatArray:
     return np.where(border > 0, border, interior_variance(system))
 
 
-def unseen_corners(system: Preconditioner) -> list[tuple[int, int]]:
+def unseen_corners(system: SlidingCamera) -> list[tuple[int, int]]:
     """Return the corner pixels, (row, column), where two edges meet that some lens types do not see.
 
     Errors there reach along both edges to their ends, and no strip shows their variance.
@@ -111,8 +113,8 @@ def unseen_corners(system: Preconditioner) -> list[tuple[int, int]]:
         [
             place
             for place, unseen in (
-                (0, any(pair[axis].first > 0 for pair in system.types)),
-                (size - 1, any(pair[axis].end < size for pair in system.types)),
+                (0, any(each.axes[axis].first > 0 for each in system.types)),
+                (size - 1, any(each.axes[axis].end < size for each in system.types)),
             )
             if unseen
         ]
@@ -121,24 +123,24 @@ def unseen_corners(system: Preconditioner) -> list[tuple[int, int]]:
     return [(row, column) for row in ends[0] for column in ends[1]]
 
 
-def interior_variance(system: Preconditioner) -> float:
+def interior_variance(system: SlidingCamera) -> float:
     """Mean of 1 / spectrum over the frequencies of a frame without edges."""
     vertical, horizontal = (
         2 * np.pi * (np.arange(min(size, FINEST)) + 0.5) / min(size, FINEST) for size in system.shape
     )
     total = np.full((vertical.size, horizontal.size), system.prior)
     for means, weight in zip(system.types, system.weights, strict=True):
-        total += weight * np.outer(means[0].transfer_at(vertical), means[1].transfer_at(horizontal))
+        total += weight * np.outer(means.vertical.transfer_at(vertical), means.horizontal.transfer_at(horizontal))
     return float(np.mean(1 / total))
 
 
-def _strip_variance(system: Preconditioner, axis: int, part: slice) -> FloatArray:
+def _strip_variance(system: SlidingCamera, axis: int, part: slice) -> FloatArray:
     """The diagonal of the inverse of K in a strip along one edge, (depth, length), by blocks of its columns."""
     prior = float(np.asarray(system.prior))
     depth, length = part.stop - part.start, system.shape[1 - axis]
     wide = max(system.widest(1 - axis) - 1, 1)
-    across = [means[axis].gram[part, part].toarray() for means in system.types]
-    along = [weight * means[1 - axis].gram for means, weight in zip(system.types, system.weights, strict=True)]
+    across = [means.axes[axis].gram[part, part].toarray() for means in system.types]
+    along = [weight * means.axes[1 - axis].gram for means, weight in zip(system.types, system.weights, strict=True)]
     blocks = [slice(first, last) for first, last in pairwise([*range(0, length, wide), length])]
 
     def block(row: int, column: int) -> FloatArray:
@@ -154,30 +156,63 @@ def _strip_variance(system: Preconditioner, axis: int, part: slice) -> FloatArra
     return inverse_diagonal(len(blocks), block).reshape(length, depth).T
 
 
-def small_posterior_variance(system: Preconditioner, precision: FloatArray) -> FloatArray:
-    """Return the diagonal of K^-1 for correlated pixels, from a small frame with the same edges.
+class SmallFrames:
+    """Small frames with the edges of a large one, whose middle represents any interior, for any prior and any kernels.
 
-    precision : 1 / the spectrum of the prior on a frame of `small_shape`
+    Errors of waves that some lens types do not see reach from edge to edge. Where an edge has as many such waves in a
+    frame of any length n, their part in the variance of a pixel falls with 1 / n, which two lengths show.
+
+    precision : from a shape to 1 / P0 of independent pixels, or 1 / the spectrum of the prior on that shape
     """
-    shape = small_shape(system.shape)
-    vertical, horizontal = (np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape)
-    waves = np.kron(vertical, horizontal)
-    total = waves.T @ (precision.ravel()[:, None] * waves)
-    for pair, weight in zip(system.types, system.weights, strict=True):
-        rows, columns = (_shortened(means, size).gram.toarray() for means, size in zip(pair, shape, strict=True))
-        total += weight * np.kron(rows, columns)
+
+    def __init__(self, system: SlidingCamera, precision: Callable[[tuple[int, int]], float | FloatArray]) -> None:
+        """Shorten the camera `system` to about SIDE pixels, and along each axis to SHORT."""
+        self.shape = system.shape
+        rows, columns = (min(SIDE, size) for size in self.shape)
+        self._whole = _shortened(system, (rows, columns), precision)
+        shorter = ((min(SHORT, rows), columns), (rows, min(SHORT, columns)))
+        self._shorter = [
+            (axis, _shortened(system, shape, precision))
+            for axis, shape in enumerate(shorter)
+            if self.shape[axis] > SIDE
+        ]
+
+    def variance(self, weights: tuple[float, ...], by_prior: float, *, extrapolated: bool) -> FloatArray:
+        """Return the diagonal of K^-1, (rows, columns), for weights of the lens types and a prior times a factor.
+
+        extrapolated : True to take the law of the length into account
+        """
+        whole = _enlarged(_variance(self._whole, weights, by_prior), self.shape)
+        total = whole.copy()
+        for axis, system in self._shorter if extrapolated else ():
+            share = (1 / self.shape[axis] - 1 / SIDE) / (1 / SHORT - 1 / SIDE)
+            total += share * (_enlarged(_variance(system, weights, by_prior), self.shape) - whole)
+        return np.maximum(total, LEAST_SHARE * whole)
+
+
+def _shortened(
+    system: SlidingCamera, shape: tuple[int, int], precision: Callable[[tuple[int, int]], float | FloatArray]
+) -> SlidingCamera:
+    return SlidingCamera(tuple(each.shortened(shape) for each in system.types), system.weights, precision(shape))
+
+
+def _variance(system: SlidingCamera, weights: tuple[float, ...], by_prior: float) -> FloatArray:
+    """Return the diagonal of K^-1 of a small frame: (rows, columns)."""
+    if not isinstance(system.prior, np.ndarray):
+        total = by_prior * system.prior * np.eye(system.shape[0] * system.shape[1])
+    else:
+        vertical, horizontal = (np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in system.shape)
+        waves = np.kron(vertical, horizontal)
+        total = waves.T @ (by_prior * system.prior.ravel()[:, None] * waves)
+    for each, weight in zip(system.types, weights, strict=True):
+        total += weight * each.information
     factor, _ = factorise_positive(total)
-    variance = np.diagonal(factor.inverse()).reshape(shape)
-    return variance[np.ix_(*(_small_index(*sizes) for sizes in zip(system.shape, shape, strict=True)))]
+    return np.diagonal(factor.inverse()).reshape(system.shape)
 
 
-def small_shape(shape: tuple[int, int]) -> tuple[int, int]:
-    """Return rows and columns of the small frame that represents one of `shape`."""
-    return min(SIDE, shape[0]), min(SIDE, shape[1])
-
-
-def _shortened(means: BoxMeans, size: int) -> BoxMeans:
-    return replace(means, end=size - (means.size - means.end), size=size)
+def _enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return the map of a small frame for a frame of `shape`."""
+    return variance[np.ix_(*(_small_index(*sizes) for sizes in zip(shape, variance.shape, strict=True)))]
 
 
 def _small_index(size: int, side: int) -> NDArray[np.intp]:
@@ -191,7 +226,7 @@ class NearlyEven:
     """The interior of a frame whose lens types are shift-invariant, with mean weights as `system` has them."""
 
     camera: Camera
-    system: Preconditioner
+    system: SlidingCamera
 
     def variances(self, weights: FloatArray) -> FloatArray:
         """Return the variances for weights, (M,), near the means: (rows, columns)."""
@@ -235,10 +270,8 @@ class NearlyEven:
     def _shares(self) -> list[FloatArray]:
         """Return p of each type by the distance of the pixel from the first one of the box, from -REACH to REACH."""
         boxes: list[FloatArray] = []
-        for vertical, horizontal in self.system.types:
-            axes = [
-                np.repeat([1 / means.width, 0.0], [means.width, GRID - means.width]) for means in (vertical, horizontal)
-            ]
+        for each in self.system.types:
+            axes = [np.repeat([1 / means.width, 0.0], [means.width, GRID - means.width]) for means in each.axes]
             boxes.append(np.outer(*axes))
         transfer = [np.asarray(fft.fft2(box)) for box in boxes]
         spectrum = float(np.asarray(self.system.prior)) + sum(

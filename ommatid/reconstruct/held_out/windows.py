@@ -47,7 +47,9 @@ PER_AXIS = 3  # most windows along each axis
 
 def fitted_prior(task: EstimationTask) -> PriorTable | None:
     """Return the exponential prior of largest evidence with the task's noise; None if measurements are too few."""
-    side = max(FIT_WINDOW, FIT_REACHES * task.model.reach)
+    side = max(FIT_WINDOW, FIT_REACHES * task.model.windowed.reach)
+    if task.model.stored is None and side > WIDEST_WINDOW:  # kernels as wide as the windows
+        return None
     windows = product(*(_spread(size, side) for size in task.shape))
     blocks = [_window(task, rows, columns) for rows, columns in windows]
     residual = np.concatenate([block.residual for block in blocks])
@@ -121,7 +123,7 @@ def windows(task: EstimationTask, robust: bool) -> tuple[list[Window], int]:
     shape = task.shape
     if robust or _knows_detail(task) or shape[0] * shape[1] <= MOST_WHOLE:
         return [(slice(0, shape[0]), slice(0, shape[1]))], 1
-    side = min(max(WINDOW, REACHES * task.model.reach), WIDEST_WINDOW)
+    side = min(max(WINDOW, REACHES * task.model.windowed.reach), WIDEST_WINDOW)
     rows, columns = (_intervals(size, side) for size in shape)
     shown = product(_evenly(rows), _evenly(columns))
     return [(down, across) for down, across in shown], len(rows) * len(columns)

@@ -81,15 +81,15 @@ class EstimationTask:
 
     def window(self, rows: slice, columns: slice) -> TaskWindow:
         """Cut out a window of f with the used measurements that see nothing outside it."""
-        inside = self.model.measurements_inside(rows, columns)
+        inside = self.model.windowed.measurements_inside(rows, columns)
         used = self.used[inside]
         numbers, shape = inside[used], (rows.stop - rows.start, columns.stop - columns.start)
-        index, matrix = self.among_used(numbers), self.model.submatrix(rows, columns)[used]
+        index, matrix = self.among_used(numbers), self.model.windowed.submatrix(rows, columns)[used]
         return TaskWindow(matrix, self.recorded[numbers], self.expected_noise[index], index, shape)
 
     def used_inside(self, rows: slice, columns: slice) -> IntArray:
         """Return the numbers, in ascending order, of the used measurements that see nothing outside a window of f."""
-        inside = self.model.measurements_inside(rows, columns)
+        inside = self.model.windowed.measurements_inside(rows, columns)
         return inside if self.complete else inside[self.used[inside]]
 
     def among_used(self, numbers: IntArray) -> IntArray:

@@ -64,7 +64,7 @@ def tile_cost(task: EstimationTask, variance: FloatArray) -> float | None:
     size = task.tiles.size
     if task.prior.kind != "independent" or max(task.shape) <= size or not (task.expected_noise > 0).all():
         return None
-    if task.model.reach > size:  # footprints as wide as a tile leave K without a band
+    if task.model.windowed.reach > size:  # footprints as wide as a tile leave K without a band
         return None
     sides = [min(TILES * size, length) for length in task.shape]
     rows, columns = (
@@ -241,10 +241,10 @@ class TileMethod(Method):
         varied = [values for values in (task.expected_noise, *noise.values()) if not is_uniform(values)]
         digests: list[str] = []
         if varied or not task.complete:
-            inside = task.model.measurements_inside(*tile.window)
+            inside = task.model.windowed.measurements_inside(*tile.window)
             index = task.among_used(task.used_inside(*tile.window))
             digests = [digest(task.used[inside]), *(digest(values[index]) for values in varied)]
-        return task.model.signature(*tile.window), tile.shape, tile.kept.tobytes(), *digests
+        return task.model.windowed.signature(*tile.window), tile.shape, tile.kept.tobytes(), *digests
 
     def _tile_task(
         self,

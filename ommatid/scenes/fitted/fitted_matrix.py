@@ -18,9 +18,10 @@ from ommatid.runtime.arrays import BoolArray, FloatArray
 
 from ..camera import Camera
 from ..lens_type import LensType, SubImager
+from ..observation import Observation, ObservationPart
 from ..tables.table import LARGEST
 from .kernels import KernelFootprints
-from .view import COUNT, K1, LEAST, MOST, ROTATION, RealBoxes, designed, displacements, entries, real_box
+from .view import COUNT, K1, LEAST, MOST, ROTATION, boxes_of, designed, displacements, entries, real_box
 
 STRUCTURES = {"own", "shared", "designed"}
 ALIKE = 0.05  # pixels of f that views may be displaced by where error maps take H as designed
@@ -108,27 +109,28 @@ class FittedMatrix:
         return views + [arrays[key] for arrays in kernels for key in sorted(arrays)]
 
     @cached_property
-    def numbers(self) -> FloatArray:
-        """The numbers of all sub-imagers, (sub-imagers, 5)."""
-        return np.concatenate([self.views[lens.name].numbers for lens in self.camera.types])
-
-    @cached_property
     def is_as_designed(self) -> bool:
         """True if H is that of the design."""
         return not self.kernels and all(self.views[lens.name].is_as_designed for lens in self.camera.types)
 
     @cached_property
-    def is_boxes(self) -> bool:
-        """True if all footprints are boxes: `boxes` applies H."""
-        straight = all(
-            views.explained.all() and not views.numbers[:, [ROTATION, K1]].any() for _, views, _, _ in self._types
-        )
-        return straight and not self.kernels and self.camera.has_box_footprints
+    def observation(self) -> Observation | None:
+        """H by boxes and kernels, None where it has entries: sub-imagers measured, rotated or distorted."""
+        parts: list[ObservationPart] = []
+        for lens, views, subs, _ in self._types:
+            if lens.name in self.kernels:
+                parts.append(self.kernels[lens.name])
+                continue
+            straight = views.explained.all() and not views.numbers[:, [ROTATION, K1]].any()
+            if not (straight and self.camera.has_boxes(lens)):
+                return None
+            parts += boxes_of(self.camera, lens, list(zip(subs, views.numbers, strict=True)))
+        return Observation(self.camera.shape, tuple(parts))
 
     @cached_property
     def is_nearly_designed(self) -> bool:
         """True if the views are where the design has them to within 0.05 pixels of f."""
-        if not self.is_boxes:
+        if self.kernels or self.observation is None:
             return False
         return all(
             float(np.abs(rows @ moved).max(initial=0.0)) <= ALIKE
@@ -136,12 +138,6 @@ class FittedMatrix:
             for sub, moved in zip(subs, views.numbers, strict=True)
             for rows in displacements(self.camera, sub, _corners(sub))
         )
-
-    @cached_property
-    def boxes(self) -> RealBoxes:
-        """H of box footprints."""
-        moved = tuple(lens.name for lens, views, _, _ in self._types if views.numbers.any())
-        return RealBoxes(self.camera, self.numbers, moved)
 
     @property
     def largest_deviation(self) -> tuple[float, int]:

@@ -6,33 +6,33 @@ Row i of H in coordinates relative to the pixel's designed footprint, W x W pixe
 
 Phi_q the kernels that all sub-imagers of the lens type share, c_q polynomials of the position (u, v) of the footprint's
 middle relative to the lens's axis, down and across in units of `scale` pixels of f. Windows and m are whole numbers, so
-that one sampling of the kernels serves all pixels. Light beside the target is cut off at its edge.
+that one sampling of the kernels serves all pixels. Light beside the target is cut off at its edge. H and its transpose
+are applied by Fourier transforms.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy import fft, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import shortened_repr
+from ommatid.runtime.memory import check_memory
 from ommatid.runtime.processors import processors
 
 from ..camera import Camera
 from ..lens_type import LensType
-from ..optics.boxes import by_rows
+from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density
 
-PIXELS_AT_ONCE = 2**14
+VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
+ENTRY = 24  # bytes of an entry of a matrix while it is made
 MOST_DEGREE = 50  # of polynomials in a file
-WIDE = 24  # pixels of f of the narrowest kernels that Fourier transforms apply faster than sums
-
-_Tables = tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, IntArray, int, IntArray]
 
 
 def terms(degree: int) -> list[tuple[int, int]]:
@@ -117,7 +117,7 @@ class KernelPlaces:
 
 
 @dataclass(frozen=True, eq=False)
-class KernelFootprints:
+class KernelFootprints(ObservationPart):
     """H of one lens type by its kernels.
 
     kernels : (S, W, W), the mean kernel first;  coefficients : (S, P) of their polynomials, of `degree`
@@ -130,6 +130,9 @@ class KernelFootprints:
     coefficients: FloatArray
     error_kernels: FloatArray
     error_coefficients: FloatArray
+    _transfers: dict[tuple[int, int], ComplexArray] = field(
+        default_factory=dict[tuple[int, int], ComplexArray], init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         """Raise ValueError for arrays that do not belong together."""
@@ -141,94 +144,186 @@ class KernelFootprints:
         if self.coefficients.shape != (len(self.kernels), terms_of) or self.error_coefficients.shape != count:
             raise ValueError("the coefficients of kernels do not belong to these")
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs: transfer functions are computed again there."""
+        return self.__dict__ | {"_transfers": {}}
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of f."""
+        return self.places.camera.shape
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements of the lens type."""
+        return self.places.lens_type.measurements
+
+    @property
+    def entries(self) -> int:
+        """Number of entries, those of value 0 and those beside the target included."""
+        return self.measurements * self.places.width**2
+
+    @property
+    def reach(self) -> int:
+        """W."""
+        return self.places.width
+
     @property
     def without_errors(self) -> KernelFootprints:
         """The same H, taken for exact."""
         return replace(self, error_coefficients=self.error_coefficients[:0])
 
-    @cached_property
-    def _shape(self) -> tuple[int, int, int, int]:
-        return (*self.places.lens_type.array, *self.places.lens_type.pixels)
+    def forward(self, seen: Seen, out: FloatArray) -> None:
+        """Write H f to `out`, (measurements of the type,)."""
+        transfers = self._transfers_on(seen.padded)
+        out[:] = self._read(seen, transfers, self.coefficients)
 
-    def _tables(self, kernels: FloatArray, coefficients: FloatArray) -> _Tables:
-        """Return the arguments of the compiled loops that do not depend on the image."""
-        weights = np.zeros((len(kernels), self.degree + 1, self.degree + 1))
+    def adjoint(self, readings: FloatArray, back: Back) -> None:
+        """Add H^T g to `back`; readings : (measurements of the type,)."""
+        lines, (rows, columns) = self._by_lines(readings), self._gather(back.padded)
+        for transfer, weight in zip(self._transfers_on(back.padded), self._weights(self.coefficients), strict=True):
+            placed = _on_lines(sparse.csr_array(rows.T), sparse.csr_array(columns.T), lines * weight)
+            spectrum = np.asarray(fft.rfft2(placed, back.padded, workers=processors(), overwrite_x=True))
+            spectrum *= np.conj(transfer)
+            back.add_spectrum(spectrum)
+
+    def _read(self, seen: Seen, transfers: ComplexArray, coefficients: FloatArray) -> FloatArray:
+        """Return what kernels with these transfer functions and coefficients read: (measurements of the type,)."""
+        rows, columns = self._gather(seen.padded)
+        total: FloatArray = np.zeros((self.places.starts[0].size, self.places.starts[1].size))
+        for transfer, weight in zip(transfers, self._weights(coefficients), strict=True):
+            product = seen.spectrum * transfer
+            every = cast(FloatArray, fft.irfft2(product, seen.padded, workers=processors(), overwrite_x=True))
+            total += weight * _on_lines(rows, columns, every)
+        down, across = self.places.lens_type.array
+        return total.reshape(down, -1, across, self.places.lens_type.pixels[1]).swapaxes(1, 2).ravel()
+
+    def _by_lines(self, readings: FloatArray) -> FloatArray:
+        """Return readings, in the order of measurements, as (sensor rows, sensor columns)."""
+        order = (*self.places.lens_type.array, *self.places.lens_type.pixels)
+        return readings.reshape(order).swapaxes(1, 2).reshape(order[0] * order[2], order[1] * order[3])
+
+    def _transfers_on(self, padded: tuple[int, int]) -> ComplexArray:
+        """Return the transfer function of each kernel on a padded grid: (S, rows, columns / 2 + 1)."""
+        if padded not in self._transfers:
+            self._transfers.clear()  # those of another grid are of no use any more
+            self._transfers[padded] = _transfers(self.kernels, padded)
+        return self._transfers[padded]
+
+    def _gather(self, padded: tuple[int, int]) -> tuple[sparse.csr_array, sparse.csr_array]:
+        """Return the matrices that take the sensor rows and the sensor columns out of a padded grid."""
+        rows, columns = (_chosen(start % size, size) for start, size in zip(self.places.starts, padded, strict=True))
+        return rows, columns
+
+    def _weights(self, coefficients: FloatArray) -> list[FloatArray | float]:
+        """Return the weight of each kernel in every reading: (sensor rows, sensor columns), or one number for all."""
+        if self.degree == 0:
+            return [float(each[0]) for each in coefficients]
+        down, across = (np.asarray(legendre.legvander(axis, self.degree)) for axis in self.places.field)
+        return [(down @ product) @ across.T for product in self._products(coefficients)]
+
+    def _products(self, coefficients: FloatArray) -> FloatArray:
+        """Return the weights of products of polynomials down and across: (S, degree + 1, degree + 1)."""
+        weights = np.zeros((len(coefficients), self.degree + 1, self.degree + 1))
         for term, (a, b) in enumerate(terms(self.degree)):
             weights[:, a, b] = coefficients[:, term]
-        down, across = (np.asarray(legendre.legvander(axis, self.degree)) for axis in self.places.field)
-        top, columns = self.places.starts
-        left = int(columns.min())
-        order = np.argsort(top, kind="stable")
-        lines = down.astype(np.float64), across.astype(np.float64)
-        return np.ascontiguousarray(kernels), weights, *lines, order, top, left, columns - left
+        return weights
 
-    def _correlate(self, image: FloatArray, kernels: FloatArray, coefficients: FloatArray) -> FloatArray:
-        """Return what kernels with these coefficients read of an image: (measurements of the type,)."""
-        from .correlation_loops import correlate  # pyright: ignore[reportUnknownVariableType]
-
-        grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.places.camera.shape)
-        tables = self._tables(kernels, coefficients)
-        if self.places.width >= WIDE:
-            return self._arranged(self._transformed(grid, *tables[:4]))
-        out = np.empty(self._shape)
-
-        def work(first: int, last: int) -> None:
-            correlate(grid, *tables, out, first, last)
-
-        by_rows(self.places.starts[0].size, work)
-        return out.ravel()
-
-    def _transformed(
-        self, image: FloatArray, kernels: FloatArray, weights: FloatArray, down: FloatArray, across: FloatArray
-    ) -> FloatArray:
-        """Return the sums of `_correlate` by Fourier transforms: (sensor rows, sensor columns).
-
-        weights : (S, P, P) of products of polynomials down and across, (sensor rows, P) and (sensor columns, P)
-        """
-        wide = self.places.width
-        rows, columns = (fft.next_fast_len(size + wide - 1, real=True) for size in self.places.camera.shape)
-        seen = _spectrum(image, (rows, columns))
-        top, left = self.places.starts
-        places = np.ix_(top % rows, left % columns)
-        out: FloatArray = np.zeros((top.size, left.size))
-        for kernel, weight in zip(kernels, weights, strict=True):
-            product = seen * np.conj(_spectrum(kernel, (rows, columns)))
-            every = fft.irfft2(product, (rows, columns), workers=processors(), overwrite_x=True)
-            out += every[places] * ((down @ weight) @ across.T)
-        return out
-
-    def _arranged(self, lines: FloatArray) -> FloatArray:
-        """Return readings, (sensor rows, sensor columns), in the order of measurements."""
-        down, across, rows, columns = self._shape
-        return lines.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()
-
-    def rows(self, pixels: IntArray) -> sparse.csr_array:
-        """Return H of some pixels of the lens type: (n, N)."""
-        camera = self.places.camera
+    def rows(self, pixels: IntArray, window: tuple[slice, slice] | None = None) -> sparse.csr_array:
+        """Return H of some pixels of the lens type on a window of f, the whole of it by default: (n, its pixels)."""
+        tall, wide = window or (slice(0, self.shape[0]), slice(0, self.shape[1]))
+        width = wide.stop - wide.start
         down, across = self.places.cells(pixels)
-        values = self._values(pixels, self.kernels, self.coefficients)
-        inside = ((down >= 0) & (down < camera.rows))[:, :, None] & ((across >= 0) & (across < camera.columns))[:, None]
-        inside &= values != 0
-        texels = down[:, :, None] * camera.columns + across[:, None]
+        values = self._values(pixels)
+        inside = ((down >= tall.start) & (down < tall.stop))[:, :, None]
+        inside = inside & ((across >= wide.start) & (across < wide.stop))[:, None] & (values != 0)
+        texels = (down - tall.start)[:, :, None] * width + (across - wide.start)[:, None]
         pointers = np.concatenate([[0], np.cumsum(inside.sum(axis=(1, 2)))])
-        return sparse.csr_array((values[inside], texels[inside], pointers), shape=(pixels.size, camera.unknowns))
+        shape = pixels.size, (tall.stop - tall.start) * width
+        return sparse.csr_array((values[inside], texels[inside], pointers), shape=shape)
 
-    def _values(self, pixels: IntArray, kernels: FloatArray, coefficients: FloatArray) -> FloatArray:
-        shares = basis(self.places.positions(pixels), self.degree) @ coefficients.T
-        return np.tensordot(shares, kernels, axes=1)
+    def _values(self, pixels: IntArray) -> FloatArray:
+        shares = basis(self.places.positions(pixels), self.degree) @ self.coefficients.T
+        return np.tensordot(shares, self.kernels, axes=1)
+
+    def _chunked(self, pixels: IntArray, window: tuple[slice, slice] | None = None) -> sparse.csr_array:
+        count = max(1, VALUES_AT_ONCE // self.places.width**2)
+        chunks = (pixels[first : first + count] for first in range(0, max(pixels.size, 1), count))
+        return sparse.csr_array(sparse.vstack([self.rows(chunk, window) for chunk in chunks], format="csr"))
 
     def to_sparse(self) -> sparse.csr_array:
-        """Return H as a sparse matrix: (measurements of the type, N)."""
-        count = self.places.lens_type.measurements
-        chunks = (np.arange(n, min(n + PIXELS_AT_ONCE, count)) for n in range(0, count, PIXELS_AT_ONCE))
-        return sparse.csr_array(sparse.vstack([self.rows(chunk) for chunk in chunks], format="csr"))
+        """Return H as a sparse matrix, (measurements of the type, N). Raises InputError if memory does not hold it."""
+        check_memory(ENTRY * self.entries, "H with its entries", "crop the target")
+        return self._chunked(np.arange(self.measurements))
+
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Return the indices of the measurements whose kernels lie inside a window of f as a whole."""
+        inside = [
+            (start >= part.start) & (start + self.places.width <= part.stop)
+            for start, part in zip(self.places.starts, (rows, columns), strict=True)
+        ]
+        order = (*self.places.lens_type.array, *self.places.lens_type.pixels)
+        every = np.arange(self.measurements).reshape(order).swapaxes(1, 2).reshape(inside[0].size, inside[1].size)
+        return np.sort(every[np.ix_(*inside)].ravel())
+
+    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to the measurements inside it."""
+        return self._chunked(self.measurements_inside(rows, columns), (rows, columns))
+
+    def signature(self, rows: slice, columns: slice) -> Hashable:
+        """Return a key of the window alone: kernels vary over the field."""
+        return rows.start, columns.start
+
+    @cached_property
+    def mean_kernel(self) -> FloatArray:
+        """The mean of the kernels over the field: (W, W)."""
+        down, across = (legendre.legvander(axis, self.degree).mean(axis=0) for axis in self.places.field)
+        means: FloatArray = np.asarray(np.einsum("sab,a,b->s", self._products(self.coefficients), down, across))
+        return np.tensordot(means, self.kernels, axes=1)
+
+    @property
+    def _densities(self) -> tuple[float, float]:
+        """Readings per row and per column of f."""
+        rows, columns = (
+            density(start, self.places.width, size) for start, size in zip(self.places.starts, self.shape, strict=True)
+        )
+        return rows, columns
+
+    def information(self) -> FloatArray:
+        """Return the mean of H^T H far from the edges, under the DCT-II: (rows, columns)."""
+        wide, (down, across) = self.places.width, self._densities
+        power = np.square(np.abs(fft.rfft2(self.mean_kernel, (2 * wide, 2 * wide))))
+        lags = np.asarray(fft.irfft2(power, (2 * wide, 2 * wide)))
+        mirrored = lags[:wide, -np.arange(wide)]  # lags down and to the left
+        even = (lags[:wide, :wide] + mirrored) / 2
+        rows, columns = (cosines(size, wide) for size in self.shape)
+        return np.maximum(down * across * (rows @ even @ columns.T), 0.0)
+
+    def edge_information(self, axis: int, strip: slice) -> FloatArray:
+        """Return H^T H of a strip along an edge, with its mean along the edge under the DCT-II."""
+        kernel = self.mean_kernel if axis == 0 else self.mean_kernel.T
+        wide, length, depth = self.places.width, self.shape[1 - axis], strip.stop - strip.start
+        angles = np.outer(np.pi * np.arange(length) / length, np.arange(wide))
+        starts = self.places.starts[axis]
+        near, counts = np.unique(starts[(starts + wide > strip.start) & (starts < strip.stop)], return_counts=True)
+        pixels: IntArray = np.asarray(range(strip.start, strip.stop), dtype=np.int64)
+        index = pixels - near[:, None]  # the kernel's row at each pixel of the strip
+        shares = np.where((index >= 0)[..., None] & (index < wide)[..., None], kernel[index.clip(0, wide - 1)], 0.0)
+        shares *= np.sqrt(counts * self._densities[1 - axis])[:, None, None]
+        total = np.zeros((length, depth, depth))
+        for waves in (np.cos(angles), np.sin(angles)):
+            read = np.moveaxis(shares @ waves.T, 2, 0)  # (length, readings, depth)
+            total += read.swapaxes(1, 2) @ read
+        return total
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array:
         """Return L, (measurements of the type, q): the error of H f is L xi, with independent xi of variance 1."""
-        columns = np.zeros((self.places.lens_type.measurements, len(self.error_coefficients)))
-        for number, coefficients in enumerate(self.error_coefficients):
-            columns[:, number] = self._correlate(image, self.error_kernels, coefficients)
-        return sparse.csc_array(columns)
+        rows, columns = (fft.next_fast_len(size + self.places.width, real=True) for size in self.shape)
+        seen = Seen(np.asarray(image, dtype=np.float64).reshape(self.shape), (rows, columns))
+        transfers = _transfers(self.error_kernels, seen.padded)
+        read = [self._read(seen, transfers, coefficients) for coefficients in self.error_coefficients]
+        none = np.zeros((self.measurements, 0))
+        return sparse.csc_array(np.stack(read, axis=1) if read else none)
 
     @property
     def description(self) -> dict[str, Any]:
@@ -248,8 +343,19 @@ class KernelFootprints:
         }
 
 
-def _spectrum(image: FloatArray, padded: tuple[int, int]) -> NDArray[np.complex128]:
-    return fft.rfft2(image, padded, workers=processors())
+def _transfers(kernels: FloatArray, padded: tuple[int, int]) -> ComplexArray:
+    """Return the conjugate transforms of kernels, which correlate an image with them."""
+    return np.conj(np.asarray(fft.rfft2(kernels, padded, workers=processors())))
+
+
+def _on_lines(rows: sparse.csr_array, columns: sparse.csr_array, image: FloatArray) -> FloatArray:
+    """Return rows @ image @ columns^T."""
+    return cast(FloatArray, (columns @ (rows @ image).T).T)
+
+
+def _chosen(index: IntArray, size: int) -> sparse.csr_array:
+    """Return the matrix that takes elements `index` out of `size`: (indices, size)."""
+    return sparse.csr_array((np.ones(index.size), index, np.arange(index.size + 1)), shape=(index.size, size))
 
 
 def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, FloatArray]) -> KernelFootprints:

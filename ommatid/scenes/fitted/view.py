@@ -10,8 +10,7 @@ H of box footprints is applied without being stored, however their views are dis
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from math import hypot, pi
 
 import numpy as np
@@ -21,7 +20,7 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..camera import Camera
 from ..lens_type import LensOptics, LensType, SubImager
-from ..optics.boxes import Box, BoxAxis, BoxFootprints, designed_box
+from ..optics.boxes import Box, BoxAxis, designed_box
 from ..pose import Misalignment, pose_of
 
 UNITS = {
@@ -146,29 +145,8 @@ def real_box(shape: tuple[int, int], sub: SubImager, numbers: FloatArray) -> Box
     return Box(alone, *axes)
 
 
-@dataclass(frozen=True)
-class RealBoxes(BoxFootprints):
-    """H of sub-imagers of which some have displaced views.
-
-    numbers : (sub-imagers, 5), of `view`;  moved : lens types whose sub-imagers are not where the design has them
-    """
-
-    numbers: FloatArray
-    moved: tuple[str, ...]
-
-    @cached_property
-    def boxes(self) -> tuple[Box, ...]:
-        """H of each lens type as designed, and of each sub-imager of the others."""
-        boxes: list[Box] = []
-        subs = iter(zip(self.camera.sub_imagers, self.numbers, strict=True))
-        for lens_type in self.camera.types:
-            own = [next(subs) for _ in range(lens_type.count)]
-            if lens_type.name in self.moved:
-                boxes += [real_box(self.camera.shape, sub, numbers) for sub, numbers in own]
-            else:
-                boxes += _designed(self.camera, lens_type)
-        return tuple(boxes)
-
-
-def _designed(camera: Camera, lens_type: LensType) -> list[Box]:
+def boxes_of(camera: Camera, lens_type: LensType, views: list[tuple[SubImager, FloatArray]]) -> list[Box]:
+    """H of a lens type's sub-imagers, whose views have these numbers, (5,) each: one part where none is displaced."""
+    if any(numbers.any() for _, numbers in views):
+        return [real_box(camera.shape, sub, numbers) for sub, numbers in views]
     return [designed_box(camera.shape, part) for part in lens_type.on_grids]

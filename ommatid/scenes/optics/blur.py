@@ -30,6 +30,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
 from ..camera import Camera
+from ..fitted.kernels import KernelFootprints, KernelPlaces
 from ..lens_type import LensType
 from .diffraction import MOST_WAVES, Pattern, end_of, pattern
 from .radial_density import RadialDensity, disk_density, disk_slant, moments, slopes
@@ -143,15 +144,7 @@ def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> s
     unit = lcm(*(number.denominator for number in (lens_type.ratio, *lens_type.step, *lens_type.origin)))
     down, across = (_axis(camera, lens_type, reach, axis, unit) for axis in (0, 1))
     offsets = np.unique(np.abs(np.concatenate([down.offset.ravel(), across.offset.ravel()])))  # symmetric
-    needed = TABLES * 8 * offsets.size**2
-    check_memory(needed, f"camera.lens.{lens_type.name}: its blur", "take simpler ratios, or less blur")
-    gap = np.maximum(offsets - unit - int(lens_type.ratio * unit), 0) / (2 * unit)
-    lit = np.hypot.outer(gap, gap) < max(reach, np.finfo(float).tiny)
-    ratio = float(lens_type.ratio)
-    table = np.where(lit, sum(share * transfer(ratio, offsets, unit, blur) for blur, share in blurs), 0.0)
-    slanted = [(blur, share) for blur, share in blurs if blur.disk and blur.weight]
-    slope = sum(share * _asymmetry(camera, lens_type, blur, offsets, unit) for blur, share in slanted)
-    slope = np.where(lit, slope, 0.0) if slanted else None
+    table, slope = _tables(camera, lens_type, offsets, unit, blurs)
     data: list[FloatArray] = []
     indices: list[IntArray] = []
     counts: list[IntArray] = []
@@ -165,6 +158,42 @@ def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> s
     pointers = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
     shape = (lens_type.measurements, camera.unknowns)
     return sparse.csr_array((np.concatenate(data), np.concatenate(indices), pointers), shape=shape)
+
+
+def _tables(
+    camera: Camera, lens_type: LensType, offsets: IntArray, unit: int, blurs: Blurs
+) -> tuple[FloatArray, FloatArray | None]:
+    """Entries of H for all pairs of offsets down and across, and their slope of `_asymmetry` if any: (n, n) each."""
+    needed = TABLES * 8 * offsets.size**2
+    check_memory(needed, f"camera.lens.{lens_type.name}: its blur", "take simpler ratios, or less blur")
+    reach, ratio = max(blur.reach for blur, _ in blurs), float(lens_type.ratio)
+    gap = np.maximum(offsets - unit - int(lens_type.ratio * unit), 0) / (2 * unit)
+    lit = np.hypot.outer(gap, gap) < max(reach, np.finfo(float).tiny)
+    table = np.where(lit, sum(share * transfer(ratio, offsets, unit, blur) for blur, share in blurs), 0.0)
+    slanted = [(blur, share) for blur, share in blurs if blur.disk and blur.weight]
+    slopes = (share * _asymmetry(camera, lens_type, blur, offsets, unit) for blur, share in slanted)
+    slope = sum(slopes, np.zeros_like(table))
+    return table, np.where(lit, slope, 0.0) if slanted else None
+
+
+def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
+    """H of a lens type as designed, as of `matrix`, by a kernel, or three where light through the rim has less weight.
+
+    Expects a camera for which `Camera.has_kernel` is true.
+    """
+    blurs = blurs_of(camera, lens_type)
+    places = KernelPlaces(camera, lens_type, ceil(max(blur.reach for blur, _ in blurs)))
+    beside = 2 * np.arange(places.width) + 1 - places.width  # from the footprint's middle, in halves of a pixel
+    offsets, index = np.unique(np.abs(beside), return_inverse=True)
+    table, slope = _tables(camera, lens_type, offsets, 1, blurs)
+    mean = table[np.ix_(index, index)]
+    if slope is None:
+        return KernelFootprints(places, 0, mean[None], np.ones((1, 1)), mean[None][:0], np.zeros((0, 0, 1)))
+    upward = np.sign(beside)[:, None] * slope[np.ix_(index, index)]
+    weights = np.diag([1.0, places.scale, places.scale])  # Legendre's P1 is the coordinate itself
+    return KernelFootprints(
+        places, 1, np.stack([mean, upward, upward.T]), weights, upward[None][:0], np.zeros((0, 0, 3))
+    )
 
 
 def entries(camera: Camera, lens_type: LensType, reach: float) -> int:

@@ -20,9 +20,9 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.processors import processors
 
 from ..camera import Camera
-from ..lens_type import LensType, adjacent_slices
+from ..lens_type import LensType
+from ..observation import Back, Observation, ObservationPart, Seen, cosines, density
 
-MOST_STORED = 2**24  # entries of H; more are computed from the geometry each time
 ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 
 
@@ -52,19 +52,33 @@ class BoxAxis:
     def start(self) -> IntArray:
         """The first pixel of f in each row of the table `share`, such that all of the row lies on the axis: (S,)."""
         first = self.shares.indices[self.shares.indptr[:-1]].astype(np.int64)
-        return np.minimum(first, self.shares.shape[1] - self._width)
+        return np.minimum(first, self.shares.shape[1] - self.width)
 
     @cached_property
     def share(self) -> FloatArray:
         """Shares of the pixels of f from `start` on: (S, largest number of pixels in an interval)."""
-        table = np.zeros((self.start.size, self._width))
+        table = np.zeros((self.start.size, self.width))
         rows = np.repeat(np.arange(self.start.size), np.diff(self.shares.indptr))
         table[rows, self.shares.indices - self.start[rows]] = self.shares.data
         return table
 
     @property
-    def _width(self) -> int:
+    def width(self) -> int:
+        """Largest number of pixels in an interval."""
         return int(np.diff(self.shares.indptr).max())
+
+    @cached_property
+    def gram(self) -> sparse.csr_array:
+        """D^T D of the shares D: (size, size), banded."""
+        return sparse.csr_array(self.shares.T @ self.shares)
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """The mean of `gram` over the pixels that intervals reach, under the DCT-II: (size,)."""
+        size = self.shares.shape[1]
+        starts = self.shares @ np.arange(size)  # their middles serve as well
+        lags = np.array([self.gram.diagonal(lag).sum() for lag in range(min(self.width, size))])
+        return cosines(size, lags.size) @ lags * (density(starts, self.width, size) / starts.size)
 
     @cached_property
     def order(self) -> IntArray:
@@ -73,23 +87,43 @@ class BoxAxis:
 
 
 @dataclass(frozen=True)
-class Box:
-    """H of one lens type: the Kronecker product of `down` and `across`, with its rows in the order of measurements."""
+class Box(ObservationPart):
+    """H of a lens type or of a sub-imager: the Kronecker product of `down` and `across`, by measurements."""
 
     lens_type: LensType
     down: BoxAxis
     across: BoxAxis
 
     @property
-    def shape(self) -> tuple[int, int, int, int]:
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of f."""
+        return self.down.shares.shape[1], self.across.shares.shape[1]
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements."""
+        return self.lens_type.measurements
+
+    @property
+    def entries(self) -> int:
+        """Number of entries."""
+        return int(self.down.shares.nnz) * int(self.across.shares.nnz)
+
+    @property
+    def reach(self) -> int:
+        """Largest number of rows or of columns of f that a measurement spans."""
+        return max(self.down.width, self.across.width)
+
+    @property
+    def _order(self) -> tuple[int, int, int, int]:
         """Rows and columns of sub-imagers, rows and columns of their pixels."""
         return (*self.lens_type.array, *self.lens_type.pixels)
 
-    def forward(self, image: FloatArray, out: FloatArray) -> None:
-        """H f: (rows, columns) to `out`, (measurements of the type,)."""
+    def forward(self, seen: Seen, out: FloatArray) -> None:
+        """Write H f to `out`, (measurements,)."""
         from .box_kernels import average  # pyright: ignore[reportUnknownVariableType]
 
-        down, across, target = self.down, self.across, out.reshape(self.shape)
+        image, down, across, target = seen.image, self.down, self.across, out.reshape(self._order)
         down_share, across_share = down.share, across.share  # computed here, not in threads
 
         def work(first: int, last: int) -> None:
@@ -97,11 +131,11 @@ class Box:
 
         by_rows(down.start.size, work)
 
-    def adjoint(self, readings: FloatArray, out: FloatArray) -> None:
-        """Add H^T g to `out`: (measurements of the type,) to (rows, columns)."""
+    def adjoint(self, readings: FloatArray, back: Back) -> None:
+        """Add H^T g to `back`; readings : (measurements,)."""
         from .box_kernels import spread  # pyright: ignore[reportUnknownVariableType]
 
-        down, across, source = self.down, self.across, readings.reshape(self.shape)
+        down, across, source, out = self.down, self.across, readings.reshape(self._order), back.image
         down_share, across_share = down.share, across.share  # computed here, not in threads
 
         def work(first: int, last: int) -> None:
@@ -109,12 +143,22 @@ class Box:
 
         by_rows(out.shape[0], work)
 
-    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
-        """Indices of the type's measurements inside a window of f, by their first pixel: (m,)."""
-        k, i = np.divmod(_inside(self.down, rows), self.lens_type.pixels[0])
-        l, j = np.divmod(_inside(self.across, columns), self.lens_type.pixels[1])  # noqa: E741
-        _, sub_columns, rows_each, columns_each = self.shape
+    def to_sparse(self) -> sparse.csr_array:
+        """Return H as a matrix: (measurements, N)."""
+        intervals = np.arange(self.down.shares.shape[0]), np.arange(self.across.shares.shape[0])
+        order = np.argsort(self._numbers(*intervals), kind="stable")
+        return sparse.csr_array(sparse.kron(self.down.shares, self.across.shares, format="csr"))[order]
+
+    def _numbers(self, down: IntArray, across: IntArray) -> IntArray:
+        """Indices of the measurements of all pairs of intervals along the two axes: (pairs,)."""
+        k, i = np.divmod(down, self.lens_type.pixels[0])
+        l, j = np.divmod(across, self.lens_type.pixels[1])  # noqa: E741
+        _, sub_columns, rows_each, columns_each = self._order
         return (((k[:, None] * sub_columns + l) * rows_each + i[:, None]) * columns_each + j).ravel()
+
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Indices of the measurements inside a window of f, by their first pixel: (m,)."""
+        return self._numbers(_inside(self.down, rows), _inside(self.across, columns))
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """H from the window to the measurements inside it: (m, pixels of the window)."""
@@ -122,56 +166,24 @@ class Box:
         across = self.across.shares[_inside(self.across, columns)][:, columns]
         return sparse.csr_array(sparse.kron(down, across, format="csr"))
 
-
-@dataclass(frozen=True)
-class BoxFootprints:
-    """The ideal H of all lens types, applied without being stored."""
-
-    camera: Camera
-
-    @cached_property
-    def boxes(self) -> tuple[Box, ...]:
-        """H of each lens type, or of each sub-imager of a type with steered ones."""
-        return tuple(designed_box(self.camera.shape, lens_type) for lens_type in self.camera.on_grids.types)
-
-    @cached_property
-    def slices(self) -> list[slice]:
-        """The measurements of each of the boxes."""
-        return adjacent_slices(box.lens_type.measurements for box in self.boxes)
-
-    @property
-    def entries(self) -> int:
-        """Number of entries of H, if it were stored."""
-        return sum(int(box.down.shares.nnz) * int(box.across.shares.nnz) for box in self.boxes)
-
-    def forward(self, image: FloatArray) -> FloatArray:
-        """H f: (N,) or (rows, columns) to (M,)."""
-        grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.camera.shape)
-        out = np.empty(self.camera.measurements)
-        for box, pixels in zip(self.boxes, self.slices, strict=True):
-            box.forward(grid, out[pixels])
-        return out
-
-    def adjoint(self, measurements: FloatArray) -> FloatArray:
-        """H^T g: (M,) to (N,)."""
-        out = np.zeros(self.camera.shape)
-        readings = np.ascontiguousarray(measurements, dtype=np.float64)
-        for box, pixels in zip(self.boxes, self.slices, strict=True):
-            box.adjoint(readings[pixels], out)
-        return out.ravel()
-
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """A key that is equal for two windows only if their submatrices are equal."""
-        return tuple((_pattern(box.down, rows), _pattern(box.across, columns)) for box in self.boxes)
+        return _pattern(self.down, rows), _pattern(self.across, columns)
 
-    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
-        """Indices of the measurements that see nothing outside a window of f: (m,)."""
-        pairs = zip(self.slices, self.boxes, strict=True)
-        return np.concatenate([pixels.start + box.measurements_inside(rows, columns) for pixels, box in pairs])
+    def information(self) -> FloatArray:
+        """The mean of H^T H far from the edges, under the DCT-II: (rows, columns)."""
+        return np.outer(self.down.information, self.across.information)
 
-    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
-        """H from the window to the measurements inside it: (m, pixels of the window)."""
-        return sparse.csr_array(sparse.vstack([box.submatrix(rows, columns) for box in self.boxes], format="csr"))
+    def edge_information(self, axis: int, strip: slice) -> FloatArray:
+        """H^T H of a strip along an edge, with its mean along the edge under the DCT-II: (length, depth, depth)."""
+        through, along = (self.down, self.across) if axis == 0 else (self.across, self.down)
+        return along.information[:, None, None] * through.gram[strip, strip].toarray()
+
+
+def boxes_as_designed(camera: Camera) -> Observation:
+    """H of a camera whose footprints are boxes, by lens types, or by sub-imagers where some are steered."""
+    types = camera.on_grids.types
+    return Observation(camera.shape, tuple(designed_box(camera.shape, lens_type) for lens_type in types))
 
 
 def designed_box(shape: tuple[int, int], lens_type: LensType) -> Box:

@@ -1,0 +1,300 @@
+"""The action of H on images and on windows of them, by parts (Wood et al., Eq. 1).
+
+A part is H of a lens type, or of one of its sub-imagers: averages over boxes, correlations with kernels, or entries.
+H f and H^T g need no matrix; where a part of one is needed, it is made. Kernels of all parts share one Fourier
+transform of the image.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, sparse
+
+from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.processors import processors
+
+from .lens_type import adjacent_slices
+
+ComplexArray = NDArray[np.complex128]
+EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
+FULL = 0.8  # share of an axis that a part sees from which it counts as one that sees all of it
+
+
+class Seen:
+    """An image, (rows, columns), and its Fourier transform on a grid of `padded` rows and columns."""
+
+    def __init__(self, image: FloatArray, padded: tuple[int, int]) -> None:
+        """Take the grid on which kernels of all parts act without reaching around."""
+        self.image, self.padded = image, padded
+
+    @cached_property
+    def spectrum(self) -> ComplexArray:
+        """The transform, which is computed when a part first needs it."""
+        return np.asarray(fft.rfft2(self.image, self.padded, workers=processors()))
+
+
+class Back:
+    """A sum of H^T g over parts: those that add pixels, and those that add Fourier coefficients."""
+
+    def __init__(self, shape: tuple[int, int], padded: tuple[int, int]) -> None:
+        """Begin with 0."""
+        self.image, self.padded = np.zeros(shape), padded
+        self._spectrum: ComplexArray | None = None
+
+    def add_spectrum(self, spectrum: ComplexArray) -> None:
+        """Add the coefficients of an image on the padded grid."""
+        if self._spectrum is None:
+            self._spectrum = spectrum
+        else:
+            self._spectrum += spectrum
+
+    @property
+    def total(self) -> FloatArray:
+        """The sum: (rows, columns)."""
+        if self._spectrum is not None:
+            whole = fft.irfft2(self._spectrum, self.padded, workers=processors(), overwrite_x=True)
+            self.image += np.asarray(whole)[: self.image.shape[0], : self.image.shape[1]]
+            self._spectrum = None
+        return self.image
+
+
+class ObservationPart(ABC):
+    """H of some measurements, (m, N), that follow one another."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of f."""
+
+    @property
+    @abstractmethod
+    def measurements(self) -> int:
+        """Return m."""
+
+    @property
+    @abstractmethod
+    def entries(self) -> int:
+        """Number of entries other than 0, or an upper bound of it."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> int:
+        """Largest number of rows or of columns of f that a measurement spans."""
+
+    @abstractmethod
+    def forward(self, seen: Seen, out: FloatArray) -> None:
+        """Write H f to `out`, (m,)."""
+
+    @abstractmethod
+    def adjoint(self, readings: FloatArray, back: Back) -> None:
+        """Add H^T g to `back`; readings : (m,)."""
+
+    @abstractmethod
+    def to_sparse(self) -> sparse.csr_array:
+        """Return H as a matrix: (m, N)."""
+
+    @abstractmethod
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Return the indices of the measurements that see a window of f and nothing beside it."""
+
+    @abstractmethod
+    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to the measurements inside it."""
+
+    @abstractmethod
+    def signature(self, rows: slice, columns: slice) -> Hashable:
+        """Return a key that is equal for two windows only if their submatrices are equal."""
+
+    @abstractmethod
+    def information(self) -> FloatArray:
+        """Return the mean of H^T H far from the edges, under the DCT-II: (rows, columns)."""
+
+    @abstractmethod
+    def edge_information(self, axis: int, strip: slice) -> FloatArray:
+        """Return H^T H of a strip along an edge, with its mean along the edge under the DCT-II: (length, depth, depth).
+
+        axis : 0 of a strip of rows, 1 of a strip of columns
+        """
+
+
+@dataclass(frozen=True)
+class Entries(ObservationPart):
+    """H as a matrix: (m, N)."""
+
+    matrix: sparse.csr_array
+    grid: tuple[int, int]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of f."""
+        return self.grid
+
+    @property
+    def measurements(self) -> int:
+        """Return m."""
+        return int(self.matrix.shape[0])
+
+    @property
+    def entries(self) -> int:
+        """Number of entries."""
+        return int(self.matrix.nnz)
+
+    @cached_property
+    def _extents(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """The first and last row, first and last column of f that each measurement sees, (m,) each; EMPTY if none."""
+        row, column = np.divmod(self.matrix.indices.astype(np.int64), self.grid[1])
+        nonempty = np.diff(self.matrix.indptr) > 0
+        starts = self.matrix.indptr[:-1][nonempty]
+        found = [np.full(nonempty.size, EMPTY) for _ in range(4)]
+        for extent, (values, extreme) in zip(found, product((row, column), (np.minimum, np.maximum)), strict=True):
+            extent[nonempty] = extreme.reduceat(values, starts)
+        top, bottom, left, right = found
+        return top, bottom, left, right
+
+    @property
+    def reach(self) -> int:
+        """Largest number of rows or of columns of f that a measurement spans."""
+        top, bottom, left, right = self._extents
+        return int(max((bottom - top).max(), (right - left).max())) + 1
+
+    def forward(self, seen: Seen, out: FloatArray) -> None:
+        """Write H f to `out`, (m,)."""
+        out[:] = self.matrix @ seen.image.ravel()
+
+    def adjoint(self, readings: FloatArray, back: Back) -> None:
+        """Add H^T g to `back`; readings : (m,)."""
+        back.image += (self.matrix.T @ readings).reshape(self.grid)
+
+    def to_sparse(self) -> sparse.csr_array:
+        """Return the matrix."""
+        return self.matrix
+
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Return the indices of the measurements that see nothing outside a window of f."""
+        top, bottom, left, right = self._extents
+        inside = (top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop)
+        return np.flatnonzero(inside)
+
+    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to the measurements inside it."""
+        return on_window(self.matrix[self.measurements_inside(rows, columns)], self.grid[1], rows, columns)
+
+    def signature(self, rows: slice, columns: slice) -> Hashable:
+        """Return a key of the window alone: entries are never the same elsewhere."""
+        return rows.start, columns.start
+
+    def information(self) -> FloatArray:
+        """Return the trace of H^T H over the pixels: what is known without a shift-invariant camera."""
+        return np.full(self.grid, float(np.square(self.matrix.data).sum()) / (self.grid[0] * self.grid[1]))
+
+    def edge_information(self, axis: int, strip: slice) -> FloatArray:
+        """Return the same for a strip, so that the edge counts as any other place."""
+        depth, length = strip.stop - strip.start, self.grid[1 - axis]
+        return np.broadcast_to(float(self.information()[0, 0]) * np.eye(depth), (length, depth, depth))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """H of a camera, (M, N), by its parts in the order of measurements."""
+
+    shape: tuple[int, int]
+    parts: tuple[ObservationPart, ...]
+
+    @cached_property
+    def slices(self) -> list[slice]:
+        """The measurements of each part."""
+        return adjacent_slices(part.measurements for part in self.parts)
+
+    @property
+    def measurements(self) -> int:
+        """Return M."""
+        return self.slices[-1].stop
+
+    @property
+    def unknowns(self) -> int:
+        """Return N."""
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def entries(self) -> int:
+        """Number of entries of H, stored or not."""
+        return sum(part.entries for part in self.parts)
+
+    @cached_property
+    def reach(self) -> int:
+        """Largest number of rows or of columns of f that a measurement spans."""
+        return max(part.reach for part in self.parts)
+
+    @cached_property
+    def _padded(self) -> tuple[int, int]:
+        rows, columns = (fft.next_fast_len(size + self.reach, real=True) for size in self.shape)
+        return rows, columns
+
+    def forward(self, image: FloatArray) -> FloatArray:
+        """Return H f: (N,) or (rows, columns) to (M,)."""
+        grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.shape)
+        seen, out = Seen(grid, self._padded), np.empty(self.measurements)
+        for part, place in zip(self.parts, self.slices, strict=True):
+            part.forward(seen, out[place])
+        return out
+
+    def adjoint(self, measurements: FloatArray) -> FloatArray:
+        """Return H^T g: (M,) to (N,)."""
+        readings, back = np.ascontiguousarray(measurements, dtype=np.float64), Back(self.shape, self._padded)
+        for part, place in zip(self.parts, self.slices, strict=True):
+            part.adjoint(readings[place], back)
+        return back.total.ravel()
+
+    def to_sparse(self) -> sparse.csr_array:
+        """Return H as a matrix: (M, N)."""
+        return sparse.csr_array(sparse.vstack([part.to_sparse() for part in self.parts], format="csr"))
+
+    def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
+        """Return the indices of the measurements that see nothing outside a window of f: (m,)."""
+        pairs = zip(self.slices, self.parts, strict=True)
+        return np.concatenate([place.start + part.measurements_inside(rows, columns) for place, part in pairs])
+
+    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to the measurements inside it: (m, pixels of the window)."""
+        parts = [part.submatrix(rows, columns) for part in self.parts]
+        return sparse.csr_array(sparse.vstack(parts, format="csr"))
+
+    def signature(self, rows: slice, columns: slice) -> Hashable:
+        """Return a key that is equal for two windows only if their submatrices are equal."""
+        return tuple(part.signature(rows, columns) for part in self.parts)
+
+
+def on_window(matrix: sparse.csr_array, width: int, rows: slice, columns: slice) -> sparse.csr_array:
+    """Return rows of H that see nothing outside a window, (m, N), on the window: (m, pixels of the window).
+
+    width : columns of f
+    """
+    row, column = np.divmod(matrix.indices, width)
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    indices = (row - rows.start) * shape[1] + column - columns.start
+    return sparse.csr_array((matrix.data, indices, matrix.indptr), shape=(matrix.shape[0], shape[0] * shape[1]))
+
+
+def cosines(size: int, lags: int) -> FloatArray:
+    """Return the weights of lags 0, 1, ... of an even sequence at the frequencies of the DCT-II: (size, lags)."""
+    weights = 2 * np.cos(np.outer(np.pi * np.arange(size) / size, np.arange(lags)))
+    weights[:, 0] = 1.0
+    return weights
+
+
+def density(starts: IntArray | FloatArray, width: float, size: int) -> float:
+    """Return the number of intervals per pixel of an axis; of an axis that they see in part, the mean over all of it.
+
+    starts : (S,) where intervals of `width` begin
+    """
+    count, extent = len(starts), float(np.max(starts) - np.min(starts))
+    if extent + width < FULL * size or count < 2:
+        return count / size
+    return count / (extent * count / (count - 1))

@@ -123,6 +123,10 @@ class ObservationPart(ABC):
         axis : 0 of a strip of rows, 1 of a strip of columns
         """
 
+    @abstractmethod
+    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
+        """Return H^T H of a small window at a corner: (its pixels, its pixels)."""
+
 
 @dataclass(frozen=True)
 class Entries(ObservationPart):
@@ -198,6 +202,11 @@ class Entries(ObservationPart):
         """Return the same for a strip, so that the edge counts as any other place."""
         depth, length = strip.stop - strip.start, self.grid[1 - axis]
         return np.broadcast_to(float(self.information()[0, 0]) * np.eye(depth), (length, depth, depth))
+
+    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
+        """Return the same for a corner."""
+        pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
+        return float(self.information()[0, 0]) * np.eye(pixels)
 
 
 @dataclass(frozen=True)

@@ -22,18 +22,20 @@ ODD: Lenses = (("2/7", [4, 4], "fit"), ("1/4", [3, 4], "fit"), ("1/3", [3, 3], "
 
 @pytest.mark.parametrize("camera", [frame_camera((36, 31)), diffracting((33, 36))], ids=["boxes", "kernels"])
 def test_it_is_symmetric_and_nearly_the_inverse(camera: Camera) -> None:
-    """Nearly all eigenvalues of P K are about 1; a few are small, at corners that some lens types do not see."""
+    """Eigenvalues of P K are within a sixth of 1 but for a few, at corners that some lens types do not see."""
     preconditioner = Preconditioner(observed(camera), (100.0,) * 3, 1 / P0)
     dense = precision(ideal_matrix(camera), np.full(camera.measurements, 100.0), 1 / P0)
     units = np.eye(camera.unknowns)
     inverse = np.array([preconditioner.solve(unit.reshape(camera.shape)).ravel() for unit in units])
-    np.testing.assert_allclose(inverse, inverse.T, rtol=0, atol=1e-12 * np.abs(inverse).max())
+    np.testing.assert_allclose(inverse, inverse.T, rtol=0, atol=1e-10 * np.abs(inverse).max())
     root = linalg.cholesky(dense, lower=True)
     values = linalg.eigvalsh(root.T @ inverse @ root)
     assert values.min() > 0
-    assert values.max() < 3.5
-    assert np.quantile(values, 0.02) > 0.3
-    assert 0.95 < float(np.median(values)) < 1.05
+    assert values.max() < 2.5
+    low, middle, high = np.quantile(values, [0.02, 0.5, 0.98])
+    assert 0.85 < low
+    assert abs(middle - 1) < 1e-4
+    assert high < 1.15
 
 
 def test_far_from_the_edges_it_is_the_transfer_function() -> None:
@@ -56,11 +58,11 @@ def steps(camera: Camera, noise: float | FloatArray, prior: float | FloatArray =
 
 
 def test_few_steps_whatever_the_camera() -> None:
-    """Measured 13, 60, 42 and 50: more where edges lie outside the field of some lens types, whatever the size."""
-    assert steps(frame_camera((119, 119)), 1e-2) <= 20
-    assert steps(frame_camera((70, 77)), 1e-2) <= 90
-    assert steps(diffracting((80, 77)), 1e-2) <= 70
-    assert steps(frame_camera((83, 80), ODD), 1e-2) <= 75
+    """Measured 7, 25, 24 and 39: more where edges lie outside the field of some lens types, whatever the size."""
+    assert steps(frame_camera((119, 119)), 1e-2) <= 10
+    assert steps(frame_camera((70, 77)), 1e-2) <= 35
+    assert steps(diffracting((80, 77)), 1e-2) <= 35
+    assert steps(frame_camera((83, 80), ODD), 1e-2) <= 60
 
 
 @pytest.mark.parametrize("kind", ["exponential", "power"])
@@ -68,15 +70,15 @@ def test_few_steps_with_correlated_pixels(kind: str) -> None:
     camera = frame_camera((70, 77))
     length = "8 mm" if kind == "exponential" else None
     table = PriorTable(kind=kind, variance=2000.0, correlation_length=length)  # type: ignore[arg-type]
-    assert steps(camera, 1e-2, 1 / np.asarray(spectrum_of(table, camera.shape, 1.0))) <= 75
+    assert steps(camera, 1e-2, 1 / np.asarray(spectrum_of(table, camera.shape, 1.0))) <= 27
 
 
 def test_uneven_noise_is_scaled_where_that_takes_fewer_steps() -> None:
     """Noise that varies smoothly over two decades: by the mean weight alone it takes several times as many steps."""
     camera = frame_camera((119, 119))
     place = observed(camera).forward(np.broadcast_to(np.linspace(-3, -1, 119), camera.shape))
-    assert steps(camera, 10.0**place) <= 40
+    assert steps(camera, 10.0**place) <= 15
 
 
 def test_two_types_take_more_steps_and_arrive() -> None:
-    assert steps(frame_camera((70, 77), FITTED[:2]), 1e-2) <= 260
+    assert steps(frame_camera((70, 77), FITTED[:2]), 1e-2) <= 140

@@ -98,6 +98,8 @@ def test_information_of_a_box_as_a_kernel(margin: int) -> None:
         )
         box = designed_box(frame.shape, lens_type)
         np.testing.assert_allclose(part.information(), box.information(), atol=1e-12)
+        corner = slice(0, 6), slice(38, 44)
+        np.testing.assert_allclose(part.corner_information(*corner), box.corner_information(*corner), atol=1e-12)
         for axis, strip in ((0, slice(0, 6)), (0, slice(34, 40)), (1, slice(0, 6)), (1, slice(38, 44))):
             np.testing.assert_allclose(
                 part.edge_information(axis, strip), box.edge_information(axis, strip), atol=1e-12

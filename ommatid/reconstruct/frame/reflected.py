@@ -6,10 +6,12 @@ diagonal under the cosine transform (DCT-II), as the prior is. K lacks these rea
 strip along an edge K is diagonal under the cosine transform along the edge, with a small matrix for each frequency, so
 that
 
-    P = M^-1 + sum over edges of R^T (K_e^-1 - M_e^-1) R,
+    P = M^-1 + sum over edges of R_e^T (K_e^-1 - M_e^-1) R_e
+             + sum over corners of R_c^T (K_c^-1 - sum over both edges of K_e,c^-1 + M_c^-1) R_c,
 
-with K_e and M_e the two on a strip and R the choice of its pixels (an additive Schwarz method; Smith, Bjorstad and
-Gropp 1996). Where noise is uneven, K is about S M S with S the root of the local weight over the mean.
+with K_e and M_e the two on a strip, R_e the choice of its pixels, and alike at a corner, where K_e,c is what the strip
+takes for K there: so every place counts once (an additive Schwarz method; Smith, Bjorstad and Gropp 1996). Where noise
+is uneven, K is about S M S with S the root of the local weight over the mean.
 """
 
 from __future__ import annotations
@@ -64,6 +66,9 @@ class Preconditioner:
         solution: FloatArray = np.asarray(fft.idctn(waves, 2, norm="ortho", workers=WORKERS, overwrite_x=True))
         for strip in self._strips:
             strip.add(scaled, solution)
+        for rows, columns, excess in self._corners:
+            near = scaled[rows, columns]
+            solution[rows, columns] += (excess @ near.ravel()).reshape(near.shape)
         return solution / self.scale
 
     @cached_property
@@ -72,30 +77,64 @@ class Preconditioner:
         return tuple(self._strip(axis, last=last) for axis, last in product((0, 1), (False, True)))
 
     def _strip(self, axis: int, *, last: bool) -> _Strip:
-        part = edge(self.shape[axis], DEPTH, last=last)
-        precision = np.zeros((self.shape[1 - axis], part.stop - part.start, part.stop - part.start))
-        for each, weight in zip(self.alike.parts, self.weights, strict=True):
-            precision += weight * each.edge_information(axis, part)
-        precision += prior_on_strip(self.prior, axis, part)
+        part = _edge(self.shape[axis], last=last)
+        precision = self._precision(axis, part)
         whole = _restricted(self.spectrum, axis, part)
         values, vectors = np.linalg.eigh(np.linalg.inv(precision) - np.linalg.inv(whole))
         values = np.where(values > LEAST * values[:, -1:], values, 0.0)
         return _Strip(axis, part, (vectors * values[:, None, :]) @ vectors.swapaxes(1, 2))
 
+    def _precision(self, axis: int, part: slice) -> FloatArray:
+        """K_e of a strip: (length, depth, depth)."""
+        precision = self._prior_on(axis, part)
+        for each, weight in zip(self.alike.parts, self.weights, strict=True):
+            precision += weight * each.edge_information(axis, part)
+        return precision
 
-def edge(size: int, depth: int, *, last: bool) -> slice:
+    def _prior_on(self, axis: int, part: slice) -> FloatArray:
+        """P0^-1 of a strip: (length, depth, depth)."""
+        if isinstance(self.prior, np.ndarray):
+            return _restricted(self.prior, axis, part)
+        depth = part.stop - part.start
+        return np.tile(self.prior * np.eye(depth), (self.shape[1 - axis], 1, 1))
+
+    @cached_property
+    def _corners(self) -> list[tuple[slice, slice, FloatArray]]:
+        """Rows and columns of each corner, and what it adds to P there: (pixels, pixels)."""
+        found: list[tuple[slice, slice, FloatArray]] = []
+        for bottom, right in product((False, True), repeat=2):
+            rows, columns = (_edge(size, last=last) for size, last in zip(self.shape, (bottom, right), strict=True))
+            exact = _along(self._prior_on(0, rows), columns)
+            for each, weight in zip(self.alike.parts, self.weights, strict=True):
+                exact += weight * each.corner_information(rows, columns)
+            along_row = _along(self._precision(0, rows), columns)
+            along_column = _turned(_along(self._precision(1, columns), rows), rows, columns)
+            whole = _along(_restricted(self.spectrum, 0, rows), columns)
+            first, second, third, fourth = (np.linalg.inv(each) for each in (exact, along_row, along_column, whole))
+            found.append((rows, columns, first - second - third + fourth))
+        return found
+
+
+def _along(blocks: FloatArray, part: slice) -> FloatArray:
+    """Return a strip's matrix, (length, depth, depth) by frequencies along it, on a part of its length."""
+    length, depth, _ = blocks.shape
+    waves = np.asarray(fft.dct(np.eye(length)[:, part], 2, axis=0, norm="ortho"))
+    size = waves.shape[1]
+    pairs = (waves[:, :, None] * waves[:, None, :]).reshape(length, size * size)
+    found = (blocks.reshape(length, -1).T @ pairs).reshape(depth, depth, size, size)
+    return found.transpose(0, 2, 1, 3).reshape(depth * size, depth * size)
+
+
+def _turned(matrix: FloatArray, rows: slice, columns: slice) -> FloatArray:
+    """Return the matrix of a window whose pixels were numbered by columns, with those numbered by rows."""
+    tall, wide = rows.stop - rows.start, columns.stop - columns.start
+    return matrix.reshape(wide, tall, wide, tall).transpose(1, 0, 3, 2).reshape(tall * wide, tall * wide)
+
+
+def _edge(size: int, *, last: bool) -> slice:
     """Return the pixels of a strip at the first or last end of an axis; strips at both ends do not overlap."""
-    depth = min(depth, size // 2)
+    depth = min(DEPTH, size // 2)
     return slice(size - depth, size) if last else slice(0, depth)
-
-
-def prior_on_strip(prior: float | FloatArray, axis: int, part: slice) -> FloatArray:
-    """Return P0^-1 of a strip along an edge, by frequencies along it: (length or 1, depth, depth)."""
-    return (
-        _restricted(prior, axis, part)
-        if isinstance(prior, np.ndarray)
-        else prior * np.eye(part.stop - part.start)[None]
-    )
 
 
 def _restricted(spectrum: FloatArray, axis: int, part: slice) -> FloatArray:

@@ -304,16 +304,25 @@ class KernelFootprints(ObservationPart):
         kernel = self.mean_kernel if axis == 0 else self.mean_kernel.T
         wide, length, depth = self.places.width, self.shape[1 - axis], strip.stop - strip.start
         angles = np.outer(np.pi * np.arange(length) / length, np.arange(wide))
-        starts = self.places.starts[axis]
-        near, counts = np.unique(starts[(starts + wide > strip.start) & (starts < strip.stop)], return_counts=True)
-        pixels: IntArray = np.asarray(range(strip.start, strip.stop), dtype=np.int64)
-        index = pixels - near[:, None]  # the kernel's row at each pixel of the strip
-        shares = np.where((index >= 0)[..., None] & (index < wide)[..., None], kernel[index.clip(0, wide - 1)], 0.0)
-        shares *= np.sqrt(counts * self._densities[1 - axis])[:, None, None]
+        index, roots = _near(self.places.starts[axis], wide, strip)
+        shares = np.pad(kernel, ((0, 1), (0, 0)))[index]
+        shares *= roots[:, None, None] * self._densities[1 - axis] ** 0.5
         total = np.zeros((length, depth, depth))
         for waves in (np.cos(angles), np.sin(angles)):
             read = np.moveaxis(shares @ waves.T, 2, 0)  # (length, readings, depth)
             total += read.swapaxes(1, 2) @ read
+        return total
+
+    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
+        """Return H^T H of a small window: (its pixels, its pixels)."""
+        wide, (tops, lefts) = self.places.width, self.places.starts
+        (down, roots), (across, factors) = _near(tops, wide, rows), _near(lefts, wide, columns)
+        kernel, size = np.pad(self.mean_kernel, ((0, 1), (0, 1))), down.shape[1] * across.shape[1]
+        total = np.zeros((size, size))
+        for index, root in zip(down, roots, strict=True):  # of one sensor row at a time, to bound memory
+            read = root * factors[:, None, None] * kernel[index][:, across].swapaxes(0, 1)
+            read = read.reshape(factors.size, size)
+            total += read.T @ read
         return total
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array:
@@ -346,6 +355,17 @@ class KernelFootprints(ObservationPart):
 def _transfers(kernels: FloatArray, padded: tuple[int, int]) -> ComplexArray:
     """Return the conjugate transforms of kernels, which correlate an image with them."""
     return np.conj(np.asarray(fft.rfft2(kernels, padded, workers=processors())))
+
+
+def _near(starts: IntArray, wide: int, part: slice) -> tuple[IntArray, FloatArray]:
+    """Return the row of the kernel, `wide` beside it, at pixels of a part, and the root of the number of such kernels.
+
+    starts : where kernels begin along an axis;  both for each different start near the part: (n, pixels), (n,)
+    """
+    near, counts = np.unique(starts[(starts + wide > part.start) & (starts < part.stop)], return_counts=True)
+    pixels: IntArray = np.asarray(range(part.start, part.stop), dtype=np.int64)
+    index = pixels - near[:, None]
+    return np.where((index >= 0) & (index < wide), index, wide), np.sqrt(counts)
 
 
 def _on_lines(rows: sparse.csr_array, columns: sparse.csr_array, image: FloatArray) -> FloatArray:

@@ -179,6 +179,11 @@ class Box(ObservationPart):
         through, along = (self.down, self.across) if axis == 0 else (self.across, self.down)
         return along.information[:, None, None] * through.gram[strip, strip].toarray()
 
+    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
+        """H^T H of a small window: (its pixels, its pixels)."""
+        down, across = self.down.gram[rows, rows].toarray(), self.across.gram[columns, columns].toarray()
+        return np.asarray(np.kron(down, across), dtype=np.float64)
+
 
 def boxes_as_designed(camera: Camera) -> Observation:
     """H of a camera whose footprints are boxes, by lens types, or by sub-imagers where some are steered."""

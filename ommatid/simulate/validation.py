@@ -50,7 +50,10 @@ def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
         lens_type.measurements * min(_visible_pixels(camera, lens_type), camera.unknowns) for lens_type in camera.types
     ]
     needed = ENTRY * sum(entries) + (SWEPT * max(entries) if scene.calibration.method == "points" else 0)
-    check_memory(needed, f"H of {camera.measurements} x {camera.unknowns}", "crop the target or use fewer sub-imagers")
+    remedy = "crop the target or use fewer sub-imagers"
+    if setup.camera.may_be_applied:
+        remedy = f"set calibration.method to 'ideal', whose kernels need no entries, or {remedy}"
+    check_memory(needed, f"H of {camera.measurements} x {camera.unknowns}", remedy)
 
 
 def _visible_pixels(camera: Camera, lens_type: LensType) -> int:

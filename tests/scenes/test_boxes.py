@@ -72,3 +72,16 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -
     np.testing.assert_array_equal(boxes_as_designed(cam).forward(image), forward)
     np.testing.assert_array_equal(boxes_as_designed(cam).adjoint(readings), adjoint)
     assert boxes.ROWS_AT_ONCE < 150, "otherwise there is only one task"
+
+
+@pytest.mark.parametrize(
+    ("lens", "expected"),
+    [
+        (("1/3", [3, 3], [2, 2]), True),
+        (("1/3", [2, 3], [2, 2]), False),
+        (("2/7", [3, 3], [2, 2]), False),
+        (("1", [1, 1], [9, 9]), True),
+    ],
+)
+def test_which_lens_types_are_shift_invariant(lens: Lenses, expected: bool) -> None:
+    assert camera((19, 19), (lens,)).is_sliding == expected  # type: ignore[arg-type]

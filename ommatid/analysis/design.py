@@ -47,7 +47,7 @@ def ranked(candidates: list[DesignCandidate]) -> list[DesignCandidate]:
 
 def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[str, str]]:
     """Return magnification and expected error, one row per candidate after that of the camera itself."""
-    lines = [("unchanged", f"{error_words(before.mse, DIGITS)}, null space of {before.null_space} dimensions")]
+    lines = [("unchanged", error_words(before.mse, DIGITS) + _null_space(before, ", "))]
     for candidate in candidates:
         after, name = candidate.expected, f"+ {candidate.magnification}"
         if after is None:
@@ -55,9 +55,15 @@ def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[st
             continue
         gain = f"{before.mse / after.mse:.3g} times less" if after.mse > 0 else "no error is left"
         added = after.measurements - before.measurements
-        null_space = f"null space of {after.null_space} dimensions, {added} measurements more"
-        lines.append((name, f"{error_words(after.mse, DIGITS)}, {gain}; {null_space}"))
+        more = f"{_null_space(after, '')}{', ' if after.null_space is not None else ''}{added} measurements more"
+        lines.append((name, f"{error_words(after.mse, DIGITS)}, {gain}; {more}"))
     return lines
+
+
+def _null_space(prediction: Prediction, before: str) -> str:
+    """Return the words about the null space, none for a frame, of which it is not computed."""
+    known = prediction.null_space is not None
+    return f"{before}null space of {prediction.null_space} dimensions" if known else ""
 
 
 def magnifications(text: str) -> list[Fraction]:

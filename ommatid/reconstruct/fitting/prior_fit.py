@@ -191,8 +191,8 @@ def evidence_of(task: EstimationTask, *, prior_known: bool, noise_known: bool) -
         blocks.append(Evidence(window.matrix, residual, window.expected_noise, shape, prior, noise_known))
     if not any(block.residual.size for block in blocks):
         raise InputError(
-            f"a fit of the prior or the noise takes windows of {TILE} pixels, and no footprint lies inside one as a whole;"
-            " give prior.kind = 'exponential' with its variance and correlation_length, and the noise"
+            f"a fit of the prior or the noise takes windows of {TILE} pixels, and no footprint lies inside one as a"
+            " whole; give prior.kind = 'exponential' with its variance and correlation_length, and the noise"
         )
     joined = sparse.csr_array(sparse.block_diag([block.matrix for block in blocks], format="csr"))
     residual = np.concatenate([block.residual for block in blocks])

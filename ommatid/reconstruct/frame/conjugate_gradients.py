@@ -31,7 +31,7 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.observation import Observation
 
-from ..methods.method import EstimationTask, PosteriorOperators, is_uniform
+from ..methods.method import EstimationTask, PosteriorOperators
 from .reflected import WORKERS, Preconditioner
 
 Indices = NDArray[np.intp]
@@ -43,6 +43,7 @@ MAX_STARTS = 3  # each from the recomputed residual
 SAFETY = 0.5  # of the least eigenvalue of P K, which the Lanczos matrix overestimates
 MOST_WORK = 1.2e11  # pixels times the square of the band: a minute or two with the error bars
 MAX_REFINEMENTS = 4
+EVEN = 0.1  # relative range of weights for which no scaling is tried
 TRIAL_STEPS = 10  # with each of two preconditioners, where noise is uneven
 LEAST_LOCAL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
@@ -109,7 +110,8 @@ class FrameSystem:
         if self.similar is not None:
             return self.similar
         even = Preconditioner(self._alike, self.mean_weights, self.prior)
-        if all(is_uniform(self.weights[part]) for part in self._alike.slices):
+        pairs = zip(self._alike.slices, even.weights, strict=True)
+        if all(float(np.ptp(self.weights[part])) <= EVEN * weight for part, weight in pairs):
             return even
         means = np.repeat(even.weights, [part.stop - part.start for part in self._alike.slices])
         local, average = self.observation.adjoint(self.weights), self.observation.adjoint(means)

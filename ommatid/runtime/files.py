@@ -95,21 +95,6 @@ def write_text(path: Path, text: str) -> None:
     write_whole(path, write)
 
 
-def append_text(path: Path, text: str) -> None:
-    """Append UTF-8 text to a file, and wait until the disk has it; a link in its place is replaced, as by write_whole.
-
-    Raises OSError.
-    """
-    with suppress(FileNotFoundError):
-        if path.is_symlink() or path.lstat().st_nlink > 1:
-            path.unlink()
-    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
-    with os.fdopen(descriptor, "a", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
     """Write a CSV file atomically: a header, then one line per row; None becomes an empty field.
 

@@ -16,9 +16,10 @@ from scipy import linalg, sparse
 from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY, FrameSystem, Solution
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.optics.boxes import boxes_as_designed
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_matrix
+
+from ..frames import observed
 
 WIDTHS = (3, 5, 4)
 MEAN, VARIANCE, NOISE = 127.5, 5461.25, 1e-2
@@ -38,7 +39,7 @@ class Whole:
         """Draw a frame of size x size pixels."""
         camera, rng = whole_camera(size), np.random.default_rng(seed)
         image = rng.normal(MEAN, VARIANCE**0.5, camera.unknowns)
-        readings = boxes_as_designed(camera).forward(image)
+        readings = observed(camera).forward(image)
         readings += rng.normal(0, NOISE**0.5, readings.size)
         return Whole(camera, image, readings)
 
@@ -50,7 +51,7 @@ class Whole:
     def frame(self) -> FrameSystem:
         """Return the frame's solver without any preparation."""
         weights = np.broadcast_to(1 / NOISE, self.camera.measurements)
-        return FrameSystem(boxes_as_designed(self.camera), weights, 1 / VARIANCE)
+        return FrameSystem(observed(self.camera), weights, 1 / VARIANCE)
 
     def estimate(self, accuracy: float = ACCURACY) -> Solution:
         """Return f^ - f0, computed without preparation."""

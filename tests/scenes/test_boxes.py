@@ -7,10 +7,10 @@ import pytest
 
 from ommatid.scenes.model import Model
 from ommatid.scenes.optics import boxes
-from ommatid.scenes.optics.boxes import boxes_as_designed
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import THREE, Lenses, camera, scene
+from ..frames import observed
 
 CAMERAS: list[tuple[tuple[int, int], Lenses]] = [
     ((19, 19), THREE),
@@ -25,7 +25,7 @@ CAMERAS: list[tuple[tuple[int, int], Lenses]] = [
 @pytest.mark.parametrize(("shape", "lenses"), CAMERAS)
 def test_against_the_stored_matrix(shape: tuple[int, int], lenses: Lenses) -> None:
     cam = camera(shape, lenses)
-    matrix, applied, rng = ideal_matrix(cam), boxes_as_designed(cam), np.random.default_rng(0)
+    matrix, applied, rng = ideal_matrix(cam), observed(cam), np.random.default_rng(0)
     image, readings = rng.normal(size=cam.unknowns), rng.normal(size=cam.measurements)
     np.testing.assert_allclose(applied.forward(image), matrix @ image, atol=1e-14)
     np.testing.assert_allclose(applied.adjoint(readings), matrix.T @ readings, atol=1e-13)
@@ -46,7 +46,7 @@ def test_windows_have_the_measurements_inside_them(
     expected = np.flatnonzero(~outside.any(axis=(1, 2)))
     whole = ideal_matrix(cam)
     stored = Model(scene(), cam, whole, np.zeros(whole.nnz), np.zeros((0, whole.nnz), np.float32), {"method": "points"})
-    for h in (boxes_as_designed(cam), stored.observation):
+    for h in (observed(cam), stored.observation):
         inside = h.measurements_inside(rows, columns)
         np.testing.assert_array_equal(np.sort(inside), expected)
         np.testing.assert_allclose(
@@ -57,7 +57,7 @@ def test_windows_have_the_measurements_inside_them(
 
 
 def test_windows_of_one_signature_have_the_same_h() -> None:
-    cam = boxes_as_designed(camera((70, 61), CAMERAS[1][1]))
+    cam = observed(camera((70, 61), CAMERAS[1][1]))
     first, second, edge = (slice(10, 40), slice(12, 42)), (slice(11, 41), slice(19, 49)), (slice(0, 30), slice(12, 42))
     assert cam.signature(*first) == cam.signature(*second)
     assert (cam.submatrix(*first) - cam.submatrix(*second)).nnz == 0
@@ -67,10 +67,10 @@ def test_windows_of_one_signature_have_the_same_h() -> None:
 def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     cam = camera((150, 140), CAMERAS[1][1])
     image, readings = np.random.default_rng(1).normal(size=cam.unknowns), np.ones(cam.measurements)
-    forward, adjoint = boxes_as_designed(cam).forward(image), boxes_as_designed(cam).adjoint(readings)
+    forward, adjoint = observed(cam).forward(image), observed(cam).adjoint(readings)
     monkeypatch.setattr(boxes, "processors", lambda: 1)
-    np.testing.assert_array_equal(boxes_as_designed(cam).forward(image), forward)
-    np.testing.assert_array_equal(boxes_as_designed(cam).adjoint(readings), adjoint)
+    np.testing.assert_array_equal(observed(cam).forward(image), forward)
+    np.testing.assert_array_equal(observed(cam).adjoint(readings), adjoint)
     assert boxes.ROWS_AT_ONCE < 150, "otherwise there is only one task"
 
 

@@ -14,7 +14,6 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.hardware.point_sources import unrecorded
-from ommatid.scenes.optics.boxes import boxes_as_designed
 from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
@@ -24,7 +23,7 @@ from ommatid.simulate.sampling.passes import rounding_variance
 
 from ..conftest import Command
 from ..examples import GALLERY, assert_student, needs, scene
-from ..frames import assert_methods_agree, recorded
+from ..frames import assert_methods_agree, observed, recorded
 from ..runs import document
 
 FINE = 12  # cells of a pixel of f, so that edges of footprints lie on edges of cells
@@ -76,7 +75,7 @@ def test_h_is_that_of_counted_cells() -> None:
     camera = derive(windows())
     counted = by_counting(camera)
     np.testing.assert_allclose(ideal_matrix(camera).toarray(), counted, atol=1e-14)
-    boxes, rng = boxes_as_designed(camera), np.random.default_rng(0)
+    boxes, rng = observed(camera), np.random.default_rng(0)
     image, readings = rng.normal(size=camera.unknowns), rng.normal(size=camera.measurements)
     np.testing.assert_allclose(boxes.forward(image), counted @ image, atol=1e-12)
     np.testing.assert_allclose(boxes.adjoint(readings), counted.T @ readings, atol=1e-12)

@@ -12,12 +12,11 @@ import pytest
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.hardware.point_sources import unrecorded
-from ommatid.scenes.optics.boxes import boxes_as_designed
 from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import scene
-from ..frames import assert_methods_agree
+from ..frames import assert_methods_agree, observed
 
 
 def stepped(step: Any, shape: tuple[int, int] = (20, 17), more: dict[str, Any] | None = None, **tables: Any) -> Scene:
@@ -51,7 +50,7 @@ def test_h_is_that_of_counted_cells(step: list[Any]) -> None:
     assert camera.types[0].step == (Fraction(step[0]), Fraction(step[1]))
     counted = by_counting(camera)
     np.testing.assert_allclose(ideal_matrix(camera).toarray(), counted, atol=1e-14)
-    boxes, rng = boxes_as_designed(camera), np.random.default_rng(0)
+    boxes, rng = observed(camera), np.random.default_rng(0)
     image, readings = rng.normal(size=camera.unknowns), rng.normal(size=camera.measurements)
     np.testing.assert_allclose(boxes.forward(image), counted @ image, atol=1e-12)
     np.testing.assert_allclose(boxes.adjoint(readings), counted.T @ readings, atol=1e-12)

@@ -19,9 +19,8 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.processors import processors
 
-from ..camera import Camera
 from ..lens_type import LensType
-from ..observation import Back, Observation, ObservationPart, Seen, cosines, density
+from ..observation import Back, ObservationPart, Seen, cosines, density
 
 ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 
@@ -183,12 +182,6 @@ class Box(ObservationPart):
         """H^T H of a small window: (its pixels, its pixels)."""
         down, across = self.down.gram[rows, rows].toarray(), self.across.gram[columns, columns].toarray()
         return np.asarray(np.kron(down, across), dtype=np.float64)
-
-
-def boxes_as_designed(camera: Camera) -> Observation:
-    """H of a camera whose footprints are boxes, by lens types, or by sub-imagers where some are steered."""
-    types = camera.on_grids.types
-    return Observation(camera.shape, tuple(designed_box(camera.shape, lens_type) for lens_type in types))
 
 
 def designed_box(shape: tuple[int, int], lens_type: LensType) -> Box:

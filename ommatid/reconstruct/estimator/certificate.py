@@ -310,7 +310,8 @@ class _Certifier:
             solution = self._corrected(solution, values)
             coefficients, multipliers = self.system.residuals(solution[0], solution[1], exact(shift), right)
             values = coefficients.high, multipliers.high
-        rounding = self.system.rounding_errors(solution[0].high, solution[1].high, shift, right.high)[1]
+        size = np.maximum(np.abs(solution[0].high), np.abs(shift))  # where rows determine u to be 0, q has no size
+        rounding = self.system.rounding_errors(size, solution[1].high, shift, right.high)[1]
         noise_free = self.system.problem.noise_variance == 0
         return bool((np.abs(values[1]) <= ROUNDING_MARGIN * rounding)[noise_free].all())
 

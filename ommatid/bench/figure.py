@@ -14,7 +14,7 @@ from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.runtime.printable import printable_label
 
 from .slopes import TOLERANCE, median_error, median_seconds, pareto_front
-from .table import ALONE, AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quantiles, Stage
+from .table import AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quantiles, Stage
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
@@ -190,7 +190,6 @@ def _draw_legend(figure: Any, table: BenchTable, stage: Stage) -> None:
     lines: list[Any] = [*(Line2D([], [], **style) for style in styles.values()), Line2D([], [], **FRONT)]
     names = [", ".join(word for word in (*key, slopes.get(key)) if word) for key in styles]
     note = f"Pareto front; {AUTO}: adaptive number of samples" if stage != "reconstruct" else "Pareto front"
-    note += f"; {ALONE}: a dense form without refinement" if stage == "reconstruct" else ""
     figure.legend(lines, [*names, note], loc="outside lower center", ncols=3, fontsize=9)
 
 

@@ -1,31 +1,27 @@
-"""Cost and numerical error of the solvers: dense forms, tiles of several sizes, and the frame.
+"""Cost and numerical error of the solvers: the dense one, tiles of several sizes, and the frame.
 
-Errors are relative to the exact solution, in posterior standard deviations of each pixel. The exact solution is that of
-a dense form after refinement, to fifteen digits, or, for a frame, the same frame solved to a much higher accuracy.
+Errors are relative to the exact solution, in posterior standard deviations of each pixel. The exact solution is the
+dense one, refined to fifteen digits, or, for a frame, the same frame solved to a much higher accuracy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
-from ommatid.reconstruct.estimator.estimate import FORMS, estimate, needed_memory
-from ommatid.reconstruct.forms.form import NotSolvableError
+from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.frame.frame_method import FrameMethod
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import free_memory
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.tables.estimation import TilesTable
 
-from .table import ALONE
+from .table import DENSE
 
 TILE_SIZES = ((11, 2), (15, 3), (19, 4), (27, 6), (35, 8), (51, 12))  # sides, and widths of the border that is dropped
 ACCURACIES = (1.0, 0.1, 0.01, 1e-3, 1e-4)  # estimator.accuracy of a frame
@@ -74,12 +70,14 @@ def exact_solution(task: EstimationTask, deviation: FloatArray | None = None) ->
 
 def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tuple[str, str]]]:
     """Return the settings that can be measured for this task, and those that cannot, with the reason."""
-    measurable, left_out = _form_settings(task), list[tuple[str, str]]()
+    measurable, left_out = list[SolverSetting](), list[tuple[str, str]]()
     has_frame = task.model.camera.is_sliding and bool((task.expected_noise > 0).all())
-    if not is_dense(task):
-        left_out.append(("dense forms", f"{task.model.unknowns} pixels, and the limit is {MOST_DENSE}"))
+    if is_dense(task):
+        measurable.append(SolverSetting(DENSE, f"tolerance {task.settings.tolerance:g}", _dense_image))
+    else:
+        left_out.append((DENSE, f"{task.model.unknowns} pixels, and the limit is {MOST_DENSE}"))
         if not has_frame:
-            why = "too many pixels for a dense form, and a frame does not apply: there is no exact solution"
+            why = "too many pixels for one dense problem, and a frame does not apply: there is no exact solution"
             return [], [("reconstruct", why)]
     measurable += [_tile_setting(size, overlap) for size, overlap in TILE_SIZES if size < min(task.shape)]
     if has_frame:
@@ -89,40 +87,9 @@ def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tup
     return measurable, left_out
 
 
-def _form_settings(task: EstimationTask) -> list[SolverSetting]:
-    """Return each dense form without refinement, and refined until its bound is below the tolerance."""
-    if not is_dense(task):
-        return []
-    settings: list[SolverSetting] = []
-    for name in FORMS:
-        refined = f"refined, tolerance {task.settings.tolerance:g}"
-        settings.append(SolverSetting(name, ALONE, partial(_unrefined_image, name=name)))
-        settings.append(SolverSetting(name, refined, partial(_refined_image, name=name)))
-    return settings
-
-
-def _problem(task: EstimationTask) -> tuple[Problem, FloatArray]:
+def _dense_image(task: EstimationTask) -> FloatArray:
     problem = Problem(task.model.matrix[task.used], task.prior_on(task.shape), task.expected_noise)
-    return problem, task.recorded[task.used]
-
-
-def _unrefined_image(task: EstimationTask, name: str) -> FloatArray:
-    """Compute the estimate of a form without refinement. Raises InputError if memory or precision do not suffice."""
-    problem, recorded = _problem(task)
-    needed = needed_memory(name, problem.measurements, problem.unknowns, correlated=not problem.prior.independent)
-    if needed > free_memory():
-        raise InputError(f"it needs {needed / 1e9:.1f} GB of memory")
-    try:
-        with np.errstate(all="ignore"):  # of forms that lose all digits, which their error shows
-            update = FORMS[name](problem).gain(recorded - problem.matrix @ problem.prior.mean)
-    except NotSolvableError as error:
-        raise InputError(str(error)) from error
-    return problem.prior.mean + update
-
-
-def _refined_image(task: EstimationTask, name: str) -> FloatArray:
-    problem, recorded = _problem(task)
-    return estimate(problem, recorded, name, task.settings.tolerance).image
+    return estimate(problem, task.recorded[task.used], task.settings.tolerance).image
 
 
 def _tile_setting(size: int, overlap: int) -> SolverSetting:

@@ -19,7 +19,7 @@ from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
 from ommatid.simulate.sampling.samplers import corners, law
 
-from .table import ALONE, AUTO, STAGES, Cell, ConvergenceCurve, Recommendation, RecommendedSetting, Stage
+from .table import AUTO, DENSE, STAGES, Cell, ConvergenceCurve, Recommendation, RecommendedSetting, Stage
 
 Item = TypeVar("Item")
 
@@ -137,7 +137,7 @@ def recommend(cells: Sequence[Cell], floor: float) -> Recommendation:
     floor : mean squared error with exact light and exact H, with the scene's noise
     Rendering and calibration share the scene's sampler and variant.
     """
-    choices = list(_choices([cell for cell in cells if cell.setting != ALONE], floor))
+    choices = list(_choices(cells, floor))
     if floor <= 0 or not choices:
         why = "no cell of some stage was measured within the time limit; raise --seconds"
         if floor <= 0:
@@ -202,7 +202,8 @@ def _total_seconds(choice: Sequence[Cell]) -> float:
 def _recommended(cell: Cell) -> RecommendedSetting:
     seconds = cell.seconds.median
     if cell.stage == "reconstruct":
-        return RecommendedSetting(method=cell.way, setting=cell.setting, seconds=seconds)
+        method = AUTO if cell.way == DENSE else cell.way
+        return RecommendedSetting(method=method, setting=cell.setting, seconds=seconds)
     *method, sampler = cell.way.split(", ")
     return RecommendedSetting(
         method=method[0] if method else None,

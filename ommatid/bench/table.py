@@ -20,7 +20,7 @@ from ommatid.runtime.files import write_csv, write_text
 from ommatid.runtime.input_files import check_unique_keys, read_bytes, real_path
 
 JSON, CSV = "bench.json", "bench.csv"
-ALONE = "alone"  # the setting of a dense form without refinement, which a scene cannot ask for
+DENSE = "dense"  # one dense problem, which estimator.method = "auto" takes where it fits
 AUTO = "auto"  # the setting of a cell with an adaptive number of samples: a single point, not part of a curve
 QUANTILES = 0.1, 0.5, 0.9
 
@@ -62,7 +62,7 @@ class Quantiles(_Record):
 class Cell(_Record):
     """Measurements of one setting of a stage.
 
-    way : the sampler, the method of calibration and its sampler, a dense form, "tiles" or "frame"
+    way : the sampler, the method of calibration and its sampler, "dense", "tiles" or "frame"
     samples : per pixel; of an adaptive cell the largest number at any pixel in any repeat
     setting : the remaining parameters
     scatter : standard deviation of the natural logarithm of the error over repeats, None for a single repeat

@@ -303,10 +303,10 @@ def _second_set(tiles: Tiles) -> Claim:
         if len(set(lenses)) == 1:
             one = tile(side, lenses[:1])
             halved = [abs(two.mse(noise) / one.mse(noise / 2) - 1) for noise in map(float, ACTUAL)]
-            holds &= max(halved) < EQUAL and one.form.rank == two.form.rank
+            holds &= max(halved) < EQUAL and one.rank == two.rank
             numbers[f"{side}: largest relative difference from one set at half the noise"] = max(halved)
-            numbers[f"{side}: null space of one set"] = two.camera.unknowns - one.form.rank
-            numbers[f"{side}: null space of two"] = two.camera.unknowns - two.form.rank
+            numbers[f"{side}: null space of one set"] = two.camera.unknowns - one.rank
+            numbers[f"{side}: null space of two"] = two.camera.unknowns - two.rank
             numbers[f"{side}: error of two over error of one, noise {LEAST:g}"] = two.mse(LEAST) / one.mse(LEAST)
     return Claim("a second equal set of lenses only averages noise", verdict(holds), numbers)
 
@@ -345,7 +345,7 @@ def _join(whole: PaperTile, parts: list[Posterior]) -> Posterior:
 
 def _quiet(whole: PaperTile) -> Problem:
     """Return the problem of a tile at the least noise."""
-    problem = whole.form.problem
+    problem = whole.problem
     return replace(problem, noise_variance=LEAST * problem.noise_variance)
 
 

@@ -129,7 +129,7 @@ def measure(tile: PaperTile, images: FloatArray, noises: tuple[NoiseTable, ...],
 
     seed, experiment : from which the noise of every level and image follows
     """
-    camera, matrix, mean = tile.camera, tile.form.problem.matrix, tile.form.problem.prior.mean
+    camera, matrix, mean = tile.camera, tile.problem.matrix, tile.problem.prior.mean
     light: FloatArray = np.asarray(matrix @ images.T)
     before = np.asarray(matrix @ mean)[:, None]
 
@@ -140,14 +140,13 @@ def measure(tile: PaperTile, images: FloatArray, noises: tuple[NoiseTable, ...],
     rows: list[tuple[FloatArray, float, FloatArray, float, float]] = []
     for level, noise in enumerate(noises):
         variance = noise.variance + noise.quantisation_variance
-        form = tile.form.with_noise_scaled(variance)
         values = np.stack([recorded(image, level) for image in range(len(images))], 1)
-        error = mean[:, None] + form.gain(values - before) - images.T
-        from_noise = form.gain(values - light)
-        prior = tile.form.expected_variance(variance, 0.0).mean()
-        predicted = tile.mse(variance)
+        error = mean[:, None] + tile.update(values - before, variance) - images.T
+        from_noise = tile.update(values - light, variance)
+        line = tile.line(variance)
+        prior, predicted = float(line.prior.mean()), float(line.at(variance).mean())
         squares = [np.square(values).mean(axis=0) for values in (error, from_noise)]
-        rows.append((squares[0], predicted, squares[1], predicted - prior, _spread(form.values)))
+        rows.append((squares[0], predicted, squares[1], predicted - prior, _spread(np.sqrt(tile.squares / variance))))
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     return Trials(noises, *columns)
 

@@ -13,7 +13,6 @@ from functools import cache
 
 import numpy as np
 
-from ommatid.reconstruct.forms.svd import Svd, svd
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.reconstruct.prior import independent
 from ommatid.reconstruct.problem import Problem
@@ -31,6 +30,7 @@ COMBINATIONS = (TWICE, TWO, THREE)
 EXPECTED = (1e-6, 1e-4, 1e-2, 1.0)
 ACTUAL: FloatArray = np.logspace(-6, 2, 33)
 LEAST = 1e-6
+TRUNCATION = 4  # times eps, the longer side and the largest singular value: smaller ones are set to 0
 STRAIGHT = ("camera.lens.I.distortion=",)
 
 
@@ -59,11 +59,18 @@ class TileError:
 
 @dataclass(frozen=True)
 class PaperTile:
-    """A tile of the paper with some of its lens types, decomposed for noise of variance 1."""
+    """A tile of the paper with some of its lens types: H P0^1/2 = U diag(s) V^T, with the paper's prior P0.
+
+    problem : for noise of variance 1;  rank : of H
+    squares : (N,) s^2, 0 beyond the rank;  modes : (N, N) P0^1/2 V
+    """
 
     lenses: tuple[str, ...]
     camera: Camera
-    form: Svd
+    problem: Problem
+    rank: int
+    squares: FloatArray
+    modes: FloatArray
 
     @property
     def name(self) -> str:
@@ -78,17 +85,23 @@ class PaperTile:
     @property
     def floor(self) -> float:
         """The mean error that no measurement can lower: the prior's variance times the null space's share of f."""
-        variance = float(self.form.problem.prior.variance.mean())
-        return variance * (self.camera.unknowns - self.form.rank) / self.camera.unknowns
+        variance = float(self.problem.prior.variance.mean())
+        return variance * (self.camera.unknowns - self.rank) / self.camera.unknowns
+
+    def update(self, residual: FloatArray, expected: float) -> FloatArray:
+        """Return A (g - H f0), (N, q), of the estimator that expects this noise variance; residual : (M, q)."""
+        seen = self.modes.T @ (self.problem.matrix.T @ residual)
+        return self.modes @ (seen / (expected + self.squares)[:, None])
 
     def line(self, expected: float) -> TileError:
         """Return Eq. 5 for the estimator that expects noise of this variance."""
-        prior = self.form.expected_variance(expected, 0.0)
-        return TileError(prior, self.form.expected_variance(expected, 1.0) - prior)
+        prior = np.square(self.modes) @ np.square(expected / (expected + self.squares))
+        noise = np.square(self.modes) @ (self.squares / np.square(expected + self.squares))
+        return TileError(prior, noise)
 
     def matched(self, variance: float) -> FloatArray:
         """Return Eq. 5, (N,), for the estimator that expects the actual noise."""
-        return self.form.expected_variance(variance, variance)
+        return self.line(variance).at(variance)
 
     def mse(self, variance: float) -> float:
         """Return its mean over the pixels."""
@@ -113,7 +126,21 @@ def decomposed(lenses: tuple[str, ...], camera: Camera) -> PaperTile:
     """Decompose H of a camera, with the paper's prior."""
     paper = PriorTable()
     prior = independent(paper.mean, paper.variance, camera.unknowns)
-    return PaperTile(lenses, camera, svd(Problem(ideal_matrix(camera), prior, np.ones(camera.measurements))))
+    problem = Problem(ideal_matrix(camera), prior, np.ones(camera.measurements))
+    dense = problem.dense_matrix()
+    if len(dense) > camera.unknowns:
+        dense = np.linalg.qr(dense, mode="r")
+    _, singular, right = np.linalg.svd(dense)
+    least = (
+        TRUNCATION
+        * np.finfo(np.float64).eps
+        * max(camera.measurements, camera.unknowns)
+        * float(singular.max(initial=0.0))
+    )
+    rank = int(np.sum(singular > least))
+    squares = np.zeros(camera.unknowns)
+    squares[:rank] = np.square(singular[:rank])
+    return PaperTile(lenses, camera, problem, rank, squares, prior.apply_root(right.T))
 
 
 def tiles() -> Tiles:

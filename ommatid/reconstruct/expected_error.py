@@ -19,7 +19,7 @@ from scipy import sparse, special
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
-from .estimator.certificate import RefinedForm, exact_sums, refine
+from .estimator.certificate import exact_sums, refine
 from .estimator.residuals import ExactResiduals, exact
 from .forms.form import Form
 
@@ -39,10 +39,7 @@ def is_stiff(form: Form) -> bool:
 
 def refined_solutions(form: Form, residuals: ExactResiduals, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Solve for c = `shift`, (K, q), and r = 0 with refinement: u, (K, q), and l, (M, q)."""
-    zero = np.zeros((form.problem.measurements, shift.shape[1]))
-    if isinstance(form, RefinedForm):
-        return form.solve(shift, zero)
-    refined = refine(form, residuals, shift, exact(zero))
+    refined = refine(form, residuals, shift, exact(np.zeros((form.problem.measurements, shift.shape[1]))))
     return refined.coefficients, refined.multipliers
 
 
@@ -53,12 +50,11 @@ def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray)
     Raises InputError if the sum of squares and the quadratic form c^T u of Eq. 5 differ, or if that one is uncertain.
     """
     problem, residuals = form.problem, ExactResiduals(form.problem)
-    inner = form.form if isinstance(form, RefinedForm) else form
     shift = residuals.root_transposed(exact(weights[:, None]))
-    refined = refine(inner, residuals, shift, exact(np.zeros((problem.measurements, 1))))
+    refined = refine(form, residuals, shift, exact(np.zeros((problem.measurements, 1))))
     prior, squares = float(np.square(refined.coefficients).sum()), np.square(refined.multipliers[:, 0])
     variance = prior + float(noise_variance @ squares)
-    expected, bound = (float(values[0]) for values in exact_sums(inner, residuals, shift))
+    expected, bound = (float(values[0]) for values in exact_sums(form, residuals, shift))
     ratio = np.divide(
         noise_variance,
         problem.noise_variance,
@@ -178,20 +174,31 @@ def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | No
 def expected_given(form: Form, truth: FloatArray, noise_variance: FloatArray) -> Interval:
     """Return the expected mean squared error for one image: |(I - A H)(f - f0)|^2 + trace(A Rvm A^T), over N.
 
-    Use it for a photograph, which is no draw from the prior of Eq. 5. The interval takes the error as a gamma variate
-    with mean and variance of the quadratic form: with K = A Rvm A^T, the latter is 4 b^T K b + 2 trace(K^2).
+    Use it for a photograph, which is no draw from the prior of Eq. 5.
     """
-    problem = form.problem
-    bias = bias_of(form, truth - problem.prior.mean)
+    bias = bias_of(form, truth - form.problem.prior.mean)[:, None]
+    mean, variance = squared_error(form, bias, noise_variance, np.arange(truth.size))
+    return interval(float(mean[0]), float(variance[0]), truth.size)
+
+
+def squared_error(
+    form: Form, bias: FloatArray, noise_variance: FloatArray, pixels: Pixels
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance of the sum of squared errors of some pixels, (t,) each, for the biases of t images.
+
+    With K = A Rvm A^T of these pixels, the quadratic form |b|^2 + trace(K) has the variance 4 b^T K b + 2 trace(K^2).
+
+    bias : (pixels, t) (I - A H)(f - f0)
+    """
     trace = squares = 0.0
-    for _, _, _, negative in solved_columns(form, np.arange(problem.unknowns)):
+    along = np.zeros(bias.shape[1])
+    for chunk, _, _, negative in solved_columns(form, pixels):
         weighted = noise_variance[:, None] * negative
+        covariance = -form.gain(weighted)[pixels]
         trace += float(np.sum(weighted * negative))
-        squares += float(np.square(form.gain(weighted)).sum())
-    back = problem.prior.apply_root_transposed(bias[:, None])
-    _, negative = form.solve(back, np.zeros((problem.measurements, 1)))
-    variance = 4 * float(noise_variance @ np.square(negative[:, 0])) + 2 * squares
-    return interval(float(bias @ bias) + trace, variance, truth.size)
+        squares += float(np.square(covariance).sum())
+        along += np.sum((covariance.T @ bias) * bias[chunk], axis=0)
+    return np.square(bias).sum(axis=0) + trace, 4 * along + 2 * squares
 
 
 def interval(mean: float, variance: float, count: int) -> Interval:
@@ -221,7 +228,5 @@ def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, 
         if residuals is None:
             u, negative = form.pixel_solutions(chosen)
         else:
-            unit = np.zeros((form.problem.unknowns, chosen.size))
-            unit[chosen, np.arange(chosen.size)] = 1.0
-            u, negative = refined_solutions(form, residuals, form.problem.prior.apply_root_transposed(unit))
+            u, negative = refined_solutions(form, residuals, form.problem.pixel_shift(chosen))
         yield chunk, chosen, u, negative

@@ -83,12 +83,10 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
         return ["frame"], "kernels of the lens types apply H"
     if estimator.method in ("tiles", "frame"):
         return [estimator.method], "asked for"
-    if estimator.method != "auto":
-        return ["dense"], f"the {estimator.method} form was asked for"
     if camera.unknowns <= MOST_DENSE:
         return ["dense", "tiles"], f"{camera.unknowns} pixels are few"
     if noiseless:
-        return ["tiles"], "measurements without noise need a dense form"
+        return ["tiles"], "measurements without noise need a dense solution"
     if estimator.accuracy >= TILE_ACCURACY:
         return ["tiles"], f"tiles reach an accuracy of {estimator.accuracy:g} posterior standard deviations"
     independent = scene.prior.kind == "independent"
@@ -103,7 +101,7 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
 
 def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> MethodChoice:
     """Choose the method of an estimator that expects a misaligned camera and starts from H as designed."""
-    method, form = scene.estimator.misalignment, scene.estimator.method
+    method, other = scene.estimator.misalignment, scene.estimator.method
     key = f"{scene.source}: estimator.misalignment '{method}'"
     if camera.tolerance is None:
         raise InputError(f"{key} needs to know what may be misaligned, got no [camera.tolerance]; add one")
@@ -113,8 +111,8 @@ def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Meth
         raise InputError(f"{key} takes a world made of f's pixels, got target.detail {camera.detail}; remove it")
     if not (camera.has_box_footprints and camera.has_sharp_footprints):
         raise InputError(f"{key} serves pinholes and thin lenses in focus, got blurred or distorted ones; calibrate")
-    if form in ("tiles", "frame"):
-        raise InputError(f"{key} takes a dense form, got estimator.method '{form}'; set that to 'auto'")
+    if other != "auto":
+        raise InputError(f"{key} takes one dense problem, got estimator.method '{other}'; set that to 'auto'")
     if not exact:
         raise InputError(f"{key} starts from H as designed, got a calibrated one; set calibration.method to 'ideal'")
     largest = max(lens_type.pixels[0] * lens_type.pixels[1] for lens_type in camera.types)
@@ -145,16 +143,13 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
     widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
     entries = 0 if exact else 12 * 10 * camera.measurements * widest**2
     if method in ("dense", "detail"):
-        form = scene.estimator.method
-        if form == "auto":
-            form = "covariance" if camera.measurements < camera.unknowns else "information"
         correlated = scene.prior.kind != "independent"
-        needed = needed_memory(form, camera.measurements, camera.unknowns, correlated=correlated) + entries
+        needed = needed_memory(camera.measurements, camera.unknowns, correlated=correlated) + entries
         return needed + (detail_memory(camera) if method == "detail" else 0)
     images = 8 * (5 * camera.measurements + 16 * camera.unknowns)
     if method == "tiles":
         side = scene.tiles.size**2
-        return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory("information", 3 * side, side)
+        return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory(3 * side, side)
     longest = max(camera.shape)
     strips = 8 * 4 * longest * (5 * widest) * (5 * widest * (widest - 1) + widest)
     if serves(camera, scene.prior.kind == "independent"):

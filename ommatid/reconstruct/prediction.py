@@ -19,7 +19,6 @@ from .detail.detailed_model import independent_detail
 from .estimator.estimate import factorise
 from .expected_error import expected_error, kernel_widths
 from .forms.form import Form
-from .forms.svd import Svd, svd
 from .measured_error import TRIM, trimmed_mean
 from .method_choice import METHODS, MethodChoice
 from .methods.method import EstimationTask, Execution
@@ -28,6 +27,7 @@ from .prior import Prior
 from .problem import Problem, gram
 
 PRIOR_ALONE = 0.9  # of the prior's variance: error from which measurements bring next to nothing
+NOISELESS = 1e-12  # of a measurement's prior variance: noise in place of none that an estimator expects where some is
 RANK_TOLERANCE = 1e-7  # of singular values, relative; their squares come from an eigenvalue problem in float64
 
 
@@ -105,7 +105,8 @@ def predict(
     """Predict the error of one dense problem with noise of variance `actual`.
 
     The estimator expects `estimator.noise_variance`, or the actual noise where that is not set. Without any noise the
-    error is the limit of Eq. 5: the prior's part in the null space of H.
+    error is the prior's part in the null space of H. Where an estimator expects none of the noise that there is, it is
+    the limit of Eq. 5 for ever less expected noise.
 
     actual : one variance for all measurements, or (M,); NaN leaves a measurement out
     prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
@@ -116,17 +117,15 @@ def predict(
     noise, expected_noise, used = _noises(actual, matrix.shape[0], estimator)
     matrix = matrix if used.all() else sparse.csr_array(matrix[used])
     seen, added = observability(matrix), None
-    if (expected_noise > 0).all():
-        form, solver = factorise(Problem(matrix, prior, expected_noise), estimator.method, estimator.tolerance)
-        expected = expected_error(form, {"noise": noise / prior_ratio})
-        method, variance, resolved = solver.method, prior_ratio * expected.variance, expected.resolved
-        if misalignment_variance is not None:
-            added = misalignment_variance(form, used)
-            variance = variance + added
-    else:
-        limit = svd(Problem(matrix, prior, np.ones(noise.size)))
-        variance = prior_ratio * _noiseless_limit(limit, noise / prior_ratio)
-        method, resolved = limit.name, limit.resolved()
+    if noise.any() and not (expected_noise > 0).all():
+        signal = float((abs(matrix) @ np.sqrt(prior.variance)).max(initial=0.0))
+        expected_noise = uniform(NOISELESS * signal**2, noise.size)
+    form, solver = factorise(Problem(matrix, prior, expected_noise), estimator.tolerance)
+    expected = expected_error(form, {"noise": noise / prior_ratio})
+    variance = prior_ratio * expected.variance
+    if misalignment_variance is not None and form.problem.noisy:
+        added = misalignment_variance(form, used)
+        variance = variance + added
     return Prediction(
         noise.size,
         prior.mean.size,
@@ -136,9 +135,9 @@ def predict(
         float(variance.mean()),
         trimmed_mean(variance, shape),
         TRIM,
-        float(resolved.sum()),
-        median_width(resolved),
-        method,
+        expected.degrees_of_freedom,
+        median_width(expected.resolved),
+        solver.method,
         None if added is None else float(added.mean()),
         prior_ratio * float(prior.variance.mean()),
     )
@@ -209,13 +208,3 @@ def median_width(resolved: FloatArray) -> float | None:
     """Return the median width of the averaging kernels in pixels of f, None where nothing is resolved."""
     width = float(np.median(kernel_widths(resolved)))
     return width if isfinite(width) else None
-
-
-def _noiseless_limit(limit: Svd, noise: FloatArray) -> FloatArray:
-    """Return Eq. 5, (N,), of an estimator that expects no noise; limit : form for noise 1;  noise : actual, (M,)."""
-    if not np.ptp(noise):
-        return limit.expected_variance(0.0, float(noise.max(initial=0.0)))
-    spread, rank = limit.problem.prior.apply_root, limit.rank
-    unseen = np.square(spread(limit.right[:, rank:])).sum(axis=1)
-    gain = spread(limit.right[:, :rank] / limit.values[:rank]) @ limit.left.T
-    return np.asarray(unseen + np.square(gain) @ noise)

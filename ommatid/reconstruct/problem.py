@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
@@ -90,6 +91,14 @@ class Problem:
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """Apply L^T H^T: (M, q) to (K, q)."""
         return np.asarray(self.prior.apply_root_transposed(self._factor.T @ measurements))
+
+    def pixel_shift(self, pixels: NDArray[np.intp]) -> FloatArray:
+        """Return L^T e_i of each pixel i: (K, n)."""
+        if not self.prior.independent:
+            return self.prior.root[pixels].T
+        shift = np.zeros((self.unknowns, pixels.size))
+        shift[pixels, np.arange(pixels.size)] = self.prior.root[pixels]
+        return shift
 
     def dense_matrix(self) -> FloatArray:
         """H L as a dense matrix: (M, K)."""

@@ -1,10 +1,11 @@
-"""Correct digits of every form of the estimator on stiff and extreme cases, against the exact answer.
+"""Correct digits of the certified solver on stiff and extreme cases, against the exact answer.
 
 An answer is right if the estimate and every posterior variance have nine digits. Otherwise it has to be refused or
 state a large enough error bound; an answer with an error beyond its bound is a silent loss.
 
-The figure shows the digits lost by every form against the noise variance, with three panels per H: the form alone,
-refined, and the worst posterior variance. Refusals are marked above the curves.
+The figure shows the digits lost against the noise variance, with and without a null space of H: by the estimate before
+and after refinement, and by the worst posterior variance, with the bounds that are stated. A third panel compares the
+errors of all cases with their bounds: points above the dotted line, at ten times the bound, would be silent losses.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
-from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, Estimate, estimate
+from ommatid.reconstruct.estimator.estimate import TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_csv, write_text
@@ -29,40 +30,35 @@ from .cases import Matrices, StabilityCase, extreme_cases, noise_sweep
 from .exact_answer import ExactAnswer, exact_answer
 
 FLOAT64_DIGITS = 16.0
-PANELS = (("alone", "estimate, the form alone"), ("refined", "estimate, refined"), ("variance", "worst variance"))
-STYLES = {
-    "covariance": ("tab:orange", "v"),
-    "information": ("tab:red", "s"),
-    "square-root-information": ("tab:purple", "D"),
-    "square-root-covariance": ("tab:brown", "^"),
-    "svd": ("tab:green", "o"),
-    "dual": ("tab:blue", "P"),
-    "auto": ("black", "x"),
-}
-FIRST_LANE, LANE_HEIGHT = FLOAT64_DIGITS + 1.5, 0.75  # of the marks of refusals, one lane per form
+QUANTITIES = (
+    ("alone", "estimate before refinement", {"color": "tab:orange", "marker": "v"}),
+    ("refined", "estimate", {"color": "black", "marker": "x", "linewidth": 2.0}),
+    ("variance", "worst posterior variance", {"color": "tab:blue", "marker": "o"}),
+)
+BOUNDS = (
+    ("bound", "bound of the estimate", {"color": "black"}),
+    ("variance_bound", "bound of the variances", {"color": "tab:blue"}),
+)
 TITLES = {"three": "three types: H has full rank", "two": "two types: H has a null space"}
-_TEXT = {"ha": "right", "fontsize": 8, "color": "0.4"}
-AUTO = "auto"
+LEAST_SHOWN = 1e-17  # errors and bounds below are drawn there
 DIGITS = 9.0  # of the estimate and of every posterior variance
 ALLOWED_EXCESS = 10.0  # ratio of an error to its bound: variances are checked on a sample of pixels
 NO_STATEMENT = 0.1  # a bound above it states nothing
-ANY_TOLERANCE = 1e300  # accepts every answer, with its bound
 RIGHT, REFUSED, FEWER, SILENT = "right", "refused", "fewer digits, as stated", "SILENT LOSS"
 
 
 @dataclass(frozen=True)
 class StabilityOutcome:
-    """Result of one form for one case.
+    """Result of one case.
 
-    alone, refined, variance : correct digits of u from the form alone, of the refined u, of the worst variance
+    form : that ran;  alone, refined, variance : correct digits of u from the form alone, of the refined u, of the worst variance
     bound, variance_bound : relative error bounds stated by the estimator;  reason : why the case was refused
     """
 
     case: str
     measurements: int
     unknowns: int
-    asked: str
-    ran: str
+    form: str
     verdict: str
     alone: float | None = None
     refined: float | None = None
@@ -82,70 +78,83 @@ class SweepOutcome:
 
 
 @own_style()
-def write_figure(path: Path, curves: list[SweepOutcome], files: FigureFiles = SCREEN_PNG) -> None:
-    """Draw the digits lost, with one row of panels per H and one column per quantity."""
+def write_figure(
+    path: Path, curves: list[SweepOutcome], table: list[StabilityOutcome], files: FigureFiles = SCREEN_PNG
+) -> None:
+    """Draw the digits lost against the noise, one panel per H, and the errors of all cases against their bounds."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure: Any = Figure(figsize=(14, 9.5), layout="constrained")
+    figure: Any = Figure(figsize=(14, 5.5), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(len(TITLES), len(PANELS), sharex=True, sharey=True)
-    for row, (lenses, title) in enumerate(TITLES.items()):
-        for column, (field, quantity) in enumerate(PANELS):
-            panel = axes[row][column]
-            for lane, form in enumerate(STYLES):
-                points = [point for point in curves if point.lenses == lenses and point.outcome.asked == form]
-                _draw_form(panel, points, field, form, FIRST_LANE + lane * LANE_HEIGHT)
-            _draw_axes(panel)
-            panel.set_title(f"{title}\n{quantity}", fontsize=10)
-            panel.set_xlabel("noise variance (grey levels squared)")
-            panel.set_ylabel("decimal digits lost, of 16")
-            panel.tick_params(labelleft=True, labelbottom=True)
-    handles, names = axes[0][0].get_legend_handles_labels()
+    axes = figure.subplots(1, len(TITLES) + 1)
+    for panel, (lenses, title) in zip(axes, TITLES.items(), strict=False):
+        _draw_sweep(panel, [point for point in curves if point.lenses == lenses])
+        panel.set_title(title, fontsize=10)
+    _draw_bounds(axes[-1], [*(point.outcome for point in curves), *table])
+    handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize=9)
-    figure.suptitle("Digits lost by the forms of the estimator, against exact arithmetic")
+    figure.suptitle("Digits lost by the certified solver, against exact arithmetic")
     files.replace(figure, path)
 
 
-def _draw_axes(panel: Any) -> None:
-    top = FIRST_LANE + len(STYLES) * LANE_HEIGHT
+def _draw_sweep(panel: Any, points: list[SweepOutcome]) -> None:
+    """Draw the digits lost against the noise variance, the bounds as dashed lines; the form that ran stands below."""
+    solved = [point for point in points if point.outcome.refined is not None]
+    noise = [point.noise for point in solved]
+    for field, label, style in QUANTITIES:
+        lost = [FLOAT64_DIGITS - getattr(point.outcome, field) for point in solved]
+        panel.plot(noise, lost, label=label, markersize=5, **style)
+    for field, label, style in BOUNDS:
+        stated = [FLOAT64_DIGITS - digits(getattr(point.outcome, field)) for point in solved]
+        panel.plot(noise, stated, label=label, linestyle="--", linewidth=1, **style)
+    for point in points:
+        words = point.outcome.form or REFUSED
+        panel.text(point.noise, -0.4, words, rotation=90, ha="center", va="top", fontsize=7, color="0.4")
     panel.set_xscale("log")
-    panel.set_ylim(-0.5, top)
+    panel.set_ylim(-3.5, FLOAT64_DIGITS)
     panel.set_yticks(range(0, int(FLOAT64_DIGITS) + 1, 2))
     panel.grid(visible=True, color="0.9")
-    panel.axhline(FLOAT64_DIGITS - 9, color="0.5", linewidth=1, linestyle=":")
-    panel.axhspan(FIRST_LANE - LANE_HEIGHT, top, color="0.95", zorder=0)
-    along = panel.get_yaxis_transform()
-    panel.text(0.99, FLOAT64_DIGITS - 8.9, "nine digits left", **_TEXT, transform=along, va="bottom")
-    panel.text(0.99, top - 0.3, "refused", **_TEXT, transform=along, va="top")
+    panel.axhline(FLOAT64_DIGITS - DIGITS, color="0.5", linewidth=1, linestyle=":")
+    panel.text(1e-30, FLOAT64_DIGITS - DIGITS + 0.1, "nine digits left", fontsize=8, color="0.4", va="bottom")
+    panel.set_xlabel("noise variance (grey levels squared)")
+    panel.set_ylabel("decimal digits lost, of 16")
 
 
-def _draw_form(panel: Any, points: list[SweepOutcome], field: str, form: str, lane: float) -> None:
-    """Draw the digits lost by a form, and hollow marks in its lane where it refuses."""
-    colour, marker = STYLES[form]
-    values = [getattr(point.outcome, field) for point in points]
-    lost = [float("nan") if value is None else FLOAT64_DIGITS - value for value in values]
-    style = {"linewidth": 2.2, "markersize": 6, "zorder": 5} if form == "auto" else {"linewidth": 1.2, "markersize": 5}
-    panel.plot([point.noise for point in points], lost, color=colour, marker=marker, label=form, **style)
-    refused = [point.noise for point, value in zip(points, values, strict=True) if value is None]
-    hollow = {"markerfacecolor": "none", "markersize": 5, "linestyle": "none"}
-    panel.plot(refused, [lane] * len(refused), color=colour, marker=marker, **hollow)
+def _draw_bounds(panel: Any, outcomes: list[StabilityOutcome]) -> None:
+    """Draw the error of every answer against the bound that it states."""
+    solved = [outcome for outcome in outcomes if outcome.refined is not None]
+    for (field, label, style), (bound, *_) in zip(QUANTITIES[1:], BOUNDS, strict=True):
+        stated = [max(getattr(outcome, bound), LEAST_SHOWN) for outcome in solved]
+        errors = [10 ** -getattr(outcome, field) for outcome in solved]
+        marks = {"color": style["color"], "marker": style["marker"], "linestyle": "none", "markersize": 4}
+        panel.plot(stated, errors, label=label, **marks)
+    ends = np.array([LEAST_SHOWN, 1.0])
+    panel.plot(ends, ALLOWED_EXCESS * ends, color="0.5", linewidth=1, linestyle=":")
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.set_xlim(LEAST_SHOWN, 1e-6)
+    panel.set_ylim(LEAST_SHOWN, 1e-6)
+    panel.grid(visible=True, color="0.9")
+    panel.set_title(f"{len(solved)} cases solved, {len(outcomes) - len(solved)} refused", fontsize=10)
+    panel.set_xlabel("stated relative bound")
+    panel.set_ylabel("relative error, at least 1e-16")
 
 
-def assess(case: StabilityCase, method: str, exact: ExactAnswer | None) -> StabilityOutcome:
-    """Solve a case with one form or `auto`. `exact` is None for cases that have to be refused."""
+def assess(case: StabilityCase, exact: ExactAnswer | None) -> StabilityOutcome:
+    """Solve a case. `exact` is None for cases that have to be refused."""
     sizes = case.matrix.shape
     try:
-        solution = estimate(case.problem, case.recorded, method, TOLERANCE if method == AUTO else ANY_TOLERANCE)
+        solution = estimate(case.problem, case.recorded, TOLERANCE)
     except InputError as error:
-        return StabilityOutcome(case.name, *sizes, method, "", REFUSED, reason=str(error))
+        return StabilityOutcome(case.name, *sizes, "", REFUSED, reason=str(error))
     if exact is None:
-        ran = solution.solver.method
-        return StabilityOutcome(case.name, *sizes, method, ran, SILENT, reason="should have been refused")
-    return _compare(case, method, solution, exact)
+        form = solution.solver.method
+        return StabilityOutcome(case.name, *sizes, form, SILENT, reason="should have been refused")
+    return _compare(case, solution, exact)
 
 
-def _compare(case: StabilityCase, method: str, solution: Estimate, exact: ExactAnswer) -> StabilityOutcome:
+def _compare(case: StabilityCase, solution: Estimate, exact: ExactAnswer) -> StabilityOutcome:
     problem, solver = solution.form.problem, solution.solver
     residual = ExactResiduals(problem).recorded(case.recorded).high
     with np.errstate(all="ignore"):
@@ -161,7 +170,7 @@ def _compare(case: StabilityCase, method: str, solution: Estimate, exact: ExactA
     wrong[(right == 0) & (wrong <= NEGLIGIBLE_VARIANCE * problem.prior.variance)] = 0.0
     relative = np.divide(wrong, right, out=np.where(wrong > 0, np.inf, 0.0), where=right > 0)
     variance_error = float(relative.max(initial=0))
-    bounds = (ANY_TOLERANCE if solver.bound is None else solver.bound, solver.variance_bound)
+    bounds = (np.inf if solver.bound is None else solver.bound, solver.variance_bound)
     lost = any(
         error > max(ALLOWED_EXCESS * bound, 10**-DIGITS) and bound < NO_STATEMENT
         for error, bound in zip((refined_error, variance_error), bounds, strict=True)
@@ -172,7 +181,6 @@ def _compare(case: StabilityCase, method: str, solution: Estimate, exact: ExactA
         case.name,
         problem.measurements,
         problem.unknowns,
-        method,
         solver.method,
         SILENT if lost or (invalid and max(bounds) < NO_STATEMENT) else RIGHT if enough else FEWER,
         digits(alone_error),
@@ -194,18 +202,17 @@ def _relative(error: float, size: float) -> float:
 
 
 def run(matrices: Matrices, progress: Callable[[float], None]) -> tuple[list[SweepOutcome], list[StabilityOutcome]]:
-    """Run the noise sweep with every form and `auto`, and every other case with `auto`."""
+    """Solve the noise sweep and every other case."""
     sweep, others = list(noise_sweep(matrices)), list(extreme_cases(matrices))
     total = len(sweep) + len(others)
     curves: list[SweepOutcome] = []
     for done, (lenses, noise, case) in enumerate(sweep, start=1):
-        exact = exact_answer(case.problem, case.recorded)
-        curves += [SweepOutcome(lenses, noise, assess(case, method, exact)) for method in (AUTO, *FORMS)]
+        curves.append(SweepOutcome(lenses, noise, assess(case, exact_answer(case.problem, case.recorded))))
         progress(done / total)
     table: list[StabilityOutcome] = []
     for done, case in enumerate(others, start=len(sweep) + 1):
         exact = None if case.required == "refuse" else exact_answer(case.problem, case.recorded)
-        table.append(assess(case, AUTO, exact))
+        table.append(assess(case, exact))
         progress(done / total)
     return curves, table
 
@@ -222,27 +229,25 @@ def _write(
     folder: Path, curves: list[SweepOutcome], table: list[StabilityOutcome], figures: FigureFiles
 ) -> dict[str, Any]:
     outcomes = [point.outcome for point in curves] + table
-    automatic = [outcome for outcome in outcomes if outcome.asked == AUTO]
-    verdicts = [outcome.verdict for outcome in automatic]
+    verdicts = [outcome.verdict for outcome in outcomes]
     columns = [field.name for field in fields(StabilityOutcome)]
     write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
-    write_text(folder / "stability.md", markdown(automatic))
-    write_figure(folder / "stability.png", curves, figures)
+    write_text(folder / "stability.md", markdown(outcomes))
+    write_figure(folder / "stability.png", curves, table, figures)
     return {
         "files": [str(folder / name) for name in ("stability.csv", "stability.md", "stability.png")],
-        "auto": {verdict: verdicts.count(verdict) for verdict in (RIGHT, REFUSED, FEWER, SILENT)},
-        "silent_losses_of_any_form": sum(outcome.verdict == SILENT for outcome in outcomes),
-        "cases": [asdict(outcome) for outcome in automatic],
+        "verdicts": {verdict: verdicts.count(verdict) for verdict in (RIGHT, REFUSED, FEWER, SILENT)},
+        "cases": [asdict(outcome) for outcome in outcomes],
     }
 
 
 def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the rows of the printed table: counts, the least digits of solved cases, and refused cases."""
-    lines = [(verdict, f"{count} cases") for verdict, count in summary["auto"].items()]
+    lines = [(verdict, f"{count} cases") for verdict, count in summary["verdicts"].items()]
     solved = [case for case in summary["cases"] if case["verdict"] != REFUSED]
     for field, name in (("refined", "least digits of an estimate"), ("variance", "least digits of a variance")):
         worst: dict[str, Any] = min(solved, key=lambda case: float(case[field]))
-        lines.append((name, f"{worst[field]:.1f}: {worst['case']}, {worst['ran']}"))
+        lines.append((name, f"{worst[field]:.1f}: {worst['case']}, {worst['form']}"))
     refused = [case["case"] for case in summary["cases"] if case["verdict"] == REFUSED]
     if refused:
         lines.append(("refused, for the reason in stability.md", "; ".join(refused)))
@@ -252,7 +257,7 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
 def markdown(outcomes: Iterable[StabilityOutcome]) -> str:
     """Return a table of cases with the form that ran and its correct digits."""
     lines = [
-        '# Stiff and extreme cases, `method = "auto"`',
+        "# Stiff and extreme cases",
         "",
         "Correct digits against the exact answer, of 16 in float64. Bounds are relative.",
         "",
@@ -265,5 +270,5 @@ def markdown(outcomes: Iterable[StabilityOutcome]) -> str:
             lines.append(f"{start} | | | | | refused: {outcome.reason} |")
         else:
             figures = f"{outcome.refined:.1f} | {outcome.variance:.1f} | {outcome.bound:.0e}"
-            lines.append(f"{start} | {outcome.ran} | {figures} | {outcome.verdict} |")
+            lines.append(f"{start} | {outcome.form} | {figures} | {outcome.verdict} |")
     return "\n".join(lines) + "\n"

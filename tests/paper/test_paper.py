@@ -130,7 +130,7 @@ def test_two_types_of_longer_lenses() -> None:
 @pytest.mark.parametrize("lenses", [TWICE, TWO, THREE])
 def test_a_line_agrees_with_equation_5_in_dense_matrices(lenses: tuple[str, ...]) -> None:
     shown, expected, actual = small(lenses), 1e-2, 3.0
-    h, p0 = shown.form.problem.matrix.toarray(), 5461.25
+    h, p0 = shown.problem.matrix.toarray(), 5461.25
     gain = np.linalg.solve(p0 * h @ h.T + expected * np.eye(len(h)), p0 * h).T
     left = np.eye(361) - gain @ h
     covariance = p0 * left @ left.T + actual * gain @ gain.T
@@ -309,7 +309,7 @@ def test_crossing_and_knee_of_lines() -> None:
 
 
 def from_prior(shown: PaperTile, count: int, seed: int) -> FloatArray:
-    prior, rng = shown.form.problem.prior, np.random.default_rng(seed)
+    prior, rng = shown.problem.prior, np.random.default_rng(seed)
     return prior.mean + rng.normal(size=(count, prior.mean.size)) * prior.root
 
 
@@ -320,7 +320,7 @@ def test_images_from_the_prior_err_as_predicted() -> None:
     noises = tuple(NoiseTable(variance=variance) for variance in (1e-6, 1e-3, 1.0, 100.0))
     trials = measure(shown, from_prior(shown, count, 1), noises, 3, 0)
     for level, noise in enumerate(noises):
-        eigenvalues = 5461.25 / (1 + shown.form.values**2 / noise.variance)
+        eigenvalues = 5461.25 / (1 + shown.squares / noise.variance)
         spread = np.sqrt(2 * np.sum(eigenvalues**2)) / 361
         z = (trials.mean[level] - trials.predicted[level]) / (spread / np.sqrt(count))
         assert abs(z) < stats.norm.isf(familywise(len(noises)) / 2), f"at noise {noise.variance:g}"
@@ -335,7 +335,7 @@ def test_the_noise_alone_errs_as_predicted() -> None:
     z = (trials.from_noise.mean(axis=1) / trials.noise_part - 1) / (trials.spread / np.sqrt(count))
     assert np.abs(z).max() < limit
     for level, noise in enumerate(noises[:2]):  # Gaussian: the sample's deviation is known from the fourth cumulant
-        s2 = shown.form.values**2 / noise.variance
+        s2 = shown.squares / noise.variance
         weights = s2 / (1 + s2) ** 2
         excess = 12 * np.sum(weights**4) / np.sum(weights**2) ** 2
         deviation = trials.from_noise[level].std(ddof=1) / trials.noise_part[level]

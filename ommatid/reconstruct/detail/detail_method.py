@@ -44,7 +44,7 @@ class DetailMethod(Method):
         white = Whitening((slice(0, factor.shape[0]),), (np.asarray(factor),))
         problem = white.problem(model.matrix[task.used], task.prior_on(task.shape))
         recorded = white.vector(task.recorded[task.used])
-        return white, estimate(problem, recorded, task.settings.method, task.settings.tolerance)
+        return white, estimate(problem, recorded, task.settings.tolerance)
 
     def estimate_image(self) -> FloatArray:
         """Return f^ alone: (N,)."""

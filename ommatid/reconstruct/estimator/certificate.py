@@ -10,10 +10,6 @@ dominated by the rounding error of p. Then the distance is estimated with the fo
 with that only if it reproduces a random u and l to four digits; a form that loses a direction of the prior or of the
 measurements does not.
 
-The last resort is a form whose every solution is refined: if rows and columns of H both differ widely in size, a
-float64 factorisation may keep few digits of the smallest variances and still suffice for refinement to converge. It
-costs many solutions per pixel.
-
 The root L of a correlated prior is taken as exact. With the error E of L L^T as an approximation of P0, to first order,
 
     df = (I - A H) E H^T l,    dV_i = ((I - A H) E (I - A H)^T)_ii,
@@ -26,7 +22,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +50,6 @@ SIGN_DRAWS = 6  # for noise-free measurements: a single draw may by chance agree
 REPRODUCTION_STEPS = 4  # solutions after which measurements without noise must be met
 ROUNDING_MARGIN = 1e4  # times the rounding of double-double arithmetic: some 1e-26 of the values
 SAFETY = 10  # for variances, which are checked on a sample and added up by expected errors
-CHUNK = 256  # pixels solved together
 DRAWS = 4
 MARGIN = 2.0  # times the standard deviation of dV_i
 
@@ -124,13 +118,6 @@ def refine(
     return RefinedSolution(u.high, u.low, multipliers.high, bound, change + bound, steps)
 
 
-def exact_variances(form: Form, residuals: ExactResiduals, pixels: Indices) -> tuple[FloatArray, FloatArray]:
-    """Return accurate posterior variances of some pixels and bounds on their errors: (n,) each."""
-    images = np.zeros((form.problem.unknowns, pixels.size))
-    images[pixels, np.arange(pixels.size)] = 1.0
-    return exact_sums(form, residuals, exact(form.problem.prior.apply_root_transposed(images)))
-
-
 def exact_sums(form: Form, residuals: ExactResiduals, shift: DoubleDouble) -> tuple[FloatArray, FloatArray]:
     """Return accurate posterior variances of sums of pixels and bounds on their errors: (n,) each.
 
@@ -156,7 +143,7 @@ def variance_error(form: Form, residuals: ExactResiduals) -> float:
         if not np.isfinite(variance).all():
             return float("inf")
         pixels = sampled_pixels(variance, prior.variance)
-        accurate, uncertainty = exact_variances(form, residuals, pixels)
+        accurate, uncertainty = exact_sums(form, residuals, exact(form.problem.pixel_shift(pixels)))
         # A variance of 0 is right if the accurate one cannot be distinguished from 0.
         negligible = uncertainty <= NEGLIGIBLE_VARIANCE * prior.variance[pixels]
         zero = (variance[pixels] == 0) & (accurate <= uncertainty) & negligible
@@ -314,45 +301,6 @@ class _Certifier:
         rounding = self.system.rounding_errors(size, solution[1].high, shift, right.high)[1]
         noise_free = self.system.problem.noise_variance == 0
         return bool((np.abs(values[1]) <= ROUNDING_MARGIN * rounding)[noise_free].all())
-
-
-@dataclass(frozen=True)
-class RefinedForm(Form):
-    """The refined solutions of another form."""
-
-    form: Form
-    residuals: ExactResiduals
-
-    name: ClassVar[str] = "corrected"
-
-    def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the refined solution."""
-        refined = refine(self.form, self.residuals, shift, exact(residual))
-        return refined.coefficients, refined.multipliers
-
-    @cached_property
-    def _variances(self) -> tuple[FloatArray, FloatArray]:
-        pixels = np.arange(self.problem.unknowns)
-        blocks = [pixels[start : start + CHUNK] for start in range(0, pixels.size, CHUNK)]
-        values, errors = zip(*(exact_variances(self.form, self.residuals, block) for block in blocks), strict=True)
-        return np.maximum(np.concatenate(values), 0.0), np.concatenate(errors)
-
-    def variance(self) -> FloatArray:
-        """Return the refined posterior variances."""
-        return self._variances[0]
-
-    @property
-    def description(self) -> str:
-        """Name of the form that is refined."""
-        return f"{self.form.name}, corrected"
-
-    @property
-    def variance_error(self) -> float:
-        """A bound on the relative error of every posterior variance."""
-        variance, error = self._variances
-        error = np.where(error >= 0, error, np.inf)  # NaN counts as an unbounded error
-        relative = np.divide(error, variance, out=np.where(error > 0, np.inf, 0.0), where=variance > 0)
-        return float(relative.max(initial=0.0)) + last_digit(variance)
 
 
 def estimate_rounding(form: Form, u: FloatArray, multipliers: FloatArray) -> float:

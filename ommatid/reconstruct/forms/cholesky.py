@@ -21,7 +21,7 @@ from scipy import linalg, sparse
 from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem, gram
-from .form import Form, NotSolvableError, check_noise, multipliers, whitened_matrix
+from .form import Form, NotSolvableError
 
 
 @dataclass(frozen=True)
@@ -79,17 +79,15 @@ class Covariance(Form):
         return shift + self.problem.adjoint(multiplier), multiplier
 
     @cached_property
-    def _defect_and_gain(self) -> tuple[FloatArray, FloatArray]:
-        """I - L^T H^T C^-1 H L, (K, K), and C^-1 H L, (M, K)."""
-        dense = self.problem.dense_matrix()
+    def _variance(self) -> FloatArray:
+        dense, root = self.problem.dense_matrix(), self.problem.prior.apply_root
         gain = self.factor.solve(dense)
-        return np.eye(dense.shape[1]) - dense.T @ gain, gain
+        defect = np.eye(dense.shape[1]) - dense.T @ gain
+        return np.square(root(defect)).sum(axis=1) + np.square(root(gain.T * self.problem.deviation)).sum(axis=1)
 
     def variance(self) -> FloatArray:
         """Return the diagonal of (I - A H) P0 (I - A H)^T + A Rv A^T."""
-        defect, gain = self._defect_and_gain
-        root = self.problem.prior.apply_root
-        return np.square(root(defect)).sum(axis=1) + np.square(root(gain.T * self.problem.deviation)).sum(axis=1)
+        return self._variance
 
 
 def covariance(problem: Problem) -> Covariance:
@@ -114,9 +112,12 @@ class Information(Form):
     name: ClassVar[str] = "information"
 
     def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return u = (I + B^T B)^-1 (c + L^T H^T Rv^-1 r) and its multipliers."""
+        """Return u = (I + B^T B)^-1 (c + L^T H^T Rv^-1 r) and l = Rv^-1 (r - H L u)."""
         u = self.factor.solve(shift + self.problem.adjoint(residual / self.problem.noise_variance[:, None]))
-        return u, multipliers(self.problem, u, residual)
+        return u, self._multipliers(u, residual)
+
+    def _multipliers(self, u: FloatArray, residual: FloatArray | float) -> FloatArray:
+        return (residual - self.problem.forward(u)) / self.problem.noise_variance[:, None]
 
     @cached_property
     def inverse(self) -> FloatArray:
@@ -133,20 +134,20 @@ class Information(Form):
     def pixel_solutions(self, pixels: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
         """Take u from the inverse, which costs a third of solving for every pixel."""
         prior = self.problem.prior
-        root = prior.root[pixels]
-        u = self.inverse[:, pixels] * root if prior.independent else self.inverse @ root.T
-        return u, multipliers(self.problem, u, np.zeros((self.problem.measurements, u.shape[1])))
+        u = self.inverse[:, pixels] * prior.root[pixels] if prior.independent else self.inverse @ prior.root[pixels].T
+        return u, self._multipliers(u, 0.0)
 
 
 def information(problem: Problem) -> Information:
     """Factorise in information form. Raises NotSolvableError without noise, or if float64 does not suffice."""
-    check_noise(problem)
+    if not problem.noisy:
+        raise NotSolvableError("it needs noise in every measurement")
     if problem.prior.independent:
         scaled = sparse.csr_array(problem.matrix.multiply(1 / problem.deviation[:, None]))
         scaled = sparse.csr_array(scaled.multiply(problem.prior.root[None, :]))
         normal = gram(scaled)
     else:
-        whitened = whitened_matrix(problem)
+        whitened = problem.dense_matrix() / problem.deviation[:, None]
         normal = whitened.T @ whitened
     normal[np.diag_indices(normal.shape[0])] += 1.0
     if not np.isfinite(normal).all():

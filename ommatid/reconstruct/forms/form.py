@@ -1,4 +1,4 @@
-"""Interface of the algebraic forms of the estimator (Wood et al. 2005, Eq. 4 and 5).
+"""Interface of a factorised problem (Wood et al. 2005, Eq. 4 and 5).
 
 All forms solve one linear system. With f = f0 + L u and multipliers l,
 
@@ -48,39 +48,10 @@ class Form(ABC):
 
         |u|^2 is the prior's part of Eq. 5.
         """
-        unit = np.zeros((self.problem.unknowns, pixels.size))
-        unit[pixels, np.arange(pixels.size)] = 1.0
-        shift = self.problem.prior.apply_root_transposed(unit)
-        return self.solve(shift, np.zeros((self.problem.measurements, pixels.size)))
+        return self.solve(self.problem.pixel_shift(pixels), np.zeros((self.problem.measurements, pixels.size)))
 
     def gain(self, residual: FloatArray) -> FloatArray:
         """Apply A of Eq. 4 to residuals: (M,) to (N,), or (M, q) to (N, q)."""
         block = residual[:, None] if residual.ndim == 1 else residual
         u, _ = self.solve(np.zeros((self.problem.prior.dimension, block.shape[1])), block)
         return self.problem.prior.apply_root(u).reshape(self.problem.unknowns, *residual.shape[1:])
-
-
-def check_noise(problem: Problem) -> None:
-    """Raise NotSolvableError if a measurement has no noise."""
-    if not problem.noisy:
-        raise NotSolvableError("it needs noise in every measurement")
-
-
-def whitened_matrix(problem: Problem) -> FloatArray:
-    """Return B = S^-1 H L, (M, K). Raises NotSolvableError without noise, or beyond the range of float64."""
-    check_noise(problem)
-    dense = problem.dense_matrix()
-    whitened = np.divide(dense, problem.deviation[:, None], out=dense)
-    if not np.isfinite(whitened).all():
-        raise NotSolvableError("its matrix leaves the range of double precision")
-    return whitened
-
-
-def multipliers(problem: Problem, u: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return l = Rv^-1 (r - H L u): (M, q); needs noise in every measurement."""
-    return (residual - problem.forward(u)) / problem.noise_variance[:, None]
-
-
-def root_variance(problem: Problem, root: FloatArray) -> FloatArray:
-    """Return the diagonal of L T T^T L^T for a root T, (K, q): (N,), as sums of squares."""
-    return np.square(problem.prior.apply_root(root)).sum(axis=1)

@@ -21,13 +21,13 @@ DRAWS = 32  # of images and noise for the expected residual
 
 
 class DenseMethod(Method):
-    """Estimation by one of the six dense forms."""
+    """Estimation by the certified solver."""
 
     @cached_property
     def estimate(self) -> Estimate:
         """Image, multipliers and the form that computed them."""
         task = self.task
-        arguments = task.recorded[task.used], task.settings.method, task.settings.tolerance
+        arguments = task.recorded[task.used], task.settings.tolerance
 
         def first() -> Estimate:
             problem = Problem(task.model.matrix[task.used], task.prior_on(task.shape), task.expected_noise)

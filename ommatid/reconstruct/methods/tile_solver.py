@@ -18,8 +18,8 @@ from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.processors import one_thread
 from ommatid.scenes.tables.estimation import EstimatorTable
 
-from ..estimator.estimate import FORMS, estimate
-from ..expected_error import expected_error
+from ..estimator.estimate import estimate
+from ..expected_error import expected_error, squared_error
 from ..forms.form import Form
 from ..output.run_json import SolverReport
 from ..prior import Prior
@@ -117,8 +117,7 @@ class SolvedTiles:
 def solve_tiles(task: TileTask) -> SolvedTiles:
     """Factorise once and estimate every tile of a task. Raises InputError if no form reaches the tolerance."""
     problem = task.problem
-    method = task.settings.method if task.settings.method in FORMS else "auto"
-    first = estimate(problem, task.recorded[:, 0], method, task.settings.tolerance)
+    first = estimate(problem, task.recorded[:, 0], task.settings.tolerance)
     image = first.image[task.kept, None]
     if task.recorded.shape[1] > 1:
         residual = task.recorded - (problem.matrix @ problem.prior.mean)[:, None]
@@ -149,16 +148,14 @@ def _error_given(task: TileTask, form: Form, truth: FloatArray) -> FloatArray:
     deviation = truth - form.problem.prior.mean[:, None]
     bias = (deviation - form.gain(form.problem.matrix @ deviation))[task.kept]
     actual = np.sum(list(task.noise.values()), axis=0)
-    _, negative = form.pixel_solutions(task.kept)
-    noise_covariance = negative.T @ (actual[:, None] * negative)
-    own = 4 * np.einsum("it,it->t", bias, noise_covariance @ bias) + 2 * float(np.square(noise_covariance).sum())
-    return np.stack([np.square(bias).sum(axis=0) + float(np.trace(noise_covariance)), NEIGHBOURS * own])
+    mean, variance = squared_error(form, bias, actual, task.kept)
+    return np.stack([mean, NEIGHBOURS * variance])
 
 
 def transposed_gain(task: TileTask, weights: FloatArray) -> FloatArray:
     """Return A^T w of a tile: (n,) weights of its pixels to (m,)."""
     problem = task.problem
-    form = estimate(problem, task.recorded[:, 0], tolerance=task.settings.tolerance).form
+    form = estimate(problem, task.recorded[:, 0], task.settings.tolerance).form
     shift = problem.prior.apply_root_transposed(weights[:, None])
     _, negative = form.solve(shift, np.zeros((problem.measurements, 1)))
     return -negative[:, 0]

@@ -32,7 +32,7 @@ class RobustMethod(Method):
         white = whitening(camera, misaligned, task.expected_noise, task.used)
         problem = white.problem(misaligned.matrix[task.used], prior)
         recorded = white.vector(task.recorded[task.used])
-        return white, estimate(problem, recorded, task.settings.method, task.settings.tolerance)
+        return white, estimate(problem, recorded, task.settings.tolerance)
 
     def estimate_image(self) -> FloatArray:
         """Return f^ alone: (N,)."""

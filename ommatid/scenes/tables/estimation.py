@@ -12,6 +12,7 @@ from .units import AUTO, ExpectedNoise, Length, Memory, Samples, Time, pair
 
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
 WITHOUT_NOISE = 256  # samples where there is no noise that "auto" could compare with
+WITHDRAWN_FORMS = ("covariance", "information", "square-root-information", "square-root-covariance", "svd", "dual")
 IN_PLACE_OF_AUTO = 1024  # samples of what has no adaptive number of them, where render.samples is "auto"
 
 
@@ -121,6 +122,15 @@ class PriorTable(Table):
         return self
 
 
+def _check_method(method: object) -> object:
+    if method in WITHDRAWN_FORMS:
+        raise ValueError(
+            f"'{method}' is no longer a method: the solver chooses the algebraic form itself; take 'auto', which"
+            " certifies its result, or remove the key"
+        )
+    return method
+
+
 class EstimatorTable(Table):
     """Settings of the estimate of the image."""
 
@@ -134,21 +144,11 @@ class EstimatorTable(Table):
         le=LARGEST**2,
         description="assumed variance of every pixel, beside the actual prior.variance; absent: the same",
     )
-    method: Literal[
-        "auto",
-        "covariance",
-        "information",
-        "square-root-information",
-        "square-root-covariance",
-        "svd",
-        "dual",
-        "tiles",
-        "frame",
-    ] = Field(
+    method: Annotated[Literal["auto", "tiles", "frame"], BeforeValidator(_check_method)] = Field(
         default="auto",
-        description="a dense form, tiles, or a whole frame; auto: the cheapest accurate one",
+        description="tiles, or a whole frame; auto: one dense problem where it fits, else the cheapest accurate one",
     )
-    tolerance: float = Field(default=1e-8, gt=0, le=1, description="maximum relative error of a dense form")
+    tolerance: float = Field(default=1e-8, gt=0, le=1, description="maximum relative error of a dense problem")
     accuracy: float = Field(
         default=0.01, gt=0, le=1, description="largest numerical error of a frame, in posterior standard deviations"
     )

@@ -51,7 +51,8 @@ RIGHT, REFUSED, FEWER, SILENT = "right", "refused", "fewer digits, as stated", "
 class StabilityOutcome:
     """Result of one case.
 
-    form : that ran;  alone, refined, variance : correct digits of u from the form alone, of the refined u, of the worst variance
+    form : that ran
+    alone, refined, variance : correct digits of u from the form alone, of the refined u, of the worst variance
     bound, variance_bound : relative error bounds stated by the estimator;  reason : why the case was refused
     """
 
@@ -112,8 +113,8 @@ def _draw_sweep(panel: Any, points: list[SweepOutcome]) -> None:
         words = point.outcome.form or REFUSED
         panel.text(point.noise, -0.4, words, rotation=90, ha="center", va="top", fontsize=7, color="0.4")
     panel.set_xscale("log")
-    panel.set_ylim(-3.5, FLOAT64_DIGITS)
-    panel.set_yticks(range(0, int(FLOAT64_DIGITS) + 1, 2))
+    panel.set_ylim(-3.8, 12)
+    panel.set_yticks(range(0, 13, 2))
     panel.grid(visible=True, color="0.9")
     panel.axhline(FLOAT64_DIGITS - DIGITS, color="0.5", linewidth=1, linestyle=":")
     panel.text(1e-30, FLOAT64_DIGITS - DIGITS + 0.1, "nine digits left", fontsize=8, color="0.4", va="bottom")

@@ -32,7 +32,6 @@ from ommatid.bench.reference import reference, sample_plan
 from ommatid.bench.slopes import Slope, curves, excess, pareto_front, recommend, slope
 from ommatid.bench.table import AUTO, CSV, JSON, BenchTable, Cell, Quantiles, Stage, read, row_of, write
 from ommatid.pipeline.stages import open_scene
-from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 
@@ -242,7 +241,7 @@ def test_every_sampler_method_and_solver_is_measured(subject: Subject) -> None:
     assert len(set(names)) == len(names)
     assert {job.way for job in listed if job.stage == "render"} == set(SAMPLERS)
     assert {"points, multijitter"} <= {job.way for job in listed if job.stage == "calibrate"}
-    assert {"information", "dual", "tiles"} <= {job.way for job in listed if job.stage == "reconstruct"}
+    assert {"dense", "tiles"} <= {job.way for job in listed if job.stage == "reconstruct"}
     assert all(skipped.why for skipped in left_out)
     counts = {job.samples for job in listed if (job.stage, job.way) == ("render", "multijitter")}
     assert counts == {4, 16, 64, 256, 1024, 4096, 16384, None}
@@ -290,10 +289,9 @@ def check(table: BenchTable, document: dict[str, object]) -> None:
 
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two samplers with few samples and one form: seconds on any machine."""
+    """Two samplers with few samples: seconds on any machine."""
     monkeypatch.setattr("ommatid.bench.cells.SAMPLES", (4, 16, 64))
     monkeypatch.setattr("ommatid.bench.cells.SAMPLERS", ("independent", "ldsampler"))
-    monkeypatch.setattr("ommatid.bench.precision.FORMS", {"information": FORMS["information"]})
 
 
 @pytest.mark.slow
@@ -305,7 +303,7 @@ def test_the_command_writes_its_table_and_repeats_nothing(ommatid: Command, here
     check(table, json.loads(ended.out))
     assert {measured.stage for measured in table.cells} == {"render", "calibrate", "reconstruct"}
     assert not any(skipped.late for skipped in table.left_out)
-    assert "information" in (here / "out" / CSV).read_text(encoding="utf-8")
+    assert "dense" in (here / "out" / CSV).read_text(encoding="utf-8")
     assert {path.name for path in (here / "out").iterdir()} == {JSON, CSV, *FIGURES}
     before = (here / "out" / JSON).stat().st_mtime_ns
     again = ommatid("bench", "tiny.toml", "-o", "out", "--set", "render.samples=64")

@@ -39,7 +39,7 @@ RATIOS = (
 )
 TEXTS = _quoted(
     "| |fit|auto|\\u0000|a\\u0000b.png|😀|\\u202e|[red]|\\n\\n|photo:|photo:../x|photo:camera|.|/|/dev/null|../.."
-    "|scene.toml|frame|svd|ideal|transport|exponential|power",
+    "|scene.toml|frame|tiles|ideal|transport|exponential|power",
     *("\\u001b[31mred", "\\u001b]0;title\\u0007", "\\u009b2J", "\\u2028", "$\\\\frac$", "/dev/zero", "mosaic.npy"),
     *("x" * 300, "x" * 100000),
 )

@@ -128,7 +128,7 @@ def test_the_cost_of_misalignment_is_that_of_images_with_the_actual_variance() -
     camera = replace(derive(described(50.0)), tolerance=tolerance(0))
     assumed, actual = (independent(127.5, variance, 144) for variance in (50.0, ACTUAL))
     matrix = ideal_matrix(camera)
-    form, _ = factorise(Problem(matrix, assumed, np.full(camera.measurements, NOISE)), "auto", 1e-8)
+    form, _ = factorise(Problem(matrix, assumed, np.full(camera.measurements, NOISE)))
     added = float(misalignment_variance(form, np.ones(camera.measurements, dtype=np.bool_), camera, actual).mean())
     rng, differences = np.random.default_rng(0), []
     for seed in range(300):

@@ -1,4 +1,4 @@
-"""Eq. 5 against the errors of images drawn from the prior, for every form; and the diagnostics beside it."""
+"""Eq. 5 against the errors of images drawn from the prior, by every form; and the diagnostics beside it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_eq_5_is_the_covariance_of_the_error_by_every_form(lenses: int) -> None:
     matrix, noise = ideal_matrix(small), np.random.default_rng(7).uniform(0.3, 0.7, small.measurements)
     known = Problem(matrix, independent(127.5, 5461.25, 144), noise)
     for form in FORMS:
-        factorised, _ = factorise(known, form)
+        factorised = FORMS[form](known)
         gain = factorised.gain(np.eye(small.measurements))
         hidden = np.eye(144) - gain @ matrix.toarray()
         missing = 5461.25 * hidden @ hidden.T

@@ -39,7 +39,7 @@ def restored_by(method: str, stack: Stack, model: Model, truth: FloatArray | Non
 
 def both(stack: Stack, model: Model, truth: FloatArray | None) -> tuple[Reconstruction, Reconstruction]:
     """The dense estimate and that of the whole frame."""
-    dense, frame = (restored_by(method, stack, model, truth) for method in ("information", "frame"))
+    dense, frame = (restored_by(method, stack, model, truth) for method in ("auto", "frame"))
     assert frame.solver.method == "frame"
     return dense, frame
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from ommatid.reconstruct.estimator.estimate import estimate, factorise
+from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.expected_error import bias_of, variance_of_sum
+from ommatid.reconstruct.forms.cholesky import covariance
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.errors import InputError
@@ -62,12 +63,6 @@ def test_entries_at_the_ends_of_float64(size: float) -> None:
     )
     recorded = size * np.array([200.0, 150.0, 120.0])
     assert _excess(problem, recorded) <= 1
-    for form in ("svd", "dual", "information"):
-        try:
-            solution = estimate(problem, recorded, form)
-        except InputError:
-            continue
-        assert relative_error(solution.coefficients, rational_answer(problem, recorded).coefficients) < 1e-9
 
 
 @pytest.mark.parametrize("mean", [0.0, 127.5, 1e4, 1e8, 1e10])
@@ -85,7 +80,7 @@ def test_error_bars_keep_their_digits(noise: float) -> None:
     """80 pixels, each seen by its own measurement: variance and bias of a sum in closed form."""
     count = 80
     problem = Problem(sparse.csr_array(np.eye(count)), independent(0.0, 4.0, count), np.full(count, noise))
-    form, _ = factorise(problem, "covariance")
+    form = covariance(problem)
     posterior = noise / (1 + noise / 4)
     weights = np.full(count, 1 / count)
     assert variance_of_sum(form, weights, problem.noise_variance) == pytest.approx(posterior / count, rel=1e-9)
@@ -105,4 +100,4 @@ def test_the_rounding_of_a_nearly_singular_prior_counts() -> None:
             continue
         with pytest.raises(InputError, match="nearly singular"):
             estimate(problem, recorded)
-        assert estimate(problem, recorded, tolerance=1e-4).solver.variance_bound > 1e-7
+        assert estimate(problem, recorded, 1e-4).solver.variance_bound > 1e-7

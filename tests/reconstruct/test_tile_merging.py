@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from ommatid.reconstruct.forms.dual import Indices
+from ommatid.reconstruct.forms.square_root import Indices
 from ommatid.reconstruct.methods.tile_merging import (
     Posterior,
     disjoint_tiles,

@@ -26,7 +26,7 @@ def report_of(**spent: object) -> RunReport:
             "error": given,
             "solver": {
                 "way": "dense",
-                "method": "svd",
+                "method": "information",
                 "why": "",
                 "condition": 1.0,
                 "digits": 15.0,

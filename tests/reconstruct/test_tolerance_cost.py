@@ -34,7 +34,7 @@ def tolerated(tolerance: dict[str, float | str]) -> Camera:
 
 def cost_of(camera: Camera, variance: float = 1e-2) -> float:
     prior, used = independent(127.5, 5461.25, camera.unknowns), np.ones(camera.measurements, dtype=np.bool_)
-    form, _ = factorise(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, variance)), "auto", 1e-8)
+    form, _ = factorise(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, variance)))
     return float(misalignment_variance(form, used, camera, prior).mean())
 
 

@@ -85,7 +85,7 @@ def test_frames_and_tiles_expect_the_residual_of_the_dense_estimate(method: str)
     described = wide(FRAME, noise={"variance": NOISE}, tiles={"size": 24, "overlap": 6})
     truth = 127.5 + np.random.default_rng(0).normal(0, P0**0.5, FRAME[0] * FRAME[1])
     results: list[Reconstruction] = []
-    for name in ("information", method):
+    for name in ("auto", method):
         settings = described.estimator.model_copy(update={"method": name, "accuracy": 1e-6})
         changed = described.model_copy(update={"estimator": settings})
         results.append(restore(recorded(changed, truth, NOISE), ideal_model(changed, derive(changed)), truth))

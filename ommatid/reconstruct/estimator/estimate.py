@@ -24,6 +24,7 @@ from ommatid.runtime.memory import free_memory
 from ..forms.cholesky import covariance, information
 from ..forms.dual import dual
 from ..forms.form import Form, NotSolvableError
+from ..forms.square_root import square_root
 from ..output.run_json import RejectedForm, SolverReport
 from ..problem import Problem
 from .certificate import RefinedSolution, estimate_rounding, refine, variance_error, variance_rounding
@@ -35,7 +36,12 @@ EPS = float(np.finfo(np.float64).eps)
 CONTRADICTION = 1e-6  # relative misfit of noise-free measurements; the precision of float32 files
 USEFUL_BOUND = 1e-3  # bound below which an estimate shows whether noise-free measurements are met
 UNKNOWN_BOUND = 10.0  # bound above which u is unknown, and with it which measurements contradict
-FORMS: dict[str, Callable[[Problem], Form]] = {"information": information, "covariance": covariance, "dual": dual}
+FORMS: dict[str, Callable[[Problem], Form]] = {
+    "information": information,
+    "covariance": covariance,
+    "square-root": square_root,
+    "dual": dual,
+}
 
 
 def needed_memory(measurements: int, unknowns: int, *, correlated: bool = False) -> int:
@@ -49,6 +55,7 @@ def _memory(form: str, measurements: int, unknowns: int, correlated: bool) -> in
     matrix = {
         "covariance": 3 * measurements**2 + 2 * measurements * unknowns + 2 * unknowns**2,
         "information": 7 * unknowns**2,
+        "square-root": 4 * both * unknowns + 2 * unknowns**2,
         "dual": 5 * measurements * both + 4 * both * unknowns,
     }
     return 8 * (matrix[form] + (4 * unknowns**2 if correlated else 0))
@@ -119,9 +126,9 @@ def _chain(problem: Problem) -> tuple[list[str], str]:
     if not problem.noisy:
         return ["dual"], "some measurements have no noise"
     if problem.measurements < problem.prior.dimension:
-        return ["covariance", "dual"], "fewer measurements than unknowns"
+        return ["covariance", "square-root", "dual"], "fewer measurements than unknowns"
     # If the information form fails, H has a null space, which the covariance form tolerates.
-    return ["information", "covariance", "dual"], "no fewer measurements than unknowns"
+    return ["information", "covariance", "square-root", "dual"], "no fewer measurements than unknowns"
 
 
 def _certified(
@@ -161,7 +168,7 @@ def _factorised(name: str, problem: Problem) -> Form:
         raise NotSolvableError(f"it needs {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free")
     with np.errstate(all="ignore"):  # the certificate detects overflow
         form = FORMS[name](problem)
-    if name != "dual" and form.condition * EPS > 10**-LEAST_DIGITS:
+    if name in ("information", "covariance") and form.condition * EPS > 10**-LEAST_DIGITS:
         raise NotSolvableError(f"a condition number of {form.condition:.1e} leaves no digits")
     return form
 

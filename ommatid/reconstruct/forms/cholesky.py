@@ -21,7 +21,7 @@ from scipy import linalg, sparse
 from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem, gram
-from .form import Form, NotSolvableError
+from .form import Form, NotSolvableError, check_noise, multipliers
 
 
 @dataclass(frozen=True)
@@ -114,10 +114,7 @@ class Information(Form):
     def solve(self, shift: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return u = (I + B^T B)^-1 (c + L^T H^T Rv^-1 r) and l = Rv^-1 (r - H L u)."""
         u = self.factor.solve(shift + self.problem.adjoint(residual / self.problem.noise_variance[:, None]))
-        return u, self._multipliers(u, residual)
-
-    def _multipliers(self, u: FloatArray, residual: FloatArray | float) -> FloatArray:
-        return (residual - self.problem.forward(u)) / self.problem.noise_variance[:, None]
+        return u, multipliers(self.problem, u, residual)
 
     @cached_property
     def inverse(self) -> FloatArray:
@@ -135,13 +132,12 @@ class Information(Form):
         """Take u from the inverse, which costs a third of solving for every pixel."""
         prior = self.problem.prior
         u = self.inverse[:, pixels] * prior.root[pixels] if prior.independent else self.inverse @ prior.root[pixels].T
-        return u, self._multipliers(u, 0.0)
+        return u, multipliers(self.problem, u, 0.0)
 
 
 def information(problem: Problem) -> Information:
     """Factorise in information form. Raises NotSolvableError without noise, or if float64 does not suffice."""
-    if not problem.noisy:
-        raise NotSolvableError("it needs noise in every measurement")
+    check_noise(problem)
     if problem.prior.independent:
         scaled = sparse.csr_array(problem.matrix.multiply(1 / problem.deviation[:, None]))
         scaled = sparse.csr_array(scaled.multiply(problem.prior.root[None, :]))

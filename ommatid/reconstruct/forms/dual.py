@@ -12,50 +12,16 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from ommatid.runtime.arrays import FloatArray
 
 from ..problem import Problem
-from .form import Form
-
-Indices = NDArray[np.intp]
+from .form import Form, root_variance
+from .square_root import Indices, SortedQr, sorted_qr
 
 EPS = float(np.finfo(np.float64).eps)
 SCALING_SWEEPS = 30
-
-
-@dataclass(frozen=True)
-class SortedQr:
-    """A, (m, n), m >= n: A[rows][:, pivots] = Q R with (m, n) `orthogonal` and (n, n) `triangle`."""
-
-    orthogonal: FloatArray
-    triangle: FloatArray
-    rows: Indices
-    pivots: Indices
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return the x that minimises |A x - b|: (m, q) to (n, q)."""
-        solution = np.empty((self.pivots.size, right.shape[1]))
-        projected = self.orthogonal.T @ right[self.rows]
-        solution[self.pivots] = linalg.solve_triangular(self.triangle, projected, check_finite=False)
-        return solution
-
-    def inverse(self) -> FloatArray:
-        """Return R^-1 with rows in the order of A's columns: a root T of (A^T A)^-1 = T T^T, (n, n)."""
-        inverse = np.empty_like(self.triangle)
-        lapack: Any = linalg.lapack
-        inverse[self.pivots], _ = lapack.dtrtri(self.triangle)
-        return inverse
-
-
-def sorted_qr(matrix: FloatArray) -> SortedQr:
-    """Decompose A."""
-    rows = np.argsort(-np.abs(matrix).max(axis=1, initial=0.0), kind="stable")
-    qr: Any = linalg.qr
-    orthogonal, triangle, pivots = qr(matrix[rows], mode="economic", pivoting=True, check_finite=False)
-    return SortedQr(orthogonal, triangle, rows, pivots)
 
 
 @dataclass(frozen=True)
@@ -105,7 +71,7 @@ class Dual(Form):
         root = np.zeros((dimension + self.active.size, self.free.size))
         root[self.free] = inverse
         root[self.basic] = -self.weights @ inverse
-        return np.square(self.problem.prior.apply_root(root[:dimension])).sum(axis=1)
+        return root_variance(self.problem, root[:dimension])
 
 
 def dual(problem: Problem) -> Dual:

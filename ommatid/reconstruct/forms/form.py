@@ -55,3 +55,19 @@ class Form(ABC):
         block = residual[:, None] if residual.ndim == 1 else residual
         u, _ = self.solve(np.zeros((self.problem.prior.dimension, block.shape[1])), block)
         return self.problem.prior.apply_root(u).reshape(self.problem.unknowns, *residual.shape[1:])
+
+
+def check_noise(problem: Problem) -> None:
+    """Raise NotSolvableError if a measurement has no noise."""
+    if not problem.noisy:
+        raise NotSolvableError("it needs noise in every measurement")
+
+
+def multipliers(problem: Problem, u: FloatArray, residual: FloatArray | float) -> FloatArray:
+    """Return l = Rv^-1 (r - H L u): (M, q); needs noise in every measurement."""
+    return (residual - problem.forward(u)) / problem.noise_variance[:, None]
+
+
+def root_variance(problem: Problem, root: FloatArray) -> FloatArray:
+    """Return the diagonal of L T T^T L^T for a root T, (K, q): (N,), as sums of squares."""
+    return np.square(problem.prior.apply_root(root)).sum(axis=1)

@@ -31,7 +31,7 @@ from scipy import linalg, sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 
-from ..forms.dual import Indices, sorted_qr
+from ..forms.square_root import Indices, sorted_qr
 from ..problem import Problem
 
 ROUNDING = 64 * float(np.finfo(np.float64).eps)  # of sums of products, including earlier losses in T

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ommatid.reconstruct.detail.detailed_model import independent_detail, model_of_f
+from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.reconstruct.expected_error import ExpectedError
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance
@@ -70,7 +70,7 @@ def for_prior(setup: Setup) -> StoppingRule:
         random = probe(Purpose.GOAL).normal(size=model.unknowns)
         shared = model.error_variance(prior.mean + prior.variance**0.5 * random)
         from_model = from_model if shared is None else from_model + shared
-        causes = {"noise": noise[used], "calibration": from_model[used], **independent_detail(model, used)}
+        causes = {"noise": noise[used], "calibration": from_model[used]}
         setting = scene.estimator.noise_variance
         recorded = model.forward(np.full(model.unknowns, prior.mean))
         method = METHODS[choose_method(scene, camera, exact=model.has_boxes or model.stored is None).method]
@@ -86,6 +86,7 @@ def for_prior(setup: Setup) -> StoppingRule:
                 scene.estimator,
                 scene.tiles,
                 scene.prior_ratio,
+                finer=model.camera.rows // camera.rows,
             )
             return method(task, Execution()).result(noise, None).expected
 

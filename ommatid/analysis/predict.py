@@ -60,7 +60,7 @@ def predict_ideal(scene: Scene) -> Prediction:
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.method != "dense" or camera.has_detail:
         model = model_of_f(ideal_model(scene, camera.with_grid_of_matrix), camera, scene.prior)
-        return replace(predict_frame(choice, model, actual), assumes=_ideal_assumptions(setup))
+        return replace(predict_frame(choice, model, camera, actual), assumes=_ideal_assumptions(setup))
     prior = prior_of(scene.assumed_prior, camera.shape, camera.target_pitch, camera.detail)
     added = None
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":

@@ -13,7 +13,7 @@ from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
 
 from .detail.detail_method import DetailMethod
-from .detail.detailed_model import detail_memory, is_exact_for
+from .detail.detailed_model import detail_memory, has_moments
 from .estimator.estimate import needed_memory
 from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
 from .frame.error_map import window_memory
@@ -55,9 +55,7 @@ def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
     allowed = allowed_memory(scene.estimator.memory)
     if scene.estimator.misalignment != "trust":
         return _misaligned(scene, camera, exact, allowed)
-    names, why = _candidates(scene, camera, exact)
-    if names[0] == "dense" and is_exact_for(scene, camera):
-        names = ["detail", *names[1:]]
+    names, why = _of_world(scene, camera) or _candidates(scene, camera, exact)
     memory = {name: _memory(name, scene, camera, exact) for name in names}
     for name in names:
         if memory[name] <= allowed:
@@ -68,6 +66,20 @@ def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
         f" {allowed / 1e9:.1f} GB are allowed; raise estimator.memory, or crop the target with target.origin and"
         " target.shape"
     )
+
+
+def _of_world(scene: Scene, camera: Camera) -> tuple[list[str], str] | None:
+    """Return the method for a world finer than f of which the prior says something, and why; None without one."""
+    if not camera.has_detail or scene.prior.kind == "independent":
+        return None
+    if has_moments(camera):
+        return ["detail"], "the world is finer than f, and the moments of its detail are matrices"
+    if scene.estimator.method not in ("auto", "frame"):
+        raise InputError(
+            f"{scene.source}: estimator.method '{scene.estimator.method}' does not serve {camera.unknowns} pixels in"
+            " front of a world finer than f; set it to 'auto'"
+        )
+    return ["frame"], f"{camera.unknowns} pixels in front of a world finer than f"
 
 
 def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], str]:

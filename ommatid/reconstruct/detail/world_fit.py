@@ -131,16 +131,13 @@ def world_evidence(task: EstimationTask) -> WorldEvidence:
         )
     kept = np.isin(model.fine.windowed.measurements_inside(rows, columns), inside)
     matrix = sparse.csr_array(model.fine.windowed.submatrix(rows, columns)[kept])
-    residual = task.recorded[inside] + model.offset[inside] - model.fine.matrix[inside] @ _mean(model, task)
+    of_mean = model.fine.forward(np.full(model.fine.unknowns, task.prior.mean))
+    residual = (task.recorded + model.offset - of_mean)[inside]
     deviation = np.sqrt(task.on_all_measurements(task.expected_noise, 1.0)[inside])
     whitened = sparse.csr_array(sparse.diags_array(1 / deviation) @ matrix)
     detail = model.camera.detail
     shape = (rows.stop - rows.start) // detail, (columns.stop - columns.start) // detail
     return WorldEvidence(whitened, residual / deviation, shape, detail)
-
-
-def _mean(model: DetailedModel, task: EstimationTask) -> FloatArray:
-    return np.full(model.fine.unknowns, task.prior.mean)
 
 
 def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slice, IntArray]:

@@ -89,25 +89,27 @@ class ExactVariances:
 
     noise : (M,) Rvm / Rv^2, None where the actual noise Rvm is the expected one
     accuracy : that of solutions in posterior standard deviations, if EXACT is out of reach
+    task : whose unknowns may be finer than f's pixels
     """
 
     system: FrameSystem
     noise: FloatArray | None
     accuracy: float
+    task: EstimationTask
 
     def at(self, pixels: Pixels, posterior: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return Eq. 5 of pixels whose errors are not correlated, (n,); posterior : (N,) about the diagonal of C."""
         signs = np.zeros_like(posterior)
         signs[pixels] = rng.choice([-1.0, 1.0], size=pixels.size)
         finest = EXACT * float(np.sqrt(posterior[pixels].min()))
-        solved = self._solve(signs, finest)
+        solved = self._solve(self.task.of_unknowns(signs), finest)
         if self.noise is not None:
             readings = self.system.observation.forward(solved)
             readings *= self.noise
             right = self.system.observation.adjoint(readings) + self.system.apply_prior_precision(solved)
-            smallest = float(np.min((signs * solved)[pixels]))
+            smallest = float(np.min((signs * self.task.of_f(solved))[pixels]))
             solved = self._solve(right, min(finest, EXACT * max(smallest, 0.0) / float(posterior.max()) ** 0.5))
-        return (signs * solved)[pixels]
+        return (signs * self.task.of_f(solved))[pixels]
 
     def _solve(self, right: FloatArray, accuracy: float) -> FloatArray:
         try:
@@ -241,7 +243,7 @@ class ErrorMap:
         noise = None
         if not self.as_expected:
             noise = self.system.weights**2 * self.task.on_all_measurements(self.actual, 0.0)
-        exact = ExactVariances(self.system, noise, self.task.settings.accuracy)
+        exact = ExactVariances(self.system, noise, self.task.settings.accuracy, self.task)
         local = isinstance(self.system.prior, float) and not isinstance(self.system, BandedSystem)
         local = local and not leaves_null_space(self.task.model.camera)
         return check_map(self.variance, self.maps.posterior.ravel(), self.task.shape, exact, local=local)

@@ -256,6 +256,19 @@ class KernelFootprints(ObservationPart):
         check_memory(ENTRY * self.entries, "H with its entries", "crop the target")
         return self._chunked(np.arange(self.measurements))
 
+    def coarser(self, camera: Camera, detail: int) -> KernelFootprints:
+        """Return H of images of `detail` times larger pixels; camera : on their grid."""
+        (lens_type,) = (each for each in camera.types if each.name == self.places.lens_type.name)
+        places = KernelPlaces(camera, lens_type, -(-self.places.margin // detail))
+        beside = detail * places.margin - self.places.margin
+        parts = [
+            np.pad(kernels, ((0, 0), (beside, beside), (beside, beside)))
+            .reshape(-1, places.width, detail, places.width, detail)
+            .sum(axis=(2, 4))
+            for kernels in (self.kernels, self.error_kernels)
+        ]
+        return replace(self, places=places, kernels=parts[0], error_kernels=parts[1])
+
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Return the indices of the measurements whose kernels lie inside a window of f as a whole."""
         inside = [

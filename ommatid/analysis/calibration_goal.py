@@ -73,7 +73,7 @@ def for_prior(setup: Setup) -> StoppingRule:
         causes = {"noise": noise[used], "calibration": from_model[used]}
         setting = scene.estimator.noise_variance
         recorded = model.forward(np.full(model.unknowns, prior.mean))
-        method = METHODS[choose_method(scene, camera, exact=model.has_boxes or model.stored is None).method]
+        method = METHODS[choose_method(scene, camera, exact=model.is_applied).method]
 
         def expected(noise: Noise) -> ExpectedError:
             assumed = uniform(setting, int(used.sum())) if isinstance(setting, float) else total_variance(noise)

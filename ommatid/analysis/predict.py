@@ -54,7 +54,7 @@ def predict_ideal(scene: Scene) -> Prediction:
     """Predict the error of a scene with the ideal H. Raises InputError where the estimator takes a recorded stack."""
     setup = Setup.from_scene(scene)
     camera = setup.camera
-    choice = choose_method(scene, camera, exact=camera.may_be_applied)
+    choice = choose_method(scene, camera, exact=camera.is_applied)
     actual = expected_noise(setup)
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")

@@ -126,7 +126,7 @@ def _camera(setup: Setup) -> _Camera:
     scene, simulated = setup.scene, setup.simulated
     calibrated = scene.calibration.method != "ideal"
     boxes = setup.camera.has_box_footprints and simulated.tolerance is None and setup.has_closed_form
-    if boxes and (setup.has_structured_matrix or explains(setup)):
+    if boxes and (setup.is_applied or explains(setup)):
         return _Camera(ideal_model(scene, setup.camera), None, ())
     plans = pilot.calibration_plans(setup)
     uncertain = pilot.pilot(setup, plans) if calibrated and not explains(setup) else None

@@ -48,7 +48,7 @@ class StudyFile(Record):
 def check_study(scene: Scene, camera: Camera) -> None:
     """Raise InputError where a study names a model with which this camera cannot be reconstructed."""
     for name in () if scene.study is None else scene.study.models:
-        choose_method(_with_misalignment(scene, name), camera, camera.may_be_applied)
+        choose_method(_with_misalignment(scene, name), camera, camera.is_applied)
         if name == "true" and camera.tolerance is not None and not camera.has_sharp_footprints:
             raise InputError(
                 f"{scene.source}: study.models: the 'true' H of misaligned lenses with surfaces or blur has no closed"

@@ -115,8 +115,7 @@ class ObservedStack:
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:
     """Return True if H is applied without being stored; methods for misalignment start from H as designed."""
     trusted = stack.scene.estimator.misalignment == "trust"
-    applied = model.has_boxes or model.stored is None
-    return (applied if trusted else model.is_exact) and not stack.camera.has_detail
+    return (model.is_applied if trusted else model.is_exact) and not stack.camera.has_detail
 
 
 @dataclass(frozen=True)

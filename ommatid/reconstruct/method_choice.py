@@ -49,9 +49,10 @@ class MethodChoice:
 def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
     """Choose the cheapest method with the accuracy that `estimator` asks for.
 
-    exact : whether H is that of an ideal camera
+    exact : whether H is applied by boxes and kernels
     Raises InputError where no method fits into memory.
     """
+    exact = exact and not camera.has_detail  # the model of f has entries
     allowed = allowed_memory(scene.estimator.memory)
     if scene.estimator.misalignment != "trust":
         return _misaligned(scene, camera, exact, allowed)
@@ -86,7 +87,7 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
     """Return methods in the order of preference, and why the first one is."""
     estimator = scene.estimator
     noiseless = estimator.noise_variance == 0 or (estimator.noise_variance is None and exact and not _has_noise(scene))
-    if exact and not camera.has_box_footprints:
+    if exact and camera.is_sliding and not camera.has_box_footprints:
         if estimator.method not in ("auto", "frame"):
             raise InputError(
                 f"{scene.source}: estimator.method '{estimator.method}' takes H with its entries, and blurred lenses"

@@ -81,7 +81,7 @@ def read(path: Path) -> Model:
         if "data" in arrays:
             matrix = csr_matrix(arrays, shape)
         fitted = _fitted(arrays, Setup(scene, camera).simulated)
-        if matrix is None and fitted is None and not (method == "ideal" and camera.needs_no_entries):
+        if matrix is None and fitted is None and not (method == "ideal" and camera.is_applied):
             raise ValueError("it has no entries")
     except InputError:
         raise

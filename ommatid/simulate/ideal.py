@@ -17,7 +17,7 @@ from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType, SubImager
-from ommatid.scenes.model import Model, designed_observation, is_applied
+from ommatid.scenes.model import Model, designed_observation, is_stored
 from ommatid.scenes.optics.boxes import overlap
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
@@ -96,8 +96,8 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
 
 def ideal_model(scene: Scene, camera: Camera) -> Model:
     """Return the ideal H as a model without uncertainty; by boxes and kernels it is stored only while it is small."""
-    applied = is_applied(camera, designed_observation(camera))
-    return exact_model(scene, camera, None if applied else ideal_matrix(camera), "ideal")
+    stored = is_stored(designed_observation(camera))
+    return exact_model(scene, camera, ideal_matrix(camera) if stored else None, "ideal")
 
 
 def exact_model(scene: Scene, camera: Camera, matrix: sparse.csr_array | None, method: str) -> Model:

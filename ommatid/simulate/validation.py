@@ -44,14 +44,14 @@ def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
     scene, camera, world = setup.scene, setup.calibrated.camera, setup.world.camera
     rendering = SENSOR * camera.measurements + TARGET * world.unknowns
     check_memory(rendering, "rendering", "make target.shape or the lens arrays smaller")
-    if not calibrates or setup.may_be_applied:
+    if not calibrates or setup.is_applied:
         return
     entries = [
         lens_type.measurements * min(_visible_pixels(camera, lens_type), camera.unknowns) for lens_type in camera.types
     ]
     needed = ENTRY * sum(entries) + (SWEPT * max(entries) if scene.calibration.method == "points" else 0)
     remedy = "crop the target or use fewer sub-imagers"
-    if setup.camera.may_be_applied:
+    if setup.camera.is_applied:
         remedy = f"set calibration.method to 'ideal', whose kernels need no entries, or {remedy}"
     check_memory(needed, f"H of {camera.measurements} x {camera.unknowns}", remedy)
 

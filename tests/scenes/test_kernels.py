@@ -11,7 +11,8 @@ from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_k
 from ommatid.scenes.observation import Observation
 from ommatid.scenes.optics.boxes import designed_box
 from ommatid.simulate.ideal import ideal_matrix
-from tests.examples import THREE, camera
+from tests.examples import THREE, camera, with_optics
+from tests.frames import observed
 
 CAMERA = camera()
 
@@ -104,6 +105,33 @@ def test_information_of_a_box_as_a_kernel(margin: int) -> None:
             np.testing.assert_allclose(
                 part.edge_information(axis, strip), box.edge_information(axis, strip), atol=1e-12
             )
+
+
+FINE = {
+    "the world of m x m one pixel apart": ((("1/3", [3, 3], [5, 5]),), 2, {}),
+    "three times finer": ((("1/2", [2, 2], [5, 6]),), 3, {}),
+    "fractional ratios of a world": ((("2/5", [2, 3], [4, 4]),), 2, {"focus": "900 mm"}),
+    "other arrays and steps": ((("1/3", [2, 4], [4, 2]),), 1, {"focus": "900 mm"}),
+}
+
+
+@pytest.mark.parametrize("kind", FINE)
+def test_thin_lenses_have_kernels_on_every_grid(kind: str) -> None:
+    lenses, detail, optics = FINE[kind]
+    _, made = with_optics({"aperture": "2 mm", **optics}, {"lens_pitch": "4 mm"}, lenses, (19, 19))
+    fine = replace(made, detail=detail).world
+    observation, expected = observed(fine), ideal_matrix(fine)
+    assert abs(observation.to_sparse() - expected).max() < 1e-9 * expected.max()
+    image, readings = (np.random.default_rng(seed).normal(size=size) for seed, size in enumerate(expected.shape[::-1]))
+    np.testing.assert_allclose(observation.forward(image), expected @ image, atol=1e-12 * fine.unknowns)
+    assert readings @ observation.forward(image) == pytest.approx(observation.adjoint(readings) @ image, rel=1e-10)
+
+
+def test_steered_lenses_have_kernels_of_their_own() -> None:
+    table = {"aperture": "2 mm", "sub_imager": [{"at": [0, 1], "window": [1, 2]}]}
+    _, made = with_optics(table, {"lens_pitch": "4 mm"}, (("1/3", [2, 2], [4, 4]),), (19, 19))
+    expected = ideal_matrix(made)
+    assert abs(observed(made).to_sparse() - expected).max() < 1e-9 * expected.max()
 
 
 def test_kernels_are_read_as_they_were_described() -> None:

@@ -88,8 +88,8 @@ class KernelPlaces:
 
     @cached_property
     def scale(self) -> float:
-        """The largest distance from the axis along an axis."""
-        return max(float(np.abs(beside).max()) for beside in self._beside)
+        """The largest distance from the axis along an axis, at least a pixel."""
+        return max(1.0, *(float(np.abs(beside).max()) for beside in self._beside))
 
     @property
     def field(self) -> tuple[FloatArray, FloatArray]:

@@ -58,7 +58,7 @@ class Readings:
 
     def matrix(self, shape: tuple[int, int], detail: int) -> sparse.csr_array:
         """Return the readings as a matrix on a world of this shape: (readings, its pixels)."""
-        places = [
+        places: list[IntArray] = [
             (first + detail * np.arange(count))[:, None] + np.arange(length)
             for first, count, length in zip(self.first, self.count, self.kernel.shape, strict=True)
         ]
@@ -105,9 +105,7 @@ class Bands:
         """Return the transfer function of readings with the signs and the norms of the aliases."""
         lengths = readings.kernel.shape
         waves = [_waves(size, self.detail, length) for size, length in zip(self.shape, lengths, strict=True)]
-        norms = [
-            _norms(size, self.detail, readings.is_odd(axis, self.detail)) for axis, size in enumerate(self.shape)
-        ]
+        norms = [_norms(size, self.detail, readings.is_odd(axis, self.detail)) for axis, size in enumerate(self.shape)]
         return norms[0][:, None] * (waves[0] @ readings.even @ waves[1].T) * norms[1]
 
     @cached_property
@@ -197,7 +195,7 @@ class Bands:
 
     @cached_property
     def _of_pixels(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """`_spectral`, the eigenvectors' covariance with f's wave, and its prior variance, of all groups but the last."""
+        """`_spectral`, covariances of its vectors with f's wave, and the variance of that: no last groups."""
         (values, vectors), pixels = self._spectral, self._pixels
         seen = np.stack([self._folded(self.spectrum * pixels * row) for row in self._rows], axis=-1)
         before = self._folded(self.spectrum * np.square(pixels))
@@ -232,9 +230,7 @@ class Bands:
         return groups
 
 
-def bands_of(
-    camera: Camera, detail: int, spectrum: FloatArray, weights: FloatArray, observation: Observation
-) -> Bands:
+def bands_of(camera: Camera, detail: int, spectrum: FloatArray, weights: FloatArray, observation: Observation) -> Bands:
     """Return the shift-invariant camera like one in front of a world finer than f.
 
     camera : on the grid of the world;  weights : (M,) 1 / Rv;  observation : H, whose kernels are taken as they are
@@ -277,26 +273,25 @@ def _members(size: int, detail: int) -> IntArray:
     return members
 
 
-def _shares(
-    readings: Readings, axis: int, size: int, detail: int, part: slice, *, complete: bool
-) -> FloatArray:
-    """Return which line of a kernel lies on each line of a strip: (readings near it, lines of the strip, of the kernel).
+def _shares(readings: Readings, axis: int, size: int, detail: int, part: slice, *, complete: bool) -> FloatArray:
+    """Return which line of a kernel lies on which line of a strip: (readings near it, lines of the strip, of a kernel).
 
     complete : True for readings that continue beyond the edges, where they see the world reflected
     """
     length, end = readings.kernel.shape[axis], size * detail
-    starts = readings.first[axis] + detail * np.arange(readings.count[axis])
+    starts: IntArray = readings.first[axis] + detail * np.arange(readings.count[axis])
     roots = np.ones(starts.size)
     if complete:
         odd = readings.is_odd(axis, detail)
-        middles = np.arange(size) + 0.5 if odd else np.arange(size + 1.0)
-        starts, roots = np.rint(middles * detail - length / 2).astype(np.int64), np.ones(middles.size)
+        middles = np.asarray(np.arange(size) + 0.5 if odd else np.arange(size + 1), dtype=np.float64)
+        starts = np.rint(middles * detail - length / 2).astype(np.int64)
+        roots = np.ones(middles.size)
         if not odd:
             roots[[0, -1]] = 0.5**0.5
-    lines = starts[:, None] + np.arange(length)
+    lines: IntArray = np.asarray(starts[:, None] + np.arange(length), dtype=np.int64)
     if complete:
-        lines = lines % (2 * end)
-        lines = np.where(lines < end, lines, 2 * end - 1 - lines)
+        lines %= 2 * end
+        np.copyto(lines, 2 * end - 1 - lines, where=lines >= end)
     near = ((lines >= part.start) & (lines < part.stop)).any(axis=1)
     shares = np.zeros((int(near.sum()), part.stop - part.start, length))
     reading, line = np.nonzero((lines[near] >= part.start) & (lines[near] < part.stop))

@@ -216,12 +216,17 @@ class FrameSystem:
         return self.preconditioner.solve(image.reshape(self.shape)).ravel()
 
 
-def posterior_operators(system: FrameSystem, task: EstimationTask) -> PosteriorOperators:
-    """Return A, C and their kin for means over the frame.
+def mean_accuracy(task: EstimationTask) -> float:
+    """Return the accuracy of solutions for means over the frame.
 
     The bound on the largest error of a pixel is sqrt(N) times the mean error or more.
     """
-    accuracy = max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5 / task.finer)
+    return max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5 / task.finer)
+
+
+def posterior_operators(system: FrameSystem, task: EstimationTask) -> PosteriorOperators:
+    """Return A, C and their kin for means over the frame."""
+    accuracy = mean_accuracy(task)
 
     def posterior(image: FloatArray) -> FloatArray:
         return system.solve(image, accuracy).image

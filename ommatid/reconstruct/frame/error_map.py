@@ -53,6 +53,7 @@ from .window_variances import (
     stored_stencil,
     whole_variances,
 )
+from .world_map import world_map
 
 Pixels = NDArray[np.intp]
 
@@ -89,27 +90,31 @@ class ExactVariances:
 
     noise : (M,) Rvm / Rv^2, None where the actual noise Rvm is the expected one
     accuracy : that of solutions in posterior standard deviations, if EXACT is out of reach
-    task : whose unknowns may be finer than f's pixels
+    task : whose unknowns are finer than f's pixels; None: the unknowns are f's pixels
     """
 
     system: FrameSystem
     noise: FloatArray | None
     accuracy: float
-    task: EstimationTask
+    task: EstimationTask | None = None
 
     def at(self, pixels: Pixels, posterior: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return Eq. 5 of pixels whose errors are not correlated, (n,); posterior : (N,) about the diagonal of C."""
         signs = np.zeros_like(posterior)
         signs[pixels] = rng.choice([-1.0, 1.0], size=pixels.size)
         finest = EXACT * float(np.sqrt(posterior[pixels].min()))
-        solved = self._solve(self.task.of_unknowns(signs), finest)
+        weights = signs if self.task is None else self.task.of_unknowns(signs)
+        solved = self._solve(weights, finest)
         if self.noise is not None:
             readings = self.system.observation.forward(solved)
             readings *= self.noise
             right = self.system.observation.adjoint(readings) + self.system.apply_prior_precision(solved)
-            smallest = float(np.min((signs * self.task.of_f(solved))[pixels]))
+            smallest = float(np.min((signs * self._of_f(solved))[pixels]))
             solved = self._solve(right, min(finest, EXACT * max(smallest, 0.0) / float(posterior.max()) ** 0.5))
-        return (signs * self.task.of_f(solved))[pixels]
+        return (signs * self._of_f(solved))[pixels]
+
+    def _of_f(self, image: FloatArray) -> FloatArray:
+        return image if self.task is None else self.task.of_f(image)
 
     def _solve(self, right: FloatArray, accuracy: float) -> FloatArray:
         try:
@@ -138,6 +143,26 @@ def check_map(
     if not local:
         return MapCheck(worst, worst)
     return MapCheck(worst, min(worst, abs(float(ratio.mean())) + 2 * float(ratio.std()) / ratio.size**0.5))
+
+
+def world_error_map(
+    task: EstimationTask, system: FrameSystem, actual: FloatArray
+) -> tuple[VarianceMap, MapCheck, FloatArray | float]:
+    """Return the maps of f's pixels in front of a finer world, their error at random pixels, and f's prior variance.
+
+    Errors are correlated far: pixels are taken one at a time.
+    """
+    if system.bands is None:
+        raise TypeError("expected the system of a world finer than f")
+    variances, prior, is_exact = world_map(task, system.observation, system.weights, system.bands, actual)
+    if is_exact:
+        return variances, MapCheck(0.0, 0.0), prior
+    noise = None
+    if not np.allclose(actual, task.expected_noise, rtol=1e-12):
+        noise = system.weights**2 * task.on_all_measurements(actual, 0.0)
+    exact = ExactVariances(system, noise, task.settings.accuracy, task)
+    variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
+    return variances, check_map(variance, variances.posterior.ravel(), task.shape_of_f, exact, local=False), prior
 
 
 def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bool, first: int = 0) -> Pixels:
@@ -243,7 +268,7 @@ class ErrorMap:
         noise = None
         if not self.as_expected:
             noise = self.system.weights**2 * self.task.on_all_measurements(self.actual, 0.0)
-        exact = ExactVariances(self.system, noise, self.task.settings.accuracy, self.task)
+        exact = ExactVariances(self.system, noise, self.task.settings.accuracy)
         local = isinstance(self.system.prior, float) and not isinstance(self.system, BandedSystem)
         local = local and not leaves_null_space(self.task.model.camera)
         return check_map(self.variance, self.maps.posterior.ravel(), self.task.shape, exact, local=local)

@@ -33,9 +33,16 @@ from ..output.run_json import SolverReport
 from ..prior import coloured
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .bands import bands_of
-from .conjugate_gradients import BandedSystem, FrameSystem, Solution, posterior_operators, serves
-from .error_map import MANY, ErrorMap, MapCheck
-from .world_map import world_map, world_of
+from .conjugate_gradients import (
+    BandedSystem,
+    FrameSystem,
+    Solution,
+    mean_accuracy,
+    posterior_operators,
+    serves,
+)
+from .error_map import MANY, ErrorMap, MapCheck, world_error_map
+from .world_map import world_of
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 INVARIANT = "every lens type is shift-invariant except at the edges"
@@ -155,7 +162,7 @@ class FrameMethod(Method):
         """Return the expected error, which depends on the noise and not on what is recorded."""
         task, system = self.task, self.system
         if task.finer > 1:
-            variances, check, prior = world_map(task, system, actual)
+            variances, check, prior = world_error_map(task, system, actual)
         else:
             errors, check = ErrorMap.of(task, system, actual)
             variances, prior = errors.maps, task.prior.variance
@@ -170,7 +177,7 @@ class FrameMethod(Method):
         return FrameError(expected, check, self._random_power(actual, expected.degrees_of_freedom))
 
     def _of_unknowns(self, truth: FloatArray) -> FloatArray:
-        """Return a true image on the grid of the unknowns; of one on f's grid, a world of the prior that averages to it."""
+        """Return a true image on the grid of the unknowns; one of f becomes a random world with its averages."""
         task = self.task
         if truth.size == task.model.unknowns:
             return truth
@@ -218,11 +225,12 @@ class FrameMethod(Method):
         return np.subtract(column, observed, out=observed)
 
     def _solve(self, right: FloatArray) -> FloatArray:
-        return self.system.solve(right, self.task.settings.accuracy).image
+        """Return C b for a mean over the frame, to a mean error of a hundredth of a posterior standard deviation."""
+        return self.system.solve(right, mean_accuracy(self.task)).image
 
     def _variance_of_sum(self, weights: FloatArray, actual: FloatArray) -> float:
         """Eq. 5 of w^T f^."""
-        solved = self._solve(self.task.of_unknowns(weights))
+        solved = self.system.solve(self.task.of_unknowns(weights), self.task.settings.accuracy).image
         prior_part = float(solved @ self.system.apply_prior_precision(solved))
         return float(np.sum((prior_part, self._noise_part(solved, actual))))
 

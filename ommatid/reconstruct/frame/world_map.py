@@ -15,14 +15,12 @@ from scipy import fft, linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.processors import processors
-from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.observation import Observation
 
 from ..methods.method import EstimationTask
 from ..prior import averaged_spectrum, cosine_waves
+from ..problem import is_dense
 from .bands import Bands
-from .conjugate_gradients import FrameSystem
-from .error_map import MANY, ExactVariances, MapCheck, spread_pixels
 from .variance_map import VarianceMap, enlarged
 
 SIDE = 30  # pixels of f of a small frame
@@ -31,7 +29,6 @@ COLUMNS = 128  # readings whose covariances are computed at once
 WINDOW, HALO, WINDOWS = 28, 8, 3  # pixels of f of a window and around its core; windows along each axis
 INTERIOR, EDGES = 9, 4  # levels of noise at which the two are computed; others follow from them
 LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
-PROBES, FEW_PROBES = 6, 2  # random pixels, and of many pixels
 EVEN = 1e-3  # relative range of levels that count as one
 
 
@@ -61,6 +58,7 @@ def moments(matrix: sparse.csr_array, spectrum: FloatArray, detail: int) -> Mome
     fine, shape = spectrum.shape, (spectrum.shape[0] // detail, spectrum.shape[1] // detail)
     count = matrix.shape[0]
     both, readings = np.empty((shape[0] * shape[1], count)), np.empty((count, count))
+    product = matrix.toarray() if is_dense(matrix) else matrix
     for start in range(0, count, COLUMNS):
         part = slice(start, min(start + COLUMNS, count))
         waves = fft.dctn(matrix[part].toarray().reshape(-1, *fine), 2, axes=(1, 2), norm="ortho", workers=processors())
@@ -68,7 +66,7 @@ def moments(matrix: sparse.csr_array, spectrum: FloatArray, detail: int) -> Mome
         spread = np.asarray(fft.idctn(waves, 2, axes=(1, 2), norm="ortho", workers=processors(), overwrite_x=True))
         means = spread.reshape(-1, shape[0], detail, shape[1], detail).mean(axis=(2, 4))
         both[:, part] = means.reshape(len(spread), -1).T
-        readings[:, part] = matrix @ spread.reshape(len(spread), -1).T
+        readings[:, part] = product @ spread.reshape(len(spread), -1).T
     vertical, horizontal = (np.square(cosine_waves(size)) for size in shape)
     pixels = (vertical @ averaged_spectrum(spectrum, detail) @ horizontal.T).ravel()
     return Moments(pixels, both, (readings + readings.T) / 2)
@@ -83,28 +81,24 @@ def world_of(image: FloatArray, spectrum: FloatArray, detail: int) -> FloatArray
 
 
 def world_map(
-    task: EstimationTask, system: FrameSystem, actual: FloatArray
-) -> tuple[VarianceMap, MapCheck, FloatArray | float]:
-    """Return the map of Eq. 5, its error at random pixels, and the prior variance of f's pixels.
+    task: EstimationTask, observation: Observation, weights: FloatArray, bands: Bands, actual: FloatArray
+) -> tuple[VarianceMap, FloatArray | float, bool]:
+    """Return the map of Eq. 5, the prior variance of f's pixels, and True if the map is exact.
 
-    actual : (measurements used,) noise
+    observation, weights, bands : of the frame's system;  actual : (measurements used,) noise
     """
-    bands = system.bands
-    if bands is None:
-        raise TypeError("expected the system of a world finer than f")
     if actual.size <= MOST_READINGS and max(task.shape_of_f) <= SIDE + SIDE // 2:
         exact = moments(task.model.to_sparse()[task.used], bands.spectrum, task.finer)
-        return exact.variances(task.expected_noise, actual, task.shape_of_f), MapCheck(0.0, 0.0), exact.pixels
-    ratios = _ratios(task, system, actual)
-    level = np.log(_levels(task, system.observation, system.weights))
-    variances = _frame_map(bands, task, ratios, level)
-    if len(system.observation.parts) != len(bands.types):
-        variances = _by_windows(variances, task, bands.spectrum, actual)
-    return variances, _checked(task, system, actual, variances), bands.prior_variance
+        return exact.variances(task.expected_noise, actual, task.shape_of_f), exact.pixels, True
+    level = np.log(_levels(task, observation, weights))
+    variances = _frame_map(bands, task, _ratios(task, weights, actual), level)
+    if len(observation.parts) != len(bands.types):
+        variances = _by_windows(variances, task, actual)
+    return variances, bands.prior_variance, False
 
 
-def _by_windows(variances: VarianceMap, task: EstimationTask, spectrum: FloatArray, actual: FloatArray) -> VarianceMap:
-    """Return the map of a camera that is not shift-invariant: a ratio from windows, which varies evenly between them."""
+def _by_windows(variances: VarianceMap, task: EstimationTask, actual: FloatArray) -> VarianceMap:
+    """Return the map of a camera that is not shift-invariant, with ratios from windows and, between them, even ones."""
     shape, fine = task.shape_of_f, task.finer
     side = min(WINDOW, *shape)
     starts = [np.unique(np.linspace(0, size - side, WINDOWS).round().astype(int)) for size in shape]
@@ -125,18 +119,19 @@ def _by_windows(variances: VarianceMap, task: EstimationTask, spectrum: FloatArr
             mean = float(getattr(variances, name)[place].mean())
             ratios[number, row, column] = float(getattr(found, name)[core].mean()) / mean if mean else 1.0
     middles = [each + side / 2 for each in starts]
-    maps = [
-        np.array([np.interp(np.arange(shape[0]) + 0.5, middles[0], line) for line in each.T]).T for each in ratios
-    ]
-    whole = [np.array([np.interp(np.arange(shape[1]) + 0.5, middles[1], line) for line in each]) for each in maps]
-    return VarianceMap(
-        variances.posterior * whole[0], variances.missing * whole[1], variances.noisy * whole[2]
-    )
+    down, across = (_interpolation(size, middle) for size, middle in zip(shape, middles, strict=True))
+    whole = [down @ each @ across.T for each in ratios]
+    return VarianceMap(variances.posterior * whole[0], variances.missing * whole[1], variances.noisy * whole[2])
+
+
+def _interpolation(size: int, nodes: FloatArray) -> FloatArray:
+    """Return the matrix from values at nodes of an axis to its pixels, constant beyond the nodes: (size, nodes)."""
+    return np.stack([np.interp(np.arange(size) + 0.5, nodes, unit) for unit in np.eye(nodes.size)], axis=1)
 
 
 def _frame_map(bands: Bands, task: EstimationTask, ratios: tuple[float, ...], level: FloatArray) -> VarianceMap:
     """Return the map from the levels of the noise, logarithms, (rows, columns)."""
-    small = tuple(min(SIDE, size) for size in bands.shape)
+    small = min(SIDE, bands.shape[0]), min(SIDE, bands.shape[1])
     by = bands.shape[0] - small[0], bands.shape[1] - small[1]
     types = [each.shortened(by) for each in bands.types]
     fine = small[0] * bands.detail, small[1] * bands.detail
@@ -185,23 +180,8 @@ def _levels(task: EstimationTask, observation: Observation, weights: FloatArray)
     return np.maximum(relative, LEAST_LEVEL).reshape(task.shape_of_f)
 
 
-def _ratios(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> tuple[float, ...]:
+def _ratios(task: EstimationTask, weights: FloatArray, actual: FloatArray) -> tuple[float, ...]:
     """Return the ratio of the actual to the expected noise of each lens type, weighted as the estimator weighs it."""
     ratios = task.on_all_measurements(actual / task.expected_noise, 0.0)
-    parts = [(system.weights[part], ratios[part]) for part in task.model.camera.type_slices()]
+    parts = [(weights[part], ratios[part]) for part in task.model.camera.type_slices()]
     return tuple(float(np.mean(weight * ratio)) / (float(weight.mean()) or 1.0) for weight, ratio in parts)
-
-
-def _checked(task: EstimationTask, system: FrameSystem, actual: FloatArray, variances: VarianceMap) -> MapCheck:
-    """Compare the map with exact solutions for random pixels, one at a time, since errors are correlated far."""
-    noise = None
-    if not np.allclose(actual, task.expected_noise, rtol=1e-12):
-        noise = system.weights**2 * task.on_all_measurements(actual, 0.0)
-    exact, rng = ExactVariances(system, noise, task.settings.accuracy, task), probe(Purpose.ERROR_MAP)
-    variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
-    worst = 0.0
-    for number in range(FEW_PROBES if variance.size > MANY else PROBES):
-        pixel = spread_pixels(task.shape_of_f, rng, edges=True, first=number)[:1]
-        found = exact.at(pixel, variances.posterior.ravel(), rng)
-        worst = max(worst, float(np.abs(variance[pixel] / found - 1).max()))
-    return MapCheck(worst, worst)

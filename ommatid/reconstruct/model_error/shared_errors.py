@@ -200,7 +200,7 @@ def _wider(
     if truth.size > task.model.unknowns:
         image = averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
     elif truth.size < task.model.unknowns:
-        image = np.kron(truth.reshape(rows, columns), np.ones((task.finer, task.finer))).ravel()
+        image = task.finer**2 * task.of_unknowns(truth)
     bias = task.of_f(operators.hidden(image - task.prior.mean))
     added = errors.variance_of_square(bias, actual, task, operators)
     return interval(count * without.mse + float(errors.variance.sum()), count**2 * without.variance + added, count)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from math import lcm
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
@@ -19,9 +20,11 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.processors import processors
 
-from ..camera import Camera
 from ..lens_type import LensType
 from ..observation import Back, ObservationPart, Seen, cosines, density, repetition
+
+if TYPE_CHECKING:
+    from ..camera import Camera
 
 ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 
@@ -155,6 +158,8 @@ class Box(ObservationPart):
             BoxAxis(sparse.csr_array(axis.shares @ repetition(size, detail)))
             for axis, size in zip((self.down, self.across), camera.shape, strict=True)
         )
+        for axis in (down, across):
+            axis.shares.sort_indices()
         return Box(self.lens_type.finer(Fraction(1, detail)), down, across)
 
     def _numbers(self, down: IntArray, across: IntArray) -> IntArray:

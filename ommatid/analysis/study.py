@@ -24,7 +24,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibrate import cached_model
 from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
-from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
+from ommatid.simulate.ideal import ideal_model, true_model
 
 NUMBERS, TABLE = "study.json", "study.csv"
 MISALIGNMENT = {"robust": "robust", "fitted": "fit"}  # estimator.misalignment by model; "trust" for all others
@@ -142,7 +142,7 @@ def study_models(
 
     def make(name: str) -> Model:
         if name == "true":
-            return exact_model(setup.resolved, camera, true_matrix(camera), "true")
+            return true_model(setup.resolved, camera)
         if name not in ("points", "transport"):
             return ideal_model(setup.resolved, camera)
         calibration = scene.calibration.model_copy(update={"method": name})

@@ -140,9 +140,18 @@ class Camera:
         return self.walls and not (bent or self.is_blurred(lens_type))
 
     def has_kernel(self, lens_type: LensType) -> bool:
-        """True if the designed H of a lens type is a few kernels: a blurred thin lens whose boxes are whole pixels."""
-        blurred = self.is_blurred(lens_type) and lens_type.optics.surfaces is None
-        return self.walls and blurred and lens_type.optics.distortion is None and lens_type.covers_whole_pixels
+        """True if the designed H of a lens type may be a few kernels: a blurred one whose boxes are whole pixels.
+
+        Kernels of surfaces are traced, and held by a model; distortion of more than a pixel or so is not held by them.
+        """
+        if lens_type.optics.distortion is not None or (lens_type.optics.surfaces is not None and lens_type.steered):
+            return False
+        return self.walls and self.is_blurred(lens_type) and lens_type.covers_whole_pixels
+
+    @property
+    def has_surfaces(self) -> bool:
+        """True if a lens type has surfaces."""
+        return any(lens_type.optics.surfaces is not None for lens_type in self.types)
 
     @property
     def has_structure(self) -> bool:

@@ -171,15 +171,23 @@ class Model:
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
         """L, (M, q), such that the error of H f by that of few numbers is L xi with independent xi of variance 1."""
-        return None if self.fitted is None else self.fitted.directions(image, self._gradients(image))
+        return self.fitted.directions(image, self._gradients(image)) if self.fitted and self.fitted.has_errors else None
 
     def error_variance(self, image: FloatArray) -> FloatArray | None:
         """Variance of each measurement by the errors of few numbers, (M,): the diagonal of L L^T."""
-        return None if self.fitted is None else self.fitted.error_variance(image, self._gradients(image))
+        return (
+            self.fitted.error_variance(image, self._gradients(image))
+            if self.fitted and self.fitted.has_errors
+            else None
+        )
 
     def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
         """A random error of H f by those of few numbers, L xi: (M,)."""
-        return None if self.fitted is None else self.fitted.error_draw(image, self._gradients(image), rng)
+        return (
+            self.fitted.error_draw(image, self._gradients(image), rng)
+            if self.fitted and self.fitted.has_errors
+            else None
+        )
 
     def _gradients(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """H applied to the gradient of f, (N,), down and across: (M,) each."""
@@ -287,8 +295,8 @@ class Model:
 
 
 def designed_observation(camera: Camera) -> Observation | None:
-    """Return H as designed by boxes and kernels, None where it has entries."""
-    if not camera.has_structure:
+    """Return H as designed by boxes and kernels; None where it has entries, or kernels that only a model holds."""
+    if not camera.has_structure or camera.has_surfaces:
         return None
     parts: list[ObservationPart] = []
     for lens_type in camera.on_grids.types:

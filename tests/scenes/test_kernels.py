@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
 from ommatid.scenes.observation import Observation
 from ommatid.scenes.optics.boxes import designed_box
@@ -24,9 +25,8 @@ def random_kernels(margin: int, degree: int = 2, index: int = 1) -> KernelFootpr
     return KernelFootprints(
         places,
         degree,
-        rng.normal(size=(3, *shape)),
+        KernelShapes.dense(rng.normal(size=(3, *shape)), rng.normal(size=(2, *shape))),
         rng.normal(size=(3, count)),
-        rng.normal(size=(2, *shape)),
         rng.normal(size=(4, 2, count)),
     )
 
@@ -38,7 +38,7 @@ def test_a_box_is_the_kernel_of_an_ideal_pinhole(margin: int) -> None:
         places = KernelPlaces(CAMERA, lens_type, margin)
         box = np.pad(np.full((1, int(lens_type.ratio), int(lens_type.ratio)), float(lens_type.ratio) ** -2), margin)
         box = box[margin : margin + 1]
-        footprints = KernelFootprints(places, 0, box, np.ones((1, 1)), box[:0], np.zeros((0, 0, 1)))
+        footprints = KernelFootprints(places, 0, KernelShapes.dense(box), np.ones((1, 1)), np.zeros((0, 0, 1)))
         assert abs(footprints.to_sparse() - expected[pixels]).max() < 1e-15
 
 
@@ -66,7 +66,12 @@ def test_directions_of_the_error_are_what_changed_kernels_read() -> None:
         directions = footprints.error_directions(image).toarray()
         assert directions.shape == (CAMERA.types[1].measurements, 4)
         for column, coefficients in zip(directions.T, footprints.error_coefficients, strict=True):
-            changed = replace(footprints, kernels=footprints.error_kernels, coefficients=coefficients)
+            changed = replace(
+                footprints,
+                shapes=KernelShapes.dense(footprints.shapes.error_kernels),
+                coefficients=coefficients,
+                error_coefficients=np.zeros((0, 0, coefficients.shape[1])),
+            )
             assert column == pytest.approx(changed.to_sparse() @ image.ravel(), abs=1e-11)
 
 
@@ -95,7 +100,7 @@ def test_information_of_a_box_as_a_kernel(margin: int) -> None:
         size = int(lens_type.ratio)
         kernel = np.pad(np.full((size, size), float(size) ** -2), margin)[None]
         part = KernelFootprints(
-            KernelPlaces(frame, lens_type, margin), 0, kernel, np.ones((1, 1)), kernel[:0], np.zeros((0, 0, 1))
+            KernelPlaces(frame, lens_type, margin), 0, KernelShapes.dense(kernel), np.ones((1, 1)), np.zeros((0, 0, 1))
         )
         box = designed_box(frame.shape, lens_type)
         np.testing.assert_allclose(part.information(), box.information(), atol=1e-12)

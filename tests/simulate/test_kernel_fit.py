@@ -11,6 +11,7 @@ from scipy import sparse, stats
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.calibration.point_sources import Responses
@@ -63,7 +64,7 @@ def varying(camera: Camera) -> KernelFootprints:
     coefficients[0, 0] = 1
     coefficients[1, 1] = coefficients[2, 2] = 0.03
     coefficients[3, [3, 5]] = 0.03
-    return KernelFootprints(places, 2, kernels, coefficients, kernels[:0], np.zeros((0, 0, 6)))
+    return KernelFootprints(places, 2, KernelShapes.dense(kernels), coefficients, np.zeros((0, 0, 6)))
 
 
 def rms(difference: sparse.csr_array, entries: int) -> float:
@@ -102,7 +103,8 @@ def test_components_of_a_varying_blur_are_learnt() -> None:
     assert record["degree"] == 2
     assert record["components"]["count"] >= 3
     learnt = accepted(fit).to_sparse()
-    mean = replace(varying(camera), kernels=varying(camera).kernels[:1], coefficients=np.eye(1, 6)).to_sparse()
+    first = KernelShapes.dense(varying(camera).shapes.kernels[:1])
+    mean = replace(varying(camera), shapes=first, coefficients=np.eye(1, 6)).to_sparse()
     assert rms(learnt - truth, truth.nnz) < 0.1 * rms(mean - truth, truth.nnz)
     assert rms(learnt - truth, truth.nnz) < 0.4 * rms(responses.matrix - truth, truth.nnz)
 

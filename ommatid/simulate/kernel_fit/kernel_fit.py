@@ -21,6 +21,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, basis
 from ommatid.scenes.lens_type import LensType
 
@@ -172,11 +173,5 @@ def _footprints(chart: Chart, candidate: Candidate, parts: Components) -> Kernel
     kernels = np.concatenate([orthonormal[None, :, 0], varying])
     coefficients = np.concatenate([np.eye(1, len(back)), shares.T]) @ back
     error_kernels, error_coefficients = error_directions(chart, candidate, parts)
-    return KernelFootprints(
-        chart.places,
-        candidate.degree,
-        kernels.reshape(-1, size, size),
-        coefficients,
-        error_kernels.reshape(-1, size, size),
-        error_coefficients,
-    )
+    shapes = KernelShapes.dense(kernels.reshape(-1, size, size), error_kernels.reshape(-1, size, size))
+    return KernelFootprints(chart.places, candidate.degree, shapes, coefficients, error_coefficients)

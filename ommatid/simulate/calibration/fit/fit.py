@@ -19,8 +19,8 @@ from scipy import sparse, stats
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views
-from ommatid.scenes.fitted.view import COUNT, UNITS, designed
+from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views, views_as_designed
+from ommatid.scenes.fitted.view import UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
@@ -165,19 +165,19 @@ def _fit_type(
     charted: bool,
 ) -> _TypeFit:
     if not charted:
-        return _TypeFit(_views_as_designed(subs, explained=False), None, [])
+        return _TypeFit(views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
         from ...kernel_fit.kernel_fit import fit_kernels
 
         kernels = fit_kernels(responses, camera, lens, chart_of(lens))
-        return _TypeFit(_views_as_designed(subs, kernels.accepted), None, [], kernels)
+        return _TypeFit(views_as_designed(subs, kernels.accepted), None, [], kernels)
     pointers = responses.matrix.indptr
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]
     charts = chart_rows(camera, lens, responses.matrix[rows], batches)
     try:
         fit = fit_views(camera, subs, charts, rays)
     except InputError:  # rows that no view has led to a distortion that folds the image
-        return _TypeFit(_views_as_designed(subs, explained=False), None, [])
+        return _TypeFit(views_as_designed(subs, explained=False), None, [])
     models = [predicted(camera, sub, fit.numbers[n], charts[n]) for n, sub in enumerate(subs)]
     explanations = [explanation(chart, model, rays) for chart, model in zip(charts, models, strict=True)]
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(camera.sub_imagers))
@@ -185,11 +185,6 @@ def _fit_type(
     numbers = np.where(explained[:, None], fit.numbers, designed_views(subs))
     own, shared = (np.where(explained[:, None, None], each, 0.0) for each in (fit.own, fit.shared))
     return _TypeFit(Views(numbers, explained, own, shared, fit.structure), fit, explanations)
-
-
-def _views_as_designed(subs: list[SubImager], explained: bool) -> Views:
-    nothing = np.zeros((len(subs), COUNT, 0))
-    return Views(designed_views(subs), np.full(len(subs), explained), nothing, nothing, ("designed",) * COUNT)
 
 
 def _rest(

@@ -276,9 +276,9 @@ class KernelFootprints(ObservationPart):
             np.pad(kernels, ((0, 0), (beside, beside), (beside, beside)))
             .reshape(-1, places.width, detail, places.width, detail)
             .sum(axis=(2, 4))
-            for kernels in (self.kernels, self.error_kernels)
+            for kernels in (self.shapes.kernels, self.shapes.error_kernels)
         ]
-        return replace(self, places=places, kernels=parts[0], error_kernels=parts[1])
+        return replace(self, places=places, shapes=KernelShapes.dense(*parts))
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Return the indices of the measurements whose kernels lie inside a window of f as a whole."""

@@ -17,9 +17,12 @@ import select
 import signal
 import subprocess
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from time import monotonic
 from typing import IO, Any, cast
+
+import numpy as np
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
@@ -28,7 +31,6 @@ from ommatid.runtime.memory import free_memory
 from ommatid.runtime.printable import printable
 
 from .checked_world import CheckedWorld, reason_of
-from .file_checks import MESHES
 
 LONGEST = 600.0  # seconds that a world may take
 RESERVE = 100_000_000  # bytes that a world may take even if less are free
@@ -36,6 +38,8 @@ SHOWN = 100
 MODULE = __name__  # of the `main` that a process runs
 IDLE = 20  # seconds without a world after which the process ends
 PICTURES = ("bitmap", "envmap", "projector")
+MESHES = ("ply", "obj", "serialized")
+FARTHEST = 1e30  # of a vertex
 
 
 @dataclass
@@ -188,12 +192,37 @@ def _try_world(world: dict[str, Any], answer: Any) -> None:
     for path, plugin in world["files"]:
         answer(at=path)
         if plugin in MESHES:
-            mi.load_dict({"type": plugin, "filename": os.path.realpath(path)})
+            _check_meshes(os.path.realpath(path), plugin)
         elif plugin in PICTURES:
             mi.Bitmap(os.path.realpath(path))
     answer(at="")
     built = parse_world(world["text"], world["variant"]).build()
     built.bbox()
+
+
+def _check_meshes(path: str, plugin: str) -> None:
+    """Read the meshes of a file, and check what Mitsuba trusts: indices and positions of vertices. Raises RuntimeError.
+
+    Without normals at the vertices, which Mitsuba would compute by unchecked indices.
+    """
+    import mitsuba as mi
+
+    for index in count():
+        several = {"shape_index": index} if plugin == "serialized" else {}
+        try:
+            mesh = mi.load_dict({"type": plugin, "filename": path, "face_normals": True, **several})
+        except RuntimeError:
+            if index:  # no further mesh, or none that can be read, which the world will say if it names it
+                return
+            raise
+        content = mi.traverse(mesh)
+        faces, positions = np.array(content["faces"]), np.array(content["vertex_positions"])
+        if not faces.size or int(faces.max()) >= positions.size // 3:
+            raise RuntimeError(f"{Path(path).name}: expected faces of existing vertices")
+        if not (np.abs(positions) < FARTHEST).all():
+            raise RuntimeError(f"{Path(path).name}: expected finite positions of vertices")
+        if not several:
+            return
 
 
 def _limit_memory(more: int | None) -> None:

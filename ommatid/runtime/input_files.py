@@ -20,11 +20,12 @@ from .errors import InputError, shortened_repr
 LARGEST_TEXT = 64_000_000  # bytes of a description: a scene, a lens, a table or a report
 
 _KINDS = {
+    stat.S_IFREG: "a file",
+    stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a FIFO",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
-    stat.S_IFDIR: "a folder",
 }
 
 
@@ -96,4 +97,9 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _check_kind(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: expected a regular file, got {_KINDS.get(stat.S_IFMT(mode), 'something else')}")
+        raise InputError(f"{path}: expected a regular file, got {kind(mode)}")
+
+
+def kind(mode: int) -> str:
+    """Return in words what a file of this mode is."""
+    return _KINDS.get(stat.S_IFMT(mode), "something else")

@@ -10,20 +10,19 @@ They are imported as a stack, which is reconstructed like a rendered one.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint
-from ommatid.runtime.input_files import check_regular, open_input
+from ommatid.runtime.files import file_digest, fingerprint
+from ommatid.runtime.input_files import check_regular
 from ommatid.runtime.versions import versions
 
 from ..camera import Camera
@@ -263,7 +262,7 @@ def read_frames(
         settings=settings,
         files=[path for path, _ in exposures],
         whole=bool((numbers == np.rint(numbers)).all()),
-        sources=[{"name": path.name, "sha256": _sha256(path)} for path in (*files, *dark, *flat)],
+        sources=[{"name": path.name, "sha256": file_digest(path)} for path in (*files, *dark, *flat)],
         notes=notes.describe(),
     )
 
@@ -324,11 +323,6 @@ def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSetting
 def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:
     with np.errstate(over="ignore", invalid="ignore"):
         return np.mean([numbers for _, numbers in exposures], axis=0) if exposures else None
-
-
-def _sha256(path: Path) -> str:
-    with open_input(path) as stream:
-        return hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
 
 
 def import_stack(setup: Setup, images: Sequence[Path], settings: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:

@@ -225,10 +225,8 @@ def _check_meshes(path: str, plugin: str) -> None:
             return
 
 
-def _limit_memory(more: int | None) -> None:
+def _limit_memory(more: int) -> None:
     """Let this process take so many more bytes, and no more."""
-    if more is None:
-        return
     import psutil
 
     size = psutil.Process().memory_info().data

@@ -174,7 +174,7 @@ def _all_frames(
             missing.append(frame)
         else:
             write_formats(frame.output, options.formats)
-            yield frame, partial(_kept, report)
+            yield frame, lambda report=report: (report, False)
     shared = _here(missing, prepared, options)
     if workers is not None and workers > 1:
         shared = _in_processes(missing, prepared, options, workers)
@@ -227,7 +227,3 @@ def _made_in_process(options: FrameOptions, contents: Path, frame: Frame) -> tup
 def _prepared(options: FrameOptions, contents: Path) -> Prepared:
     """Return what the first frame prepared, once per process."""
     return Prepared(options.read_model()).with_contents(pickle.loads(contents.read_bytes()))
-
-
-def _kept(report: RunReport) -> tuple[RunReport, bool]:
-    return report, False

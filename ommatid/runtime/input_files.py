@@ -15,7 +15,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, shortened_repr
+from .errors import InputError, shortened, shortened_repr
 
 LARGEST_TEXT = 64_000_000  # bytes of a description: a scene, a lens, a table or a report
 
@@ -80,6 +80,26 @@ def check_unique_keys(path: Path, content: bytes) -> None:
         json.loads(content, object_pairs_hook=_table, parse_int=len, parse_float=len)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}; delete it and make it again") from error
+
+
+def read_record(path: Path, kind: Any, what: str, cure: str, *, strict: bool = False) -> Any:
+    """Read a JSON file of records that this program wrote. Raises InputError with what was expected, and the cure.
+
+    kind : type that pydantic checks;  strict : True if numbers may not be texts
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        content = read_bytes(path)
+        record = TypeAdapter(kind).validate_json(content, strict=strict)
+    except OSError as error:
+        raise InputError(f"{path}: expected {what}, got no file that can be read ({error.strerror}); {cure}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key, reason = shortened(".".join(map(str, first["loc"]))) or "content", shortened(first["msg"])
+        raise InputError(f"{path}: expected {what}, got a file whose {key} is wrong: {reason}; {cure}") from error
+    check_unique_keys(path, content)
+    return record
 
 
 def real_path(path: Path) -> Path:

@@ -81,12 +81,13 @@ def try_world(world: CheckedWorld, variant: str, where: str, seconds: float = LO
     where : start of messages, the scene file and the world's
     Raises InputError if Mitsuba refuses it, or if that process dies or does not end.
     """
-    files = {str(path): [plugin, *_version(path)] for path, plugin in world.checked.items()}
+    named = [[str(path), plugin] for path, plugin in world.checked.items()]
+    files = [[*names, *_version(Path(names[0]))] for names in named]
     key = fingerprint([world.text, files, variant])
     if key in _trials.built:
         return
     most = max(free_memory(), RESERVE)
-    task = {"variant": variant, "text": world.text, "files": _plugins(world), "memory": most}
+    task = {"variant": variant, "text": world.text, "files": named, "memory": most}
     try:
         reason = _answer(task, where, seconds)
     except BaseException:
@@ -139,10 +140,6 @@ def _death(process: subprocess.Popen[bytes]) -> str:
 
 def _shown(at: str) -> str:
     return f"the file {printable(Path(at).name, SHOWN)}" if at else "the world"
-
-
-def _plugins(world: CheckedWorld) -> list[list[str]]:
-    return [[str(path), plugin] for path, plugin in world.checked.items()]
 
 
 def _version(path: Path) -> list[int]:

@@ -15,7 +15,7 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_csv, write_text
-from ommatid.runtime.input_files import check_unique_keys, read_bytes
+from ommatid.runtime.input_files import read_record
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -113,9 +113,7 @@ def remove_study(folder: Path) -> None:
 
 def _read_study(folder: Path) -> tuple[tuple[StudyCase, ...], str | None]:
     """Return the cases in study.json, and its fingerprint if study.csv is there too."""
-    content = read_bytes(folder / NUMBERS)
-    study = StudyFile.model_validate_json(content)
-    check_unique_keys(folder / NUMBERS, content)
+    study: StudyFile = read_record(folder / NUMBERS, StudyFile, "a study", "run the scene again")
     return study.cases, study.fingerprint if (folder / TABLE).is_file() else None
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
@@ -84,11 +84,7 @@ class SweepOutcome:
 @own_style()
 def write_figure(path: Path, curves: list[SweepOutcome], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the digits lost, with one row of panels per H and one column per quantity."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure: Any = Figure(figsize=(14, 9.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(14, 9.5, layout="constrained")
     axes = figure.subplots(len(TITLES), len(PANELS), sharex=True, sharey=True)
     for row, (lenses, title) in enumerate(TITLES.items()):
         for column, (field, quantity) in enumerate(PANELS):

@@ -19,8 +19,8 @@ from ommatid.scenes.shrinkage import shrink_variances
 
 from ..ideal import ideal_matrix
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import plan, rounding_variance
-from .point_sources import Plans, Responses, Subsets, responses_from_points
+from ..sampling.passes import rounding_variance
+from .point_sources import Plans, Responses, Subsets, responses_from_points, same_plans
 
 
 def rendered_model(
@@ -69,12 +69,6 @@ def rendered_model(
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
     return replace(model, record=record)
-
-
-def same_plans(setup: Setup) -> Plans:
-    """Return the samples that the scene asks for, the same for all lens types."""
-    work = plan(setup.scene.calibration.sample_count, setup.scene.render.sampler)
-    return {lens_type.name: work for lens_type in setup.camera.types}
 
 
 def fits(setup: Setup) -> bool:

@@ -75,10 +75,13 @@ class Setup:
 
     @property
     def is_applied(self) -> bool:
-        """True if boxes and kernels apply the estimator's H: it is ideal, or may follow from views."""
+        """True if boxes and kernels apply the estimator's H: it is ideal, or may follow from views and kernels."""
         camera, calibration = self.camera, self.scene.calibration
-        fits = calibration.method == "ideal" or (calibration.fit != "none" and camera.has_box_footprints)
-        return fits and camera.is_applied
+        if calibration.method != "ideal" and not camera.has_box_footprints:
+            steered = any(lens_type.steered for lens_type in camera.types)
+            if calibration.fit == "geometry" or camera.tolerance is not None or steered:
+                return False
+        return (calibration.method == "ideal" or calibration.fit != "none") and camera.is_applied
 
     @property
     def has_closed_form(self) -> bool:

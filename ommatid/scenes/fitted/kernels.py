@@ -245,7 +245,7 @@ class KernelFootprints(ObservationPart):
         tall, wide = window or (slice(0, self.shape[0]), slice(0, self.shape[1]))
         width = wide.stop - wide.start
         down, across = self.places.cells(pixels)
-        values = self._values(pixels)
+        values = self.values(pixels)
         inside = ((down >= tall.start) & (down < tall.stop))[:, :, None]
         inside = inside & ((across >= wide.start) & (across < wide.stop))[:, None] & (values != 0)
         texels = (down - tall.start)[:, :, None] * width + (across - wide.start)[:, None]
@@ -253,7 +253,8 @@ class KernelFootprints(ObservationPart):
         shape = pixels.size, (tall.stop - tall.start) * width
         return sparse.csr_array((values[inside], texels[inside], pointers), shape=shape)
 
-    def _values(self, pixels: IntArray) -> FloatArray:
+    def values(self, pixels: IntArray) -> FloatArray:
+        """Return the kernels of some pixels of the lens type, beside the target as well: (n, W, W)."""
         shares = basis(self.places.positions(pixels), self.degree) @ self.coefficients.T
         return np.tensordot(shares, self.shapes.kernels, axes=1)
 

@@ -13,13 +13,16 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.model import Model, fitted_model
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
+from ..entry_memory import check_entries
 from ..ideal import ideal_matrix
 from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import rounding_variance
+from .fit.chart import SIDE
 from .point_sources import Plans, Responses, Subsets, responses_from_points, same_plans
 
 
@@ -38,6 +41,9 @@ def rendered_model(
     record = dict[str, Any](method=scene.calibration.method)
 
     def measure(subsets: Subsets | None) -> Responses:
+        if setup.is_applied:  # then no memory was asked for entries
+            whole = [lens for lens in camera.types if subsets is None or _is_whole(subsets, lens)]
+            check_entries(camera, whole, scene.calibration.method, "few numbers do not explain all of H: ")
         if scene.calibration.method == "transport":
             from .ray_transport import responses_from_rays
 
@@ -69,6 +75,12 @@ def rendered_model(
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
     return replace(model, record=record)
+
+
+def _is_whole(subsets: Subsets, lens_type: LensType) -> bool:
+    """Return True if more of a lens type is measured than a chart has."""
+    subset = subsets.get(lens_type.name, np.zeros(0))
+    return subset is None or subset.size > lens_type.count * SIDE**2
 
 
 def fits(setup: Setup) -> bool:

@@ -109,8 +109,8 @@ def test_strips_mend_the_edges() -> None:
 def test_moments_are_products_with_the_covariance() -> None:
     spectrum = exponential_spectrum((12, 10), 4.0)
     root, rng = reflecting_root(spectrum), np.random.default_rng(2)
-    matrix = sparse.csr_array(rng.normal(size=(9, 120)) * (rng.random((9, 120)) < 0.3))
-    found = moments(matrix, spectrum, 2)
+    matrix = np.asarray(rng.normal(size=(9, 120)) * (rng.random((9, 120)) < 0.3), dtype=np.float64)
+    found = moments(sparse.csr_array(matrix), spectrum, 2)
     average = (sparse.kron(repetition(6, 2), repetition(5, 2)).T / 4).toarray()
     covariance = root @ root.T
     np.testing.assert_allclose(found.readings, matrix @ covariance @ matrix.T, atol=1e-10)

@@ -20,6 +20,7 @@ from ommatid.scenes.shrinkage import shrink_variances
 
 from ..entry_memory import check_entries
 from ..ideal import ideal_matrix
+from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import rounding_variance
 from .fit.chart import SIDE
@@ -40,11 +41,15 @@ def rendered_model(
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     record = dict[str, Any](method=scene.calibration.method)
 
+    # Wide kernels need as many sweeps of point sources as they have cells; their rays give the same H.
+    fast = not choose(scene.render.variant).startswith("scalar")
+    by_rays = fast and setup.is_applied and not camera.has_box_footprints
+
     def measure(subsets: Subsets | None) -> Responses:
         if setup.is_applied:  # then no memory was asked for entries
             whole = [lens for lens in camera.types if subsets is None or _is_whole(subsets, lens)]
             check_entries(camera, whole, scene.calibration.method, "few numbers do not explain all of H: ")
-        if scene.calibration.method == "transport":
+        if scene.calibration.method == "transport" or by_rays:
             from .ray_transport import responses_from_rays
 
             responses = responses_from_rays(setup, progress, plans, subsets)

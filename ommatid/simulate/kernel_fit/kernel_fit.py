@@ -3,8 +3,9 @@
 The entries of a chart of sensor pixels determine how the kernels of `ommatid.scenes.fitted.kernels` deviate from the
 design: each cell is fitted by a polynomial of the field, of the degree of the least expected error, and the variation
 over the field is reduced to its principal components. Where the rays show no deviation, H is that of the design, with
-the errors of the simplest deviation. The explanation is rejected if the residuals scatter more than the batches say: in
-any way that shows in a picture, or by more than a tenth of the entries' own variance.
+the errors of the simplest deviation. The explanation is rejected if the residuals scatter more than the batches say: by
+more than three times the noise in a picture, or a tenth of the entries' own variance. What is less, and shows in a
+picture, is added to the errors.
 
 The directions in which the kernels are uncertain follow from fits to errors drawn from the scatter of the batches. A
 draw gives every pixel of the chart a random combination of its batches' deviations, which has the covariance of the
@@ -35,6 +36,7 @@ DRAWS = 64
 SHARE = 0.99  # of the expected variance of H f that the directions describe; they are scaled to all of it
 KERNELS = 0.999  # of that variance that the common kernels of the directions describe
 MOST_DIRECTIONS, MOST_KERNELS = 16, 32
+MOST_SHOWN = 3.0  # of the variance that noise has in a picture: less is added to the errors
 MOST_UNEXPLAINED = 0.1  # of the entries' variance, with which kernels are still far better than entries
 
 
@@ -48,7 +50,7 @@ def error_directions(chart: Chart, candidate: Candidate, parts: Components) -> t
     if total <= 0:
         return np.zeros((0, cells)), np.zeros((0, 0, count))
     kept = _needed(values, SHARE, MOST_DIRECTIONS)
-    scale = (total / values[-kept:].sum() / draws) ** 0.5
+    scale = ((1 + candidate.shown) * total / values[-kept:].sum() / draws) ** 0.5
     directions = np.asarray(np.tensordot(vectors[:, -kept:].T * scale, errors, axes=1), dtype=np.float64)
     terms = directions.swapaxes(1, 2).reshape(-1, cells)
     shown = chart.seen(terms * chart.share**0.5)
@@ -121,9 +123,7 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
     details, reason = _details(chart, candidate), ""
     if candidate.rejected:
         reason = f"the entries scatter more about the kernels than rays do ({', '.join(candidate.rejected)})"
-    if any(name.endswith("picture") for name in candidate.rejected) or (
-        candidate.rejected and candidate.unexplained > MOST_UNEXPLAINED
-    ):
+    if candidate.shown > MOST_SHOWN or (candidate.rejected and candidate.unexplained > MOST_UNEXPLAINED):
         return KernelFit(False, reason, details=details)
     parts = components(chart, candidate)
     details["components"] = {

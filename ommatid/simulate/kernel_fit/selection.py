@@ -30,7 +30,7 @@ class Candidate:
     """A polynomial for every cell; if it is `as_designed`, all are 0, and their errors those of the sums.
 
     coefficients : (1 + B, C, P) of the mean and of the batches' deviations;  chances : of each test
-    unexplained : mean square of what it leaves of an entry beside noise, in units of the entry's variance
+    excesses : of each test, the part of its sum of squares that is not noise, in units of the noise
     """
 
     degree: int
@@ -39,13 +39,23 @@ class Candidate:
     sums: Sums
     coefficients: FloatArray
     chances: dict[str, float]
-    unexplained: float
+    excesses: dict[str, float]
 
     @property
     def rejected(self) -> list[str]:
         """The tests that it does not pass."""
         single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(self.chances))
         return [name for name, value in self.chances.items() if value < single]
+
+    @property
+    def unexplained(self) -> float:
+        """Mean square of what it leaves of an entry beside noise, in units of the entry's variance."""
+        return self.excesses["all cells"]
+
+    @property
+    def shown(self) -> float:
+        """The largest excess of the tests of a picture that it does not pass, in units of the noise."""
+        return max((self.excesses[name] for name in self.rejected if name.endswith("picture")), default=0.0)
 
 
 def highest_degree(chart: Chart) -> int:
@@ -83,7 +93,8 @@ def _tested(chart: Chart, sums: Sums, own: Sums, as_designed: bool, symmetric: b
     left = residual(sums.up_to(min(own.degree + HIGHER, sums.degree)), coefficients)
     tests = term_sums(chart, left) | residual_sums(chart, coefficients, own.degree)
     chances = {name: chance(products) for name, products in tests.items()}
-    return Candidate(own.degree, symmetric, as_designed, own, coefficients, chances, excess(tests["all cells"]))
+    excesses = {name: excess(products) for name, products in tests.items()}
+    return Candidate(own.degree, symmetric, as_designed, own, coefficients, chances, excesses)
 
 
 def _best(sums: Sums, reference: FloatArray, shown: _PictureOfChart) -> tuple[Sums, bool]:

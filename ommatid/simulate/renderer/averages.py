@@ -40,7 +40,7 @@ class Averages:
         import mitsuba as mi
 
         self._camera, self._box, self._parts = camera, lens_type.ratio.numerator, lens_type.ratio.denominator
-        fine = np.kron(picture, np.ones((self._parts, self._parts)))
+        fine: FloatArray = np.repeat(np.repeat(picture, self._parts, axis=0), self._parts, axis=1)
         means = np.full(self._box, 1 / self._box)
         moments = ((np.arange(self._box) + 0.5) / self._box - 0.5) / self._box
         down, offset_down = (_over_boxes(fine, weights) for weights in (means, moments))
@@ -48,9 +48,8 @@ class Averages:
         layers.append(_over_boxes(down.T, moments).T)
         self._shape = layers[0].shape
         data = np.ascontiguousarray(np.stack(layers, axis=-1), dtype=np.float32)
-        self._texture: Any = mi.Texture2f(
-            mi.TensorXf(data), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp
-        )
+        texture: Any = mi.Texture2f
+        self._texture = texture(mi.TensorXf(data), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp)
 
     def light(self, ray: Any, falloff: tuple[Any, Any]) -> Any:
         """Return the radiance that the pixels of rays from their middles meet.

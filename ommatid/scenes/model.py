@@ -171,23 +171,23 @@ class Model:
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
         """L, (M, q), such that the error of H f by that of few numbers is L xi with independent xi of variance 1."""
-        return self.fitted.directions(image, self._gradients(image)) if self.fitted and self.fitted.has_errors else None
+        fitted = self._uncertain
+        return None if fitted is None else fitted.directions(image, self._gradients(image))
 
     def error_variance(self, image: FloatArray) -> FloatArray | None:
         """Variance of each measurement by the errors of few numbers, (M,): the diagonal of L L^T."""
-        return (
-            self.fitted.error_variance(image, self._gradients(image))
-            if self.fitted and self.fitted.has_errors
-            else None
-        )
+        fitted = self._uncertain
+        return None if fitted is None else fitted.error_variance(image, self._gradients(image))
 
     def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
         """A random error of H f by those of few numbers, L xi: (M,)."""
-        return (
-            self.fitted.error_draw(image, self._gradients(image), rng)
-            if self.fitted and self.fitted.has_errors
-            else None
-        )
+        fitted = self._uncertain
+        return None if fitted is None else fitted.error_draw(image, self._gradients(image), rng)
+
+    @property
+    def _uncertain(self) -> FittedMatrix | None:
+        """H by few numbers, if these have errors."""
+        return self.fitted if self.fitted is not None and self.fitted.has_errors else None
 
     def _gradients(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """H applied to the gradient of f, (N,), down and across: (M,) each."""

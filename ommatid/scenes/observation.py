@@ -116,6 +116,12 @@ class ObservationPart(ABC):
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to the measurements inside it."""
 
+    def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to some measurements; those that see more than it are kernels' alone."""
+        inside = self.measurements_inside(rows, columns)
+        order = np.argsort(inside)
+        return self.submatrix(rows, columns)[order[np.searchsorted(inside, numbers, sorter=order)]]
+
     @abstractmethod
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key that is equal for two windows only if their submatrices are equal."""
@@ -294,6 +300,16 @@ class Observation:
         """Return H from a window of f to the measurements inside it: (m, pixels of the window)."""
         parts = [part.submatrix(rows, columns) for part in self.parts]
         return sparse.csr_array(sparse.vstack(parts, format="csr"))
+
+    def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to some measurements: (numbers, pixels of the window); see `ObservationPart`.
+
+        numbers : in the order of the parts
+        """
+        pairs = zip(self.slices, self.parts, strict=True)
+        chosen = [(place.start, part, (numbers >= place.start) & (numbers < place.stop)) for place, part in pairs]
+        found = [part.rows_on(numbers[own] - start, rows, columns) for start, part, own in chosen if own.any()]
+        return sparse.csr_array(sparse.vstack(found, format="csr"))
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key that is equal for two windows only if their submatrices are equal."""

@@ -156,6 +156,42 @@ def test_a_frame_estimates_the_world_and_averages_it(kind: str, monkeypatch: pyt
     assert of_f.interval.mse == pytest.approx(exact.expected.mse, rel=0.4)
 
 
+@cache
+def blurred(prior_kind: str) -> tuple[Setup, Model]:
+    """Apertures whose Airy patterns are wider than the target, before a world three times finer, without entries."""
+    prior = EXPONENTIAL if prior_kind == "exponential" else {"kind": prior_kind}
+    tables = {"prior": prior, "noise": {"variance": 1e-2}, "calibration": {"method": "ideal"}}
+    lenses = (("1/3", [3, 3], [7, 7]), ("1/2", [2, 2], [11, 11]))
+    described, _ = with_optics({"aperture": "0.4 mm"}, {"lens_pitch": "1 mm"}, lenses, (24, 24), **tables)
+    described = described.model_copy(update={"target": described.target.model_copy(update={"detail": 3})})
+    setup = Setup.from_scene(described)
+    model = ideal_model(setup.resolved, setup.calibrated.camera)
+    assert model.stored is None
+    return setup, model
+
+
+def test_few_pixels_in_front_of_a_large_world_are_a_dense_problem() -> None:
+    """Where pixels are independent, f's own H has entries although that of the world has none."""
+    setup, model = blurred("independent")
+    coarse = model_of_f(model, setup.camera, setup.scene.prior)
+    expected = model.observation.to_sparse() @ repetition((24, 24), 3)
+    np.testing.assert_allclose(coarse.matrix.toarray(), expected.toarray(), atol=1e-12)
+
+
+def test_a_prior_is_fitted_behind_kernels_wider_than_the_target() -> None:
+    """No measurement sees a window alone: those of its middle do, with their light from beside it as noise."""
+    setup, model = blurred("fit")
+    update = {"kind": "exponential", "correlation_length": 6.0, "variance": 900.0}
+    table = setup.scene.prior.model_copy(update=update)
+    world = WorldPrior.of(table, (24, 24), 1.0, 3).draw(np.random.default_rng(1)) + 127.5
+    stack = exposed(setup, model.forward(world), np.zeros(model.measurements), {})
+    result = restore(stack, model, world)
+    assert result.fit is not None
+    assert result.choice.method == "detail"
+    logs = np.log([(result.fit.variance or 0) / 900.0, (result.fit.length or 0) / 6.0])
+    assert np.abs(logs / np.array(result.fit.spread)).max() < 4
+
+
 def test_the_covariance_of_a_lag_is_averaged_over_places() -> None:
     """Pixels beyond the edge are those of the mirror image."""
     shown = case("misaligned")

@@ -24,6 +24,7 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.model import Model
 from ommatid.scenes.observation import Observation
 from ommatid.scenes.tables.estimation import PriorTable
@@ -182,9 +183,10 @@ def _without_detail(model: Model, camera: Camera, mean: float) -> DetailedModel:
     expansion = repetition(camera.shape, camera.detail)
     if model.stored is None:
         coarse = model.observation.coarser(camera, camera.detail)
-        return _detailed(model, camera, mean, coarse, expansion, np.zeros(model.unknowns), None, None)
-    matrix = sparse.csr_array(model.stored @ expansion)
-    return _detailed(model, camera, mean, matrix, expansion, np.zeros(model.unknowns), None, None)
+        gain = coarse.to_sparse() if camera.unknowns <= MOST_DENSE else coarse
+    else:
+        gain = sparse.csr_array(model.stored @ expansion)
+    return _detailed(model, camera, mean, gain, expansion, np.zeros(model.unknowns), None, None)
 
 
 def _exact(model: Model, camera: Camera, prior: PriorTable) -> DetailedModel:

@@ -90,8 +90,8 @@ def world_map(
     if actual.size <= MOST_READINGS and max(task.shape_of_f) <= SIDE + SIDE // 2:
         exact = moments(task.model.to_sparse()[task.used], bands.spectrum, task.finer)
         return exact.variances(task.expected_noise, actual, task.shape_of_f), exact.pixels, True
-    level = np.log(_levels(task, observation, weights))
-    variances = _frame_map(bands, task, _ratios(task, weights, actual), level)
+    level = np.log(levels(task, observation, weights))
+    variances = _frame_map(bands, task, mean_ratios(task, weights, actual), level)
     if len(observation.parts) != len(bands.types):
         variances = _by_windows(variances, task, actual)
     return variances, bands.prior_variance, False
@@ -150,11 +150,11 @@ def _frame_map(bands: Bands, task: EstimationTask, ratios: tuple[float, ...], le
         maps = zip((found.posterior, found.missing, found.noisy), even.variances(level, ratios), strict=True)
         return [enlarged(each / max(mean, np.finfo(float).tiny), bands.shape) for each, mean in maps]
 
-    pairs = zip(_between(level, INTERIOR, inside), _between(level, EDGES, edges), strict=True)
+    pairs = zip(between(level, INTERIOR, inside), between(level, EDGES, edges), strict=True)
     return VarianceMap(*(one * other for one, other in pairs))
 
 
-def _between(level: FloatArray, count: int, maps: Callable[[float], list[FloatArray]]) -> list[FloatArray]:
+def between(level: FloatArray, count: int, maps: Callable[[float], list[FloatArray]]) -> list[FloatArray]:
     """Return maps at each pixel's level, between those of `count` levels, whose logarithms are interpolated."""
     low, high = float(level.min()), float(level.max())
     if high - low <= EVEN:
@@ -170,7 +170,7 @@ def _between(level: FloatArray, count: int, maps: Callable[[float], list[FloatAr
     return [np.exp(each) for each in total]
 
 
-def _levels(task: EstimationTask, observation: Observation, weights: FloatArray) -> FloatArray:
+def levels(task: EstimationTask, observation: Observation, weights: FloatArray) -> FloatArray:
     """Return the weights of each pixel's measurements relative to the means of their lens types: (rows, columns)."""
     means = np.empty_like(weights)
     for part in task.model.camera.type_slices():
@@ -180,7 +180,7 @@ def _levels(task: EstimationTask, observation: Observation, weights: FloatArray)
     return np.maximum(relative, LEAST_LEVEL).reshape(task.shape_of_f)
 
 
-def _ratios(task: EstimationTask, weights: FloatArray, actual: FloatArray) -> tuple[float, ...]:
+def mean_ratios(task: EstimationTask, weights: FloatArray, actual: FloatArray) -> tuple[float, ...]:
     """Return the ratio of the actual to the expected noise of each lens type, weighted as the estimator weighs it."""
     ratios = task.on_all_measurements(actual / task.expected_noise, 0.0)
     parts = [(weights[part], ratios[part]) for part in task.model.camera.type_slices()]

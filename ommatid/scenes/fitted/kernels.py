@@ -282,10 +282,10 @@ class KernelFootprints(ObservationPart):
         return replace(self, places=places, shapes=KernelShapes.dense(*parts))
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
-        """Return the indices of the measurements whose kernels lie inside a window of f as a whole."""
+        """Return the indices of the measurements that see nothing of f beside a window of it."""
         inside = [
-            (start >= part.start) & (start + self.places.width <= part.stop)
-            for start, part in zip(self.places.starts, (rows, columns), strict=True)
+            (np.maximum(start, 0) >= part.start) & (np.minimum(start + self.places.width, size) <= part.stop)
+            for start, part, size in zip(self.places.starts, (rows, columns), self.shape, strict=True)
         ]
         order = (*self.places.lens_type.array, *self.places.lens_type.pixels)
         every = np.arange(self.measurements).reshape(order).swapaxes(1, 2).reshape(inside[0].size, inside[1].size)
@@ -294,6 +294,10 @@ class KernelFootprints(ObservationPart):
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to the measurements inside it."""
         return self._chunked(self.measurements_inside(rows, columns), (rows, columns))
+
+    def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to some measurements; what they see beside it is left out."""
+        return self.rows(numbers, (rows, columns))
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key of the window alone: kernels vary over the field."""

@@ -52,6 +52,8 @@ class Renderer:
     staged : the world, if there is one
     """
 
+    _picture: FloatArray | None = None
+
     def __init__(
         self,
         camera: Camera,
@@ -88,8 +90,7 @@ class Renderer:
         self._placement = MILLIMETRES_AT_ORIGIN
         self._texels = "target.emitter.radiance.data"
         self._texture: Any = None
-        self._picture: FloatArray | None = None
-        self._averages: dict[str, Averages] = {}
+        self._averages: dict[str, Averages] = {}  # of `_picture`
         if world is None:
             texture: Any = mi.load_dict(black(camera, self.channels)) if fast else black(camera, self.channels)
             self._scene = mi.load_dict(scene_of(target_of(camera, texture)))

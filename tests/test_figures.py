@@ -39,6 +39,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/speed.md", None): "times and ratios of `make bench`",
     ("docs/batches.md", "Many frames of one camera"): "ratios of times, measured once",
     ("docs/frames.md", "Time and memory"): "times and memory, `python -m tests.benchmarks frames`",
+    ("docs/frames.md", "Worlds finer than f"): "experiments against exact solutions, which no command prints",
     ("docs/frames.md", "Whole frames"): "defaults and limits of the program",
     ("docs/frames.md", "Error bars"): "experiments against exact solutions, which no command prints",
     ("docs/frames.md", "Tiles"): "experiments against exact solutions, which no command prints",

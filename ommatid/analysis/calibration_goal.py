@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ommatid.reconstruct.detail.detailed_model import independent_detail, model_of_f
+from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.reconstruct.expected_error import ExpectedError
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance
 from ommatid.reconstruct.noise import SHARED, Noise, known_noise, uniform, usable_pixels
 from ommatid.reconstruct.restore import restore
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint
 from ommatid.runtime.streams import Purpose, probe
@@ -32,7 +32,8 @@ def for_stack(stack: Stack) -> StoppingRule:
     """Return the rule by the error budget of the stack for which H is calibrated."""
 
     def added_error(model: Model) -> float:
-        bound = _negligible_bound(stack, model)
+        used = usable_pixels(stack, model).used
+        bound = _bound(model, used, total_variance(known_noise(stack))[used])
         if bound is not None:
             return bound
         restoration = restore(stack, model)
@@ -65,15 +66,17 @@ def for_prior(setup: Setup) -> StoppingRule:
         used = np.isfinite(noise)
         if model.stored is not None:
             used &= np.diff(model.stored.indptr) > 0
+        elif (bound := _bound(model, used, noise[used])) is not None:
+            return bound
         model = model_of_f(model, camera, prior)
         from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
         random = probe(Purpose.GOAL).normal(size=model.unknowns)
         shared = model.error_variance(prior.mean + prior.variance**0.5 * random)
         from_model = from_model if shared is None else from_model + shared
-        causes = {"noise": noise[used], "calibration": from_model[used], **independent_detail(model, used)}
+        causes = {"noise": noise[used], "calibration": from_model[used]}
         setting = scene.estimator.noise_variance
         recorded = model.forward(np.full(model.unknowns, prior.mean))
-        method = METHODS[choose_method(scene, camera, exact=model.has_boxes or model.stored is None).method]
+        method = METHODS[choose_method(scene, camera, exact=model.is_applied).method]
 
         def expected(noise: Noise) -> ExpectedError:
             assumed = uniform(setting, int(used.sum())) if isinstance(setting, float) else total_variance(noise)
@@ -86,6 +89,7 @@ def for_prior(setup: Setup) -> StoppingRule:
                 scene.estimator,
                 scene.tiles,
                 scene.prior_ratio,
+                finer=model.camera.rows // camera.rows,
             )
             return method(task, Execution()).result(noise, None).expected
 
@@ -95,21 +99,21 @@ def for_prior(setup: Setup) -> StoppingRule:
     return StoppingRule(added_error, fingerprint(["prior", _tables(scene)]), "Eq. 5 for images drawn from the prior")
 
 
-def _negligible_bound(stack: Stack, model: Model) -> float | None:
-    """Return a bound on the part due to the uncertainty of H if it is small against the other noise, else None.
+def _bound(model: Model, used: BoolArray, others: FloatArray) -> float | None:
+    """Return a bound on the part due to the uncertainty of H where a reconstruction can be saved, else None.
 
-    It saves a reconstruction. Both are compared measurement by measurement, for images of white noise from 0 to 255: by
-    the maximum where it is negligible everywhere, by the mean where a few rows are spoilt by stray rays.
+    It is compared with the variances of the other noise, of the measurements used, for images of white noise from 0 to
+    255: by the maximum where it is negligible everywhere, by the mean where a few rows are spoilt by stray rays. By the
+    mean, too, where H is large and follows from kernels, whose errors all measurements of a lens type share alike.
     """
-    used = usable_pixels(stack, model).used
-    others = total_variance(known_noise(stack))[used]
     uncertain = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))
     shared = model.error_variance(WHITE * probe(Purpose.GOAL_BOUND).random(model.unknowns))
     uncertain = uncertain if shared is None else uncertain + shared
     relative = uncertain[used] / np.maximum(others, TINY)
     if not relative.size or float(relative.max()) <= NEGLIGIBLE:
         return float(relative.max(initial=0.0))
-    return float(relative.mean()) if float(relative.mean()) <= NEGLIGIBLE / 10 else None
+    alike = model.stored is None and not model.camera.has_box_footprints
+    return float(relative.mean()) if alike or float(relative.mean()) <= NEGLIGIBLE / 10 else None
 
 
 def _added(noise: Noise, expected: ExpectedError, mse_without: Callable[[], float]) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.reconstruct.output.run_json import DepthBin
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.printable import printable_label
@@ -121,12 +121,9 @@ def draw(
     files: FigureFiles = SCREEN_PNG,
 ) -> None:
     """Draw error and expected deviation against distance above, and each lens type's disparity below."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullLocator
 
-    figure: Any = Figure(figsize=(6.4, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(6.4, 6.4, layout="constrained")
     figure.suptitle(printable_label(title))
     above, below = figure.subplots(2, 1, sharex=True)
     below.set_xscale("log")

@@ -54,13 +54,13 @@ def predict_ideal(scene: Scene) -> Prediction:
     """Predict the error of a scene with the ideal H. Raises InputError where the estimator takes a recorded stack."""
     setup = Setup.from_scene(scene)
     camera = setup.camera
-    choice = choose_method(scene, camera, exact=camera.may_be_applied)
+    choice = choose_method(scene, camera, exact=camera.is_applied)
     actual = expected_noise(setup)
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.method != "dense" or camera.has_detail:
         model = model_of_f(ideal_model(scene, camera.with_grid_of_matrix), camera, scene.prior)
-        return replace(predict_frame(choice, model, actual), assumes=_ideal_assumptions(setup))
+        return replace(predict_frame(choice, model, camera, actual), assumes=_ideal_assumptions(setup))
     prior = prior_of(scene.assumed_prior, camera.shape, camera.target_pitch, camera.detail)
     added = None
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":

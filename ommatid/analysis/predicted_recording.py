@@ -125,8 +125,8 @@ def _camera(setup: Setup) -> _Camera:
     """Return H of the camera that records: in closed form, or where it has none from a pilot."""
     scene, simulated = setup.scene, setup.simulated
     calibrated = scene.calibration.method != "ideal"
-    boxes = setup.camera.has_box_footprints and simulated.tolerance is None and setup.has_closed_form
-    if boxes and (setup.has_structured_matrix or explains(setup)):
+    designed = simulated.tolerance is None and setup.has_closed_form
+    if designed and (setup.is_applied or (setup.camera.has_box_footprints and explains(setup))):
         return _Camera(ideal_model(scene, setup.camera), None, ())
     plans = pilot.calibration_plans(setup)
     uncertain = pilot.pilot(setup, plans) if calibrated and not explains(setup) else None

@@ -15,7 +15,7 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_csv, write_text
-from ommatid.runtime.input_files import check_unique_keys, read_bytes
+from ommatid.runtime.input_files import read_record
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -24,7 +24,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibrate import cached_model
 from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
-from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
+from ommatid.simulate.ideal import ideal_model, true_model
 
 NUMBERS, TABLE = "study.json", "study.csv"
 MISALIGNMENT = {"robust": "robust", "fitted": "fit"}  # estimator.misalignment by model; "trust" for all others
@@ -48,7 +48,7 @@ class StudyFile(Record):
 def check_study(scene: Scene, camera: Camera) -> None:
     """Raise InputError where a study names a model with which this camera cannot be reconstructed."""
     for name in () if scene.study is None else scene.study.models:
-        choose_method(_with_misalignment(scene, name), camera, camera.may_be_applied)
+        choose_method(_with_misalignment(scene, name), camera, camera.is_applied)
         if name == "true" and camera.tolerance is not None and not camera.has_sharp_footprints:
             raise InputError(
                 f"{scene.source}: study.models: the 'true' H of misaligned lenses with surfaces or blur has no closed"
@@ -113,9 +113,7 @@ def remove_study(folder: Path) -> None:
 
 def _read_study(folder: Path) -> tuple[tuple[StudyCase, ...], str | None]:
     """Return the cases in study.json, and its fingerprint if study.csv is there too."""
-    content = read_bytes(folder / NUMBERS)
-    study = StudyFile.model_validate_json(content)
-    check_unique_keys(folder / NUMBERS, content)
+    study: StudyFile = read_record(folder / NUMBERS, StudyFile, "a study", "run the scene again")
     return study.cases, study.fingerprint if (folder / TABLE).is_file() else None
 
 
@@ -142,7 +140,7 @@ def study_models(
 
     def make(name: str) -> Model:
         if name == "true":
-            return exact_model(setup.resolved, camera, true_matrix(camera), "true")
+            return true_model(setup.resolved, camera)
         if name not in ("points", "transport"):
             return ideal_model(setup.resolved, camera)
         calibration = scene.calibration.model_copy(update={"method": name})

@@ -6,7 +6,7 @@ before its stages, which can be wrapped: to make everything again, and to write 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from ommatid.reconstruct.output.estimate_formats import Format, write_formats
 from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
-from ommatid.runtime.execution.workers import LOST, Completed
+from ommatid.runtime.execution.workers import Completed
 from ommatid.runtime.files import clear_abandoned, make_folder
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_output
@@ -109,9 +109,8 @@ class Batch:
     def _in_processes(self, members: Sequence[Member], count: int) -> Runs:
         """Yield scenes as they end; the processes write to the scenes' own folders."""
         with worker_pool(count=count) as pool:
-            for ended in pool.each(partial(_run_in_process, self.open, self.stages), members):
-                member = members[ended.index]
-                yield member, partial(self._collect, member, ended)
+            ended = pool.each(partial(_run_in_process, self.open, self.stages), members)
+            yield from self._collected(ended, members, list(members))
 
     def _on_cluster(self, members: Sequence[Member], cluster: Cluster) -> Runs:
         """Yield scenes with errors that show already here, then the others as they end."""
@@ -132,18 +131,32 @@ class Batch:
         with worker_pool(cluster) as pool:
             pool.check_versions(partial(self.versions, auto_variant))
             packages = _ScenePackages(self.open, tuple(waiting))
-            try:
-                for ended in pool.each(partial(carry_out, self.stages), packages):
-                    if ended.is_lost:
-                        raise MachineError(LOST)
-                    member = packages.sent[ended.index]
-                    waiting.remove(member)
-                    yield member, partial(self._collect, member, ended)
-            except MachineError as error:
-                left = [member for member in waiting if member not in packages.failed]
-                packages.failed |= _unfinished(left, error)
+            ended = pool.each(partial(carry_out, self.stages), packages)
+            yield from self._collected(ended, packages.sent, waiting, packages.failed)
+
+    def _collected(
+        self,
+        tasks: Iterable[Completed[SceneOutcome]],
+        sent: Sequence[Member],
+        waiting: list[Member],
+        failed: dict[Member, Exception] | None = None,
+    ) -> Runs:
+        """Yield the scenes of tasks as they end, then those left over if connection or processes are lost.
+
+        sent : scenes by the tasks' indices;  waiting : all scenes;  failed : those that could not be sent
+        """
+        failed = {} if failed is None else failed
+        try:
+            for ended in tasks:
+                if ended.loss is not None:
+                    raise ended.loss
+                member = sent[ended.index]
+                waiting.remove(member)
+                yield member, partial(self._collect, member, ended)
+        except MachineError as error:
+            failed |= _unfinished([member for member in waiting if member not in failed], error)
         for member in waiting:
-            yield member, partial(_raise, packages.failed[member])
+            yield member, partial(_raise, failed[member])
 
     def _collect(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
         """Write the files that a worker returned, and report its stages. Raises the worker's error.
@@ -166,7 +179,7 @@ class Batch:
 
 
 def _unfinished(members: Sequence[Member], error: MachineError) -> dict[Member, Exception]:
-    """Return an error for each scene that is left when a cluster fails. The first one counts the others."""
+    """Return an error for each scene that is left when a cluster or a process fails; the first counts the others."""
     if not members:
         return {}
     first, *others = members

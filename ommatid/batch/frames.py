@@ -23,7 +23,7 @@ from ommatid.reconstruct.output.estimate_formats import Format, check_formats, c
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
-from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint
 from ommatid.runtime.input_files import real_path
@@ -174,7 +174,7 @@ def _all_frames(
             missing.append(frame)
         else:
             write_formats(frame.output, options.formats)
-            yield frame, partial(_returned, (report, False))
+            yield frame, lambda report=report: (report, False)
     shared = _here(missing, prepared, options)
     if workers is not None and workers > 1:
         shared = _in_processes(missing, prepared, options, workers)
@@ -189,9 +189,8 @@ def _here(frames: Sequence[Frame], prepared: Prepared, options: FrameOptions) ->
 
 
 def _in_processes(frames: Sequence[Frame], prepared: Prepared, options: FrameOptions, workers: int) -> Reports:
-    """Yield the first frame, made here, then the others as processes make them."""
-    for frame in frames[:1]:
-        yield frame, partial(_returned, _outcome(frame, prepared, options))
+    """Yield the first frame, made here by its caller, then the others as processes make them."""
+    yield from _here(frames[:1], prepared, options)
     others = frames[1:]
     if not others:
         return
@@ -200,7 +199,9 @@ def _in_processes(frames: Sequence[Frame], prepared: Prepared, options: FrameOpt
         contents.write_bytes(pickle.dumps(prepared.contents(*SENT)))
         with worker_pool(count=min(workers, len(others))) as pool:
             for task in pool.each(partial(_made_in_process, options, contents), others):
-                yield others[task.index], partial(_collected, task.result)
+                if task.loss is not None:
+                    raise task.loss
+                yield others[task.index], task.result
 
 
 def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunReport, bool]:
@@ -218,31 +219,11 @@ def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunR
     return report, True
 
 
-Outcome = tuple[RunReport, bool] | Exception
-
-
-def _outcome(frame: Frame, prepared: Prepared, options: FrameOptions) -> Outcome:
-    try:
-        return _made(frame, prepared, options)
-    except (InputError, MachineError, OSError, MemoryError) as error:
-        return error
-
-
-def _made_in_process(options: FrameOptions, contents: Path, frame: Frame) -> Outcome:
-    return _outcome(frame, _prepared(options, contents), options)
+def _made_in_process(options: FrameOptions, contents: Path, frame: Frame) -> tuple[RunReport, bool]:
+    return _made(frame, _prepared(options, contents), options)
 
 
 @lru_cache(maxsize=1)
 def _prepared(options: FrameOptions, contents: Path) -> Prepared:
     """Return what the first frame prepared, once per process."""
     return Prepared(options.read_model()).with_contents(pickle.loads(contents.read_bytes()))
-
-
-def _collected(result: Callable[[], Outcome]) -> tuple[RunReport, bool]:
-    return _returned(result())
-
-
-def _returned(outcome: Outcome) -> tuple[RunReport, bool]:
-    if isinstance(outcome, Exception):
-        raise outcome
-    return outcome

@@ -51,7 +51,7 @@ def plan(
     """
     check_scene(setup)
     check_files(setup, member.folder)
-    choice = choose_method(setup.scene, setup.camera, setup.may_be_applied)
+    choice = choose_method(setup.scene, setup.camera, setup.is_applied)
     described = summary.describe(setup, variant.choose(setup.scene.render.variant), choice)
     states = dict.fromkeys(STAGES, TO_MAKE) if force else _states(member.folder, setup)
     cost = estimate_cost(member, changes, lenses)
@@ -109,7 +109,7 @@ def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str])
     """Estimate the cost of a scene of a batch; 0 for one with errors, which are reported when it is run."""
     try:
         setup = Setup.from_scene(read(member.scene, (*changes, *member.changes), lenses))
-        choice = choose_method(setup.scene, setup.camera, setup.may_be_applied)
+        choice = choose_method(setup.scene, setup.camera, setup.is_applied)
     except InputError:
         return CostEstimate(0.0, 0)
     calibration, samples = setup.scene.calibration, setup.scene.calibration.samples

@@ -10,11 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
-from ommatid.runtime.input_files import check_unique_keys, read_bytes
+from ommatid.runtime.input_files import read_record
 from ommatid.scenes.tables.toml import value_of
 
 NUMBERS = "sweep.json"
@@ -120,14 +119,7 @@ def write_rows(path: Path, rows: Sequence[SweepRow]) -> None:
 
 def read_rows(path: Path) -> list[SweepRow]:
     """Read sweep.json. Raises InputError if it is missing, damaged or another file."""
-    try:
-        content = read_bytes(path)
-        rows = TypeAdapter(list[SweepRow]).validate_json(content)
-    except OSError as error:
-        raise InputError(f"{path}: could not be read ({error.strerror}); `ommatid run --sweep` writes it") from error
-    except ValidationError as error:
-        raise InputError(f"{path}: expected the table of a sweep, got something else; repeat the sweep") from error
-    check_unique_keys(path, content)
+    rows: list[SweepRow] = read_record(path, list[SweepRow], "the table of a sweep", "repeat `ommatid run --sweep`")
     return rows
 
 

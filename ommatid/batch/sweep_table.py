@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ommatid.figures.quantity_axis import GREY_LEVELS, QuantityAxis, quantity_axis, spans_decade
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.runtime.files import clear_abandoned, make_folder, write_csv
 from ommatid.runtime.printable import printable_label
@@ -109,14 +109,10 @@ def _columns(rows: Sequence[SweepRow]) -> list[str]:
 @own_style()
 def write_figure(path: Path, rows: Sequence[SweepRow], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the errors of a sweep. Raises MachineError."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     settings = _settings(rows)
     x_key, colour_key, style_keys = _roles(settings)
     axis = _axis(x_key, settings)
-    figure: Any = Figure(figsize=(10, 6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10, 6, layout="constrained")
     panel = figure.subplots()
     shown = list(dict.fromkeys(setting[colour_key] for setting in settings)) if colour_key else [""]
     colours = _colours(colour_key, shown)

@@ -10,7 +10,7 @@ from math import log
 from pathlib import Path
 from typing import Any
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.runtime.printable import printable_label
 
 from .slopes import TOLERANCE, median_error, median_seconds, pareto_front
@@ -36,13 +36,9 @@ Ordinate = Callable[[Cell], Quantiles | None]
 @own_style()
 def write_figures(folder: Path, table: BenchTable, files: FigureFiles = SCREEN_PNG) -> None:
     """Write a PNG for each stage that has cells: render.png, calibrate.png, reconstruct.png."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     for stage in STAGES:
         if table.of(stage):
-            figure: Any = Figure(figsize=(19, 7.4), layout="constrained")
-            FigureCanvasAgg(figure)
+            figure = new_figure(19, 7.4, layout="constrained")
             _draw(figure, table, stage)
             files.replace(figure, folder / f"{stage}.png")
 

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
 
-from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_csv, write_text
-from ommatid.runtime.input_files import check_unique_keys, read_bytes, real_path
+from ommatid.runtime.input_files import read_record, real_path
 
 JSON, CSV = "bench.json", "bench.csv"
 DENSE = "dense"  # one dense problem, which estimator.method = "auto" takes where it fits
@@ -194,19 +194,9 @@ def write(folder: Path, table: BenchTable) -> None:
 
 def read(path: Path) -> BenchTable:
     """Read bench.json. Raises InputError if the file is missing, truncated or not written by `ommatid bench`."""
-    try:
-        content = read_bytes(path)
-        table = BenchTable.model_validate_json(content, strict=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); run `ommatid bench` to create it") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        field, reason = shortened(".".join(map(str, first["loc"]))) or "the file", shortened(first["msg"])
-        raise InputError(
-            f"{path}: expected the output of `ommatid bench`, but {field} is not valid ({reason});"
-            " run `ommatid bench` again"
-        ) from error
-    check_unique_keys(path, content)
+    table: BenchTable = read_record(
+        path, BenchTable, "the output of `ommatid bench`", "run `ommatid bench` again", strict=True
+    )
     return table
 
 

@@ -17,7 +17,7 @@ from ommatid.scenes.geometry.optical_terms import LensTerms, OpticalTerms, optic
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Scene
 
-from .saving import FORMATS, SCREEN_PNG, FigureFiles, own_style
+from .saving import FORMATS, SCREEN_PNG, FigureFiles, new_figure, own_style
 from .sensor_drawing import draw_sensor, draw_sub_images, length_words, sensor_aspect, write_beside
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
@@ -47,16 +47,12 @@ def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True) -> A
 
     described : False leaves out the title and the table of the lens types, where both stand beside the drawing
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     colours = {lens_type.name: COLOURS[index % len(COLOURS)] for index, lens_type in enumerate(camera.types)}
     terms = optical_terms(scene, camera)
     face = min(HIGHEST, max(LOWEST, NEAR_WIDTH / sensor_aspect(camera, terms)))
     key, above = (LINE * (len(camera.types) + 2.5), ABOVE) if described else (0.0, ABOVE - 2 * LINE)
     height = above + SECTION + BETWEEN + face + BELOW + key
-    figure: Any = Figure(figsize=(WIDTH, height))
-    FigureCanvasAgg(figure)
+    figure = new_figure(WIDTH, height)
 
     def axes(left: float, bottom: float, width: float, tall: float) -> Any:
         return figure.add_axes((left / WIDTH, bottom / height, width / WIDTH, tall / height))

@@ -75,6 +75,16 @@ def own_style() -> Generator[None]:
         yield
 
 
+def new_figure(width: float, height: float, **options: Any) -> Any:
+    """Return an empty figure of a size in inches, which needs no screen; options : of Matplotlib's Figure."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def save_figure(figure: Any, path: Path, formats: Sequence[str] = ("png",), resolution: int = SCREEN) -> None:
     """Write a figure beside `path` in each format; the suffix of `path` is replaced. Raises InputError or MachineError.
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.printable import printable_label
@@ -33,7 +33,7 @@ EXPECTED_NOISE = "noise variance that\nthe estimator expects"
 @own_style()
 def draw_sweeps(path: Path, shown: list[PaperTile], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 2 or 4: mean error against actual noise, whole and trimmed, one line per estimator and combination."""
-    figure = _figure(12.0, 6.0)
+    figure = new_figure(12.0, 6.0, layout="constrained")
     side = shown[0].side
     panels = figure.subplots(1, 2, sharey=True)
     for axes, trim in zip(panels, (0, TRIM), strict=True):
@@ -60,7 +60,7 @@ def draw_maps(path: Path, shown: list[PaperTile], noise: float, files: FigureFil
 
     Every map has its own scale, from 0 to its maximum.
     """
-    figure = _figure(14.5, 8.8)
+    figure = new_figure(14.5, 8.8, layout="constrained")
     figure.get_layout_engine().set(wspace=0.08, hspace=0.06)
     side = shown[0].side
     for panels, trim in zip(figure.subplots(2, len(shown)), (0, TRIM), strict=True):
@@ -91,7 +91,7 @@ def _error_map(figure: Any, axes: Any, tile: PaperTile, noise: float, trim: int)
 @own_style()
 def draw_sides(path: Path, shown: list[PaperTile], files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 5: tiles of several sizes with three lens types, on the same axes."""
-    figure = _figure(15.0, 5.8)
+    figure = new_figure(15.0, 5.8, layout="constrained")
     panels = figure.subplots(1, len(shown), sharey=True)
     for axes, tile in zip(panels, shown, strict=True):
         for number, (expected, colour) in enumerate(zip(EXPECTED, NOISE_COLOURS, strict=True)):
@@ -120,7 +120,7 @@ def _error_of_one(axes: Any, best: FloatArray) -> None:
 @own_style()
 def draw_distortion(path: Path, shown: list[PaperTile], noise: float, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw error against noise of one lens type with and without distortion and of three types, and maps of it."""
-    figure = _figure(14.5, 5.2)
+    figure = new_figure(14.5, 5.2, layout="constrained")
     axes, *panels = figure.subplots(1, 1 + len(shown), width_ratios=(1.9, *(1.0 for _ in shown)))
     for tile, colour in zip(shown, LENS_COLOURS, strict=True):
         label = f"{tile.name}: {tile.camera.measurements} measurements"
@@ -144,7 +144,7 @@ def draw_distortion(path: Path, shown: list[PaperTile], noise: float, files: Fig
 @own_style()
 def draw_photograph(path: Path, photograph: Photograph, side: int, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw Fig. 7: measured and predicted errors of six tiles against noise and bits, the tiles above."""
-    figure = _figure(13.0, 10.2)
+    figure = new_figure(13.0, 10.2, layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 3.2))
     name = (
         f"Six tiles of {Path(photograph.name).name}, {side} x {side} pixels each, reconstructed from three lens types"
@@ -215,15 +215,6 @@ def _marker(number: int) -> dict[str, Any]:
 def _power(value: float) -> str:
     exponent = round(np.log10(value))
     return f"$10^{{{exponent}}}$" if exponent else "1"
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure: Any = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def _axes(axes: Any, title: str, across: str, up: str) -> None:

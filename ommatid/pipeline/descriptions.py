@@ -42,7 +42,7 @@ class DesignComparison:
 def describe_scene(scene: Scene) -> dict[str, Any]:
     """Describe the geometry and the plan of a scene in JSON's types. Raises InputError that names the scene file."""
     setup = Setup.from_scene(scene)
-    choice = choose_method(scene, setup.camera, setup.may_be_applied)
+    choice = choose_method(scene, setup.camera, setup.is_applied)
     with naming_source(scene.source):
         lens_optics, light = optics(setup.camera), electrons(setup)
         world = {} if scene.world is None else {"world": check_world(setup).describe()}

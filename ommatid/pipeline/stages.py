@@ -97,7 +97,7 @@ def check_run(setup: Setup, folder: Path) -> None:
     if scene.study is not None and "transport" in scene.study.models:
         with naming_source(scene.source):
             check_transport_variant(choose_variant(scene.render.variant), "study.models")
-    choose_method(scene, camera, setup.may_be_applied)  # checks the memory before any work
+    choose_method(scene, camera, setup.is_applied)  # checks the memory before any work
     check_study(scene, camera)
     check_files(setup, folder)
 

@@ -17,8 +17,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .detail.detailed_model import CAUSE as DETAIL
-from .detail.detailed_model import DetailedModel, independent_detail, model_of_f
+from .detail.detailed_model import DetailedModel, model_of_f
 from .detail.world_fit import fit_world
 from .expected_error import interval
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
@@ -68,16 +67,11 @@ class ObservedStack:
 
     def initial_noise(self) -> Noise:
         """Return the noise before there is an estimate."""
-        return self.with_detail(initial_noise(self.stack, self.model, self.usable, self.prior))
+        return initial_noise(self.stack, self.model, self.usable, self.prior)
 
     def noise_for(self, image: FloatArray, noise: Noise) -> Noise:
         """Return the noise with the parts that depend on the light for an estimate, (N,)."""
-        return self.with_detail(noise_for_image(image, self.stack, self.model, self.usable, noise))
-
-    def with_detail(self, noise: Noise) -> Noise:
-        """Add the variance of detail finer than f, unless the method knows its covariance."""
-        known = {name: values for name, values in noise.items() if name != DETAIL}
-        return known | independent_detail(self.model, self.usable.used)
+        return noise_for_image(image, self.stack, self.model, self.usable, noise)
 
     @property
     def detail_variance(self) -> FloatArray | float:
@@ -114,14 +108,14 @@ class ObservedStack:
             scene.tiles,
             scene.prior_ratio,
             shared_image,
+            model.camera.rows // self.stack.camera.rows,
         )
 
 
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:
     """Return True if H is applied without being stored; methods for misalignment start from H as designed."""
     trusted = stack.scene.estimator.misalignment == "trust"
-    applied = model.has_boxes or model.stored is None
-    return (applied if trusted else model.is_exact) and not stack.camera.has_detail
+    return (model.is_applied if trusted else model.is_exact) and not stack.camera.has_detail
 
 
 @dataclass(frozen=True)
@@ -206,7 +200,7 @@ def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Res
     try:
         return work(choice)
     except NotReachedError as error:
-        if stack.scene.estimator.method != "auto":
+        if stack.scene.estimator.method != "auto" or stack.camera.has_detail:
             raise
         return work(replace(choice, method="tiles", why=str(error)))
 
@@ -222,10 +216,11 @@ def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution:
         return assumed
     image = assumed.method.image
     for _ in range(ROUNDS):
-        values, pixels = censored(stack, model, usable, image, assumed.fit)
+        of_image = assumed.method.task.model
+        values, pixels = censored(stack, of_image, usable, image, assumed.fit)
         assumed = _assumptions(values, model, pixels, choice, execution)
-        before, image = image, assumed.method.image
-        if has_converged(model.light(before), model.light(image), stack, usable):
+        before, image = of_image.light(image), assumed.method.image
+        if has_converged(before, assumed.method.task.model.light(image), stack, usable):
             break
     return assumed
 
@@ -260,7 +255,7 @@ def _assumptions(
         # The uncertainty of H was taken at an image that the first prior had left noisy.
         better, fitted = _with_fit(first, model, noise, fit)
         image = preliminary(better, fitted).image
-        noise = first.with_detail(better.noise_for(image, noise))
+        noise = better.noise_for(image, noise)
         fit = _fit(first, noise)
     if fit is not None:
         observation, noise = _with_fit(first, model, noise, fit)
@@ -331,4 +326,4 @@ def _with_fit(observation: ObservedStack, model: Model, noise: Noise, fit: Prior
         observation = observation.with_prior(observation.prior.model_copy(update=update), model)
     if fit.noise_variance is not None:
         noise = {**_certain(noise), "noise": uniform(fit.noise_variance, noise["rendering"].size)}
-    return observation, observation.with_detail(noise)
+    return observation, noise

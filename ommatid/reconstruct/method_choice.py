@@ -13,7 +13,7 @@ from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
 
 from .detail.detail_method import DetailMethod
-from .detail.detailed_model import detail_memory, is_exact_for
+from .detail.detailed_model import detail_memory, has_moments
 from .estimator.estimate import needed_memory
 from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
 from .frame.error_map import window_memory
@@ -49,15 +49,14 @@ class MethodChoice:
 def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
     """Choose the cheapest method with the accuracy that `estimator` asks for.
 
-    exact : whether H is that of an ideal camera
+    exact : whether H is applied by boxes and kernels
     Raises InputError where no method fits into memory.
     """
+    exact = exact and not camera.has_detail  # the model of f has entries
     allowed = allowed_memory(scene.estimator.memory)
     if scene.estimator.misalignment != "trust":
         return _misaligned(scene, camera, exact, allowed)
-    names, why = _candidates(scene, camera, exact)
-    if names[0] == "dense" and is_exact_for(scene, camera):
-        names = ["detail", *names[1:]]
+    names, why = _of_world(scene, camera) or _candidates(scene, camera, exact)
     memory = {name: _memory(name, scene, camera, exact) for name in names}
     for name in names:
         if memory[name] <= allowed:
@@ -70,11 +69,25 @@ def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
     )
 
 
+def _of_world(scene: Scene, camera: Camera) -> tuple[list[str], str] | None:
+    """Return the method for a world finer than f of which the prior says something, and why; None without one."""
+    if not camera.has_detail or scene.prior.kind == "independent":
+        return None
+    if has_moments(camera):
+        return ["detail"], "the world is finer than f, and the moments of its detail are matrices"
+    if scene.estimator.method not in ("auto", "frame"):
+        raise InputError(
+            f"{scene.source}: estimator.method '{scene.estimator.method}' does not serve {camera.unknowns} pixels in"
+            " front of a world finer than f; set it to 'auto'"
+        )
+    return ["frame"], f"{camera.unknowns} pixels in front of a world finer than f"
+
+
 def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], str]:
     """Return methods in the order of preference, and why the first one is."""
     estimator = scene.estimator
     noiseless = estimator.noise_variance == 0 or (estimator.noise_variance is None and exact and not _has_noise(scene))
-    if exact and not camera.has_box_footprints:
+    if exact and camera.is_sliding and not camera.has_box_footprints:
         if estimator.method not in ("auto", "frame"):
             raise InputError(
                 f"{scene.source}: estimator.method '{estimator.method}' takes H with its entries, and blurred lenses"

@@ -27,7 +27,6 @@ from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .detail.detailed_model import CAUSE as DETAIL
 from .fitting.prior_fit import PriorFit
 from .methods.method import is_uniform, total_variance
 from .prior import coloured, spectrum_of
@@ -41,7 +40,6 @@ CERTAIN = (
     "rendering",
     "calibration",
     SHARED,
-    DETAIL,
     SATURATION,
 )  # noise that stays known when the rest of it is to be fitted
 ROUNDS = 6

@@ -11,11 +11,10 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import EstimatorTable
 
-from .detail.detailed_model import CAUSE as DETAIL
-from .detail.detailed_model import independent_detail
 from .estimator.estimate import factorise
 from .expected_error import expected_error, kernel_widths
 from .forms.form import Form
@@ -143,15 +142,15 @@ def predict(
     )
 
 
-def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray) -> Prediction:
+def predict_frame(choice: MethodChoice, model: Model, camera: Camera, actual: float | FloatArray) -> Prediction:
     """Predict the error by the method chosen; rank, null space and condition of H where one dense problem serves.
 
     Use it for frames, and where the world is finer than f.
 
-    actual : one variance for all measurements, or (M,); NaN leaves a measurement out
+    camera : on f's grid;  actual : one variance for all measurements, or (M,); NaN leaves a measurement out
     Raises InputError where the noise is to be fitted to a stack, or where the estimator has no noise to expect.
     """
-    scene, camera = model.scene, model.camera
+    scene = model.scene
     noise, expected_noise, used = _noises(actual, model.measurements, scene.estimator)
     if not (expected_noise > 0).all():
         raise InputError(
@@ -159,9 +158,6 @@ def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray
             " above 0"
         )
     recorded = model.forward(np.full(model.unknowns, scene.prior.mean))
-    detail = independent_detail(model, used)
-    if detail and scene.estimator.noise_variance is None:
-        expected_noise = expected_noise + detail[DETAIL]
     task = EstimationTask(
         model,
         recorded,
@@ -171,12 +167,13 @@ def predict_frame(choice: MethodChoice, model: Model, actual: float | FloatArray
         scene.estimator,
         scene.tiles,
         scene.prior_ratio,
+        finer=model.camera.rows // camera.rows,
     )
-    result = METHODS[choice.method](task, Execution()).result({"noise": noise, **detail}, None)
+    result = METHODS[choice.method](task, Execution()).result({"noise": noise}, None)
     seen = observability(model.matrix[used]) if choice.method in ("dense", "detail") else None
     return Prediction(
         measurements=noise.size,
-        unknowns=model.unknowns,
+        unknowns=camera.unknowns,
         rank=None if seen is None else seen.rank,
         null_space=None if seen is None else seen.null_space,
         condition=None if seen is None else seen.condition,

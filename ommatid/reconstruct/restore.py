@@ -66,7 +66,7 @@ def verdict_of(
         pixels_used=int(used.sum()),
         left_out=without_pixels(stack.camera, used),
     )
-    light = partial(assumed.method.task.model.light, result.image)
+    light = partial(assumed.method.task.model.light, assumed.method.image)
     evidence = evidence_of(stack, model, used, light, assumed.prior.kind == "independent")
     return judge(_parts(stack, model, assumed, result), evidence, check)
 
@@ -271,7 +271,8 @@ def _restored(
 
 def truth_for(choice: MethodChoice, truth: FloatArray | None, camera: Camera) -> FloatArray | None:
     """Return what a method compares its estimate with: the world where it takes detail into account, else f."""
-    return truth if truth is None or choice.method == "detail" else _image(truth, camera)
+    knows_world = choice.method == "detail" or (choice.method == "frame" and camera.has_detail)
+    return truth if truth is None or knows_world else _image(truth, camera)
 
 
 def _image(truth: FloatArray, camera: Camera) -> FloatArray:
@@ -291,12 +292,13 @@ def _residual(whole: ResidualPart, assumed: Assumptions, degrees_of_freedom: flo
 
 def _spurious_information(task: EstimationTask, expected: ExpectedError) -> FloatArray:
     """Return the share of each pixel's apparent information that the noise of H may have produced: (N,)."""
-    model = task.model
+    model, count = task.model, expected.variance.size
     if not model.variance.any():
-        return np.zeros(model.unknowns)
+        return np.zeros(count)
     noise = np.full(model.measurements, np.inf)
     noise[task.used] = task.expected_noise
     if isinstance(model, DetailedModel) and model.detail_covariance is not None:
         noise += model.detail_variance
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
-        return np.nan_to_num(model.spurious_information(noise) * expected.variance)
+        information = task.finer**2 * task.of_f(model.spurious_information(noise))
+        return np.nan_to_num(information * expected.variance)

@@ -15,16 +15,17 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, shortened_repr
+from .errors import InputError, shortened, shortened_repr
 
 LARGEST_TEXT = 64_000_000  # bytes of a description: a scene, a lens, a table or a report
 
 _KINDS = {
+    stat.S_IFREG: "a file",
+    stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a FIFO",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
-    stat.S_IFDIR: "a folder",
 }
 
 
@@ -81,6 +82,26 @@ def check_unique_keys(path: Path, content: bytes) -> None:
         raise InputError(f"{path}: {error}; delete it and make it again") from error
 
 
+def read_record(path: Path, kind: Any, what: str, cure: str, *, strict: bool = False) -> Any:
+    """Read a JSON file of records that this program wrote. Raises InputError with what was expected, and the cure.
+
+    kind : type that pydantic checks;  strict : True if numbers may not be texts
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        content = read_bytes(path)
+        record = TypeAdapter(kind).validate_json(content, strict=strict)
+    except OSError as error:
+        raise InputError(f"{path}: expected {what}, got no file that can be read ({error.strerror}); {cure}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key, reason = shortened(".".join(map(str, first["loc"]))) or "content", shortened(first["msg"])
+        raise InputError(f"{path}: expected {what}, got a file whose {key} is wrong: {reason}; {cure}") from error
+    check_unique_keys(path, content)
+    return record
+
+
 def real_path(path: Path) -> Path:
     """Return the absolute path without symbolic links; one with links in a circle as far as it can be followed."""
     return Path(os.path.realpath(path))
@@ -96,4 +117,9 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _check_kind(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: expected a regular file, got {_KINDS.get(stat.S_IFMT(mode), 'something else')}")
+        raise InputError(f"{path}: expected a regular file, got {kind(mode)}")
+
+
+def kind(mode: int) -> str:
+    """Return in words what a file of this mode is."""
+    return _KINDS.get(stat.S_IFMT(mode), "something else")

@@ -140,10 +140,23 @@ class Camera:
         return self.walls and not (bent or self.is_blurred(lens_type))
 
     def has_kernel(self, lens_type: LensType) -> bool:
-        """True if the designed H of a lens type is a few kernels: a blurred thin lens that sees every m x m box."""
-        blurred = self.is_blurred(lens_type) and lens_type.optics.surfaces is None
-        bent = lens_type.optics.distortion is not None or lens_type.is_rotated
-        return self.walls and blurred and not bent and lens_type.is_sliding
+        """True if the designed H of a lens type may be a few kernels: a blurred one whose boxes are whole pixels.
+
+        Kernels of surfaces are traced, and held by a model; distortion of more than a pixel or so is not held by them.
+        """
+        if lens_type.optics.distortion is not None or (lens_type.optics.surfaces is not None and lens_type.steered):
+            return False
+        return self.walls and self.is_blurred(lens_type) and lens_type.covers_whole_pixels
+
+    @property
+    def has_surfaces(self) -> bool:
+        """True if a lens type has surfaces."""
+        return any(lens_type.optics.surfaces is not None for lens_type in self.types)
+
+    @property
+    def has_structure(self) -> bool:
+        """True if the designed H consists of boxes and kernels."""
+        return all(self.has_boxes(lens_type) or self.has_kernel(lens_type) for lens_type in self.types)
 
     @property
     def is_sliding(self) -> bool:
@@ -151,16 +164,10 @@ class Camera:
         return all(lens_type.is_sliding for lens_type in self.types)
 
     @property
-    def may_be_applied(self) -> bool:
-        """True if the estimator takes the designed H without its entries: boxes, or kernels of large frames."""
-        if self.has_detail or self.has_box_footprints:
-            return not self.has_detail
-        return self.needs_no_entries and self.is_sliding and self.unknowns > MOST_DENSE
-
-    @property
-    def needs_no_entries(self) -> bool:
-        """True if the designed H is applied by boxes and kernels alone."""
-        return all(self.has_boxes(lens_type) or self.has_kernel(lens_type) for lens_type in self.types)
+    def is_applied(self) -> bool:
+        """True if the designed H, on the grid of its columns, needs no entries: boxes, or kernels of large frames."""
+        camera = self.with_grid_of_matrix
+        return camera.has_box_footprints or (camera.has_structure and camera.unknowns > MOST_DENSE)
 
     def is_blurred(self, lens_type: LensType) -> bool:
         """True if a point of the target is imaged as more than a point: by surfaces, defocus or diffraction."""

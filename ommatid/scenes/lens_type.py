@@ -114,7 +114,7 @@ class LensType:
         """Number of sensor pixels of all sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
 
-    def finer(self, detail: int) -> LensType:
+    def finer(self, detail: int | Fraction) -> LensType:
         """The same lens type on a grid of the target that is `detail` times finer along both axes."""
         origin = self.origin[0] * detail, self.origin[1] * detail
         step = self.step[0] * detail, self.step[1] * detail

@@ -92,7 +92,7 @@ class Model:
     @property
     def windowed(self) -> Observation:
         """The representation of H that windows are cut out of."""
-        return self.applied if self.has_boxes else self.observation
+        return self.applied if self.is_applied else self.observation
 
     @property
     def entries(self) -> int:
@@ -106,9 +106,9 @@ class Model:
         return designed and self.camera.has_box_footprints
 
     @property
-    def has_boxes(self) -> bool:
-        """True if boxes apply H: it is ideal, or calibrated with box footprints."""
-        return self.structure is not None and all(isinstance(part, Box) for part in self.structure.parts)
+    def is_applied(self) -> bool:
+        """True if H is applied without entries: by boxes at every size, by kernels where it is large."""
+        return self.stored is None or (self.structure is not None and _has_boxes(self.structure))
 
     @property
     def is_nearly_designed(self) -> bool:
@@ -171,15 +171,23 @@ class Model:
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
         """L, (M, q), such that the error of H f by that of few numbers is L xi with independent xi of variance 1."""
-        return None if self.fitted is None else self.fitted.directions(image, self._gradients(image))
+        fitted = self._uncertain
+        return None if fitted is None else fitted.directions(image, self._gradients(image))
 
     def error_variance(self, image: FloatArray) -> FloatArray | None:
         """Variance of each measurement by the errors of few numbers, (M,): the diagonal of L L^T."""
-        return None if self.fitted is None else self.fitted.error_variance(image, self._gradients(image))
+        fitted = self._uncertain
+        return None if fitted is None else fitted.error_variance(image, self._gradients(image))
 
     def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
         """A random error of H f by those of few numbers, L xi: (M,)."""
-        return None if self.fitted is None else self.fitted.error_draw(image, self._gradients(image), rng)
+        fitted = self._uncertain
+        return None if fitted is None else fitted.error_draw(image, self._gradients(image), rng)
+
+    @property
+    def _uncertain(self) -> FittedMatrix | None:
+        """H by few numbers, if these have errors."""
+        return self.fitted if self.fitted is not None and self.fitted.has_errors else None
 
     def _gradients(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """H applied to the gradient of f, (N,), down and across: (M,) each."""
@@ -287,27 +295,29 @@ class Model:
 
 
 def designed_observation(camera: Camera) -> Observation | None:
-    """Return H as designed by boxes and kernels, None where it has entries."""
-    if not camera.needs_no_entries:
+    """Return H as designed by boxes and kernels; None where it has entries, or kernels that only a model holds."""
+    if not camera.has_structure or camera.has_surfaces:
         return None
     parts: list[ObservationPart] = []
-    for lens_type in camera.types:
+    for lens_type in camera.on_grids.types:
         if camera.has_boxes(lens_type):
-            parts += [designed_box(camera.shape, part) for part in lens_type.on_grids]
+            parts.append(designed_box(camera.shape, lens_type))
         else:
             from .optics.blur import kernels
 
-            parts.append(kernels(camera, lens_type))
+            parts.append(kernels(camera.on_grids, lens_type))
     return Observation(camera.shape, tuple(parts))
 
 
-def is_applied(camera: Camera, structure: Observation | None) -> bool:
-    """Return True if an H of this structure is applied by it alone, since its entries are many and none are needed."""
+def is_stored(structure: Observation | None) -> bool:
+    """Return True if an H of this structure is stored with its entries: it has no other form, or is small."""
     if structure is None:
-        return False
-    if camera.has_box_footprints:
-        return structure.entries > MOST_STORED
-    return camera.unknowns > MOST_DENSE and camera.is_sliding
+        return True
+    return structure.entries <= MOST_STORED if _has_boxes(structure) else structure.unknowns <= MOST_DENSE
+
+
+def _has_boxes(structure: Observation) -> bool:
+    return all(isinstance(part, Box) for part in structure.parts)
 
 
 @dataclass(frozen=True)
@@ -324,7 +334,7 @@ def fitted_model(
 ) -> Model:
     """Return the model; H by boxes and kernels is stored only while it is small."""
     if rest is None:
-        entries = None if is_applied(camera, fitted.observation) else fitted.to_sparse()
+        entries = fitted.to_sparse() if is_stored(fitted.observation) else None
         count = 0 if entries is None else int(entries.nnz)
         return Model(scene, camera, entries, np.zeros(count), np.zeros((0, count), np.float32), record, fitted=fitted)
     explained = fitted.to_sparse()

@@ -80,8 +80,8 @@ def read(path: Path) -> Model:
         matrix, shape = None, tuple(arrays["shape"].tolist())
         if "data" in arrays:
             matrix = csr_matrix(arrays, shape)
-        fitted = _fitted(arrays, Setup(scene, camera).simulated)
-        if matrix is None and fitted is None and not (method == "ideal" and camera.needs_no_entries):
+        fitted = _fitted(arrays, camera if method == "ideal" else Setup(scene, camera).simulated)
+        if matrix is None and fitted is None and (method != "ideal" or camera.has_surfaces or not camera.is_applied):
             raise ValueError("it has no entries")
     except InputError:
         raise

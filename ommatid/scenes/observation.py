@@ -12,6 +12,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.processors import processors
 
 from .lens_type import adjacent_slices
+
+if TYPE_CHECKING:
+    from .camera import Camera
 
 ComplexArray = NDArray[np.complex128]
 EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
@@ -101,12 +105,22 @@ class ObservationPart(ABC):
         """Return H as a matrix: (m, N)."""
 
     @abstractmethod
+    def coarser(self, camera: Camera, detail: int) -> ObservationPart:
+        """Return H of images of `detail` times larger pixels; camera : on their grid."""
+
+    @abstractmethod
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Return the indices of the measurements that see a window of f and nothing beside it."""
 
     @abstractmethod
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to the measurements inside it."""
+
+    def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to some measurements; those that see more than it are kernels' alone."""
+        inside = self.measurements_inside(rows, columns)
+        order = np.argsort(inside)
+        return self.submatrix(rows, columns)[order[np.searchsorted(inside, numbers, sorter=order)]]
 
     @abstractmethod
     def signature(self, rows: slice, columns: slice) -> Hashable:
@@ -179,6 +193,11 @@ class Entries(ObservationPart):
     def to_sparse(self) -> sparse.csr_array:
         """Return the matrix."""
         return self.matrix
+
+    def coarser(self, camera: Camera, detail: int) -> Entries:
+        """Return H of images of `detail` times larger pixels; camera : on their grid."""
+        down, across = (repetition(size, detail) for size in camera.shape)
+        return Entries(sparse.csr_array(self.matrix @ sparse.kron(down, across, format="csr")), camera.shape)
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Return the indices of the measurements that see nothing outside a window of f."""
@@ -261,6 +280,13 @@ class Observation:
             part.adjoint(readings[place], back)
         return back.total.ravel()
 
+    def coarser(self, camera: Camera, detail: int) -> Observation:
+        """Return H of images of `detail` times larger pixels, each of which is made of equal ones.
+
+        camera : on the grid of these images
+        """
+        return Observation(camera.shape, tuple(part.coarser(camera, detail) for part in self.parts))
+
     def to_sparse(self) -> sparse.csr_array:
         """Return H as a matrix: (M, N)."""
         return sparse.csr_array(sparse.vstack([part.to_sparse() for part in self.parts], format="csr"))
@@ -275,9 +301,24 @@ class Observation:
         parts = [part.submatrix(rows, columns) for part in self.parts]
         return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
+    def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to some measurements: (numbers, pixels of the window); see `ObservationPart`.
+
+        numbers : in the order of the parts
+        """
+        pairs = zip(self.slices, self.parts, strict=True)
+        chosen = [(place.start, part, (numbers >= place.start) & (numbers < place.stop)) for place, part in pairs]
+        found = [part.rows_on(numbers[own] - start, rows, columns) for start, part, own in chosen if own.any()]
+        return sparse.csr_array(sparse.vstack(found, format="csr"))
+
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key that is equal for two windows only if their submatrices are equal."""
         return tuple(part.signature(rows, columns) for part in self.parts)
+
+
+def repetition(size: int, detail: int) -> sparse.csr_array:
+    """Return the matrix that repeats each of `size` pixels of an axis `detail` times: (detail size, size)."""
+    return sparse.csr_array(sparse.kron(sparse.eye_array(size), np.ones((detail, 1)), format="csr"))
 
 
 def on_window(matrix: sparse.csr_array, width: int, rows: slice, columns: slice) -> sparse.csr_array:

@@ -74,17 +74,14 @@ class Setup:
         return resolved(self.scene, self.coarse_shape or self.camera.shape)
 
     @property
-    def has_structured_matrix(self) -> bool:
-        """True if the estimator's H is ideal with box footprints, so that no matrix needs to be stored."""
-        camera = self.camera
-        return self.scene.calibration.method == "ideal" and camera.has_box_footprints and not camera.has_detail
-
-    @property
-    def may_be_applied(self) -> bool:
-        """True if boxes and kernels apply the estimator's H: it is ideal or may follow from views, and not stored."""
+    def is_applied(self) -> bool:
+        """True if boxes and kernels apply the estimator's H: it is ideal, or may follow from views and kernels."""
         camera, calibration = self.camera, self.scene.calibration
-        fits = calibration.method == "ideal" or (calibration.fit != "none" and camera.has_box_footprints)
-        return fits and camera.may_be_applied
+        if calibration.method != "ideal" and not camera.has_box_footprints:
+            steered = any(lens_type.steered for lens_type in camera.types)
+            if calibration.fit == "geometry" or camera.tolerance is not None or steered:
+                return False
+        return (calibration.method == "ideal" or calibration.fit != "none") and camera.is_applied
 
     @property
     def has_closed_form(self) -> bool:

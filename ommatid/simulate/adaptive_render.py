@@ -7,10 +7,11 @@ passes or more, is half of the allowed one, and rounds are planned for a quarter
 by chance lets no bad pixel pass, and few rounds need another. Through pinholes, stratified samples make the variance
 fall like 1 / samples^1.5, since only those at the edges of pixels of f err. Where a grid of samples fits these edges
 none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.passes`), and are
-done where these agree. Behind lenses, where a ray has four numbers and more, points are Sobol's (`renderer.draws`)
-unless another sampler than the default is asked for: measured, their variance is 1.5 to 1.8 times lower than
-multijitter's at 256 samples in a pass, 1.9 to 2.3 times at 1024 and 3.1 to 3.3 times at 4096, in the same time. The
-seeds of a sub-imager do not depend on the other ones.
+done where these agree. Behind lenses points are Sobol's (`renderer.draws`) unless another sampler than the default is
+asked for. Behind thin lenses the picture is averaged over each pixel exactly (`renderer.averages`), and only the point
+spread is sampled. Behind surfaces a ray has four numbers and more: measured, the variance of Sobol's points is 1.5 to
+1.8 times lower than multijitter's at 256 samples in a pass, 1.9 to 2.3 times at 1024 and 3.1 to 3.3 times at 4096, in
+the same time. The seeds of a sub-imager do not depend on the other ones.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import WHITE
 from ommatid.scenes.recording import expected_recording_of, flat_values
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -59,7 +61,8 @@ LEAST = 256  # samples per pixel of a first round, at least
 MOST = 2**20  # samples per pixel of a round, at most
 MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
 MOST_PASSES = 1024  # of all rounds of a sub-imager: they number its seeds
-SOBOL = "sobol"  # in records, Sobol's points of pixel and pupil
+SOBOL = "sobol"  # in records, Sobol's points of the pupil, and of the pixel where its averages are not exact
+TABULATED = 1e-5  # of the light of a white target, deviation by the tables that rays of a point spread are drawn from
 REACHED = "reached"  # how a sub-imager ends; otherwise the reason why it could not:
 TIME, SAMPLES, FLOAT32 = "render.time is over", "no more samples are taken", "float32 rounds as much"
 AllowedVariance = Callable[[FloatArray, slice], FloatArray]  # of light on some measurements, and their slice
@@ -218,7 +221,7 @@ class AdaptiveRounds:
             self._sobol[index],
         ):
             tally.add(values)
-        floor = rounding_variance(tally.mean, self._renderer.float32_samples(work.samples))
+        floor = self._floor(index, tally.mean, work.samples)
         self.mean[start + pixels] = tally.mean
         self.variance[start + pixels] = np.maximum(posterior_variances(tally.variance, work.passes), floor)
         sub.add_round(work, tally.variance)
@@ -239,8 +242,8 @@ class AdaptiveRounds:
         rows = self._slices[index]
         mean, variance = self.mean[rows][pixels], self.variance[rows][pixels]
         # No number of samples gets below the rounding.
-        fewest = self._renderer.float32_samples(self._grid(index, LEAST).samples)
-        target = np.maximum(self._allowed(self.mean[rows], rows)[pixels], rounding_variance(mean, fewest) / AIM)
+        floor = self._floor(index, mean, self._grid(index, LEAST).samples)
+        target = np.maximum(self._allowed(self.mean[rows], rows)[pixels], floor / AIM)
         still = variance > DONE * target  # False for NaN: pixels that receive no light
         if not still.all() and not sub.fewest:
             sub.fewest = sub.spent
@@ -256,6 +259,12 @@ class AdaptiveRounds:
         if sub.next.total < LEAPS[0] * sub.last.total or sub.seeds + sub.next.passes > MOST_PASSES:
             self._end(sub, index, SAMPLES)
         return still
+
+    def _floor(self, index: int, values: FloatArray, samples: int) -> FloatArray:
+        """Return the variance that no number of samples goes below: float32's rounding, and tables of point spreads."""
+        floor = rounding_variance(values, self._renderer.float32_samples(samples))
+        diffracts = self._sobol[index] and self._world.wavelengths
+        return np.maximum(floor, (TABULATED * WHITE) ** 2) if diffracts else floor
 
     def _end(self, sub: SubImagerProgress, index: int, why: str) -> None:
         """End a sub-imager: its target is reached, or it is not for the reason `why`."""

@@ -16,8 +16,12 @@ from scipy import sparse
 from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import MOST_DENSE
+from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, views_as_designed
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
+from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType, SubImager
-from ommatid.scenes.model import Model, designed_observation, is_applied
+from ommatid.scenes.model import Model, designed_observation, fitted_model, is_stored
 from ommatid.scenes.optics.boxes import overlap
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
@@ -95,9 +99,53 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
 
 
 def ideal_model(scene: Scene, camera: Camera) -> Model:
-    """Return the ideal H as a model without uncertainty; by boxes and kernels it is stored only while it is small."""
-    applied = is_applied(camera, designed_observation(camera))
-    return exact_model(scene, camera, None if applied else ideal_matrix(camera), "ideal")
+    """Return the ideal H as a model without uncertainty; by boxes and kernels it is stored only while it is small.
+
+    Raises InputError for a large H of surfaces that kernels do not hold, nor memory.
+    """
+    if not (camera.has_surfaces and camera.is_applied):
+        stored = is_stored(designed_observation(camera))
+        return exact_model(scene, camera, ideal_matrix(camera) if stored else None, "ideal")
+    try:
+        return fitted_model(scene, camera, _designed_by_kernels(camera), None, {"method": "ideal"})
+    except InputError as obstacle:
+        try:
+            return exact_model(scene, camera, ideal_matrix(camera), "ideal")
+        except InputError as error:
+            raise InputError(f"{obstacle}; {error}") from error
+
+
+def true_model(scene: Scene, camera: Camera) -> Model:
+    """Return H of all sub-imagers misaligned as the camera's tolerance draws them. Raises as `true_matrix` does."""
+    if camera.tolerance is None and camera.unknowns > MOST_DENSE:
+        return ideal_model(scene, camera)
+    return exact_model(scene, camera, true_matrix(camera), "true")
+
+
+def designed_kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
+    """Return H of a blurred lens type as designed by kernels that a file holds.
+
+    Expects a lens type for which `Camera.has_kernel` is true. Raises InputError if kernels do not hold it.
+    """
+    if lens_type.optics.surfaces is not None:
+        from .lenses import surface_kernels
+
+        return surface_kernels.kernels(camera, lens_type)
+    if lens_type.steered:
+        raise InputError(f"camera.lens.{lens_type.name}: sub-imagers off the grid have kernels of their own")
+    from ommatid.scenes.optics import blur
+
+    exact = blur.kernels(camera, lens_type)
+    return replace(exact, shapes=KernelShapes.low_rank(exact.shapes.kernels, exact.places.width))
+
+
+def _designed_by_kernels(camera: Camera) -> FittedMatrix:
+    views: dict[str, Views] = {}
+    for lens_type in camera.types:
+        subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
+        views[lens_type.name] = views_as_designed(subs)
+    blurred = (lens_type for lens_type in camera.types if not camera.has_boxes(lens_type))
+    return FittedMatrix(camera, views, {each.name: designed_kernels(camera, each) for each in blurred})
 
 
 def exact_model(scene: Scene, camera: Camera, matrix: sparse.csr_array | None, method: str) -> Model:

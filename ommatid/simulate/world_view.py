@@ -102,7 +102,9 @@ def world_view(setup: Setup) -> WorldView:
     key = fingerprint([describe(scene), camera.describe(), scene.render.model_dump(mode="json"), variant])
     if key in _known:
         return _known[key]
-    alone = with_tables(scene, world=table.model_copy(update={"white": 1.0}), target=_without_picture(scene))
+    alone = with_tables(
+        scene, world=table.model_copy(update={"white": 1.0}), target=scene.target.model_copy(update={"image": None})
+    )
     renderer = Renderer(coarse_camera(camera), variant, scene.render.sampler, world=alone)
     world: Any = renderer.staged
     origins, directions = views(camera)
@@ -255,10 +257,6 @@ def coarse_camera(camera: Camera) -> Camera:
     times = -(-max(camera.shape) // COARSE)
     rows, columns = (max(1, count // times) for count in camera.shape)
     return ideal_camera(replace(camera, rows=rows, columns=columns, target_pitch=camera.target_pitch * times, detail=1))
-
-
-def _without_picture(scene: Scene) -> Any:
-    return scene.target.model_copy(update={"image": None})
 
 
 def _brightest(renderer: Any, seed: int) -> float:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
@@ -83,11 +83,7 @@ def write_figure(
     path: Path, curves: list[SweepOutcome], table: list[StabilityOutcome], files: FigureFiles = SCREEN_PNG
 ) -> None:
     """Draw the digits lost against the noise, one panel per H, and the errors of all cases against their bounds."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure: Any = Figure(figsize=(14, 5.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(14, 5.5, layout="constrained")
     axes = figure.subplots(1, len(TITLES) + 1)
     for panel, (lenses, title) in zip(axes, TITLES.items(), strict=False):
         _draw_sweep(panel, [point for point in curves if point.lenses == lenses])

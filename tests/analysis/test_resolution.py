@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from ommatid.analysis.averaging_kernel import ErrorWindow, error_window
-from ommatid.analysis.resolution import crossing, edge_response, of_sub_image, of_window, radial_spectrum
+from ommatid.analysis.resolution import crossing, edge_response, of_sub_image, of_window, radial_spectrum, transfer
 from ommatid.reconstruct.output.result_files import reconstruct
 from ommatid.reconstruct.prior import exponential
 from ommatid.runtime.arrays import FloatArray
@@ -37,10 +37,10 @@ def window_of(shape: tuple[int, int], lenses: Lenses, noise: float, **tables: An
 
 def test_pixels_seen_one_by_one_have_the_response_of_a_wiener_filter() -> None:
     window = window_of((12, 12), (("1", [1, 1], [12, 12]),), 50.0)
-    transfer, edge = of_window(window)
+    waves, edge = of_window(window)
     share = PRIOR / (PRIOR + 50.0)
-    np.testing.assert_allclose(transfer.horizontal, share)
-    np.testing.assert_allclose(transfer.vertical, share)
+    np.testing.assert_allclose(waves.horizontal, share)
+    np.testing.assert_allclose(waves.vertical, share)
     assert (edge.values[0], edge.values[-1]) == pytest.approx((0, share), abs=1e-12)
     assert edge.width == pytest.approx(0.8), "a step between two pixels, from 10 % to 90 % by linear interpolation"
     assert window.correlated_pixels == pytest.approx(1)
@@ -49,15 +49,25 @@ def test_pixels_seen_one_by_one_have_the_response_of_a_wiener_filter() -> None:
 def test_blocks_of_two_pixels_have_the_response_of_a_box() -> None:
     """Each pixel of a block is estimated by the mean of its four, times p / (p + 4 v)."""
     window = window_of((12, 12), (("1/2", [1, 1], [6, 6]),), 10.0)
-    transfer, _ = of_window(window)
+    waves, _ = of_window(window)
     share = PRIOR / (PRIOR + 4 * 10.0)
     # Pixels stand half a pixel before and after the middle of their block: exp(+-i pi u) cos(pi u), on average.
-    np.testing.assert_allclose(transfer.horizontal, share * np.cos(np.pi * transfer.frequencies) ** 2, atol=1e-12)
-    np.testing.assert_allclose(transfer.vertical, transfer.horizontal, atol=1e-12)
-    assert transfer.half == pytest.approx(np.arccos(np.sqrt(0.5 / share)) / np.pi, abs=1e-3)
+    np.testing.assert_allclose(waves.horizontal, share * np.cos(np.pi * waves.frequencies) ** 2, atol=1e-12)
+    np.testing.assert_allclose(waves.vertical, waves.horizontal, atol=1e-12)
+    assert waves.half == pytest.approx(np.arccos(np.sqrt(0.5 / share)) / np.pi, abs=1e-3)
     # C = p (I - share J / 4) in a block: correlations of three pixels, -share / 4 / (1 - share / 4)
     correlation = share / 4 / (1 - share / 4)
     assert window.correlated_pixels == pytest.approx(1 + 3 * correlation**2)
+
+
+def test_a_kernel_along_a_row_lowers_the_contrast_of_waves_along_it_alone() -> None:
+    """The mean of three pixels of a row is the Dirichlet kernel, and none of a column."""
+    kernels = np.zeros((1, 7, 9))
+    kernels[0, 3, 3:6] = 1 / 3
+    found = transfer(kernels, np.array([[3.0, 4.0]]))
+    waves = 2 * np.pi * found.frequencies
+    np.testing.assert_allclose(found.horizontal, np.abs(1 + 2 * np.cos(waves)) / 3, atol=1e-12)
+    np.testing.assert_allclose(found.vertical, 1.0)
 
 
 def test_a_sensor_pixel_has_the_response_of_its_box() -> None:
@@ -102,9 +112,9 @@ def test_the_middle_of_a_frame_is_that_of_its_window(size: int) -> None:
     lenses: Lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
     window = window_of((size, size), lenses, 1.0)
     assert window.is_whole == (size == 12)
-    transfer, edge = of_window(window)
-    assert transfer.horizontal[0] == pytest.approx(edge.values[-1], rel=0.02)
-    np.testing.assert_allclose(transfer.horizontal, transfer.vertical, rtol=1e-9)
+    waves, edge = of_window(window)
+    assert waves.horizontal[0] == pytest.approx(edge.values[-1], rel=0.02)
+    np.testing.assert_allclose(waves.horizontal, waves.vertical, rtol=1e-9)
 
 
 # --- degrees of freedom

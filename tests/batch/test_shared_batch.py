@@ -168,6 +168,26 @@ def test_ctrl_c_keeps_finished_files_and_leaves_no_processes(here: Path, scenes:
     assert list(scratch.iterdir()) == []
 
 
+@pytest.mark.slow
+def test_a_batch_whose_process_dies_keeps_what_is_finished(here: Path, scenes: list[str]) -> None:
+    """As where memory runs out: one sentence, and the scenes that were finished."""
+    (here / "long.toml").write_text(LONG, encoding="utf-8")
+    with started("run", scenes[0], "long.toml", "-o", "out", "--workers", "2") as command:
+        assert command.stderr is not None
+        for stage in ("render", "calibrate", "reconstruct", "report"):
+            assert command.stderr.readline().startswith(f"{stage}: done")
+        wait_for(here / "out" / "long" / "stack.exr")
+        for process in psutil.Process(command.pid).children():
+            if "spawn_main" in " ".join(process.cmdline()):
+                process.kill()
+        messages = command.stderr.read()
+    assert re.fullmatch(
+        r"ommatid: long.toml: a process died, .*; finished results stay, repeat the command .*\n", messages
+    )
+    assert command.returncode == 1
+    assert {path.name for path in (here / "out" / "seed1").iterdir()} == FILES
+
+
 # A slow callback of the garbage collector, once there is a file "flag": Python drops a Ctrl-C inside it.
 SLOW_CALLBACK = """
 import gc, pathlib, sys, time

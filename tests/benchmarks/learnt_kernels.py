@@ -47,11 +47,11 @@ def draw_row(figure: Figure, row: Any, title: str, footprints: KernelFootprints)
     extent = (-half, half, half, -half)
     field = places.positions(np.arange(places.lens_type.measurements))
     shares = basis(field, footprints.degree) @ footprints.coefficients.T
-    mean = np.maximum(footprints.kernels[0, crop, crop], 1e-6)
+    mean = np.maximum(footprints.shapes.kernels[0, crop, crop], 1e-6)
     images = [row[0].imshow(np.log10(mean), extent=extent, cmap="magma")]
     row[0].set_title(f"{title}\nmean kernel, log10 of H")
     for number in (1, 2):
-        effect = footprints.kernels[number, crop, crop] * np.abs(shares[:, number]).max() * 1e4
+        effect = footprints.shapes.kernels[number, crop, crop] * np.abs(shares[:, number]).max() * 1e4
         most = np.abs(effect).max()
         images.append(row[number].imshow(effect, extent=extent, cmap="RdBu_r", vmin=-most, vmax=most))
         row[number].set_title(f"component {number}\nlargest effect on H (1e-4)")

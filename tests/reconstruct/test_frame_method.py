@@ -158,11 +158,11 @@ def test_large_cameras_of_lenses_are_applied_without_entries() -> None:
     camera = derive(scene)
     model = ideal_model(scene, camera)
     assert model.stored is None
-    assert camera.may_be_applied
-    assert choose_method(scene, camera, camera.may_be_applied).method == "frame"
+    assert camera.is_applied
+    assert choose_method(scene, camera, camera.is_applied).method == "frame"
     tiles = scene.model_copy(update={"estimator": scene.estimator.model_copy(update={"method": "tiles"})})
     with pytest.raises(InputError, match="blurred lenses have too many for 7021 pixels; set it to 'auto' or 'frame'"):
-        choose_method(tiles, camera, camera.may_be_applied)
+        choose_method(tiles, camera, camera.is_applied)
     truth = drawn(2, camera.shape)
     done = restore(recorded(scene, truth, VARIANCE, matrix=ideal_matrix(camera)), model, truth)
     assert done.verdict.trusted
@@ -174,7 +174,7 @@ def test_the_prediction_of_a_frame_is_that_of_the_dense_problem() -> None:
     scene = wide(SMALL, noise={"variance": 1e-2}, estimator={"method": "frame"})
     camera = derive(scene)
     model = ideal_model(scene, camera)
-    prediction = predict_frame(choose_method(scene, camera, exact=True), model, 1e-2)
+    prediction = predict_frame(choose_method(scene, camera, exact=True), model, camera, 1e-2)
     dense = restored_by("information", recorded(scene, drawn(0, SMALL), 1e-2), model, None)
     assert prediction.mse == pytest.approx(dense.expected.mse, rel=1e-3)
     assert prediction.trimmed_mse == pytest.approx(dense.trimmed_mse, rel=1e-3)

@@ -94,6 +94,17 @@ def test_predictions_are_those_of_exact_conditioning(noise: float, types: int, c
         assert float(np.sum(predicted[index].whitened ** 2)) == pytest.approx(chi_squared, rel=1e-10)
 
 
+def test_a_sub_imager_of_one_pixel_errs_by_the_error_of_its_prediction() -> None:
+    described = scene((12, 12), (*SMALL[:1], ("1/4", [2, 2], [1, 1])), **NOISE)
+    camera = derive(described)
+    stack = recorded(described, draw(camera), 1e-2)
+    problem = Problem(ideal_matrix(camera), independent(127.5, P0, 144), np.full(camera.measurements, 1e-2))
+    error, precision, _ = exact_prediction(problem, stack.values, blocks_of(camera)[-1])
+    entry = check_held_out(stack, ideal_model(described, camera), fitted=False).sub_imagers[-1]
+    assert entry.rms_error == pytest.approx(abs(error[0]), rel=1e-8)
+    assert entry.expected_rms == pytest.approx(precision[0] ** -0.5, rel=1e-8)
+
+
 def chi_squared(errors: list[BlockErrors]) -> FloatArray:
     return np.array([float(block.whitened @ block.whitened) for block in errors])
 

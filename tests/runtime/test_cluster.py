@@ -127,7 +127,7 @@ def test_strangers_are_refused_on_both_sides(encrypted: str, files: Path, monkey
     monkeypatch.setattr(workers, "PATIENCE", 6.0)  # on a busy machine it takes a second to tell the certificates apart
     own = {"authority": "a", "member": "a"}
     for address, names, message in (
-        (encrypted, {**own, "authority": "b"}, "was not signed by the authority of Dask's configuration"),
+        (encrypted, {**own, "authority": "b"}, "no encrypted scheduler answers there that accepts the certificate"),
         (encrypted, {**own, "member": "b"}, "no encrypted scheduler answers there that accepts the certificate"),
         (encrypted, {**own, "member": "none"}, "Dask's configuration names files that cannot be used"),
         (encrypted, {}, "expected certificates in Dask's configuration"),

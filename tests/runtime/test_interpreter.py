@@ -72,7 +72,7 @@ def test_workers_in_a_hostile_folder_open_only_what_was_named(hostile: Path, tmp
     command = [sys.executable, "-P", "-m", "ommatid", "render", *scenes, "-o", output, "--workers", "2"]
     run(command, hostile, **watched)
     events = (tmp_path / "log").read_text(encoding="utf-8").splitlines()
-    assert sum(event.startswith("process") for event in events) == 3
+    assert sum(event.startswith("process") for event in events) == 4, "this one, two that work, multiprocessing's own"
     assert [event for event in events if not event.startswith("process")] == []
 
 
@@ -130,7 +130,7 @@ def test_figures_do_not_depend_on_settings(tmp_path: Path) -> None:
 def test_other_modules_start_no_python() -> None:
     """multiprocessing's processes, and Python started by `-c`, would have the current folder on their path."""
     for name, path in modules().items():
-        assert "multiprocessing" not in imports(name)
+        assert "multiprocessing" not in imports(name) or name.endswith(".execution.pool"), name
         text = path.read_text(encoding="utf-8")
         safe = name.endswith(".execution.interpreter") or text.count("sys.executable") == text.count('executable, "-P"')
         assert safe, name

@@ -48,21 +48,20 @@ def meets_the_other(folder: Path, item: int) -> int:
     raise TimeoutError("one worker does nothing")
 
 
-def digits_or_death_once(flag: Path, seed: int) -> list[float]:
-    """Digits; the first worker that executes item 3 is killed, as on a machine that runs out of memory."""
-    if seed == 3:
-        try:
-            flag.touch(exist_ok=False)
-        except FileExistsError:
-            return digits(seed)
-        os.kill(os.getpid(), signal.SIGKILL)
-    return digits(seed)
-
-
 def digits_or_death(seed: int) -> list[float]:
     if seed == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return digits(seed)
+
+
+class UnsendableError(Exception):
+    def __init__(self, first: str, second: str) -> None:
+        super().__init__(first)
+        self.second = second
+
+
+def raises_unsendable(item: int) -> None:
+    raise UnsendableError("egg", str(item))
 
 
 def fine_or_raises(item: type[Exception] | None) -> str:
@@ -151,25 +150,20 @@ def test_a_failure_is_the_same_here_and_on_a_cluster(
             ended[1].result()
 
 
-@pytest.mark.slow
-def test_the_task_of_a_killed_process_is_repeated(tmp_path: Path) -> None:
-    flag = tmp_path / "died"
-    with worker_pool(count=2) as pool:
-        results = pool.map(partial(digits_or_death_once, flag), range(8), no_progress, 8)
-    assert flag.exists()
-    assert results == [digits(seed) for seed in range(8)]
-
-
-@pytest.mark.slow
-def test_a_task_that_kills_every_process_is_given_up_and_the_others_are_done(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    with worker_pool(count=2) as pool:
-        ended = {task.index: task for task in pool.each(digits_or_death, range(4))}
-    assert [ended[index].result() for index in (0, 2, 3)] == [digits(seed) for seed in (0, 2, 3)]
-    with pytest.raises(MachineError, match="every worker that tried it died"):
-        ended[1].result()
+def test_a_process_that_dies_ends_the_tasks_with_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+    with (
+        pytest.raises(MachineError, match=r"^a process died, .*; finished results stay, repeat the command"),
+        worker_pool(count=2) as pool,
+    ):
+        pool.map(digits_or_death, range(6), no_progress, 6)
     assert capfd.readouterr().err == ""
+
+
+def test_an_exception_that_cannot_be_sent_is_described() -> None:
+    with worker_pool(count=2) as pool:
+        ended = list(pool.each(raises_unsendable, range(2)))
+        with pytest.raises(RuntimeError, match="UnsendableError: egg"):
+            ended[0].result()
 
 
 def test_processes_use_no_network_share_the_processors_and_leave_nothing(

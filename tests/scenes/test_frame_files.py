@@ -12,7 +12,7 @@ import tifffile
 from ommatid.pipeline.camera_files import import_file
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats.picture import LUMINANCE, grey
-from ommatid.scenes.hardware.frames import AcquisitionSettings, FrameNotes, pictures_of, stored_pictures
+from ommatid.scenes.hardware.frames import AcquisitionSettings, FrameNotes, stored_pictures
 
 from . import picture_bytes as made
 from .mosaics import SCENE, SHAPE
@@ -24,7 +24,7 @@ RNG = np.random.default_rng(19)
 def test_numbers_of_a_png_are_those_of_the_sensor(colour: int, bits: int, tmp_path: Path) -> None:
     counts = RNG.integers(0, 2**bits, (14, 15, made.SAMPLES[colour]))
     (tmp_path / "a.png").write_bytes(made.png(counts, colour, bits))
-    (frame,) = pictures_of(tmp_path / "a.png", "images")
+    frame = stored_pictures(tmp_path / "a.png", "images")[0].pixels
     expected = counts[..., 0] if colour == 0 else counts @ np.array(LUMINANCE)
     np.testing.assert_allclose(grey(frame, "here"), expected, rtol=1e-12)
 
@@ -35,13 +35,14 @@ def test_every_page_is_a_frame_and_is_turned_by_its_own_orientation(tmp_path: Pa
         for frame, orientation in zip((frames[0], frames[1][:, ::-1], frames[2].T), (1, 2, 5), strict=True):
             tag = [(274, 3, 1, orientation, True)]
             cast(Any, file).write(np.ascontiguousarray(frame), photometric="minisblack", metadata=None, extratags=tag)
-    np.testing.assert_array_equal(pictures_of(tmp_path / "a.tif", "images"), frames)
+    found = [stored.pixels for stored in stored_pictures(tmp_path / "a.tif", "images")]
+    np.testing.assert_array_equal(found, frames)
 
 
 def test_jpeg_is_refused_by_its_content(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(made.jpeg(np.zeros((16, 16), np.uint8)))
     with pytest.raises(InputError, match=r"a\.png: expected a PNG file, got a JPEG, which does not keep the sensor's"):
-        pictures_of(tmp_path / "a.png", "images")
+        stored_pictures(tmp_path / "a.png", "images")
 
 
 def noted(tmp_path: Path, **frames: bytes | np.ndarray[Any, Any]) -> list[str]:

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
 from ommatid.scenes.observation import Observation
 from ommatid.scenes.optics.boxes import designed_box
 from ommatid.simulate.ideal import ideal_matrix
-from tests.examples import THREE, camera
+from tests.examples import THREE, camera, with_optics
+from tests.frames import observed
 
 CAMERA = camera()
 
@@ -23,9 +25,8 @@ def random_kernels(margin: int, degree: int = 2, index: int = 1) -> KernelFootpr
     return KernelFootprints(
         places,
         degree,
-        rng.normal(size=(3, *shape)),
+        KernelShapes.dense(rng.normal(size=(3, *shape)), rng.normal(size=(2, *shape))),
         rng.normal(size=(3, count)),
-        rng.normal(size=(2, *shape)),
         rng.normal(size=(4, 2, count)),
     )
 
@@ -37,7 +38,7 @@ def test_a_box_is_the_kernel_of_an_ideal_pinhole(margin: int) -> None:
         places = KernelPlaces(CAMERA, lens_type, margin)
         box = np.pad(np.full((1, int(lens_type.ratio), int(lens_type.ratio)), float(lens_type.ratio) ** -2), margin)
         box = box[margin : margin + 1]
-        footprints = KernelFootprints(places, 0, box, np.ones((1, 1)), box[:0], np.zeros((0, 0, 1)))
+        footprints = KernelFootprints(places, 0, KernelShapes.dense(box), np.ones((1, 1)), np.zeros((0, 0, 1)))
         assert abs(footprints.to_sparse() - expected[pixels]).max() < 1e-15
 
 
@@ -65,7 +66,12 @@ def test_directions_of_the_error_are_what_changed_kernels_read() -> None:
         directions = footprints.error_directions(image).toarray()
         assert directions.shape == (CAMERA.types[1].measurements, 4)
         for column, coefficients in zip(directions.T, footprints.error_coefficients, strict=True):
-            changed = replace(footprints, kernels=footprints.error_kernels, coefficients=coefficients)
+            changed = replace(
+                footprints,
+                shapes=KernelShapes.dense(footprints.shapes.error_kernels),
+                coefficients=coefficients,
+                error_coefficients=np.zeros((0, 0, coefficients.shape[1])),
+            )
             assert column == pytest.approx(changed.to_sparse() @ image.ravel(), abs=1e-11)
 
 
@@ -94,7 +100,7 @@ def test_information_of_a_box_as_a_kernel(margin: int) -> None:
         size = int(lens_type.ratio)
         kernel = np.pad(np.full((size, size), float(size) ** -2), margin)[None]
         part = KernelFootprints(
-            KernelPlaces(frame, lens_type, margin), 0, kernel, np.ones((1, 1)), kernel[:0], np.zeros((0, 0, 1))
+            KernelPlaces(frame, lens_type, margin), 0, KernelShapes.dense(kernel), np.ones((1, 1)), np.zeros((0, 0, 1))
         )
         box = designed_box(frame.shape, lens_type)
         np.testing.assert_allclose(part.information(), box.information(), atol=1e-12)
@@ -104,6 +110,33 @@ def test_information_of_a_box_as_a_kernel(margin: int) -> None:
             np.testing.assert_allclose(
                 part.edge_information(axis, strip), box.edge_information(axis, strip), atol=1e-12
             )
+
+
+FINE = {
+    "the world of m x m one pixel apart": ((("1/3", [3, 3], [5, 5]),), 2, {}),
+    "three times finer": ((("1/2", [2, 2], [5, 6]),), 3, {}),
+    "fractional ratios of a world": ((("2/5", [2, 3], [4, 4]),), 2, {"focus": "900 mm"}),
+    "other arrays and steps": ((("1/3", [2, 4], [4, 2]),), 1, {"focus": "900 mm"}),
+}
+
+
+@pytest.mark.parametrize("kind", FINE)
+def test_thin_lenses_have_kernels_on_every_grid(kind: str) -> None:
+    lenses, detail, optics = FINE[kind]
+    _, made = with_optics({"aperture": "2 mm", **optics}, {"lens_pitch": "4 mm"}, lenses, (19, 19))
+    fine = replace(made, detail=detail).world
+    observation, expected = observed(fine), ideal_matrix(fine)
+    assert abs(observation.to_sparse() - expected).max() < 1e-9 * expected.max()
+    image, readings = (np.random.default_rng(seed).normal(size=size) for seed, size in enumerate(expected.shape[::-1]))
+    np.testing.assert_allclose(observation.forward(image), expected @ image, atol=1e-12 * fine.unknowns)
+    assert readings @ observation.forward(image) == pytest.approx(observation.adjoint(readings) @ image, rel=1e-10)
+
+
+def test_steered_lenses_have_kernels_of_their_own() -> None:
+    table = {"aperture": "2 mm", "sub_imager": [{"at": [0, 1], "window": [1, 2]}]}
+    _, made = with_optics(table, {"lens_pitch": "4 mm"}, (("1/3", [2, 2], [4, 4]),), (19, 19))
+    expected = ideal_matrix(made)
+    assert abs(observed(made).to_sparse() - expected).max() < 1e-9 * expected.max()
 
 
 def test_kernels_are_read_as_they_were_described() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.hardware.frames import patches, pictures_of
+from ommatid.scenes.hardware.frames import patches, stored_pictures
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_model
@@ -238,4 +238,4 @@ def test_a_restricted_import_still_has_all_types_on_the_sensor(imaging_camera: C
 
 def test_a_colour_array_is_one_picture(tmp_path: Path) -> None:
     np.save(tmp_path / "colour.npy", np.zeros((20, 30, 3), dtype=np.uint8))
-    assert [picture.shape for picture in pictures_of(tmp_path / "colour.npy", "images")] == [(20, 30, 3)]
+    assert [stored.pixels.shape for stored in stored_pictures(tmp_path / "colour.npy", "images")] == [(20, 30, 3)]

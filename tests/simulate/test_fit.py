@@ -82,7 +82,10 @@ def test_the_chart_is_a_grid_with_the_corners() -> None:
 
 @pytest.mark.slow
 def test_the_numbers_err_as_their_covariance_says() -> None:
-    """Over 20 draws of 6 sub-imagers each: squared errors over their stated variances have mean 1."""
+    """Over 20 draws of 6 sub-imagers each: squared errors over their stated variances have mean 1.
+
+    Of numbers that were measured: one that is taken as designed errs by nothing here, whatever may be wrong with it.
+    """
     _, pinholes = with_optics({}, WRONG, FEW)
     true, squares, refused = true_matrix(pinholes), [], 0
     expected = [misaligned(pinholes, *each) for each in zip(pinholes.sub_imagers, misalignments(pinholes), strict=True)]
@@ -95,7 +98,8 @@ def test_the_numbers_err_as_their_covariance_says() -> None:
             error = views.numbers - np.array([expected[number] for number in subs])
             unit = np.array([scales(pinholes, pinholes.sub_imagers[number]) for number in subs])
             variance = np.square(views.own).sum(axis=2) + np.square(views.shared).sum(axis=2)
-            kept = (variance > (1e-6 * unit) ** 2) & views.explained[:, None]
+            measured = np.array([structure != "designed" for structure in views.structure])
+            kept = (variance > (1e-6 * unit) ** 2) & views.explained[:, None] & measured
             squares += (np.square(error)[kept] / variance[kept]).tolist()
         assert {fit.matrix.views["A"].structure[number] for number in (MAGNIFICATION, ROTATION)} == {"own"}
     assert refused <= 3  # of 120, at a significance of 1 % for each camera

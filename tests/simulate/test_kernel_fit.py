@@ -11,6 +11,7 @@ from scipy import sparse, stats
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.calibration.point_sources import Responses
@@ -63,7 +64,7 @@ def varying(camera: Camera) -> KernelFootprints:
     coefficients[0, 0] = 1
     coefficients[1, 1] = coefficients[2, 2] = 0.03
     coefficients[3, [3, 5]] = 0.03
-    return KernelFootprints(places, 2, kernels, coefficients, kernels[:0], np.zeros((0, 0, 6)))
+    return KernelFootprints(places, 2, KernelShapes.dense(kernels), coefficients, np.zeros((0, 0, 6)))
 
 
 def rms(difference: sparse.csr_array, entries: int) -> float:
@@ -82,15 +83,52 @@ def test_h_of_a_defocused_lens_is_ten_times_better_known_than_its_entries() -> N
 
 @pytest.mark.slow
 def test_errors_of_h_f_are_as_large_as_promised() -> None:
+    """Of lenses that are focused elsewhere than the design says, so that all of their kernels are learnt."""
     camera, rng = defocused(), np.random.default_rng(1)
-    truth, image = ideal_matrix(camera), np.random.default_rng(2).normal(127, 74, camera.unknowns)
+    other = with_optics({"aperture": "0.4 mm", "focus": "700 mm"}, {"wavelength": "none"}, ONE)[1]
+    truth, image = ideal_matrix(other), np.random.default_rng(2).normal(127, 74, camera.unknowns)
     ratios: list[float] = []
     for _ in range(16):
         footprints = accepted(fit_kernels(drawn(truth, rng), camera, camera.types[0]))
+        assert len(footprints.shapes.core)
         error = (footprints.to_sparse() - truth) @ image
         promised = np.square(footprints.error_directions(image).toarray()).sum(axis=1)
         ratios.append(float(np.square(error).mean() / promised.mean()))
     assert np.mean(ratios) == pytest.approx(1, abs=3 * float(np.std(ratios, ddof=1)) / len(ratios) ** 0.5)
+
+
+def diffracting(shape: tuple[int, int]) -> Camera:
+    """A camera of lenses whose light reaches 115 pixels of f."""
+    optics = {"aperture": "0.4 mm"}, {"wavelength": "550 nm", "lens_pitch": "1 mm"}
+    return with_optics(*optics, (("1/3", [3, 3], [6, 6]),), shape)[1]
+
+
+def test_wide_kernels_are_the_ideal_within_their_errors() -> None:
+    """As long as rays show no deviation from the design, in 20 calibrations and all readings of a picture."""
+    camera, rng = diffracting((21, 21)), np.random.default_rng(8)
+    truth, image = ideal_matrix(camera), np.random.default_rng(9).uniform(0, 255, camera.unknowns)
+    scores: list[float] = []
+    for _ in range(20):
+        responses = drawn(truth, rng)
+        footprints = accepted(fit_kernels(responses, camera, camera.types[0]))
+        assert footprints.places.width == 115
+        error = (footprints.to_sparse() - truth) @ image
+        deviation = np.sqrt(np.square(footprints.error_directions(image).toarray()).sum(axis=1))
+        scores.append(float(np.abs(error / deviation).max()))
+        assert np.square(error).mean() < 0.01 * np.square((responses.matrix - truth) @ image).mean()
+    assert max(scores) < stats.norm.isf(0.5e-3 / len(scores) / camera.measurements)
+
+
+def test_wide_kernels_are_learnt_where_they_deviate() -> None:
+    """From lenses of a wavelength that the design does not know: in the core, and in the light around it."""
+    camera = diffracting((21, 21))
+    truth = ideal_matrix(replace(camera, wavelength=700e-6))
+    fit = fit_kernels(drawn(truth, np.random.default_rng(10), 4096), camera, camera.types[0])
+    assert not fit.record()["as_designed"]
+    learnt, designed = accepted(fit).to_sparse(), ideal_matrix(camera)
+    image = np.random.default_rng(11).uniform(0, 255, camera.unknowns)
+    assert rms((learnt - truth), truth.nnz) < 0.1 * rms(designed - truth, truth.nnz)
+    assert np.abs((learnt - truth) @ image).max() < 0.1 * np.abs((designed - truth) @ image).max()
 
 
 def test_components_of_a_varying_blur_are_learnt() -> None:
@@ -102,7 +140,8 @@ def test_components_of_a_varying_blur_are_learnt() -> None:
     assert record["degree"] == 2
     assert record["components"]["count"] >= 3
     learnt = accepted(fit).to_sparse()
-    mean = replace(varying(camera), kernels=varying(camera).kernels[:1], coefficients=np.eye(1, 6)).to_sparse()
+    first = KernelShapes.dense(varying(camera).shapes.kernels[:1])
+    mean = replace(varying(camera), shapes=first, coefficients=np.eye(1, 6)).to_sparse()
     assert rms(learnt - truth, truth.nnz) < 0.1 * rms(mean - truth, truth.nnz)
     assert rms(learnt - truth, truth.nnz) < 0.4 * rms(responses.matrix - truth, truth.nnz)
 
@@ -125,7 +164,7 @@ def test_correct_explanations_are_rarely_rejected() -> None:
     truth = ideal_matrix(camera)
     fits = [fit_kernels(drawn(truth, rng, 64), camera, camera.types[0]) for _ in range(12)]
     rejected = sum(not fit.accepted or bool(fit.reason) for fit in fits)
-    assert stats.binom.sf(rejected - 1, len(fits), 0.01) > 1e-3
+    assert stats.binom.sf(rejected - 1, len(fits), 0.001) > 1e-3
 
 
 def test_sub_imagers_with_a_blur_of_their_own_are_rejected() -> None:

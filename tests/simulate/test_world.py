@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, cached_stack, light
+from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.world import files, has_interreflections, stage
 
 from ..examples import SLOW_SCALAR, VARIANTS, assert_student, needs
@@ -60,6 +63,25 @@ def test_the_ground_truth_is_the_mean_over_each_pixel(tmp_path: Path, variant: s
     assert np.isfinite(found.depth[5, 5])
     assert found.variance.mean() < 0.01
     assert found.samples == 4 * 256
+
+
+def test_the_ground_truth_shares_no_ray_with_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the seeds of the sampler: with the data's, the estimate would be compared with its own noise."""
+    described, camera = world(tmp_path, rectangle(5.5, 7, 0.25, 0, Z, glow(0.5)), variant="scalar_rgb")
+    started: list[set[int]] = []
+    exposed = Renderer.expose
+
+    def expose(self: Renderer, group: str, samples: int, seed: Callable[[int], int], **rest: Any) -> Any:
+        started[-1].update(map(seed, range(len(camera.sub_imagers))))
+        return exposed(self, group, samples, seed, **rest)
+
+    monkeypatch.setattr(Renderer, "expose", expose)
+    for make in (truth, light):
+        started.append(set())
+        make(Setup(described, camera))
+    assert started[0]
+    assert started[1]
+    assert not started[0] & started[1]
 
 
 @pytest.mark.parametrize("variant", SLOW_SCALAR)

@@ -10,7 +10,7 @@ import pytest
 from ommatid.interface import read_scene
 from ommatid.runtime.errors import InputError
 from ommatid.simulate.renderer.worlds.checked_world import check_world_files
-from ommatid.simulate.renderer.worlds.file_checks import check_named_file
+from ommatid.simulate.renderer.worlds.trial import try_world
 
 from ..conftest import TINY, Command
 from ..examples import GALLERY
@@ -22,12 +22,13 @@ EACH = 6  # worlds of each family
 
 
 def test_hostile_worlds_are_refused_in_one_short_sentence(tmp_path: Path) -> None:
+    """Files by their XML, before Mitsuba starts; meshes in the process that reads them first."""
     for number in range(EACH * len(FAMILIES)):
         folder = tmp_path / str(number)
         folder.mkdir()
         path = hostile_world(number, folder)
         with pytest.raises(InputError) as refused:
-            check_world_files(path, WHERE)
+            try_world(check_world_files(path, WHERE), "scalar_rgb", f"{WHERE}: {path}")
         sentence = str(refused.value)
         assert sentence.startswith(f"{WHERE}: ")
         assert sentence.isprintable()
@@ -46,6 +47,25 @@ def test_sound_meshes_are_read(tmp_path: Path) -> None:
         checked = check_world_files(path, WHERE)
         assert checked.files == [path, tmp_path / name]
         assert f'value="{tmp_path / name}"' in checked.text
+        try_world(checked, "scalar_rgb", WHERE)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (OBJ + "f 1 2 9\n", "reference to invalid vertex 9"),
+        (OBJ.replace("1 0 0", "nan 0 0"), "invalid vertex position data"),
+        ("v 0 0 0\n", "m.obj: expected faces of existing vertices"),
+    ],
+)
+def test_a_changed_mesh_is_tried_again_and_refused_with_its_reason(tmp_path: Path, content: str, reason: str) -> None:
+    (tmp_path / "m.obj").write_text(OBJ, encoding="utf-8")
+    path = tmp_path / "world.xml"
+    path.write_text(mesh("m.obj"), encoding="utf-8")
+    try_world(check_world_files(path, WHERE), "scalar_rgb", WHERE)
+    (tmp_path / "m.obj").write_text(content, encoding="utf-8")
+    with pytest.raises(InputError, match=reason):
+        try_world(check_world_files(path, WHERE), "scalar_rgb", WHERE)
 
 
 def test_includes_and_variables_become_one_text_with_its_places(tmp_path: Path) -> None:
@@ -91,17 +111,6 @@ def test_fifos_are_refused_without_waiting(tmp_path: Path, content: str) -> None
         check_world_files(path, WHERE)
 
 
-def test_a_changed_file_is_checked_again(tmp_path: Path) -> None:
-    (tmp_path / "m.obj").write_text(OBJ, encoding="utf-8")
-    path = tmp_path / "world.xml"
-    path.write_text(mesh("m.obj"), encoding="utf-8")
-    first = check_world_files(path, WHERE)
-    assert check_world_files(path, WHERE) is first
-    (tmp_path / "m.obj").write_text(OBJ + "f 1 2 9\n", encoding="utf-8")
-    with pytest.raises(InputError, match="indices from 1 to 3"):
-        check_world_files(path, WHERE)
-
-
 @pytest.mark.parametrize("path", sorted((GALLERY / "worlds").glob("*.xml")), ids=lambda path: path.stem)
 def test_the_worlds_of_the_gallery_are_sound(path: Path) -> None:
     assert check_world_files(path, WHERE).files == [path]
@@ -130,18 +139,3 @@ def test_the_python_interface_has_the_option(tmp_path: Path) -> None:
     path.write_text(TINY, encoding="utf-8")
     assert not read_scene(path).allows_outside
     assert read_scene(path, set="noise.variance=1e-3", allow_outside=True).allows_outside
-
-
-@pytest.mark.parametrize("face", ["1 2 3", "1/1 2/1 3/1", "1//1 2//1 3//1", "1/1/1 2/1/1 3/1/1", "1/ 2/ 3/", "1 2/1 3"])
-def test_a_wrong_line_among_many_is_named(face: str, tmp_path: Path) -> None:
-    """Lines of one kind are checked together, and a line that stands out by itself."""
-    path, lines = (
-        tmp_path / "m.obj",
-        ["v 0 0 1", "v 1 0 1", "v 0 1.5 -1e-2", "vt 0 0", "vn 0 0 1", *[f"f {face}"] * 300],
-    )
-    path.write_text("\n".join(lines), encoding="utf-8")
-    check_named_file(path, "obj")
-    for at, wrong in ((200, f"f {face.replace('3', '4')}"), (100, f"f {face.replace('1', '0', 1)}"), (2, "v 1 2 nan")):
-        path.write_text("\n".join([*lines[:at], wrong, *lines[at:]]), encoding="utf-8")
-        with pytest.raises(InputError, match=rf"\(line {at + 1}: expected"):
-            check_named_file(path, "obj")

@@ -109,17 +109,16 @@ def panels(maps: ResultMaps, single: str = "", numbers: dict[str, str] | None = 
     return shown
 
 
-def group(name: str, shown: list[Panel], block: int, size: tuple[int, int], pixel: str = "") -> dict[str, Any]:
+def group(name: str, shown: list[Panel], block: int, size: tuple[int, int]) -> dict[str, Any]:
     """Return the maps of panels for the page's program.
 
-    block : side of the pixels of a map in pixels of the image of `size`;  pixel : name of a pixel of it
+    block : side of the pixels of a map in pixels of the image of `size`
     """
     return {
         "name": name,
         "block": block,
         "rows": size[0],
         "columns": size[1],
-        "pixel": pixel,
         "maps": [
             {
                 "name": panel.name,

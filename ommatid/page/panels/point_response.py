@@ -14,10 +14,9 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
-from ommatid.scenes.model import Model
-from ommatid.scenes.optics.boxes import overlap
+from ommatid.scenes.model import Model, designed_observation
+from ommatid.scenes.observation import Observation
 
 from .maps import ColourScale, Panel, value_words
 
@@ -62,33 +61,41 @@ def _response(model: Model, index: int, ideal: IdealMatrix | None) -> PointRespo
     unknown = row * camera.columns + column
     maps: dict[str, FloatArray] = {}
     error = None
-    if model.stored is None:  # box footprints: a product
-        maps["measured"] = _box_response(camera, sub, row, column)
+    pixels = lens_type.pixels[0] * lens_type.pixels[1]
+    start = camera.type_slices()[index].start + (sub.k * lens_type.array[1] + sub.l) * pixels
+    rows = slice(start, start + pixels)
+    if model.stored is None:
+        maps["measured"] = _applied_response(model.observation, rows, unknown).reshape(lens_type.pixels)
     else:
-        pixels = lens_type.pixels[0] * lens_type.pixels[1]
-        start = camera.type_slices()[index].start + (sub.k * lens_type.array[1] + sub.l) * pixels
-        maps["measured"], error = _stored_response(model, slice(start, start + pixels), unknown, lens_type.pixels)
-    ideal_map = None if ideal is None or model.is_exact else _ideal_response(ideal, sub, unknown)
+        maps["measured"], error = _stored_response(model, rows, unknown, lens_type.pixels)
+    ideal_map = None
+    if ideal is not None and not model.is_exact:
+        designed = designed_observation(camera) if model.stored is None else None
+        if designed is not None:
+            ideal_map = _applied_response(designed, rows, unknown).reshape(lens_type.pixels)
+        elif model.stored is not None:
+            ideal_map = _ideal_response(ideal, sub, unknown)
     if ideal_map is not None:
         maps["ideal"] = ideal_map
         if error is not None:
             maps["difference"] = _in_standard_errors(maps["measured"] - ideal_map, error)
-    rows, columns = _bounds(maps["measured"] if ideal_map is None else np.abs(maps["measured"]) + np.abs(ideal_map))
+    shown, columns = _bounds(maps["measured"] if ideal_map is None else np.abs(maps["measured"]) + np.abs(ideal_map))
     return PointResponse(
         lens=lens_type.name,
         k=sub.k,
         l=sub.l,
         source=(row, column),
-        corner=(rows.start, columns.start),
-        maps={name: image[rows, columns] for name, image in maps.items()},
+        corner=(shown.start, columns.start),
+        maps={name: image[shown, columns] for name, image in maps.items()},
         is_exact=model.is_exact,
     )
 
 
-def _box_response(camera: Camera, sub: SubImager, row: int, column: int) -> FloatArray:
-    down = overlap(sub.type.ratio, sub.type.pixels[0], sub.window[0], camera.rows)[:, [row]].toarray()
-    across = overlap(sub.type.ratio, sub.type.pixels[1], sub.window[1], camera.columns)[:, [column]].toarray()
-    return np.asarray(down @ across.T, dtype=np.float64)
+def _applied_response(observation: Observation, rows: slice, column: int) -> FloatArray:
+    """Return some rows of a column of H that is not stored."""
+    source = np.zeros(observation.unknowns)
+    source[column] = 1.0
+    return observation.forward(source)[rows]
 
 
 def _stored_response(model: Model, rows: slice, column: int, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:

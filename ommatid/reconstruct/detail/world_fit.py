@@ -16,6 +16,7 @@ from scipy import linalg, optimize, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import PriorTable
 
@@ -26,6 +27,7 @@ from .world_prior import WorldPrior
 
 LENGTHS = (0.5, 1.5, 4.0, 10.0, 25.0, 60.0)  # pixels of f, from which the search starts
 MOST = 700  # measurements whose covariance is diagonalised
+WIDE = 24  # pixels of f of a window whose measurements see more than it
 SPARSE = 0.1  # share of entries of H, from which products with it as a dense matrix are faster
 STEP = 0.2  # of the logarithm of the length, for the curvature
 TOLERANCE = 0.02  # of the logarithm of the length, far below what the evidence can distinguish
@@ -129,40 +131,61 @@ def world_evidence(task: EstimationTask) -> WorldEvidence:
         raise InputError(
             f"a fit of the prior or the noise takes {MIN_MEASUREMENTS} measurements or more, got {inside.size}"
         )
-    kept = np.isin(model.fine.windowed.measurements_inside(rows, columns), inside)
-    matrix = sparse.csr_array(model.fine.windowed.submatrix(rows, columns)[kept])
-    residual = task.recorded[inside] + model.offset[inside] - model.fine.matrix[inside] @ _mean(model, task)
-    deviation = np.sqrt(task.on_all_measurements(task.expected_noise, 1.0)[inside])
+    matrix = model.fine.windowed.rows_on(inside, rows, columns)
+    light = model.fine.forward(np.ones(model.fine.unknowns))[inside]
+    residual = (task.recorded + model.offset)[inside] - task.prior.mean * light
+    beside = np.square(light - np.asarray(matrix.sum(axis=1)).ravel()) * float(np.mean(np.square(residual)))
+    deviation = np.sqrt(task.on_all_measurements(task.expected_noise, 1.0)[inside] + beside)
     whitened = sparse.csr_array(sparse.diags_array(1 / deviation) @ matrix)
     detail = model.camera.detail
     shape = (rows.stop - rows.start) // detail, (columns.stop - columns.start) // detail
     return WorldEvidence(whitened, residual / deviation, shape, detail)
 
 
-def _mean(model: DetailedModel, task: EstimationTask) -> FloatArray:
-    return np.full(model.fine.unknowns, task.prior.mean)
-
-
 def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slice, IntArray]:
     """Return the largest window in the middle with at most MOST used measurements inside, and these.
 
-    Where blur reaches so far that a smaller window holds too few, the larger one with MOST of its measurements.
+    Where blur reaches so far that it holds too few, a window of WIDE pixels and the measurements of its middle; the
+    light that these receive from beside it counts as noise.
     """
-    most, wider = max(task.shape), None
-    for side in range(most, 0, -1):
-        rows, columns = (
-            slice((size - min(side, size)) // 2 * detail, ((size - min(side, size)) // 2 + min(side, size)) * detail)
-            for size in task.shape
-        )
+    for side in range(max(task.shape), 0, -1):
+        rows, columns = _middle(task.shape, side, detail)
         inside = fine.windowed.measurements_inside(rows, columns)
         inside = inside[task.used[inside]]
-        if inside.size < MIN_MEASUREMENTS and wider is not None:
-            rows, columns, inside = wider
-            return rows, columns, inside[np.linspace(0, inside.size - 1, MOST).round().astype(np.int64)]
-        if inside.size <= MOST:
+        if MIN_MEASUREMENTS <= inside.size <= MOST:
             return rows, columns, inside
-        wider = rows, columns, inside
-    raise InputError(f"a fit of the prior takes {MIN_MEASUREMENTS} measurements or more in a window, got none")
+        if inside.size <= MOST:
+            break
+    rows, columns = _middle(task.shape, WIDE, detail)
+    down, across = (part.start + np.array([0.25, 0.75]) * (part.stop - part.start) for part in (rows, columns))
+    row, column = _footprints(fine.camera)
+    near = (row > down[0]) & (row < down[1]) & (column > across[0]) & (column < across[1])
+    return rows, columns, np.flatnonzero(near & task.used)
+
+
+def _middle(shape: tuple[int, int], side: int, detail: int) -> tuple[slice, slice]:
+    """Return a window of at most `side` pixels of f in the middle, in pixels of the world."""
+    sides = [min(side, size) for size in shape]
+    rows, columns = (
+        slice((size - part) // 2 * detail, ((size - part) // 2 + part) * detail)
+        for size, part in zip(shape, sides, strict=True)
+    )
+    return rows, columns
+
+
+def _footprints(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Return row and column of the middle of each measurement's footprint: (M,) each."""
+    places: list[FloatArray] = []
+    for lens_type in camera.on_grids.types:
+        ratio, order = float(lens_type.ratio), (*lens_type.array, *lens_type.pixels)
+        axes = [
+            np.add.outer([float(start) for start in lens_type.starts(axis)], ratio * (np.arange(pixels) + 0.5))
+            for axis, pixels in enumerate(lens_type.pixels)
+        ]
+        down = np.broadcast_to(axes[0][:, None, :, None], order)
+        places.append(np.stack([down.ravel(), np.broadcast_to(axes[1][None, :, None, :], order).ravel()]))
+    row, column = np.concatenate(places, axis=1)
+    return row, column
 
 
 def _variance_bounds(evidence: WorldEvidence) -> tuple[float, float]:

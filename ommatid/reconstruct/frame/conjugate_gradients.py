@@ -32,6 +32,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.observation import Observation
 
 from ..methods.method import EstimationTask, PosteriorOperators
+from .bands import Bands
 from .reflected import WORKERS, Preconditioner
 
 Indices = NDArray[np.intp]
@@ -73,13 +74,15 @@ class FrameSystem:
     prior : 1 / P0 of independent pixels, or 1 / its spectrum, (rows, columns), under the DCT-II
     alike : boxes and kernels that are like `observation`, for the preconditioner; None: that itself
     similar : the preconditioner of the same prior and similar weights, None to make one of these
+    bands : the camera like this one in front of a world finer than f, if these are the unknowns
     """
 
     observation: Observation
     weights: FloatArray
     prior: float | FloatArray
     alike: Observation | None = field(default=None, kw_only=True)
-    similar: Preconditioner | None = field(default=None, kw_only=True)
+    similar: Preconditioner | Bands | None = field(default=None, kw_only=True)
+    bands: Bands | None = field(default=None, kw_only=True)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -105,21 +108,28 @@ class FrameSystem:
         return self.observation.adjoint(self.weights * readings)
 
     @cached_property
-    def preconditioner(self) -> Preconditioner:
-        """P of the mean weights, or scaled by the local ones where noise is uneven and that takes fewer steps."""
+    def preconditioner(self) -> Preconditioner | Bands:
+        """P of the mean weights, or scaled by the local ones where noise is uneven: what takes the fewest steps.
+
+        In front of a world finer than f it is that of `bands`, or if H is far from shift-invariant that of `alike`.
+        """
         if self.similar is not None:
             return self.similar
-        even = Preconditioner(self._alike, self.mean_weights, self.prior)
-        pairs = zip(self._alike.slices, even.weights, strict=True)
+        weights, candidates = self.mean_weights, list[Preconditioner | Bands]()
+        if self.bands is not None:
+            candidates.append(self.bands)
+        if self.bands is None or len(self.observation.parts) != len(self.bands.types):
+            candidates.append(Preconditioner(self._alike, weights, self.prior))
+        pairs = zip(self._alike.slices, weights, strict=True)
         if all(float(np.ptp(self.weights[part])) <= EVEN * weight for part, weight in pairs):
-            return even
-        means = np.repeat(even.weights, [part.stop - part.start for part in self._alike.slices])
+            return candidates[0] if len(candidates) == 1 else min(candidates, key=self._after_trial)
+        means = np.repeat(weights, [part.stop - part.start for part in self._alike.slices])
         local, average = self.observation.adjoint(self.weights), self.observation.adjoint(means)
         relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
-        scaled = replace(even, scale=np.sqrt(np.maximum(relative, LEAST_LOCAL)).reshape(self.shape))
-        return min((even, scaled), key=self._after_trial)
+        scale = np.sqrt(np.maximum(relative, LEAST_LOCAL)).reshape(self.shape)
+        return min([*candidates, *(replace(each, scale=scale) for each in candidates)], key=self._after_trial)
 
-    def _after_trial(self, candidate: Preconditioner) -> float:
+    def _after_trial(self, candidate: Preconditioner | Bands) -> float:
         """Return the bound that a few steps with a preconditioner reach."""
         right = self.apply(probe(Purpose.PRECONDITIONER).normal(size=self.observation.unknowns))
         return replace(self, similar=candidate)._steps(right, TRIAL_STEPS)
@@ -206,12 +216,17 @@ class FrameSystem:
         return self.preconditioner.solve(image.reshape(self.shape)).ravel()
 
 
-def posterior_operators(system: FrameSystem, task: EstimationTask) -> PosteriorOperators:
-    """Return A, C and their kin for means over the frame.
+def mean_accuracy(task: EstimationTask) -> float:
+    """Return the accuracy of solutions for means over the frame.
 
     The bound on the largest error of a pixel is sqrt(N) times the mean error or more.
     """
-    accuracy = max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5)
+    return max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5 / task.finer)
+
+
+def posterior_operators(system: FrameSystem, task: EstimationTask) -> PosteriorOperators:
+    """Return A, C and their kin for means over the frame."""
+    accuracy = mean_accuracy(task)
 
     def posterior(image: FloatArray) -> FloatArray:
         return system.solve(image, accuracy).image

@@ -53,6 +53,7 @@ from .window_variances import (
     stored_stencil,
     whole_variances,
 )
+from .world_map import between, levels, mean_ratios, world_map
 
 Pixels = NDArray[np.intp]
 
@@ -72,7 +73,6 @@ SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where th
 LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies a thousandfold
 WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
 LEVELS = 4  # of even noise, for a correlated prior
-LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 
 @dataclass(frozen=True)
@@ -89,25 +89,31 @@ class ExactVariances:
 
     noise : (M,) Rvm / Rv^2, None where the actual noise Rvm is the expected one
     accuracy : that of solutions in posterior standard deviations, if EXACT is out of reach
+    task : whose unknowns are finer than f's pixels; None: the unknowns are f's pixels
     """
 
     system: FrameSystem
     noise: FloatArray | None
     accuracy: float
+    task: EstimationTask | None = None
 
     def at(self, pixels: Pixels, posterior: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return Eq. 5 of pixels whose errors are not correlated, (n,); posterior : (N,) about the diagonal of C."""
         signs = np.zeros_like(posterior)
         signs[pixels] = rng.choice([-1.0, 1.0], size=pixels.size)
         finest = EXACT * float(np.sqrt(posterior[pixels].min()))
-        solved = self._solve(signs, finest)
+        weights = signs if self.task is None else self.task.of_unknowns(signs)
+        solved = self._solve(weights, finest)
         if self.noise is not None:
             readings = self.system.observation.forward(solved)
             readings *= self.noise
             right = self.system.observation.adjoint(readings) + self.system.apply_prior_precision(solved)
-            smallest = float(np.min((signs * solved)[pixels]))
+            smallest = float(np.min((signs * self._of_f(solved))[pixels]))
             solved = self._solve(right, min(finest, EXACT * max(smallest, 0.0) / float(posterior.max()) ** 0.5))
-        return (signs * solved)[pixels]
+        return (signs * self._of_f(solved))[pixels]
+
+    def _of_f(self, image: FloatArray) -> FloatArray:
+        return image if self.task is None else self.task.of_f(image)
 
     def _solve(self, right: FloatArray, accuracy: float) -> FloatArray:
         try:
@@ -136,6 +142,26 @@ def check_map(
     if not local:
         return MapCheck(worst, worst)
     return MapCheck(worst, min(worst, abs(float(ratio.mean())) + 2 * float(ratio.std()) / ratio.size**0.5))
+
+
+def world_error_map(
+    task: EstimationTask, system: FrameSystem, actual: FloatArray
+) -> tuple[VarianceMap, MapCheck, FloatArray | float]:
+    """Return the maps of f's pixels in front of a finer world, their error at random pixels, and f's prior variance.
+
+    Errors are correlated far: pixels are taken one at a time.
+    """
+    if system.bands is None:
+        raise TypeError("expected the system of a world finer than f")
+    variances, prior, is_exact = world_map(task, system.observation, system.weights, system.bands, actual)
+    if is_exact:
+        return variances, MapCheck(0.0, 0.0), prior
+    noise = None
+    if not np.allclose(actual, task.expected_noise, rtol=1e-12):
+        noise = system.weights**2 * task.on_all_measurements(actual, 0.0)
+    exact = ExactVariances(system, noise, task.settings.accuracy, task)
+    variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
+    return variances, check_map(variance, variances.posterior.ravel(), task.shape_of_f, exact, local=False), prior
 
 
 def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bool, first: int = 0) -> Pixels:
@@ -356,46 +382,17 @@ class ErrorMap:
 
     @cached_property
     def _mean_ratios(self) -> tuple[float, ...]:
-        """Ratio of the actual to the expected noise of each lens type, weighted as the estimator weighs it."""
-        weights = self.system.weights
-        ratios = self.task.on_all_measurements(self.actual / self.task.expected_noise, 0.0)
-        parts = [(weights[part], ratios[part]) for part in self.task.model.camera.type_slices()]
-        return tuple(float(np.mean(weight * ratio)) / (float(weight.mean()) or 1.0) for weight, ratio in parts)
+        return mean_ratios(self.task, self.system.weights, self.actual)
 
     def _interpolated_map(self) -> VarianceMap:
         """Variances of uneven noise from those of even noise, at the level of the measurements of each pixel."""
-        level = np.log(self._local_weight())
-        low, high = float(level.min()), float(level.max())
-        if high - low <= EVEN:
-            return self._even_map()
-        levels = np.linspace(low, high, LEVELS)
-        maps = [self._even_map(float(np.exp(value))) for value in levels]
-        place = np.clip((level - low) / (high - low) * (LEVELS - 1), 0, LEVELS - 1)
-        below = np.minimum(place.astype(np.intp), LEVELS - 2)
-        share = (place - below).reshape(self.task.shape)
 
-        def interpolated(parts: list[FloatArray]) -> FloatArray:
-            logs = np.log(np.maximum(np.array([part.ravel() for part in parts]), np.finfo(float).tiny))
-            pixels = np.arange(below.size)
-            first, second = (logs[number, pixels].reshape(self.task.shape) for number in (below, below + 1))
-            return np.exp(first + share * (second - first))
+        def at(value: float) -> list[FloatArray]:
+            even = self._even_map(float(np.exp(value)))
+            return [even.posterior, even.missing, even.noisy]
 
-        return VarianceMap(
-            interpolated([each.posterior for each in maps]),
-            interpolated([each.missing for each in maps]),
-            interpolated([each.noisy for each in maps]),
-        )
-
-    def _local_weight(self) -> FloatArray:
-        """Weights of the measurements of each pixel relative to the means of their types: (N,)."""
-        means = np.empty(self.task.model.measurements)
-        slices = self.task.model.camera.type_slices()
-        for part, weight in zip(slices, self._sliding.weights, strict=True):
-            means[part] = weight
-        adjoint = self.system.observation.adjoint
-        local, average = adjoint(self.system.weights), adjoint(means)
-        relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
-        return np.maximum(relative, LEAST_LEVEL)
+        level = np.log(levels(self.task, self.system.observation, self.system.weights))
+        return VarianceMap(*between(level, LEVELS, at))
 
 
 def window_memory(camera: Camera) -> int:

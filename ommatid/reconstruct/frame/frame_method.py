@@ -16,6 +16,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, probe
 
+from ..detail.detailed_model import CAUSE as DETAIL
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import (
     EstimationTask,
@@ -29,11 +30,23 @@ from ..methods.method import (
 )
 from ..methods.prepared import SAME_NOISE
 from ..output.run_json import SolverReport
+from ..prior import coloured
 from ..verdict.residual_power import ResidualInputs, ResidualPower
-from .conjugate_gradients import BandedSystem, FrameSystem, Solution, posterior_operators, serves
-from .error_map import MANY, ErrorMap, MapCheck
+from .bands import bands_of
+from .conjugate_gradients import (
+    BandedSystem,
+    FrameSystem,
+    Solution,
+    mean_accuracy,
+    posterior_operators,
+    serves,
+)
+from .error_map import MANY, ErrorMap, MapCheck, world_error_map
+from .world_map import world_of
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
+INVARIANT = "every lens type is shift-invariant except at the edges"
+WORLD = "the world finer than f is estimated, and f's pixels are its averages"
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
 SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
 ERRORS = "errors"  # name of a FrameError among what frames share
@@ -58,9 +71,9 @@ class FrameMethod(Method):
     def __init__(self, task: EstimationTask, execution: Execution) -> None:
         """Raises InputError if the camera is not shift-invariant and too large, or a measurement has no noise."""
         super().__init__(task, execution)
-        self._banded = serves(task.model.camera, task.prior.kind == "independent")
+        self._banded = task.finer == 1 and serves(task.model.camera, task.prior.kind == "independent")
         for lens_type in task.model.camera.types:
-            if not (self._banded or lens_type.is_sliding):
+            if not (task.finer > 1 or self._banded or lens_type.is_sliding):
                 raise InputError(
                     f"estimator.method 'frame': lens type '{lens_type.name}' is no array of m x m sub-imagers with"
                     " step 1 and magnification 1/m, and the frame is too large for another solver, or its prior"
@@ -83,6 +96,9 @@ class FrameMethod(Method):
         if self._banded:
             banded = BandedSystem(observation, weights, prior, task.model.matrix)
             return self.shared("system", self.conditions(), lambda: banded)[0]
+        if task.finer > 1:
+            bands = bands_of(task.model.camera, task.finer, 1 / np.asarray(prior), weights, observation)
+            return FrameSystem(observation, weights, prior, alike=task.model.alike, bands=bands)
         system = FrameSystem(observation, weights, prior, alike=task.model.alike)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
@@ -119,12 +135,12 @@ class FrameMethod(Method):
         errors, difference = self.shared(ERRORS, self.conditions(noise), make, SAME_NOISE)
         self.execution.progress(0.9)
         expected, check = errors.expected, errors.check
-        deviation = None if truth is None else truth - task.prior.mean
+        deviation = None if truth is None else self._of_unknowns(truth) - task.prior.mean
         given = None if deviation is None else self._interval(deviation, actual, expected, check.mean)
         solver = SolverReport(
             way="frame",
             method="frame",
-            why=NULL_SPACE if self._banded else "every lens type is shift-invariant except at the edges",
+            why=NULL_SPACE if self._banded else WORLD if task.finer > 1 else INVARIANT,
             condition=solution.condition if isfinite(solution.condition) else None,
             variance_bound=check.worst + (difference or 0.0),
             bound=solution.bound,
@@ -132,7 +148,7 @@ class FrameMethod(Method):
             unit="posterior standard deviation",
         )
         return MethodResult(
-            self.image,
+            task.of_f(self.image),
             residual_multipliers(task, self.image),
             solver,
             expected,
@@ -145,14 +161,39 @@ class FrameMethod(Method):
     def _frame_error(self, noise: dict[str, FloatArray], actual: FloatArray) -> FrameError:
         """Return the expected error, which depends on the noise and not on what is recorded."""
         task, system = self.task, self.system
-        errors, check = ErrorMap.of(task, system, actual)
-        variances, variance = errors.maps, errors.variance
+        if task.finer > 1:
+            variances, check, prior = world_error_map(task, system, actual)
+        else:
+            errors, check = ErrorMap.of(task, system, actual)
+            variances, prior = errors.maps, task.prior.variance
+        variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
         self.execution.progress(0.7)
-        resolved = 1 - variances.posterior.ravel() / task.prior.variance
-        parts = self._parts(noise, float(variances.noisy.mean()))
+        resolved = 1 - variances.posterior.ravel() / prior
+        parts, missing = self._parts(noise, float(variances.noisy.mean())), float(variances.missing.mean())
+        if task.finer > 1:
+            parts[DETAIL] = min(self._by_detail(), missing)
         self.execution.progress(0.8)
-        expected = ExpectedError(variance, float(variances.missing.mean()), parts, resolved)
+        expected = ExpectedError(variance, missing - parts.get(DETAIL, 0.0), parts, resolved)
         return FrameError(expected, check, self._random_power(actual, expected.degrees_of_freedom))
+
+    def _of_unknowns(self, truth: FloatArray) -> FloatArray:
+        """Return a true image on the grid of the unknowns; one of f becomes a random world with its averages."""
+        task = self.task
+        if truth.size == task.model.unknowns:
+            return truth
+        mean, spectrum = task.prior.mean, 1 / np.asarray(task.precision_on(task.shape))
+        drawn = mean + coloured(spectrum, probe(Purpose.DETAIL).normal(size=task.shape))
+        left = (truth - task.of_f(drawn.ravel())).reshape(task.shape_of_f)
+        return drawn.ravel() + world_of(left, spectrum, task.finer)
+
+    def _by_detail(self) -> float:
+        """Return the mean squared error by what f does not hold of a random world of the prior."""
+        task = self.task
+        world = task.draw_deviation(probe(Purpose.DETAIL))
+        spectrum = 1 / np.asarray(task.precision_on(task.shape))
+        world -= world_of(task.of_f(world).reshape(task.shape_of_f), spectrum, task.finer)
+        right = self.system.right_hand_side(task.on_all_measurements(task.observe(world), 0.0))
+        return float(np.square(task.of_f(self._solve(right))).mean())
 
     def _random_power(self, actual: FloatArray, freedoms: float) -> ResidualPower:
         """Return the expected squares of the residual, by solutions for random images and noise, of f0 as true image.
@@ -184,11 +225,12 @@ class FrameMethod(Method):
         return np.subtract(column, observed, out=observed)
 
     def _solve(self, right: FloatArray) -> FloatArray:
-        return self.system.solve(right, self.task.settings.accuracy).image
+        """Return C b for a mean over the frame, to a mean error of a hundredth of a posterior standard deviation."""
+        return self.system.solve(right, mean_accuracy(self.task)).image
 
     def _variance_of_sum(self, weights: FloatArray, actual: FloatArray) -> float:
         """Eq. 5 of w^T f^."""
-        solved = self._solve(weights)
+        solved = self.system.solve(self.task.of_unknowns(weights), self.task.settings.accuracy).image
         prior_part = float(solved @ self.system.apply_prior_precision(solved))
         return float(np.sum((prior_part, self._noise_part(solved, actual))))
 
@@ -215,7 +257,7 @@ class FrameMethod(Method):
             else:
                 random = rng.normal(size=values.size) * np.sqrt(values)
                 solved = self._solve(self.system.right_hand_side(self.task.on_all_measurements(random, 0.0)))
-                parts[name] = float(np.mean(np.square(solved)))
+                parts[name] = float(np.mean(np.square(self.task.of_f(solved))))
                 uniform = (float(values[0]), parts[name]) if is_uniform(values) else uniform
         share = mean / (sum(parts.values()) or 1.0)
         return {name: part * share for name, part in parts.items()}
@@ -223,13 +265,13 @@ class FrameMethod(Method):
     def _interval(
         self, deviation: FloatArray, actual: FloatArray, expected: ExpectedError, map_error: float
     ) -> Interval:
-        """Interval of the mean squared error of the true image; f - f0 is `deviation`, (N,)."""
-        system, count = self.system, deviation.size
-        bias = self._solve(system.apply_prior_precision(deviation))
-        along = self._noise_part(self._solve(bias), actual)
+        """Interval of the mean squared error of the true image; that less its prior's mean is `deviation`."""
+        task, system, count = self.task, self.system, expected.variance.size
+        bias = task.of_f(self._solve(system.apply_prior_precision(deviation)))
+        along = self._noise_part(self._solve(task.of_unknowns(bias)), actual)
         random = probe(Purpose.ERROR_INTERVAL).normal(size=count)
-        gain = self._transposed_gain(self._solve(random))
-        back = self._solve(system.right_hand_side(self.task.on_all_measurements(actual * gain, 0.0)))
-        noisy = count * sum(expected.parts.values())
+        gain = self._transposed_gain(self._solve(task.of_unknowns(random)))
+        back = task.of_f(self._solve(system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
+        noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
         variance = 4 * along + 2 * float(back @ back) + (map_error * noisy) ** 2
         return interval(float(bias @ bias) + noisy, variance, count)

@@ -182,11 +182,11 @@ class SmallFrames:
 
         extrapolated : True to take the law of the length into account
         """
-        whole = _enlarged(_variance(self._whole, weights, by_prior), self.shape)
+        whole = enlarged(_variance(self._whole, weights, by_prior), self.shape)
         total = whole.copy()
         for axis, system in self._shorter if extrapolated else ():
             share = (1 / self.shape[axis] - 1 / SIDE) / (1 / SHORT - 1 / SIDE)
-            total += share * (_enlarged(_variance(system, weights, by_prior), self.shape) - whole)
+            total += share * (enlarged(_variance(system, weights, by_prior), self.shape) - whole)
         return np.maximum(total, LEAST_SHARE * whole)
 
 
@@ -210,7 +210,7 @@ def _variance(system: SlidingCamera, weights: tuple[float, ...], by_prior: float
     return np.diagonal(factor.inverse()).reshape(system.shape)
 
 
-def _enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Return the map of a small frame for a frame of `shape`."""
     return variance[np.ix_(*(_small_index(*sizes) for sizes in zip(shape, variance.shape, strict=True)))]
 

@@ -57,6 +57,7 @@ class EstimationTask:
     expected_noise : (measurements used,) the noise variance that the estimator assumes, 0 allowed
     shared_image : (N,) whose `error_directions` by few numbers of H are part of the expected noise; None: they are not
     prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
+    finer : the model's pixels, the unknowns, are so many times finer than f's along both axes
     """
 
     model: Model
@@ -68,6 +69,7 @@ class EstimationTask:
     tiles: estimation.TilesTable
     prior_ratio: float = 1.0
     shared_image: FloatArray | None = None
+    finer: int = 1
 
     @cached_property
     def complete(self) -> bool:
@@ -76,8 +78,27 @@ class EstimationTask:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of f."""
+        """Rows and columns of the unknowns."""
         return self.model.camera.rows, self.model.camera.columns
+
+    @property
+    def shape_of_f(self) -> tuple[int, int]:
+        """Rows and columns of f."""
+        return self.shape[0] // self.finer, self.shape[1] // self.finer
+
+    def of_f(self, image: FloatArray) -> FloatArray:
+        """Return the averages A w over pixels of f: (unknowns,) to (N,)."""
+        if self.finer == 1:
+            return image
+        rows, columns = self.shape_of_f
+        return image.reshape(rows, self.finer, columns, self.finer).mean(axis=(1, 3)).ravel()
+
+    def of_unknowns(self, weights: FloatArray) -> FloatArray:
+        """Return A^T c, the weights of the unknowns in a weighted sum of pixels of f: (N,) to (unknowns,)."""
+        if self.finer == 1:
+            return weights
+        whole = np.kron(weights.reshape(self.shape_of_f), np.full((self.finer, self.finer), self.finer**-2.0))
+        return np.asarray(whole, dtype=np.float64).ravel()
 
     def window(self, rows: slice, columns: slice) -> TaskWindow:
         """Cut out a window of f with the used measurements that see nothing outside it."""

@@ -142,8 +142,9 @@ def _likely_leverage(task: EstimationTask) -> FloatArray:
 
 
 def can_be_corrected(method: Method) -> bool:
-    """Return True if the batches of the calibration can show the attenuation."""
-    return bool(method.task.used.any()) and method.task.model.has_error_halves
+    """Return True if the batches of the calibration can show the attenuation, on f's own grid."""
+    task = method.task
+    return task.finer == 1 and bool(task.used.any()) and task.model.has_error_halves
 
 
 def with_attenuation(

@@ -43,12 +43,12 @@ LEAST_LEFT = 0.05  # of an expected square of the residual
 class SharedErrors:
     """Columns of L, or random combinations of them, before and after the estimator.
 
-    readings : (K, measurements used);  images : (K, N) A of each
+    residuals : (K, measurements used) what the estimate leaves of each;  images : (K, N) A of each
     exact : True if they are all columns of L, False if their squares have the right mean alone
     directions : L, (measurements used, q), None where it is too large
     """
 
-    readings: FloatArray
+    residuals: FloatArray
     images: FloatArray
     exact: bool
     directions: sparse.csc_array | None
@@ -62,15 +62,12 @@ class SharedErrors:
         """Return w^T K w of (N,) weights."""
         if self.exact or self.directions is None:
             return float(np.square(self.images @ weights).sum())
-        back = operators.weigh(task.observe(operators.posterior(weights)))
+        back = operators.weigh(task.observe(operators.posterior(task.of_unknowns(weights))))
         return float(np.square(self.directions.T @ back).sum())
 
-    def residuals(self, task: EstimationTask, operators: PosteriorOperators) -> SharedResidual:
+    def whitened(self, task: EstimationTask, operators: PosteriorOperators) -> SharedResidual:
         """Return their whitened residuals."""
-        white = [
-            whitened(reading - task.observe(image), task, operators)
-            for reading, image in zip(self.readings, self.images, strict=True)
-        ]
+        white = [whitened(residual, task, operators) for residual in self.residuals]
         return SharedResidual(np.array(white, dtype=np.float32).reshape(len(white), -1), self.exact)
 
     def variance_of_square(
@@ -83,7 +80,8 @@ class SharedErrors:
             weights = probe(Purpose.SHARED_PRODUCTS).normal(size=(CROSS_DRAWS, len(combined)))
             combined = weights @ combined / CROSS_DRAWS**0.5
         across = sum(
-            float(actual @ np.square(operators.weigh(task.observe(operators.posterior(image))))) for image in combined
+            float(actual @ np.square(operators.weigh(task.observe(operators.posterior(task.of_unknowns(image))))))
+            for image in combined
         )
         return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
 
@@ -121,8 +119,11 @@ def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: Fl
                 return None
             draws.append(draw[used] / count**0.5)
         readings = np.array(draws)
-    images = np.array([operators.gain(reading) for reading in readings]).reshape(len(readings), model.unknowns)
-    return SharedErrors(readings, images, exact, directions)
+    residuals, images = np.empty_like(readings), np.empty((len(readings), task.shape_of_f[0] * task.shape_of_f[1]))
+    for number, reading in enumerate(readings):
+        solved = operators.gain(reading)
+        residuals[number], images[number] = reading - task.observe(solved), task.of_f(solved)
+    return SharedErrors(residuals, images, exact, directions)
 
 
 def bound(task: EstimationTask, image: FloatArray) -> float:
@@ -168,7 +169,7 @@ def with_shared_errors(
         power = _with_residuals(power, errors, given, task, operators)
     return replace(
         result,
-        expected=_with_variance(result.expected, errors, task.shape),
+        expected=_with_variance(result.expected, errors, task.shape_of_f),
         interval=None
         if result.interval is None or truth is None
         else _wider(result.interval, given, truth, actual, task, operators),
@@ -194,9 +195,13 @@ def _wider(
     task: EstimationTask,
     operators: PosteriorOperators,
 ) -> Interval:
-    count, camera = task.model.unknowns, task.model.camera
-    image = truth if truth.size == count else averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
-    bias = operators.hidden(image - task.prior.mean)
+    (rows, columns), camera = task.shape_of_f, task.model.camera
+    count, image = rows * columns, truth
+    if truth.size > task.model.unknowns:
+        image = averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
+    elif truth.size < task.model.unknowns:
+        image = task.finer**2 * task.of_unknowns(truth)
+    bias = task.of_f(operators.hidden(image - task.prior.mean))
     added = errors.variance_of_square(bias, actual, task, operators)
     return interval(count * without.mse + float(errors.variance.sum()), count**2 * without.variance + added, count)
 
@@ -213,8 +218,8 @@ def _with_residuals(
     if operators.whiten is not None and task.shared_image is not None:
         # What was whitened held the errors as independent, and so does the expected residual.
         prior = np.maximum(prior - _as_independent(task, operators), LEAST_LEFT * prior)
-    shared = errors.residuals(task, operators)
-    of_given = shared if given is errors else given.residuals(task, operators)
+    shared = errors.whitened(task, operators)
+    of_given = shared if given is errors else given.whitened(task, operators)
     noise = None if power.noise is None else power.noise + of_given.power
     return replace(power, prior=prior + shared.power, noise=noise, shared=shared, shared_given=of_given)
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, own_style
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.printable import printable_label
 from ommatid.scenes.formats import exr
@@ -43,17 +43,13 @@ class OverviewPanel:
 @own_style()
 def write_overview(folder: Path, stack: Stack, report: RunReport, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the result in a folder, which has estimate.exr. Raises InputError or MachineError."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     maps = {name: channel.astype(np.float64) for name, channel in exr.read(folder / ESTIMATE)[0].channels.items()}
     panels, grey = _panels(stack, maps), _grey_range(maps.get("truth", maps["estimate"]))
     rows, across = grid(len(panels) + 1)
     width, height = COLUMN_INCHES * across, ROW_INCHES * rows + TOP - 0.35
-    figure: Any = Figure(figsize=(width, height))
+    figure = new_figure(width, height)
     edges = {"left": LEFT / width, "right": 1 - RIGHT / width, "bottom": BOTTOM / height, "top": 1 - TOP / height}
     figure.subplots_adjust(**edges, wspace=0.5, hspace=0.45)
-    FigureCanvasAgg(figure)
     _write_headline(figure, stack.scene.title, report)
     for index, panel in enumerate(panels):
         _draw_panel(figure, figure.add_subplot(rows, across, 1 + index), panel, grey)

@@ -11,11 +11,11 @@ from math import log10
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, computed_field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, computed_field
 
-from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
-from ommatid.runtime.input_files import check_unique_keys, read_bytes
+from ommatid.runtime.input_files import read_record
 from ommatid.scenes.formats.provenance import FitRecord
 
 RUN = "run.json"
@@ -407,21 +407,7 @@ def write(folder: Path, report: RunReport) -> None:
 def read(folder: Path) -> RunReport:
     """Read run.json of a folder. Raises InputError where there is none, or where a key is missing or wrong."""
     path = folder / RUN
-    try:
-        content = read_bytes(path)
-        report = RunReport.model_validate_json(content)
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected the results of a run, got no file that can be read ({error.strerror})"
-        ) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = shortened(".".join(map(str, first["loc"]))) or "content"
-        raise InputError(
-            f"{path}: expected the results of a run, got a file whose {key} is wrong: {shortened(first['msg'])};"
-            " delete it and run the scene again"
-        ) from error
-    check_unique_keys(path, content)
+    report: RunReport = read_record(path, RunReport, "the results of a run", "run the scene again")
     if not report.fingerprint:
         raise InputError(f"{path}: expected the results of a run, got a file without fingerprint; run the scene again")
     return report

@@ -287,7 +287,7 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
     if check.variance_bound > SIZE:
         findings.reasons.append(
             f"the variances of some pixels are wrong by {100 * check.variance_bound:.2g} % or more: the solver's map of"
-            " them is an approximation; crop the target to 4000 pixels, or set estimator.method to 'tiles' (pinholes)"
+            " them is an approximation; crop the target, or for pinholes set estimator.method to 'tiles'"
         )
 
 

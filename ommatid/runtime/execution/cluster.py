@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-import ssl
 import sys
 import warnings
 from collections.abc import Callable, Generator, Iterable
@@ -177,7 +176,7 @@ def _connected(cluster: Cluster) -> Generator[Any]:
         asyncio.run(_check_scheduler(cluster, security))
         client: Any = _answer(start, 2 * workers.PATIENCE + 1)
     except Exception as error:  # another server at this address may answer anything
-        raise InputError(f"{cluster}: {_reason(cluster, error)}") from error
+        raise InputError(f"{cluster}: {_no_answer(cluster)}") from error
     with closing(client):
         try:
             _answer(partial(client.wait_for_workers, 1, workers.PATIENCE), workers.PATIENCE + 1)
@@ -203,14 +202,8 @@ def _security(cluster: Cluster) -> Any:
     return configured
 
 
-def _reason(cluster: Cluster, error: BaseException) -> str:
-    """Return why there is no connection, and what to do."""
-    causes: list[BaseException] = []
-    while error not in causes:
-        causes.append(error)
-        error = error.__cause__ or error.__context__ or error
-    if any(isinstance(cause, ssl.SSLCertVerificationError) for cause in causes):
-        return "the certificate of the scheduler was not signed by the authority of Dask's configuration (ca-file)"
+def _no_answer(cluster: Cluster) -> str:
+    """Return that there is no connection, and what to do."""
     if cluster.address.startswith("tls://"):
         return "no encrypted scheduler answers there that accepts the certificate; check both, and Dask's configuration"
     return "no scheduler answers there; start one with `dask scheduler`, or correct the address"

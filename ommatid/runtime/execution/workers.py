@@ -1,7 +1,7 @@
 """Parallel execution of independent tasks.
 
 A task is a function defined in a module, applied to one item; both are sent as pickles. Results do not depend on which
-worker executes a task, nor on how many workers fail meanwhile.
+worker executes a task.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -27,6 +27,7 @@ PATIENCE = 10.0  # seconds to wait for a scheduler that does not answer, or for 
 ANSWER = 60.0  # seconds to wait for the answer of a scheduler that has answered before, and may be busy
 POLL = 0.5  # seconds between two checks for a dropped Ctrl-C
 LOST = "the connection to the scheduler was lost; check that it is running, and repeat the command"
+DIED = "a process died, maybe for want of memory; finished results stay, repeat the command with fewer --workers"
 
 
 @dataclass(frozen=True)
@@ -37,16 +38,18 @@ class Completed(Generic[Result]):
     _future: Future[Result]
 
     @property
-    def is_lost(self) -> bool:
-        """Return True if the connection to the cluster was lost before the task had ended."""
-        return self._future.cancelled() or isinstance(self._future.exception(), CancelledError)
+    def loss(self) -> MachineError | None:
+        """Return the reason if all that has not ended is lost with this task: connection or processes."""
+        if self._future.cancelled() or isinstance(self._future.exception(), CancelledError):
+            return MachineError(LOST)
+        return MachineError(DIED) if isinstance(self._future.exception(), BrokenExecutor) else None
 
     def result(self) -> Result:
         """Return the function's result, or raise its exception. Raises MachineError if no worker survived it."""
+        if self.loss is not None:
+            raise self.loss
         try:
             return self._future.result()
-        except CancelledError as error:
-            raise MachineError(LOST) from error
         except Exception as error:
             if isinstance(error, ImportError) or str(error).startswith("Can't get attribute"):  # while unpickling
                 raise InputError(
@@ -81,7 +84,7 @@ class Workers:
         with interrupts_remembered() as check_interrupt, _cancelling(pending):
             while True:
                 for index, item in islice(remaining, max(0, max(1, self._size()) - len(pending))):
-                    pending[self._executor.submit(function, item)] = index
+                    pending[self._submit(function, item)] = index
                 if not pending:
                     return
                 ended = _first_completed(pending, check_interrupt)
@@ -90,6 +93,12 @@ class Workers:
                     raise MachineError("no workers are left; start some and repeat the command")
                 for future in sorted(ended, key=pending.__getitem__):
                     yield Completed(pending.pop(future), future)
+
+    def _submit(self, function: Callable[[Item], Result], item: Item) -> Future[Result]:
+        try:
+            return self._executor.submit(function, item)
+        except BrokenExecutor as error:
+            raise MachineError(DIED) from error
 
     def check_versions(self, facts: Callable[[], dict[str, str]]) -> None:
         """Raise InputError if `facts`, such as versions, differ on a worker; on this machine they never do."""

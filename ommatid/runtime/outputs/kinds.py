@@ -12,7 +12,7 @@ import stat
 from pathlib import Path
 
 from ..errors import InputError
-from ..input_files import real_path
+from ..input_files import kind, real_path
 from ..printable import printable
 
 # Suffixes of all files that are written; a folder may hold anything else.
@@ -22,14 +22,6 @@ SUFFIXES = frozenset(
 LONGEST = 200  # bytes of a name: 255, less what is added to the names of temporary files
 SHORT = 110  # characters of each of two paths in one sentence
 _SYSTEM = Path("/dev"), Path("/proc"), Path("/sys")
-_KINDS = {
-    stat.S_IFREG: "a file",
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a FIFO",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFSOCK: "a socket",
-}
 
 
 def check_output(path: Path, *inputs: Path) -> None:
@@ -39,11 +31,11 @@ def check_output(path: Path, *inputs: Path) -> None:
         raise InputError(f"{named}: the folder {printable(path.parent, SHORT)} does not exist; create it first")
     if not stat.S_ISDIR(parent):
         folder = printable(path.parent, SHORT)
-        raise InputError(f"{named}: expected a file in a folder, but {folder} is {_kind(parent)}")
+        raise InputError(f"{named}: expected a file in a folder, but {folder} is {kind(parent)}")
     if mode is not None and stat.S_ISDIR(mode):
         raise InputError(f"{named}: expected the name of a file, got a folder")
     if mode is not None and not stat.S_ISREG(mode):
-        raise InputError(f"{named}: expected the name of a file, got {_kind(mode)}; choose another name")
+        raise InputError(f"{named}: expected the name of a file, got {kind(mode)}; choose another name")
     _check_place(path, path.parent)
     for source in inputs:
         if real_path(path) == real_path(source):
@@ -60,14 +52,14 @@ def check_folder(path: Path) -> None:
         return
     if not stat.S_ISDIR(mode):
         raise InputError(
-            f"{printable(path)}: expected a folder to write to, but {_kind(mode)} of that name is in the way"
+            f"{printable(path)}: expected a folder to write to, but {kind(mode)} of that name is in the way"
         )
     _check_place(path, path)
     with os.scandir(path) as entries:
         for entry in entries:
             inside = _mode(path / entry.name) if Path(entry.name).suffix in SUFFIXES else None
             if inside is not None and not (stat.S_ISREG(inside) or stat.S_ISDIR(inside)):
-                found = f"{printable(path / entry.name)}: expected a regular file, got {_kind(inside)}"
+                found = f"{printable(path / entry.name)}: expected a regular file, got {kind(inside)}"
                 raise InputError(f"{found}; remove it or choose another folder")
 
 
@@ -128,10 +120,6 @@ def _check_place(path: Path, folder: Path) -> None:
     resolved = real_path(folder)
     if resolved == _SYSTEM[0] or any(resolved.is_relative_to(system) for system in _SYSTEM[1:]):
         raise InputError(f"{printable(path)}: expected a place for files, got one of the system's, {resolved}")
-
-
-def _kind(mode: int) -> str:
-    return _KINDS.get(stat.S_IFMT(mode), "something else")
 
 
 def _wrong(name: str) -> str:

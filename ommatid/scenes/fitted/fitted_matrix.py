@@ -20,6 +20,7 @@ from ..camera import Camera
 from ..lens_type import LensType, SubImager
 from ..observation import Observation, ObservationPart
 from ..tables.table import LARGEST
+from .kernel_shapes import Numbers
 from .kernels import KernelFootprints
 from .view import COUNT, K1, LEAST, MOST, ROTATION, boxes_of, designed, displacements, entries, real_box
 
@@ -99,14 +100,20 @@ class FittedMatrix:
         ]
 
     @property
-    def determining(self) -> list[FloatArray]:
+    def determining(self) -> list[Numbers]:
         """All arrays that determine H and its errors, in a fixed order; part of fingerprints."""
         names = [lens.name for lens in self.camera.types]
-        views = [
+        views: list[Numbers] = [
             each for name in names for each in (self.views[name].numbers, self.views[name].own, self.views[name].shared)
         ]
         kernels = [self.kernels[name].arrays for name in names if name in self.kernels]
         return views + [arrays[key] for arrays in kernels for key in sorted(arrays)]
+
+    @property
+    def has_errors(self) -> bool:
+        """True if some number has an error."""
+        views = any(each.own.shape[2] or each.shared.shape[2] for each in self.views.values())
+        return views or any(len(each.error_coefficients) for each in self.kernels.values())
 
     @cached_property
     def is_as_designed(self) -> bool:
@@ -259,6 +266,12 @@ def gradient(image: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, Flo
 def designed_views(subs: list[SubImager]) -> FloatArray:
     """Return the numbers of sub-imagers as designed: (sub-imagers, 5)."""
     return np.array([designed(sub) for sub in subs])
+
+
+def views_as_designed(subs: list[SubImager], explained: bool = True) -> Views:
+    """Return the views of a lens type's sub-imagers as designed, without errors."""
+    nothing = np.zeros((len(subs), COUNT, 0))
+    return Views(designed_views(subs), np.full(len(subs), explained), nothing, nothing, ("designed",) * COUNT)
 
 
 def _corners(sub: SubImager) -> tuple[FloatArray, FloatArray]:

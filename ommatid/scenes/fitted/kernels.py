@@ -12,7 +12,7 @@ are applied by Fourier transforms.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, cast
@@ -29,6 +29,7 @@ from ommatid.runtime.processors import processors
 from ..camera import Camera
 from ..lens_type import LensType
 from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density
+from .kernel_shapes import KernelShapes, Numbers
 
 VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
 ENTRY = 24  # bytes of an entry of a matrix while it is made
@@ -88,13 +89,19 @@ class KernelPlaces:
 
     @cached_property
     def scale(self) -> float:
-        """The largest distance from the axis along an axis."""
-        return max(float(np.abs(beside).max()) for beside in self._beside)
+        """The largest distance from the axis along an axis, at least a pixel."""
+        return max(1.0, *(float(np.abs(beside).max()) for beside in self._beside))
 
     @property
     def field(self) -> tuple[FloatArray, FloatArray]:
         """u of each sensor row and v of each sensor column, from -1 to 1."""
         return self._beside[0] / self.scale, self._beside[1] / self.scale
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """The largest |u| and |v|."""
+        u, v = (float(np.abs(axis).max()) for axis in self.field)
+        return u, v
 
     def lines(self, pixels: IntArray) -> tuple[IntArray, IntArray]:
         """Return the sensor row and the sensor column of pixels of the lens type, in the order of measurements."""
@@ -120,15 +127,14 @@ class KernelPlaces:
 class KernelFootprints(ObservationPart):
     """H of one lens type by its kernels.
 
-    kernels : (S, W, W), the mean kernel first;  coefficients : (S, P) of their polynomials, of `degree`
-    error_kernels, error_coefficients : (E, W, W), (q, E, P): directions of the error of H, each of variance 1
+    shapes : S kernels, the mean kernel first, and E of errors;  coefficients : (S, P) of their polynomials, of `degree`
+    error_coefficients : (q, E, P): directions of the error of H, each of variance 1
     """
 
     places: KernelPlaces
     degree: int
-    kernels: FloatArray
+    shapes: KernelShapes
     coefficients: FloatArray
-    error_kernels: FloatArray
     error_coefficients: FloatArray
     _transfers: dict[tuple[int, int], ComplexArray] = field(
         default_factory=dict[tuple[int, int], ComplexArray], init=False, repr=False
@@ -137,11 +143,10 @@ class KernelFootprints(ObservationPart):
     def __post_init__(self) -> None:
         """Raise ValueError for arrays that do not belong together."""
         terms_of, width = len(terms(self.degree)), self.places.width
-        lines = self.kernels.shape, self.error_kernels.shape
-        if any(len(shape) != 3 or shape[1:] != (width, width) for shape in lines):
-            raise ValueError(f"expected kernels of {width} x {width} pixels of f, got {lines}")
-        count = len(self.error_coefficients), len(self.error_kernels), terms_of
-        if self.coefficients.shape != (len(self.kernels), terms_of) or self.error_coefficients.shape != count:
+        if self.shapes.width != width:
+            raise ValueError(f"expected kernels of {width} x {width} pixels of f, got {self.shapes.width}")
+        count = len(self.error_coefficients), len(self.shapes.error_core), terms_of
+        if self.coefficients.shape != (self.shapes.count, terms_of) or self.error_coefficients.shape != count:
             raise ValueError("the coefficients of kernels do not belong to these")
 
     def __getstate__(self) -> dict[str, Any]:
@@ -171,12 +176,16 @@ class KernelFootprints(ObservationPart):
     @property
     def without_errors(self) -> KernelFootprints:
         """The same H, taken for exact."""
-        return replace(self, error_coefficients=self.error_coefficients[:0])
+        none = self.error_coefficients[:0, :0]
+        return replace(self, shapes=self.shapes.without_errors, error_coefficients=none)
 
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements of the type,)."""
-        transfers = self._transfers_on(seen.padded)
-        out[:] = self._read(seen, transfers, self.coefficients)
+        total: FloatArray = np.zeros((self.places.starts[0].size, self.places.starts[1].size))
+        readings = self._correlated(seen, self._transfers_on(seen.padded))
+        for every, weight in zip(readings, self._weights(self.coefficients), strict=True):
+            total += weight * every
+        out[:] = self._in_order(total)
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements of the type,)."""
@@ -187,16 +196,18 @@ class KernelFootprints(ObservationPart):
             spectrum *= np.conj(transfer)
             back.add_spectrum(spectrum)
 
-    def _read(self, seen: Seen, transfers: ComplexArray, coefficients: FloatArray) -> FloatArray:
-        """Return what kernels with these transfer functions and coefficients read: (measurements of the type,)."""
+    def _correlated(self, seen: Seen, transfers: ComplexArray) -> Iterator[FloatArray]:
+        """Yield what each kernel with these transfer functions reads: (sensor rows, sensor columns)."""
         rows, columns = self._gather(seen.padded)
-        total: FloatArray = np.zeros((self.places.starts[0].size, self.places.starts[1].size))
-        for transfer, weight in zip(transfers, self._weights(coefficients), strict=True):
+        for transfer in transfers:
             product = seen.spectrum * transfer
             every = cast(FloatArray, fft.irfft2(product, seen.padded, workers=processors(), overwrite_x=True))
-            total += weight * _on_lines(rows, columns, every)
+            yield _on_lines(rows, columns, every)
+
+    def _in_order(self, lines: FloatArray) -> FloatArray:
+        """Return readings by (sensor rows, sensor columns) in the order of measurements."""
         down, across = self.places.lens_type.array
-        return total.reshape(down, -1, across, self.places.lens_type.pixels[1]).swapaxes(1, 2).ravel()
+        return lines.reshape(down, -1, across, self.places.lens_type.pixels[1]).swapaxes(1, 2).ravel()
 
     def _by_lines(self, readings: FloatArray) -> FloatArray:
         """Return readings, in the order of measurements, as (sensor rows, sensor columns)."""
@@ -207,7 +218,7 @@ class KernelFootprints(ObservationPart):
         """Return the transfer function of each kernel on a padded grid: (S, rows, columns / 2 + 1)."""
         if padded not in self._transfers:
             self._transfers.clear()  # those of another grid are of no use any more
-            self._transfers[padded] = _transfers(self.kernels, padded)
+            self._transfers[padded] = _transfers(self.shapes.kernels, padded)
         return self._transfers[padded]
 
     def _gather(self, padded: tuple[int, int]) -> tuple[sparse.csr_array, sparse.csr_array]:
@@ -234,7 +245,7 @@ class KernelFootprints(ObservationPart):
         tall, wide = window or (slice(0, self.shape[0]), slice(0, self.shape[1]))
         width = wide.stop - wide.start
         down, across = self.places.cells(pixels)
-        values = self._values(pixels)
+        values = self.values(pixels)
         inside = ((down >= tall.start) & (down < tall.stop))[:, :, None]
         inside = inside & ((across >= wide.start) & (across < wide.stop))[:, None] & (values != 0)
         texels = (down - tall.start)[:, :, None] * width + (across - wide.start)[:, None]
@@ -242,9 +253,10 @@ class KernelFootprints(ObservationPart):
         shape = pixels.size, (tall.stop - tall.start) * width
         return sparse.csr_array((values[inside], texels[inside], pointers), shape=shape)
 
-    def _values(self, pixels: IntArray) -> FloatArray:
+    def values(self, pixels: IntArray) -> FloatArray:
+        """Return the kernels of some pixels of the lens type, beside the target as well: (n, W, W)."""
         shares = basis(self.places.positions(pixels), self.degree) @ self.coefficients.T
-        return np.tensordot(shares, self.kernels, axes=1)
+        return np.tensordot(shares, self.shapes.kernels, axes=1)
 
     def _chunked(self, pixels: IntArray, window: tuple[slice, slice] | None = None) -> sparse.csr_array:
         count = max(1, VALUES_AT_ONCE // self.places.width**2)
@@ -256,11 +268,24 @@ class KernelFootprints(ObservationPart):
         check_memory(ENTRY * self.entries, "H with its entries", "crop the target")
         return self._chunked(np.arange(self.measurements))
 
+    def coarser(self, camera: Camera, detail: int) -> KernelFootprints:
+        """Return H of images of `detail` times larger pixels; camera : on their grid."""
+        (lens_type,) = (each for each in camera.types if each.name == self.places.lens_type.name)
+        places = KernelPlaces(camera, lens_type, -(-self.places.margin // detail))
+        beside = detail * places.margin - self.places.margin
+        parts = [
+            np.pad(kernels, ((0, 0), (beside, beside), (beside, beside)))
+            .reshape(-1, places.width, detail, places.width, detail)
+            .sum(axis=(2, 4))
+            for kernels in (self.shapes.kernels, self.shapes.error_kernels)
+        ]
+        return replace(self, places=places, shapes=KernelShapes.dense(*parts))
+
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
-        """Return the indices of the measurements whose kernels lie inside a window of f as a whole."""
+        """Return the indices of the measurements that see nothing of f beside a window of it."""
         inside = [
-            (start >= part.start) & (start + self.places.width <= part.stop)
-            for start, part in zip(self.places.starts, (rows, columns), strict=True)
+            (np.maximum(start, 0) >= part.start) & (np.minimum(start + self.places.width, size) <= part.stop)
+            for start, part, size in zip(self.places.starts, (rows, columns), self.shape, strict=True)
         ]
         order = (*self.places.lens_type.array, *self.places.lens_type.pixels)
         every = np.arange(self.measurements).reshape(order).swapaxes(1, 2).reshape(inside[0].size, inside[1].size)
@@ -269,6 +294,10 @@ class KernelFootprints(ObservationPart):
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to the measurements inside it."""
         return self._chunked(self.measurements_inside(rows, columns), (rows, columns))
+
+    def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to some measurements; what they see beside it is left out."""
+        return self.rows(numbers, (rows, columns))
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key of the window alone: kernels vary over the field."""
@@ -279,7 +308,7 @@ class KernelFootprints(ObservationPart):
         """The mean of the kernels over the field: (W, W)."""
         down, across = (legendre.legvander(axis, self.degree).mean(axis=0) for axis in self.places.field)
         means: FloatArray = np.asarray(np.einsum("sab,a,b->s", self._products(self.coefficients), down, across))
-        return np.tensordot(means, self.kernels, axes=1)
+        return np.tensordot(means, self.shapes.kernels, axes=1)
 
     @property
     def _densities(self) -> tuple[float, float]:
@@ -329,10 +358,13 @@ class KernelFootprints(ObservationPart):
         """Return L, (measurements of the type, q): the error of H f is L xi, with independent xi of variance 1."""
         rows, columns = (fft.next_fast_len(size + self.places.width, real=True) for size in self.shape)
         seen = Seen(np.asarray(image, dtype=np.float64).reshape(self.shape), (rows, columns))
-        transfers = _transfers(self.error_kernels, seen.padded)
-        read = [self._read(seen, transfers, coefficients) for coefficients in self.error_coefficients]
-        none = np.zeros((self.measurements, 0))
-        return sparse.csc_array(np.stack(read, axis=1) if read else none)
+        lines = np.zeros((len(self.error_coefficients), *(start.size for start in self.places.starts)))
+        shares = [self._weights(coefficients) for coefficients in self.error_coefficients]
+        transfers = _transfers(self.shapes.error_kernels, seen.padded)
+        for number, every in enumerate(self._correlated(seen, transfers)):
+            for read, weights in zip(lines, shares, strict=True):
+                read += weights[number] * every
+        return sparse.csc_array(np.array([self._in_order(read) for read in lines]).reshape(len(lines), -1).T)
 
     @property
     def description(self) -> dict[str, Any]:
@@ -342,12 +374,10 @@ class KernelFootprints(ObservationPart):
         }
 
     @property
-    def arrays(self) -> dict[str, FloatArray]:
+    def arrays(self) -> dict[str, Numbers]:
         """The arrays of a file."""
-        return {
-            "kernels": self.kernels,
+        return self.shapes.arrays | {
             "coefficients": self.coefficients,
-            "error_kernels": self.error_kernels,
             "error_coefficients": self.error_coefficients,
         }
 
@@ -378,10 +408,17 @@ def _chosen(index: IntArray, size: int) -> sparse.csr_array:
     return sparse.csr_array((np.ones(index.size), index, np.arange(index.size + 1)), shape=(index.size, size))
 
 
-def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, FloatArray]) -> KernelFootprints:
-    """Return the kernels of a file: the inverse of `description` and `arrays`. Raises ValueError for others."""
+def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, Any]) -> KernelFootprints:
+    """Return the kernels of a file: the inverse of `description` and `arrays`.
+
+    Raises ValueError for others, and InputError for kernels that do not fit into memory.
+    """
     margin, degree = description["margin"], description["degree"]
     if any(type(each) is not int or each < 0 for each in (margin, degree)) or degree > MOST_DEGREE:
         raise ValueError(f"expected a margin and a degree of kernels, got {shortened_repr((margin, degree))}")
     (lens_type,) = (each for each in camera.types if each.name == description["lens"])
-    return KernelFootprints(KernelPlaces(camera, lens_type, margin), degree, **arrays)
+    coefficients, errors = (arrays.pop(name) for name in ("coefficients", "error_coefficients"))
+    places = KernelPlaces(camera, lens_type, margin)
+    needed = 8 * (len(coefficients) + errors.shape[1]) * places.width**2
+    check_memory(needed, f"the kernels of lens type {lens_type.name}", "calibrate again")
+    return KernelFootprints(places, degree, KernelShapes(**arrays), coefficients, errors)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from ommatid.runtime.memory import check_memory
 
 BYTES = 24  # of memory per number: as stored, in float64, and a copy of that
 UPRIGHT = 1  # value of the orientation tag
-ORIENTATION_TAG, SHORT = 274, 3
+ORIENTATION_TAG = 274
 LINEAR, USUAL = 1.0, 1 / 2.2  # gammas: of values proportional to light, and of most pictures
 
 
@@ -63,23 +62,14 @@ def upright(picture: StoredPicture, orientation: int) -> StoredPicture:
 
 def orientation_of(exif: bytes) -> int:
     """Return the orientation that EXIF data state; 1, upright, if they state none or are damaged."""
+    from PIL import Image
+
+    described = Image.Exif()
     try:
-        return _stated_orientation(exif.removeprefix(b"Exif\0\0"))
-    except struct.error:  # damaged
+        described.load(exif)
+        return int(described.get(ORIENTATION_TAG, UPRIGHT))
+    except Exception:  # Pillow has many for damaged data
         return UPRIGHT
-
-
-def _stated_orientation(content: bytes) -> int:
-    """Return the orientation of EXIF data that begin with their byte order. Raises struct.error if they are cut."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(content[:4])
-    if order is not None:
-        (start,) = struct.unpack_from(f"{order}I", content, 4)
-        (count,) = struct.unpack_from(f"{order}H", content, start)
-        for index in range(count):
-            tag, kind, values, value = struct.unpack_from(f"{order}HHIH", content, start + 2 + 12 * index)
-            if (tag, kind, values) == (ORIENTATION_TAG, SHORT, 1):
-                return int(value)
-    return UPRIGHT
 
 
 def profile_notes(profile: bytes) -> tuple[str, ...]:

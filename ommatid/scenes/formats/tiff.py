@@ -1,7 +1,7 @@
 """TIFF files: grey or RGB pages, uncompressed or compressed with Deflate or PackBits.
 
-The list of pages is walked here, since tifffile follows a circular one without end, and the sizes of all strips and
-tiles are checked before tifffile inflates them, which it does without a limit. What a file says of its pages in its
+Pages are asked for one by one, since tifffile follows a circular list of them without end, and the sizes of all strips
+and tiles are checked before tifffile inflates them, which it does without a limit. What a file says of its pages in its
 descriptions (OME, ImageJ) is not used: such texts may name other files.
 """
 
@@ -10,9 +10,8 @@ from __future__ import annotations
 import io
 import logging
 import re
-import struct
 import zlib
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
@@ -63,51 +62,46 @@ def description(path: Path) -> str:
         raise ValueError("it is damaged") from error
 
 
+class _Raising(logging.Handler):
+    """Raises what tifffile logs as an error, after which it goes on with what it could read."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno >= logging.ERROR:
+            raise ValueError(record.getMessage())
+
+
 @contextmanager
 def _opened(stream: BinaryIO, path: Path) -> Generator[list[Any]]:
     """The pages of a file as tifffile describes them, except reduced copies of other pages."""
     import tifffile
 
-    log = logging.getLogger("tifffile")
-    if not log.handlers:  # otherwise its messages appear on stderr
-        log.addHandler(logging.NullHandler())
-    log.propagate = False
-    count = _count_pages(stream)
+    log, raising = logging.getLogger("tifffile"), _Raising()
+    propagated, log.propagate = log.propagate, False
+    log.addHandler(raising)
     stream.seek(0)
-    with cast(Any, tifffile).TiffFile(stream, name="picture.tif", **PLAIN) as file:
-        found = [file.pages[index] for index in range(count)]
-        _check_listed(path, found)
-        yield [page for page in found if not page.is_reduced] or found[:1]
+    try:
+        with cast(Any, tifffile).TiffFile(stream, name="picture.tif", **PLAIN) as file:
+            found = list(_pages(file))
+            _check_listed(path, found)
+            yield [page for page in found if not page.is_reduced] or found[:1]
+    finally:
+        log.removeHandler(raising)
+        log.propagate = propagated
 
 
-def _count_pages(stream: BinaryIO) -> int:
-    """Return the number of pages; a list that returns to an earlier page ends there. Raises ValueError for damage."""
-    size = stream.seek(0, io.SEEK_END)
-    stream.seek(0)
-    start = stream.read(16)
-    order = {b"II": "<", b"MM": ">"}.get(start[:2])
-    version = int.from_bytes(start[2:4], "little" if order == "<" else "big")
-    if order is None or version not in (42, 43):
-        raise ValueError("it is no TIFF file")
-    number, offset, tag = ("Q", "Q", 20) if version == 43 else ("H", "I", 12)
-    (place,) = struct.unpack_from(order + offset, start, 8 if version == 43 else 4)
-    known: set[int] = set()
-    while place and place not in known:
-        known.add(place)
-        stream.seek(place)
-        tags = _number(stream, order + number)
-        if place + tags * tag > size or len(known) > MOST_PAGES:
-            raise ValueError("its list of pages is damaged")
-        stream.seek(tags * tag, io.SEEK_CUR)
-        place = _number(stream, order + offset)
-    return len(known)
-
-
-def _number(stream: BinaryIO, kind: str) -> int:
-    content = stream.read(struct.calcsize(kind))
-    if len(content) < struct.calcsize(kind):
-        raise ValueError("its list of pages is cut short")
-    return int(struct.unpack(kind, content)[0])
+def _pages(file: Any) -> Iterator[Any]:
+    """Yield the pages; a list that returns to an earlier page ends there. Raises ValueError for very many."""
+    known = set[int]()
+    for index in range(MOST_PAGES):
+        try:
+            page = file.pages[index]
+        except IndexError:
+            return
+        if page.offset in known:
+            return
+        known.add(page.offset)
+        yield page
+    raise ValueError(f"it has more than {MOST_PAGES} pages")
 
 
 def _read(stream: BinaryIO, path: Path, found: list[Any]) -> list[StoredPicture]:

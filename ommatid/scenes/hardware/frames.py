@@ -10,20 +10,18 @@ They are imported as a stack, which is reconstructed like a rendered one.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import fingerprint
-from ommatid.runtime.input_files import check_regular, open_input
+from ommatid.runtime.files import file_digest, fingerprint
+from ommatid.runtime.input_files import check_regular
 from ommatid.runtime.versions import versions
 
 from ..camera import Camera
@@ -78,16 +76,11 @@ def files_in(path: Path) -> list[Path]:
     return files
 
 
-def pictures_of(path: Path, what: str) -> list[NDArray[Any]]:
-    """The numbers of the pictures in a file: a single one, or all of a (count, rows, columns) array or of all pages.
+def stored_pictures(path: Path, what: str) -> list[StoredPicture]:
+    """The pictures in a file, with what is lost when they are read: one, those of an array, or of all pages.
 
     Raises InputError if there is none.
     """
-    return [stored.pixels for stored in stored_pictures(path, what)]
-
-
-def stored_pictures(path: Path, what: str) -> list[StoredPicture]:
-    """The pictures in a file, with what is lost when they are read. Raises InputError if there is none."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected {what} as PNG, TIFF, EXR or NPY files, whose numbers are the sensor's")
     try:
@@ -206,6 +199,15 @@ class RecordedFrames:
     sources: list[dict[str, str]]
     notes: list[str]
 
+    def conversion(self, source: Path) -> tuple[FloatArray, FloatArray]:
+        """Return the means of dark and flat frames, by which a [sensor]'s readings are converted. Raises InputError."""
+        if self.dark is None or self.flat is None:
+            raise InputError(
+                f"{source}: a [sensor] needs dark and flat frames to convert its readings; pass them with --dark and"
+                " --flat, or remove [sensor]"
+            )
+        return self.dark, self.flat
+
     @property
     def scale(self) -> FloatArray:
         """Units of f per digital number, (M,); NaN for dead pixels."""
@@ -263,7 +265,7 @@ def read_frames(
         settings=settings,
         files=[path for path, _ in exposures],
         whole=bool((numbers == np.rint(numbers)).all()),
-        sources=[{"name": path.name, "sha256": _sha256(path)} for path in (*files, *dark, *flat)],
+        sources=[{"name": path.name, "sha256": file_digest(path)} for path in (*files, *dark, *flat)],
         notes=notes.describe(),
     )
 
@@ -304,9 +306,9 @@ def corners(
 
 def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSettings, *, mosaics: bool) -> SensorLayout:
     """Find out from the first images if they are mosaics or pictures of single sub-imagers. Raises InputError."""
-    first = pictures_of(images[0], "images")
-    shape, subs = grey(first[0], str(images[0])).shape, camera.sub_imagers
-    count = len(first) + (0 if mosaics else sum(len(pictures_of(path, "images")) for path in images[1:]))
+    first = stored_pictures(images[0], "images")
+    shape, subs = grey(first[0].pixels, str(images[0])).shape, camera.sub_imagers
+    count = len(first) + (0 if mosaics else sum(len(stored_pictures(path, "images")) for path in images[1:]))
     single = len(subs) == 1 and shape == subs[0].type.pixels
     if single or (count > 1 and not mosaics):
         if settings.origin is not None:
@@ -324,11 +326,6 @@ def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSetting
 def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:
     with np.errstate(over="ignore", invalid="ignore"):
         return np.mean([numbers for _, numbers in exposures], axis=0) if exposures else None
-
-
-def _sha256(path: Path) -> str:
-    with open_input(path) as stream:
-        return hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
 
 
 def import_stack(setup: Setup, images: Sequence[Path], settings: AcquisitionSettings) -> tuple[Stack, RecordedFrames]:
@@ -362,14 +359,10 @@ def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Rec
 
     A single dark or flat frame is taken for the mean of `sensor.frames`; of several, their number is used instead.
     """
-    if frames.dark is None or frames.flat is None:
-        raise InputError(
-            f"{source}: a [sensor] needs dark and flat frames to convert its readings; pass them with --dark and"
-            " --flat, or remove [sensor]"
-        )
+    dark, flat = frames.conversion(source)
     if frames.averaged > 1:
         sensor = sensor.model_copy(update={"frames": frames.averaged})
-    digital, dark, flat = (_as_float32(values) for values in (frames.numbers[0], frames.dark, frames.flat))
+    digital, dark, flat = (_as_float32(values) for values in (frames.numbers[0], dark, flat))
     return Recording(sensor, digital, dark, flat, np.full(digital.size, frames.settings.flat_value))
 
 

@@ -270,7 +270,8 @@ def from_recorded_points(
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     _check_pixels_of_f(setup)
     frames = read_frames(camera, images, settings, mosaics=True)
-    _check_conversion(scene, frames)
+    if scene.sensor is not None:
+        frames.conversion(scene.source)
     positions = (
         positions_by_rows(camera, frames.files) if places is None else read_positions(places, camera, frames.files)
     )
@@ -308,14 +309,6 @@ def _check_pixels_of_f(setup: Setup) -> None:
         raise InputError(
             f"{setup.scene.source}: recorded point sources fill pixels of f, got target.detail {setup.camera.detail};"
             " set it to 1"
-        )
-
-
-def _check_conversion(scene: Scene, frames: RecordedFrames) -> None:
-    if scene.sensor is not None and (frames.dark is None or frames.flat is None):
-        raise InputError(
-            f"{scene.source}: a [sensor] needs dark and flat frames to convert readings of points; pass them with"
-            " --dark and --flat, or remove [sensor]"
         )
 
 

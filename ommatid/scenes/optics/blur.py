@@ -30,6 +30,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
 from ..camera import Camera
+from ..fitted.kernel_shapes import KernelShapes
 from ..fitted.kernels import KernelFootprints, KernelPlaces
 from ..lens_type import LensType
 from .diffraction import MOST_WAVES, Pattern, end_of, pattern
@@ -188,12 +189,11 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     table, slope = _tables(camera, lens_type, offsets, 1, blurs)
     mean = table[np.ix_(index, index)]
     if slope is None:
-        return KernelFootprints(places, 0, mean[None], np.ones((1, 1)), mean[None][:0], np.zeros((0, 0, 1)))
+        return KernelFootprints(places, 0, KernelShapes.dense(mean[None]), np.ones((1, 1)), np.zeros((0, 0, 1)))
     upward = np.sign(beside)[:, None] * slope[np.ix_(index, index)]
     weights = np.diag([1.0, places.scale, places.scale])  # Legendre's P1 is the coordinate itself
-    return KernelFootprints(
-        places, 1, np.stack([mean, upward, upward.T]), weights, upward[None][:0], np.zeros((0, 0, 3))
-    )
+    shapes = KernelShapes.dense(np.stack([mean, upward, upward.T]))
+    return KernelFootprints(places, 1, shapes, weights, np.zeros((0, 0, 3)))
 
 
 def entries(camera: Camera, lens_type: LensType, reach: float) -> int:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from math import lcm
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
@@ -20,7 +21,10 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.processors import processors
 
 from ..lens_type import LensType
-from ..observation import Back, ObservationPart, Seen, cosines, density
+from ..observation import Back, ObservationPart, Seen, cosines, density, repetition
+
+if TYPE_CHECKING:
+    from ..camera import Camera
 
 ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 
@@ -147,6 +151,16 @@ class Box(ObservationPart):
         intervals = np.arange(self.down.shares.shape[0]), np.arange(self.across.shares.shape[0])
         order = np.argsort(self._numbers(*intervals), kind="stable")
         return sparse.csr_array(sparse.kron(self.down.shares, self.across.shares, format="csr"))[order]
+
+    def coarser(self, camera: Camera, detail: int) -> Box:
+        """H of images of `detail` times larger pixels; camera : on their grid."""
+        down, across = (
+            BoxAxis(sparse.csr_array(axis.shares @ repetition(size, detail)))
+            for axis, size in zip((self.down, self.across), camera.shape, strict=True)
+        )
+        for axis in (down, across):
+            axis.shares.sort_indices()
+        return Box(self.lens_type.finer(Fraction(1, detail)), down, across)
 
     def _numbers(self, down: IntArray, across: IntArray) -> IntArray:
         """Indices of the measurements of all pairs of intervals along the two axes: (pairs,)."""

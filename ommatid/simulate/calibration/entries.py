@@ -13,14 +13,18 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.model import Model, fitted_model
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
+from ..entry_memory import check_entries
 from ..ideal import ideal_matrix
+from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import plan, rounding_variance
-from .point_sources import Plans, Responses, Subsets, responses_from_points
+from ..sampling.passes import rounding_variance
+from .fit.chart import SIDE
+from .point_sources import Plans, Responses, Subsets, responses_from_points, same_plans
 
 
 def rendered_model(
@@ -37,8 +41,15 @@ def rendered_model(
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     record = dict[str, Any](method=scene.calibration.method)
 
+    # Wide kernels need as many sweeps of point sources as they have cells; their rays give the same H.
+    fast = not choose(scene.render.variant).startswith("scalar")
+    by_rays = fast and setup.is_applied and not camera.has_box_footprints
+
     def measure(subsets: Subsets | None) -> Responses:
-        if scene.calibration.method == "transport":
+        if setup.is_applied:  # then no memory was asked for entries
+            whole = [lens for lens in camera.types if subsets is None or _is_whole(subsets, lens)]
+            check_entries(camera, whole, scene.calibration.method, "few numbers do not explain all of H: ")
+        if scene.calibration.method == "transport" or by_rays:
             from .ray_transport import responses_from_rays
 
             responses = responses_from_rays(setup, progress, plans, subsets)
@@ -71,10 +82,10 @@ def rendered_model(
     return replace(model, record=record)
 
 
-def same_plans(setup: Setup) -> Plans:
-    """Return the samples that the scene asks for, the same for all lens types."""
-    work = plan(setup.scene.calibration.sample_count, setup.scene.render.sampler)
-    return {lens_type.name: work for lens_type in setup.camera.types}
+def _is_whole(subsets: Subsets, lens_type: LensType) -> bool:
+    """Return True if more of a lens type is measured than a chart has."""
+    subset = subsets.get(lens_type.name, np.zeros(0))
+    return subset is None or subset.size > lens_type.count * SIDE**2
 
 
 def fits(setup: Setup) -> bool:

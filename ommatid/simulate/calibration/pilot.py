@@ -24,11 +24,11 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
 from ..renderer.variant import choose, unusable_reason
-from ..sampling.passes import BATCHES, MOST_SAMPLES, Plan, cells_of, on_grid, plan
+from ..sampling.passes import BATCHES, Plan, plan
 from ..sampling.samplers import expected_exponent, fitting
 from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model
-from .point_sources import Plans
+from .point_sources import Plans, same_plans
 
 MOST_RAYS = 2**26  # of a pilot: some seconds
 FEWEST_SAMPLES = 16  # per pixel in a pass
@@ -108,18 +108,14 @@ def calibration_plans(setup: Setup) -> Plans:
     scene = setup.scene
     if scene.calibration.samples == "auto":
         return plans_of(setup, LEAST, float64=True)
-    work = plan(scene.calibration.samples, scene.render.sampler)
-    return {lens_type.name: work for lens_type in setup.camera.types}
+    return same_plans(setup)
 
 
 def rendering_plans(setup: Setup) -> Plans:
     """Return the samples that the scene's rendering takes, by lens type; of "auto" those of its first round."""
     render = setup.scene.render
     if render.samples == "auto":
-        return {
-            lens_type.name: on_grid(LEAST, render.sampler, cells_of(lens_type.ratio), MOST_SAMPLES)
-            for lens_type in setup.camera.types
-        }
+        return plans_of(setup, LEAST, float64=False)
     work = plan(render.samples, render.sampler)
     return {lens_type.name: work for lens_type in setup.camera.types}
 

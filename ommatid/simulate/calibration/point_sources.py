@@ -86,8 +86,7 @@ def responses_from_points(
 
     scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
     renderer = Renderer(camera, variant, scene.render.sampler, together=False)  # each type has its own spacing
-    if plans is None:
-        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
+    plans = same_plans(setup) if plans is None else plans
     chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets
     sweeps = {group: SourceSweep(renderer, group, chosen[group]) for group in renderer.groups if group in chosen}
     shares = {group: sweep.visible.spacing**2 for group, sweep in sweeps.items()}
@@ -108,10 +107,13 @@ def responses_from_points(
         finished = {**finished, **sweep.state()} if checkpoint is not None else finished
         parts[group].append(sweep.part(work))
         done += shares[group]
-    whole = [
-        on_all_rows(each, renderer.rows(group), chosen.get(group), camera.unknowns) for group, each in parts.items()
-    ]
-    return joined_parts(whole, plans, variant, scene.render.seed)
+    return joined_parts(renderer, parts, chosen, plans, variant, scene.render.seed)
+
+
+def same_plans(setup: Setup) -> Plans:
+    """Return the samples that the scene asks for, the same for all lens types."""
+    work = plan(setup.scene.calibration.sample_count, setup.scene.render.sampler)
+    return {lens_type.name: work for lens_type in setup.camera.types}
 
 
 def on_all_rows(parts: list[Part], rows: slice, subset: IntArray | None, unknowns: int) -> Part:
@@ -132,9 +134,13 @@ def on_all_rows(parts: list[Part], rows: slice, subset: IntArray | None, unknown
     return matrix, np.concatenate(variances), np.concatenate(batches, axis=1)
 
 
-def joined_parts(parts: list[Part], plans: Plans, variant: str, seed: int) -> Responses:
+def joined_parts(
+    renderer: Renderer, parts: dict[str, list[Part]], subsets: Subsets, plans: Plans, variant: str, seed: int
+) -> Responses:
     """Join the responses of all groups, in their order; all have the same number of passes."""
-    rows, variances, batches = zip(*parts, strict=True)
+    unknowns = renderer.camera.unknowns
+    whole = [on_all_rows(each, renderer.rows(name), subsets.get(name), unknowns) for name, each in parts.items()]
+    rows, variances, batches = zip(*whole, strict=True)
     work = max(plans.values(), key=lambda plan: plan.samples)
     return Responses(
         matrix=sparse.csr_array(sparse.vstack(rows, format="csr")),

@@ -20,8 +20,8 @@ from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import check_transport_variant, choose
-from ..sampling.passes import BATCHES, Plan, plan
-from .point_sources import Part, Plans, Responses, Subsets, joined_parts, on_all_rows
+from ..sampling.passes import BATCHES, Plan
+from .point_sources import Part, Plans, Responses, Subsets, joined_parts, same_plans
 
 if TYPE_CHECKING:
     from ..renderer.renderer import Renderer
@@ -86,14 +86,13 @@ def responses_from_rays(
     scene, variant = setup.scene, choose(setup.scene.render.variant)
     check_transport_variant(variant)
     renderer = Renderer(setup.simulated, variant, scene.render.sampler, together=False)
-    if plans is None:
-        plans = dict.fromkeys(renderer.groups, plan(scene.calibration.sample_count, scene.render.sampler))
+    plans = same_plans(setup) if plans is None else plans
     parts: dict[str, list[Part]] = {group: [] for group in renderer.groups}
-    chosen = {group: None if subsets is None else subsets.get(group) for group in renderer.groups}
+    chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets
     blocks = [
         (group, block)
         for group in renderer.groups
-        if subsets is None or group in subsets
+        if group in chosen
         for block in renderer.blocks(group, plans[group].samples, chosen[group])
     ]
     for index, (group, block) in enumerate(blocks):
@@ -103,10 +102,7 @@ def responses_from_rays(
             passes.append(one_pass(renderer, group, block, work, number, scene.render.seed, chosen[group]))
             progress((index + (number + 1) / work.passes) / len(blocks))
         parts[group].append(_joined(passes, (block.stop - block.start, setup.camera.unknowns)))
-    whole = [
-        on_all_rows(each, renderer.rows(group), chosen[group], setup.camera.unknowns) for group, each in parts.items()
-    ]
-    return joined_parts(whole, plans, variant, scene.render.seed)
+    return joined_parts(renderer, parts, chosen, plans, variant, scene.render.seed)
 
 
 def one_pass(

@@ -1,8 +1,8 @@
-"""The number of terms and of components of a lens type's kernels, and tests of the explanation as a whole.
+"""The number of terms and of components of a lens type's deviations, and tests of the explanation as a whole.
 
 More terms bring noise, fewer a bias. The sum of both in H f of a typical picture is estimated without bias from the
 fit with the most terms and from the scatter of the batches (Mallows 1973, Technometrics 15, 661); the fewest terms that
-an F test does not reject would leave a bias of several times the noise. F tests at 1 % for all together accept or
+an F test does not reject would leave a bias of several times the noise. F tests at 0.1 % for all together accept or
 reject the result.
 """
 
@@ -15,52 +15,47 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.fitted.kernels import basis
 
-from .regression import Chart, Sums, chance, excess, gram, residual, sums_of
+from .deviations import Chart
+from .regression import Sums, chance, excess, gram, residual, sums_of
 
-LEVEL = 3.0  # mean squared over variance of a picture whose values are uniform between 0 and 255
-CORRELATED = 3.0  # pixels of f over which a picture's correlation falls to 1/e
-SIGNIFICANCE = 0.01  # at which a correct model is rejected, by all tests together
+SIGNIFICANCE = 0.001  # at which a correct model is rejected, by all tests together
 MOST_DEGREE = 4
 HIGHER = 2  # degrees by which a test looks further than the model
 MOST_SHOWN = 200  # pixels of the chart for which errors in a picture are computed
 PIXELS_PER_TERM = 3  # of the chart, at least
 
 
-def seen(errors: FloatArray) -> FloatArray:
-    """Return errors of kernels, (..., C), in coordinates whose squares add up to the variance of H f: (..., C + 1).
-
-    The picture has a variance of 1, and a correlation that falls exponentially down and across.
-    """
-    size = round(errors.shape[-1] ** 0.5)
-    place = np.arange(size, dtype=np.float64)
-    apart = np.abs(place[:, None] - place)
-    values, vectors = np.linalg.eigh(np.exp(-apart / CORRELATED))
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    varied = root @ errors.reshape(*errors.shape[:-1], size, size) @ root
-    level = LEVEL**0.5 * errors.sum(axis=-1, keepdims=True)
-    return np.concatenate([varied.reshape(errors.shape), level], axis=-1)
-
-
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A polynomial for every cell.
+    """A polynomial for every cell; if it is `as_designed`, all are 0, and their errors those of the sums.
 
     coefficients : (1 + B, C, P) of the mean and of the batches' deviations;  chances : of each test
-    unexplained : mean square of what it leaves of an entry beside noise, in units of the entry's variance
+    excesses : of each test, the part of its sum of squares that is not noise, in units of the noise
     """
 
     degree: int
     symmetric: bool
+    as_designed: bool
     sums: Sums
     coefficients: FloatArray
     chances: dict[str, float]
-    unexplained: float
+    excesses: dict[str, float]
 
     @property
     def rejected(self) -> list[str]:
         """The tests that it does not pass."""
         single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(self.chances))
         return [name for name, value in self.chances.items() if value < single]
+
+    @property
+    def unexplained(self) -> float:
+        """Mean square of what it leaves of an entry beside noise, in units of the entry's variance."""
+        return self.excesses["all cells"]
+
+    @property
+    def shown(self) -> float:
+        """The largest excess of the tests of a picture that it does not pass, in units of the noise."""
+        return max((self.excesses[name] for name in self.rejected if name.endswith("picture")), default=0.0)
 
 
 def highest_degree(chart: Chart) -> int:
@@ -77,35 +72,42 @@ def _determined(chart: Chart, degree: int) -> bool:
 def choose(chart: Chart) -> Candidate:
     """Return the polynomial of the least expected error.
 
-    That of a lens without symmetry is taken only if it passes all tests and the symmetric one does not.
+    That of a lens without symmetry is taken only if it passes all tests and the symmetric one does not, and the design
+    if neither does.
     """
     highest = highest_degree(chart)
     sums = sums_of(chart, highest)
     reference, shown = sums.fitted(), _PictureOfChart(chart)
-    symmetric = _tested(chart, sums, _best(sums.symmetric, reference, shown), True)
+    symmetric = _tested(chart, sums, *_best(sums.symmetric, reference, shown), symmetric=True)
     if not symmetric.rejected:
         return symmetric
-    general = _tested(chart, sums, _best(sums, reference, shown), False)
-    return symmetric if general.rejected else general
+    general = _tested(chart, sums, *_best(sums, reference, shown), symmetric=False)
+    if not general.rejected:
+        return general
+    designed = _tested(chart, sums, sums.symmetric.up_to(0), as_designed=True, symmetric=True)
+    return symmetric if designed.rejected else designed
 
 
-def _tested(chart: Chart, sums: Sums, own: Sums, symmetric: bool) -> Candidate:
-    coefficients = own.fitted()
+def _tested(chart: Chart, sums: Sums, own: Sums, as_designed: bool, symmetric: bool) -> Candidate:
+    coefficients = np.zeros_like(own.entries) if as_designed else own.fitted()
     left = residual(sums.up_to(min(own.degree + HIGHER, sums.degree)), coefficients)
     tests = term_sums(chart, left) | residual_sums(chart, coefficients, own.degree)
     chances = {name: chance(products) for name, products in tests.items()}
-    return Candidate(own.degree, symmetric, own, coefficients, chances, excess(tests["all cells"]))
+    excesses = {name: excess(products) for name, products in tests.items()}
+    return Candidate(own.degree, symmetric, as_designed, own, coefficients, chances, excesses)
 
 
-def _best(sums: Sums, reference: FloatArray, shown: _PictureOfChart) -> Sums:
-    """Return the sums of the degree with the least expected loss."""
-    losses: list[float] = []
+def _best(sums: Sums, reference: FloatArray, shown: _PictureOfChart) -> tuple[Sums, bool]:
+    """Return the sums of the degree with the least expected loss, and True if the design has less."""
+    none = np.zeros_like(reference)
+    losses = [expected_loss(shown(reference, sums.degree), shown(none, sums.degree))]
     for degree in range(min(MOST_DEGREE, sums.degree) + 1):
         coefficients = sums.up_to(degree).fitted()
         padded = np.zeros_like(reference)
         padded[..., : coefficients.shape[-1]] = coefficients
         losses.append(expected_loss(shown(reference - padded, sums.degree), shown(padded, sums.degree)))
-    return sums.up_to(int(np.argmin(losses)))
+    best = int(np.argmin(losses))
+    return sums.up_to(max(best - 1, 0)), best == 0
 
 
 def expected_loss(dropped: FloatArray, kept: FloatArray) -> float:
@@ -124,18 +126,18 @@ class _PictureOfChart:
     def __init__(self, chart: Chart) -> None:
         """Choose the pixels."""
         some = np.unique(np.linspace(0, len(chart.pixels) - 1, MOST_SHOWN).round().astype(np.int64))
-        self._field, self._inside = chart.field[some], chart.inside[some]
+        self._chart, self._field, self._inside = chart, chart.field[some], chart.inside[some]
 
     def __call__(self, coefficients: FloatArray, degree: int) -> FloatArray:
         """Return coefficients, (k, C, P), in coordinates whose squares are the variance of H f: (k, n, C + 1)."""
         x = basis(self._field, degree)
-        return np.array([seen((x @ each.T) * self._inside) for each in coefficients])
+        return np.array([self._chart.seen((x @ each.T) * self._inside) for each in coefficients])
 
 
 def term_sums(chart: Chart, left: Sums) -> dict[str, FloatArray]:
     """Return the sums of squares of polynomials that explain most of a residual: of all cells, and in a picture."""
     fitted = left.fitted()
-    shown = seen((fitted @ np.linalg.cholesky(left.whole)).swapaxes(1, 2) * chart.share**0.5)
+    shown = chart.seen((fitted @ np.linalg.cholesky(left.whole)).swapaxes(1, 2) * chart.share**0.5)
     return {
         "terms": gram(fitted * chart.weights[:, None], left.entries),
         "terms in a picture": gram(shown, shown),
@@ -149,13 +151,13 @@ def residual_sums(chart: Chart, coefficients: FloatArray, degree: int) -> dict[s
     means: list[FloatArray] = []
     shown: list[FloatArray] = []
     root = np.sqrt(chart.weights)
-    counts = _by_sub_imager(chart, chart.inside.astype(np.float64))
+    counts = _by_sub_imager(chart, chart.inside)
     for entries, each in zip((chart.values, *chart.batches), coefficients, strict=True):
-        left = np.where(chart.inside, entries - x @ each.T, 0.0)
+        left = entries - chart.inside * (x @ each.T)
         every.append(left * root)
         mean = _by_sub_imager(chart, left) / np.sqrt(np.maximum(counts, 1.0))
         means.append(mean * root)
-        shown.append(seen(mean))
+        shown.append(chart.seen(mean))
     tests = {"all cells": _gram(every)}
     if len(counts) > 1:
         tests["sub-imagers"] = _gram(means)
@@ -212,6 +214,6 @@ def _loss_of_rank(chart: Chart, varying: FloatArray, field: FloatArray, cells: F
     rest = rest - (rest @ cells.T) @ cells
     root = np.sqrt(chart.weights)
     dropped, kept = (
-        seen(np.divide(part, root, out=np.zeros_like(part), where=root > 0)) for part in (rest, varying - rest)
+        chart.seen(np.divide(part, root, out=np.zeros_like(part), where=root > 0)) for part in (rest, varying - rest)
     )
     return expected_loss(dropped, kept)

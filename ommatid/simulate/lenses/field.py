@@ -27,7 +27,7 @@ from .wavefront import GRID_REACH, Wavefront, wavefront_of
 
 HEIGHTS = 17  # at which the middle and the amount of the light are traced, splines between
 TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors of its cells
-MOST_NODES = 9
+MOST_NODES = 17
 MOST_WIDER = 2.0  # ratio of the widths of a common grid and of the narrowest that a wave of its own would have
 LEAST_VERGENCE = 1e-9  # of a far target; that of 0 has no plane
 MOST_ABERRATED = 2.0  # spot of rays in disks of defocus, up to which it is that of defocus
@@ -123,15 +123,21 @@ class LensField:
         last = float(self._rays[0][-1])
         known = {height: self.lit_wave(height) for height in (0.0, last)}
         grid = self._common_grid(list(known.values()))
-        heights, waiting = [0.0, last], [(0.0, last)]
-        while waiting and len(heights) < MOST_NODES:
-            low, high = waiting.pop()
+
+        def interval(low: float, high: float) -> tuple[float, float, float]:
+            """Return the error of interpolation in the middle of an interval, and its ends."""
             middle = (low + high) / 2
             known[middle] = self.lit_wave(middle)
             ends = [point_spread(known[height], grid).values for height in (low, middle, high)]
-            if np.abs(ends[1] - (ends[0] + ends[2]) / 2).sum() > TOLERANCE:
-                heights.append(middle)
-                waiting += [(low, middle), (middle, high)]
+            return float(np.abs(ends[1] - (ends[0] + ends[2]) / 2).sum()), low, high
+
+        heights, intervals = [0.0, last], [interval(0.0, last)]
+        while len(heights) < MOST_NODES and max(intervals)[0] > TOLERANCE:
+            worst = max(intervals)
+            middle = (worst[1] + worst[2]) / 2
+            intervals.remove(worst)
+            heights.append(middle)
+            intervals += [interval(worst[1], middle), interval(middle, worst[2])]
         heights.sort()
         return np.array(heights), [known[height] for height in heights]
 

@@ -118,8 +118,8 @@ def _by_rays(
         values = np.zeros(camera.shape)
         for wave, share in field.between(float(np.hypot(x, y))):
             across, up = wave.turned(float(np.arctan2(-x, y))).hits / camera.target_pitch
-            down = _overlaps(pixels.rows[pixel], -up, camera.rows, 0.0)
-            beside = _overlaps(pixels.columns[pixel], -across, camera.columns, 0.0)
+            down = overlaps(pixels.rows[pixel], -up, camera.rows, 0.0)
+            beside = overlaps(pixels.columns[pixel], -across, camera.columns, 0.0)
             values += (down * (share * wave.light)[:, None]).T @ beside
         yield pixel, values
 
@@ -140,8 +140,8 @@ def _by_waves(
             x, y = pixels.x[pixel], pixels.y[pixel]
             turned = spread.T if abs(x) > abs(y) else spread
             turned = turned[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1]
-            down = _overlaps(pixels.rows[pixel], -offsets, camera.rows, cell)
-            beside = _overlaps(pixels.columns[pixel], -offsets, camera.columns, cell)
+            down = overlaps(pixels.rows[pixel], -offsets, camera.rows, cell)
+            beside = overlaps(pixels.columns[pixel], -offsets, camera.columns, cell)
             yield pixel, np.asarray(down.T @ turned @ beside, dtype=np.float64)
 
 
@@ -152,7 +152,7 @@ def _key(field: LensField, x: float, y: float) -> tuple[int, int]:
     return round(angle / (pi / 2) * turns), round(float(np.hypot(x, y)) / field.field * levels)
 
 
-def _overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float) -> FloatArray:
+def overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float) -> FloatArray:
     """Return the share of the interval between two edges, moved by each offset, in each texel: (n, size).
 
     cell : spacing of the offsets, whose frequencies are left out; 0: none

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import ceil, pi
+from math import ceil, log, pi
 from typing import Any
 
 import numpy as np
@@ -82,11 +82,13 @@ class DiffractingLens(LensModel):
         import drjit as dr
 
         sample = sampler.next_2d()
-        band = self._band(sampler)
+        band, share, light = self._band(sampler), sample.x, falloff(x, y, 0.0, 0.0, depth)
+        if self.spreads and self.captured < 1:  # the light beyond a ring falls as 1 / radius: as many rays to each
+            beyond = dr.exp(sample.x * log(1 - self.captured))
+            share, light = (1 - beyond) / self.captured, light * beyond
         sine, cosine = dr.sincos(2 * pi * sample.y)
         chief = self.chief(x, y, depth)
-        beam = Beam(sample.x, cosine, sine, 2 * (x * cosine + y * sine) * (self._aperture / 2) / (depth * depth))
-        light = falloff(x, y, 0.0, 0.0, depth)
+        beam = Beam(share, cosine, sine, 2 * (x * cosine + y * sine) * (self._aperture / 2) / (depth * depth))
         shift = 1 / depth - 1 / self._depth
         if self.distance is None:
             slopes, slant = self._displaced(chief, 1 / self._camera.distance + shift, beam, band)

@@ -113,6 +113,27 @@ class RayGenerator:
         draws, places = SobolDraws(seed, lanes, samples), self._load(block, subset)
         return Rays(*self._emit(places, passes * samples, lanes, draws.next_2d(), draws), samples)
 
+    def middle_rays(
+        self, samples: int, seed: int, block: slice, passes: int, subset: IntArray
+    ) -> tuple[Rays, tuple[Any, Any]]:
+        """Start rays as `sobol_rays` does, but from the middles of pixels; return the falloff across their pixels, too.
+
+        falloff : relative change of the weight from one edge of a ray's pixel to the other, down and across
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        lanes, each = (block.stop - block.start) * passes * samples, passes * samples
+        draws, places = SobolDraws(seed, lanes, samples), self._load(block, subset)
+        self.lens.spreads = True
+        ray = Rays(*self._emit(places, each, lanes, mi.Point2f(0.5), draws), samples)
+        self.lens.spreads = False
+        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
+        x, y, z = (dr.gather(mi.Float, row, index) for row in places[0][:3])
+        x, y = x + self._pitch / 2, y + self._pitch / 2
+        slope = -4 * self._pitch / (x * x + y * y + z * z)  # of cos^4
+        return ray, (slope * y, slope * x)
+
     def grid_rays(self, grid: Grid, passes: int, keys: IntArray, pixels: IntArray) -> Rays:
         """Start one ray per cell of a grid over each pixel and pass, of pinholes, by random numbers of each pixel.
 

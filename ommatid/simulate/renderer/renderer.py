@@ -27,6 +27,7 @@ from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.passes import Plan
 from ..sampling.samplers import fitting
+from .averages import Averages, has_averages
 from .draws import Grid
 from .plugins import black, depths, scene_of, stock_sensors, target_of
 from .variant import activate, check_fast_variant
@@ -50,6 +51,8 @@ class Renderer:
     is_fast : True on the backends where the rays of many pixels start together
     staged : the world, if there is one
     """
+
+    _picture: FloatArray | None = None
 
     def __init__(
         self,
@@ -87,6 +90,7 @@ class Renderer:
         self._placement = MILLIMETRES_AT_ORIGIN
         self._texels = "target.emitter.radiance.data"
         self._texture: Any = None
+        self._averages: dict[str, Averages] = {}  # of `_picture`
         if world is None:
             texture: Any = mi.load_dict(black(camera, self.channels)) if fast else black(camera, self.channels)
             self._scene = mi.load_dict(scene_of(target_of(camera, texture)))
@@ -124,6 +128,7 @@ class Renderer:
 
         if not self._texels:
             return
+        self._picture, self._averages = (images[0] if self._texture is not None else None), {}
         texels = np.zeros((self.camera.rows, self.camera.columns, self.channels), dtype=np.float32)
         for channel, image in enumerate(images):
             texels[..., channel] = image * self._unit
@@ -171,7 +176,8 @@ class Renderer:
         index : of the sub-imager in the camera;  pixels : of it; on the scalar backend the others cost as much
         seed : the sampler's seed by the number of a pass. Seeds differ between sub-imagers, so that the values do not
             depend on which others are rendered; on the fast backends, where the passes start together, the first counts
-        sobol : True takes Sobol's points of pixel and pupil; on the fast backends, without a world
+        sobol : True takes Sobol's points of the pupil, and exact averages over the pixel or Sobol's points of it, too;
+            on the fast backends, without a world
         """
         sub, rows = self.camera.sub_imagers[index], self.camera.slices()[index]
         group = next(name for name, types in self.groups.items() if sub.type in types)
@@ -181,9 +187,15 @@ class Renderer:
             return np.stack(films) / self._unit
         generator, subset = self._generators[group], pixels + (rows.start - self.rows(group).start)
         parts, start = list[FloatArray](), generator.sobol_rays if sobol else generator.rays
+        averages = self._averages_of(sub.type) if sobol else None
         for block in generator.blocks(work.total, pixels.size):
-            rays = start(work.samples, block_seed(seed(0), block.start), block, work.passes, subset)
-            parts.append(self._readings(group, rays).reshape(-1, work.passes).T)
+            arguments = work.samples, block_seed(seed(0), block.start), block, work.passes, subset
+            if averages is not None:
+                rays, falloff = generator.middle_rays(*arguments)
+                readings = self._weighed(group, rays, averages.light(rays.ray, falloff))
+            else:
+                readings = self._readings(group, start(*arguments))
+            parts.append(readings.reshape(-1, work.passes).T)
         return np.concatenate(parts, axis=1)
 
     def expose_grid(self, rows: slice, work: Plan, margin: float, keys: IntArray) -> Iterator[tuple[slice, FloatArray]]:
@@ -219,12 +231,24 @@ class Renderer:
             light = self._integrator.sample(self._scene, sampler, rays.ray, None, True)[0].x
         else:
             light = self._radiance(rays.ray)
+        return self._weighed(group, rays, light)
+
+    def _weighed(self, group: str, rays: Rays, light: Any) -> FloatArray:
+        """Return the readings of the pixels of these rays from the light that each meets: (pixels of the block,)."""
         if rays.weight is None:
             return self._sound(rays.sums(light)[0] / rays.samples / self._unit)
         total, weight = rays.sums(light * rays.weight, rays.weight)
         self._sound(total / rays.samples / self._unit)
         share = self.captured(group) / self._unit
         return np.divide(total * share, weight, out=np.full(weight.size, np.nan), where=weight > 0)
+
+    def _averages_of(self, lens_type: LensType) -> Averages | None:
+        """Return the picture's averages over the boxes of a lens type, None where these are not equal."""
+        if self._picture is None or not has_averages(self.camera, lens_type):
+            return None
+        if lens_type.name not in self._averages:
+            self._averages[lens_type.name] = Averages(self.camera, lens_type, self._picture * self._unit)
+        return self._averages[lens_type.name]
 
     def _radiance(self, ray: Any) -> Any:
         """Return the target's radiance where rays meet it: what the integrator yields, in a third of the time."""

@@ -8,17 +8,16 @@ segments if anything reflects it.
 # pyright: basic
 from __future__ import annotations
 
-import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.input_files import open_input
+from ommatid.runtime.files import file_digest
 from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.world import FROM_FILE, WorldTable
@@ -112,10 +111,7 @@ def describe(scene: Scene) -> dict[str, Any]:
     """Describe a world for a fingerprint, by SHA-256 of its file and of those that it names. Raises InputError."""
     world = world_of(scene)
     folder = path_of(scene).parent
-    sums: dict[str, str] = {}
-    for path in files(scene):
-        with open_input(path) as stream:
-            sums[os.path.relpath(path, folder)] = hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
+    sums = {os.path.relpath(path, folder): file_digest(path) for path in files(scene)}
     place, has_target = world.describe_place(), scene.target.image is not None
     return {"white": world.white, "target": has_target, "files": sums, **({"place": place} if place else {})}
 

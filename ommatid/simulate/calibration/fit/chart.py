@@ -18,16 +18,22 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
 SIDE = 12  # most pixels of a chart along a side of a sub-imager
+SHARED = 650  # pixels of a chart that serve kernels, which all sub-imagers of a lens type share
 BESIDE = 1  # pixels of f around what a pixel's rays meet, where a model may expect light too
 
 
-def chart_of(lens_type: LensType, whole: BoolArray | None = None) -> IntArray:
+def side_for_kernels(lens_type: LensType) -> int:
+    """Return the most pixels along a side of a sub-imager in a chart for kernels."""
+    return min(SIDE, max(2, round((SHARED / lens_type.count) ** 0.5)))
+
+
+def chart_of(lens_type: LensType, whole: BoolArray | None = None, side: int = SIDE) -> IntArray:
     """Return the pixels of a lens type that are measured, by their number in the type, rising: (pixels,).
 
-    whole : (sub-imagers,), True for those of which all pixels are measured
+    whole : (sub-imagers,), True for those of which all pixels are measured;  side : most pixels of a chart along a side
     """
     rows, columns = (
-        np.unique(np.linspace(0, size - 1, min(size, SIDE)).round().astype(np.int64)) for size in lens_type.pixels
+        np.unique(np.linspace(0, size - 1, min(size, side)).round().astype(np.int64)) for size in lens_type.pixels
     )
     few = (rows[:, None] * lens_type.pixels[1] + columns).ravel()
     size = lens_type.pixels[0] * lens_type.pixels[1]

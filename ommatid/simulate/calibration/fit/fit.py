@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import sparse, stats
 
-from ommatid.runtime.arrays import Float32Array, FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views
-from ommatid.scenes.fitted.view import COUNT, UNITS, designed
+from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views, views_as_designed
+from ommatid.scenes.fitted.view import UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
 from ..point_sources import Responses, Subsets
-from .chart import ChartRows, chart_of, chart_rows
+from .chart import ChartRows, chart_of, chart_rows, side_for_kernels
 from .view_fit import SIGNIFICANCE, ViewFit, fit_views, predicted
 
 if TYPE_CHECKING:
@@ -124,13 +124,14 @@ def calibrate_by_fit(
     rays : per pixel of each lens type, of all passes;  with_kernels : True if kernels may explain blur
     """
     charted = {lens.name: has_chart(camera, lens, with_kernels) for lens in camera.types}
-    subsets: Subsets = {lens.name: chart_of(lens) if charted[lens.name] else None for lens in camera.types}
+    charts = {lens.name: _chart(camera, lens) for lens in camera.types}
+    subsets: Subsets = {name: chart if charted[name] else None for name, chart in charts.items()}
     responses = measure(subsets)
     fits = {
         lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], charted[lens.name])
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
-    charted = {lens.name: charted[lens.name] and chart_of(lens).size < lens.measurements for lens in camera.types}
+    charted = {lens.name: charted[lens.name] and charts[lens.name].size < lens.measurements for lens in camera.types}
     unexplained: Subsets = {
         lens.name: chart_of(lens, ~fits[lens.name].views.explained)
         for lens in camera.types
@@ -150,6 +151,11 @@ def calibrate_by_fit(
     return FittedCalibration(fitted, rest, responses, record)
 
 
+def _chart(camera: Camera, lens: LensType) -> IntArray:
+    """Return the pixels of a lens type that are measured first: (pixels,)."""
+    return chart_of(lens) if is_sharp(camera, lens) else chart_of(lens, side=side_for_kernels(lens))
+
+
 def _by_type(camera: Camera) -> list[list[SubImager]]:
     subs = iter(camera.sub_imagers)
     return [[next(subs) for _ in range(lens.count)] for lens in camera.types]
@@ -165,19 +171,19 @@ def _fit_type(
     charted: bool,
 ) -> _TypeFit:
     if not charted:
-        return _TypeFit(_views_as_designed(subs, explained=False), None, [])
+        return _TypeFit(views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
         from ...kernel_fit.kernel_fit import fit_kernels
 
-        kernels = fit_kernels(responses, camera, lens, chart_of(lens))
-        return _TypeFit(_views_as_designed(subs, kernels.accepted), None, [], kernels)
+        kernels = fit_kernels(responses, camera, lens, _chart(camera, lens))
+        return _TypeFit(views_as_designed(subs, kernels.accepted), None, [], kernels)
     pointers = responses.matrix.indptr
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]
     charts = chart_rows(camera, lens, responses.matrix[rows], batches)
     try:
         fit = fit_views(camera, subs, charts, rays)
     except InputError:  # rows that no view has led to a distortion that folds the image
-        return _TypeFit(_views_as_designed(subs, explained=False), None, [])
+        return _TypeFit(views_as_designed(subs, explained=False), None, [])
     models = [predicted(camera, sub, fit.numbers[n], charts[n]) for n, sub in enumerate(subs)]
     explanations = [explanation(chart, model, rays) for chart, model in zip(charts, models, strict=True)]
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(camera.sub_imagers))
@@ -185,11 +191,6 @@ def _fit_type(
     numbers = np.where(explained[:, None], fit.numbers, designed_views(subs))
     own, shared = (np.where(explained[:, None, None], each, 0.0) for each in (fit.own, fit.shared))
     return _TypeFit(Views(numbers, explained, own, shared, fit.structure), fit, explanations)
-
-
-def _views_as_designed(subs: list[SubImager], explained: bool) -> Views:
-    nothing = np.zeros((len(subs), COUNT, 0))
-    return Views(designed_views(subs), np.full(len(subs), explained), nothing, nothing, ("designed",) * COUNT)
 
 
 def _rest(

@@ -11,6 +11,7 @@ import io
 import re
 from dataclasses import dataclass, field
 from functools import cache
+from math import inf
 from pathlib import Path
 from typing import Any
 from xml.sax import SAXParseException, handler
@@ -21,8 +22,9 @@ from ommatid.runtime.input_files import LARGEST_TEXT, check_regular, read_bytes
 from ommatid.runtime.printable import printable
 
 from ..variant import mitsuba_folder
-from .file_checks import SHOWN, check_named_file
 
+SHOWN = 80  # characters of a name in messages
+LARGEST = {"spectrum": 64_000_000, "regular": 64_000_000, "irregular": 64_000_000}  # bytes of files of spectra
 DEEPEST_INCLUDE, MOST_INCLUDES = 15, 1000  # the former as in Mitsuba
 LONGEST_REASON = 180  # characters
 VERSION_OF_NAMES = 2  # from which Mitsuba's properties have today's names
@@ -60,6 +62,7 @@ def reason_of(error: str, world: CheckedWorld) -> str:
         return f"in {world.place(int(match[1]))}"
 
     reason = re.sub(r"\[[\w.]+(:\d+)?\] ", "", " ".join(error.split()))
+    reason = re.sub(r'^At dictionary node "root": failed to instantiate \w+ plugin of type "\w+": ', "", reason)
     reason = re.sub(r"(?:(?:At|While loading|Error while loading) )?string \(line (\d+), col \d+\)", place, reason)
     return printable(reason, LONGEST_REASON)
 
@@ -230,14 +233,9 @@ class _Expansion:
             raise InputError(f"{place}: expected files in 'filename' alone, got the path {named}")
         if key is not None:
             path = self._found(attributes[key], place)
-            if path not in self.checked:
-                try:
-                    check_named_file(path, plugin)
-                except InputError as error:
-                    raise InputError(f"{place}: {error}") from error
-                except (OSError, ValueError, OverflowError) as error:
-                    reason = printable(error, SHOWN)
-                    raise InputError(f"{place}: {printable(path)} could not be read ({reason})") from error
+            if path.stat().st_size > LARGEST.get(plugin, inf):
+                largest = LARGEST[plugin] / 1e6
+                raise InputError(f"{place}: {printable(path)}: expected at most {largest:g} MB; shorten it")
             self.files[path] = None
             self.checked[path] = plugin
             attributes[key] = str(path.resolve())

@@ -17,9 +17,12 @@ import select
 import signal
 import subprocess
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from time import monotonic
 from typing import IO, Any, cast
+
+import numpy as np
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
@@ -28,7 +31,6 @@ from ommatid.runtime.memory import free_memory
 from ommatid.runtime.printable import printable
 
 from .checked_world import CheckedWorld, reason_of
-from .file_checks import MESHES
 
 LONGEST = 600.0  # seconds that a world may take
 RESERVE = 100_000_000  # bytes that a world may take even if less are free
@@ -36,6 +38,8 @@ SHOWN = 100
 MODULE = __name__  # of the `main` that a process runs
 IDLE = 20  # seconds without a world after which the process ends
 PICTURES = ("bitmap", "envmap", "projector")
+MESHES = ("ply", "obj", "serialized")
+FARTHEST = 1e30  # of a vertex
 
 
 @dataclass
@@ -77,12 +81,13 @@ def try_world(world: CheckedWorld, variant: str, where: str, seconds: float = LO
     where : start of messages, the scene file and the world's
     Raises InputError if Mitsuba refuses it, or if that process dies or does not end.
     """
-    files = {str(path): [plugin, *_version(path)] for path, plugin in world.checked.items()}
+    named = [[str(path), plugin] for path, plugin in world.checked.items()]
+    files = [[*names, *_version(Path(names[0]))] for names in named]
     key = fingerprint([world.text, files, variant])
     if key in _trials.built:
         return
     most = max(free_memory(), RESERVE)
-    task = {"variant": variant, "text": world.text, "files": _plugins(world), "memory": most}
+    task = {"variant": variant, "text": world.text, "files": named, "memory": most}
     try:
         reason = _answer(task, where, seconds)
     except BaseException:
@@ -137,10 +142,6 @@ def _shown(at: str) -> str:
     return f"the file {printable(Path(at).name, SHOWN)}" if at else "the world"
 
 
-def _plugins(world: CheckedWorld) -> list[list[str]]:
-    return [[str(path), plugin] for path, plugin in world.checked.items()]
-
-
 def _version(path: Path) -> list[int]:
     status = path.stat()
     return [status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino]
@@ -188,7 +189,7 @@ def _try_world(world: dict[str, Any], answer: Any) -> None:
     for path, plugin in world["files"]:
         answer(at=path)
         if plugin in MESHES:
-            mi.load_dict({"type": plugin, "filename": os.path.realpath(path)})
+            _check_meshes(os.path.realpath(path), plugin)
         elif plugin in PICTURES:
             mi.Bitmap(os.path.realpath(path))
     answer(at="")
@@ -196,10 +197,33 @@ def _try_world(world: dict[str, Any], answer: Any) -> None:
     built.bbox()
 
 
-def _limit_memory(more: int | None) -> None:
+def _check_meshes(path: str, plugin: str) -> None:
+    """Read the meshes of a file, and check what Mitsuba trusts: indices and positions of vertices. Raises RuntimeError.
+
+    Without normals at the vertices, which Mitsuba would compute by unchecked indices.
+    """
+    import mitsuba as mi
+
+    for index in count():
+        several = {"shape_index": index} if plugin == "serialized" else {}
+        try:
+            mesh = mi.load_dict({"type": plugin, "filename": path, "face_normals": True, **several})
+        except RuntimeError:
+            if index:  # no further mesh, or none that can be read, which the world will say if it names it
+                return
+            raise
+        content = mi.traverse(mesh)
+        faces, positions = np.array(content["faces"]), np.array(content["vertex_positions"])
+        if not faces.size or int(faces.max()) >= positions.size // 3:
+            raise RuntimeError(f"{Path(path).name}: expected faces of existing vertices")
+        if not (np.abs(positions) < FARTHEST).all():
+            raise RuntimeError(f"{Path(path).name}: expected finite positions of vertices")
+        if not several:
+            return
+
+
+def _limit_memory(more: int) -> None:
     """Let this process take so many more bytes, and no more."""
-    if more is None:
-        return
     import psutil
 
     size = psutil.Process().memory_info().data

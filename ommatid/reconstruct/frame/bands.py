@@ -1,0 +1,349 @@
+"""A shift-invariant camera in front of a world finer than f, by groups of waves that its readings cannot tell apart.
+
+The world w has F x F pixels in each pixel of f, and reflecting edges, so that its prior P is diagonal in the cosine
+waves of the world. Readings one pixel of f apart that continue beyond the edges, where they see the world reflected,
+map the waves of frequencies k, 2n - k, 2n + k, 4n - k, ... along an axis (n pixels of f) to one and the same wave of
+readings. In such a group of at most F x F waves a lens type is one row b_t, its transfer function with the signs of
+the aliases, and with the weights w_t = 1 / Rv
+
+    K = P^-1 + sum over types of w_t b_t b_t^T,   K^-1 = P - P B (W^-1 + B^T P B)^-1 B^T P,
+
+where the matrix to be inverted has as many rows as there are lens types. Pixels of f are averages of w: one more row a,
+so that a^T K^-1 a, averaged over the groups, is the variance of a pixel of f far from the edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+from math import ceil
+
+import numpy as np
+from scipy import fft, sparse
+
+from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.processors import processors
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.kernels import KernelFootprints
+from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.observation import Observation
+
+DEPTH = 12  # pixels of f of a strip
+LEAST = 1e-12  # of the eigenvalues of a strip's correction, relative to the largest
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings one pixel of f apart, along both axes, by a kernel of the world's pixels.
+
+    kernel : (rows, columns);  first : row and column of the world where that of the first reading begins
+    count : readings down and across
+    """
+
+    kernel: FloatArray
+    first: tuple[int, int]
+    count: tuple[int, int]
+
+    @cached_property
+    def even(self) -> FloatArray:
+        """The mean of the kernel and its mirror images."""
+        upright = (self.kernel + self.kernel[::-1]) / 2
+        return (upright + upright[:, ::-1]) / 2
+
+    def is_odd(self, axis: int, detail: int) -> bool:
+        """Return True if the middles of readings are those of pixels of f, False if they are edges between these."""
+        return round((2 * self.first[axis] + self.kernel.shape[axis]) / detail) % 2 == 1
+
+    def matrix(self, shape: tuple[int, int], detail: int) -> sparse.csr_array:
+        """Return the readings as a matrix on a world of this shape: (readings, its pixels)."""
+        places: list[IntArray] = [
+            (first + detail * np.arange(count))[:, None] + np.arange(length)
+            for first, count, length in zip(self.first, self.count, self.kernel.shape, strict=True)
+        ]
+        down, across = places[0][:, None, :, None], places[1][None, :, None, :]
+        inside = (down >= 0) & (down < shape[0]) & (across >= 0) & (across < shape[1])
+        inside = inside & (self.kernel != 0)
+        pixels = np.broadcast_to(down * shape[1] + across, inside.shape)[inside]
+        values = np.broadcast_to(self.kernel, inside.shape)[inside]
+        pointers = np.concatenate([[0], np.cumsum(inside.sum(axis=(2, 3)).ravel())])
+        size = self.count[0] * self.count[1], shape[0] * shape[1]
+        return sparse.csr_array((values, pixels, pointers), shape=size)
+
+    def shortened(self, by: tuple[int, int]) -> Readings:
+        """Return the readings of an image of fewer rows and columns of f with the same edges."""
+        rows, columns = (max(count - less, 1) for count, less in zip(self.count, by, strict=True))
+        return replace(self, count=(rows, columns))
+
+
+@dataclass(frozen=True)
+class Bands:
+    """The camera's lens types as rows b_t, and the prior, on the waves of a world.
+
+    shape : rows and columns of f;  detail : F;  spectrum : P, (F rows, F columns);  weights : w_t
+    """
+
+    shape: tuple[int, int]
+    detail: int
+    spectrum: FloatArray
+    types: tuple[Readings, ...]
+    weights: tuple[float, ...]
+    scale: FloatArray | float = field(default=1.0, repr=False)  # S of the precision S K S, (F rows, F columns)
+
+    @cached_property
+    def _rows(self) -> tuple[FloatArray, ...]:
+        """b_t of each lens type: (F rows, F columns)."""
+        return tuple(self._row(each) for each in self.types)
+
+    @cached_property
+    def _pixels(self) -> FloatArray:
+        """a, of the averages over pixels of f: (F rows, F columns)."""
+        return self._row(Readings(np.full((self.detail, self.detail), self.detail**-2.0), (0, 0), self.shape))
+
+    def _row(self, readings: Readings) -> FloatArray:
+        """Return the transfer function of readings with the signs and the norms of the aliases."""
+        lengths = readings.kernel.shape
+        waves = [_waves(size, self.detail, length) for size, length in zip(self.shape, lengths, strict=True)]
+        norms = [_norms(size, self.detail, readings.is_odd(axis, self.detail)) for axis, size in enumerate(self.shape)]
+        return norms[0][:, None] * (waves[0] @ readings.even @ waves[1].T) * norms[1]
+
+    @cached_property
+    def _spectral(self) -> tuple[FloatArray, FloatArray]:
+        """Eigenvalues of W^1/2 B^T P B W^1/2 of each group, (rows + 1, columns + 1, types), and W^1/2 eigenvectors.
+
+        Where all types see a wave of large variance alike, the inverse of the matrix itself would have no digits.
+        """
+        rows, roots = self._rows, np.sqrt(np.array(self.weights))
+        inner = np.empty((self.shape[0] + 1, self.shape[1] + 1, len(rows), len(rows)))
+        for one, first in enumerate(rows):
+            weighted = self.spectrum * first
+            for other, second in enumerate(rows[: one + 1]):
+                inner[..., one, other] = inner[..., other, one] = self._folded(weighted * second)
+        values, vectors = np.linalg.eigh(inner * roots[:, None] * roots)
+        return np.maximum(values, 0.0), roots[:, None] * vectors
+
+    def solve(self, image: FloatArray) -> FloatArray:
+        """Return K^-1 r of the camera whose readings continue beyond the edges: (F rows, F columns)."""
+        scaled = image / self.scale
+        waves = np.asarray(fft.dctn(scaled, 2, norm="ortho", workers=processors()))
+        waves *= self.spectrum
+        seen = np.stack([self._folded(waves * row) for row in self._rows], axis=-1)
+        values, vectors = self._spectral
+        along = np.einsum("ijtu,ijt->iju", vectors, seen) / (1 + values)
+        back = np.einsum("ijtu,iju->ijt", vectors, along)
+        for number, row in enumerate(self._rows):
+            waves -= self.spectrum * row * self._unfolded(np.ascontiguousarray(back[..., number]))
+        solved: FloatArray = np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True))
+        for strip in self._strips:
+            strip.add(scaled, solved)
+        return solved / self.scale
+
+    @cached_property
+    def _strips(self) -> tuple[Strip, ...]:
+        """What lacks at the top, bottom, left and right: K has no readings there that M has."""
+        return tuple(self._strip(axis, last) for axis, last in product((0, 1), (False, True)))
+
+    def _strip(self, axis: int, last: bool) -> Strip:
+        size, detail = self.shape[axis], self.detail
+        depth = min(DEPTH, size // 2) * detail
+        part = slice(size * detail - depth, size * detail) if last else slice(0, depth)
+        members = _members(self.shape[1 - axis], detail)
+        waves = np.asarray(fft.dct(np.eye(size * detail)[:, part], 2, axis=0, norm="ortho"))
+        pairs = (waves[:, :, None] * waves[:, None, :]).reshape(len(waves), -1)
+        precision = 1 / (self.spectrum if axis == 0 else self.spectrum.T)
+        priors = (precision.T @ pairs).reshape(-1, depth, depth)[members]
+        priors[members < 0] = np.eye(depth)
+        seen, whole = (np.zeros((len(members), depth, detail, depth, detail)) for _ in range(2))
+        for number in range(detail):
+            for total in (seen, whole):
+                total[:, :, number, :, number] = priors[:, number]
+        for readings, weight in zip(self.types, self.weights, strict=True):
+            along = self._along(readings, axis)[members]
+            along[members < 0] = 0.0
+            for total, complete in ((seen, False), (whole, True)):
+                shares = _shares(readings, axis, size, detail, part, complete=complete)
+                values = np.einsum("pxa,kla->kpxl", shares, along, optimize=True).reshape(len(members), len(shares), -1)
+                total += (weight * values.swapaxes(1, 2) @ values).reshape(total.shape)
+        count = depth * detail
+        excess = np.linalg.inv(seen.reshape(-1, count, count)) - np.linalg.inv(whole.reshape(-1, count, count))
+        values, vectors = np.linalg.eigh((excess + excess.swapaxes(1, 2)) / 2)
+        values = np.where(values > LEAST * values[:, -1:], values, 0.0)
+        return Strip(axis, part, members, (vectors * values[:, None, :]) @ vectors.swapaxes(1, 2))
+
+    def _along(self, readings: Readings, axis: int) -> FloatArray:
+        """Return the transfer function along an edge of each line of a kernel across it: (waves, lines)."""
+        kernel = readings.even if axis == 0 else readings.even.T
+        size = self.shape[1 - axis]
+        norms = _norms(size, self.detail, readings.is_odd(1 - axis, self.detail))
+        return norms[:, None] * (_waves(size, self.detail, kernel.shape[1]) @ kernel.T)
+
+    def variances(self, level: float, ratios: tuple[float, ...]) -> tuple[float, float, float]:
+        """Return the posterior variance of a pixel of f far from the edges, and the parts of Eq. 5 by prior and noise.
+
+        level : by which all weights are multiplied;  ratios : of the actual to the expected noise of each lens type
+        """
+        values, vectors, seen, before = self._of_pixels
+        along = seen / (1 + level * values)
+        posterior = before - level * np.einsum("iju,iju->ij", along, seen)
+        gain = np.einsum("ijtu,iju->ijt", vectors, along) * level
+        # The noise of a type, 1 / w, passes through its gain; both are finite for a weight of 0.
+        weights = level * np.array(self.weights)
+        noise = np.divide(np.square(gain), weights, out=np.zeros_like(gain), where=weights > 0)
+        total, missing = posterior.mean(), (posterior - noise.sum(axis=-1)).mean()
+        return float(total), float(missing), float((noise @ np.array(ratios)).mean())
+
+    @cached_property
+    def _of_pixels(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """`_spectral`, covariances of its vectors with f's wave, and the variance of that: no last groups."""
+        (values, vectors), pixels = self._spectral, self._pixels
+        seen = np.stack([self._folded(self.spectrum * pixels * row) for row in self._rows], axis=-1)
+        before = self._folded(self.spectrum * np.square(pixels))
+        inside = (slice(None, -1), slice(None, -1))
+        return values[inside], vectors[inside], np.einsum("ijtu,ijt->iju", vectors, seen)[inside], before[inside]
+
+    @cached_property
+    def prior_variance(self) -> float:
+        """Prior variance of a pixel of f, averaged over the image."""
+        return float(self._of_pixels[3].mean())
+
+    def _folded(self, waves: FloatArray) -> FloatArray:
+        """Return the sums of coefficients over the waves of each group: (rows + 1, columns + 1)."""
+        for axis, size in enumerate(self.shape):
+            shape = list(waves.shape)
+            shape[axis] = size + 1
+            total = np.zeros(shape)
+            for part, target in _segments(size, self.detail):
+                total[_at(axis, target)] += waves[_at(axis, part)]
+            waves = total
+        return waves
+
+    def _unfolded(self, groups: FloatArray) -> FloatArray:
+        """Return each group's value at all of its waves: (F rows, F columns)."""
+        for axis, size in enumerate(self.shape):
+            shape = list(groups.shape)
+            shape[axis] = size * self.detail
+            waves = np.empty(shape)
+            for part, target in _segments(size, self.detail):
+                waves[_at(axis, part)] = groups[_at(axis, target)]
+            groups = waves
+        return groups
+
+
+def bands_of(camera: Camera, detail: int, spectrum: FloatArray, weights: FloatArray, observation: Observation) -> Bands:
+    """Return the shift-invariant camera like one in front of a world finer than f.
+
+    camera : on the grid of the world;  weights : (M,) 1 / Rv;  observation : H, whose kernels are taken as they are
+    """
+    parts = {part.places.lens_type.name: part for part in observation.parts if isinstance(part, KernelFootprints)}
+    types: list[Readings] = []
+    means: list[float] = []
+    for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
+        kernel = _box(float(lens_type.ratio)) if lens_type.name not in parts else parts[lens_type.name].mean_kernel
+        readings = _readings(lens_type, kernel, detail)
+        taken = lens_type.measurements / (readings.count[0] * readings.count[1])
+        types.append(readings)
+        means.append(float(weights[rows].mean()) * taken)
+    return Bands((camera.rows // detail, camera.columns // detail), detail, spectrum, tuple(types), tuple(means))
+
+
+def _readings(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings:
+    """Return the readings of all boxes one pixel of f apart in the field of a lens type."""
+    first, count = list[int](), list[int]()
+    for (start, end), length in zip(lens_type.bounds, kernel.shape, strict=True):
+        first.append(round(float(start) + (float(lens_type.ratio) - length) / 2))
+        count.append(max(round((float(end - start) - float(lens_type.ratio)) / detail) + 1, 1))
+    return Readings(kernel, (first[0], first[1]), (count[0], count[1]))
+
+
+def _box(ratio: float) -> FloatArray:
+    """Return the mean over a box of this side: (rows, columns)."""
+    side = ceil(ratio)
+    share = np.full(side, 1 / ratio)
+    share[[0, -1]] = (1 - (side - 2) / ratio) / 2 if side > 1 else 1.0
+    return np.outer(share, share)
+
+
+def _members(size: int, detail: int) -> IntArray:
+    """Return the waves of the world in each group of an axis, (size + 1, detail), -1 where there are fewer."""
+    members = np.full((size + 1, detail), -1)
+    numbers = np.arange(size * detail)
+    for number, (part, target) in enumerate(_segments(size, detail)):
+        members[target, number] = numbers[part]
+    return members
+
+
+def _shares(readings: Readings, axis: int, size: int, detail: int, part: slice, *, complete: bool) -> FloatArray:
+    """Return which line of a kernel lies on which line of a strip: (readings near it, lines of the strip, of a kernel).
+
+    complete : True for readings that continue beyond the edges, where they see the world reflected
+    """
+    length, end = readings.kernel.shape[axis], size * detail
+    starts: IntArray = readings.first[axis] + detail * np.arange(readings.count[axis])
+    roots = np.ones(starts.size)
+    if complete:
+        odd = readings.is_odd(axis, detail)
+        middles = np.asarray(np.arange(size) + 0.5 if odd else np.arange(size + 1), dtype=np.float64)
+        starts = np.rint(middles * detail - length / 2).astype(np.int64)
+        roots = np.ones(middles.size)
+        if not odd:
+            roots[[0, -1]] = 0.5**0.5
+    lines: IntArray = np.asarray(starts[:, None] + np.arange(length), dtype=np.int64)
+    if complete:
+        lines %= 2 * end
+        np.copyto(lines, 2 * end - 1 - lines, where=lines >= end)
+    near = ((lines >= part.start) & (lines < part.stop)).any(axis=1)
+    shares = np.zeros((int(near.sum()), part.stop - part.start, length))
+    reading, line = np.nonzero((lines[near] >= part.start) & (lines[near] < part.stop))
+    shares[reading, lines[near][reading, line] - part.start, line] = roots[near][reading]
+    return shares
+
+
+@dataclass(frozen=True)
+class Strip:
+    """K_e^-1 - M_e^-1 of a strip along an edge, by groups of waves along it: (groups, depth F, depth F)."""
+
+    axis: int
+    part: slice
+    members: IntArray
+    excess: FloatArray
+
+    def add(self, right: FloatArray, solution: FloatArray) -> None:
+        """Add R^T (K_e^-1 - M_e^-1) R r to the solution."""
+        source, target = (right, solution) if self.axis == 0 else (right.T, solution.T)
+        waves = np.asarray(fft.dct(source[self.part], 2, axis=1, norm="ortho", workers=processors()))
+        missing = self.members < 0
+        groups = waves[:, self.members]  # (depth, groups, F)
+        groups[:, missing] = 0.0
+        depth, count, detail = groups.shape
+        solved = np.einsum("kij,kj->ki", self.excess, groups.swapaxes(0, 1).reshape(count, -1))
+        waves[:, self.members[~missing]] = solved.reshape(count, depth, detail).swapaxes(0, 1)[:, ~missing]
+        target[self.part] += np.asarray(fft.idct(waves, 2, axis=1, norm="ortho", workers=processors()))
+
+
+def _at(axis: int, part: slice) -> tuple[slice, ...]:
+    return (part,) if axis == 0 else (slice(None), part)
+
+
+def _segments(size: int, detail: int) -> Iterator[tuple[slice, slice]]:
+    """Yield ranges of waves of the world and the groups that they belong to, which rise or fall."""
+    for number in range(detail):
+        part = slice(number * size, (number + 1) * size)
+        yield part, slice(0, size) if number % 2 == 0 else slice(size, 0, -1)
+
+
+def _waves(size: int, detail: int, length: int) -> FloatArray:
+    """Return the cosines of all waves of the world about the middle of `length` of its pixels: (F size, length)."""
+    angles = np.pi * np.arange(size * detail) / (size * detail)
+    return np.cos(np.outer(angles, np.arange(length) - (length - 1) / 2))
+
+
+def _norms(size: int, detail: int, odd: bool) -> FloatArray:
+    """Return the sign of each wave as readings see it, times the root of its norm on them: (F size,)."""
+    number, place = np.divmod(np.arange(size * detail), size)
+    turns = (number + 1) // 2  # by which the wave of the readings is shifted
+    norms = np.full(size * detail, detail**-0.5)
+    zero, highest = (place == 0) & (number % 2 == 0), (place == 0) & (number % 2 == 1)
+    norms[zero & (number > 0)] = (2 / detail) ** 0.5
+    norms[highest] = 0.0 if odd else (2 / detail) ** 0.5
+    return np.where(odd & (turns % 2 == 1), -norms, norms)

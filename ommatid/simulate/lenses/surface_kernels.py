@@ -1,0 +1,176 @@
+"""Kernels of lenses with surfaces as designed: the rows of `surface_matrix` as polynomials of the field.
+
+Rows are computed at a chart of field positions, nodes of Gauss and Legendre in a quadrant. A lens is round, so that the
+other quadrants mirror it. Least squares give each cell's polynomial of the lowest degree that serves, and the cells
+vary together, so that a few kernels are enough. Distortion moves a footprint within its kernel: the polynomials hold
+displacements of up to about a pixel of f, and what they do not hold keeps its entries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from math import ceil
+
+import numpy as np
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.memory import check_memory
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
+from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
+from ommatid.scenes.lens_type import LensType
+
+from .field import LensField, bands, check_waves, field_of
+from .point_spread import point_spread
+from .surface_matrix import overlaps
+
+CHARTS = {3: (2, 4), 5: (6, 8), 9: (10, 12, 14, 16)}  # nodes along a side of a quadrant, and degrees for them
+HIGHEST = 16
+TOLERANCE = 1e-3  # error of an entry, relative to the largest of its row, with which a degree is enough,
+MOST = 3e-3  # and with which the highest is: where light begins to be cut off by a rim, polynomials serve less
+SHARE = 0.5  # of it that leaving out components may take
+COPIES = 12  # arrays of the chart's size that are held at once
+
+
+@dataclass(frozen=True, eq=False)
+class _FieldRows:
+    """Rows of H of a lens type at any position of its field, on W x W pixels of f."""
+
+    places: KernelPlaces
+    fields: tuple[tuple[LensField, float], ...]
+
+    def at(self, u: float, v: float) -> FloatArray:
+        """Return the row at (u, v) of the field: (W, W)."""
+        beside = np.array([u, v]) * self.places.scale
+        total, light = np.zeros((self.places.width, self.places.width)), 0.0
+        for field, weight in self.fields:
+            x, y = beside[::-1] * self._pitch
+            lit = weight * float(field.brightness(np.array([np.hypot(x, y)]))[0])
+            if lit > 0:
+                total += lit * self._row(field, float(x), float(y), beside)
+            light += lit
+        return total / light if light > 0 else total
+
+    @property
+    def _pitch(self) -> float:
+        """Distance on the sensor per pixel of f."""
+        camera = self.places.camera
+        return camera.target_pitch * camera.depth(self.places.lens_type) / camera.distance
+
+    def _row(self, field: LensField, x: float, y: float, beside: FloatArray) -> FloatArray:
+        camera, wide = self.places.camera, self.places.width
+        edges = _edges(camera, field, x, y) - (beside - wide / 2)[:, None]
+        angle, height = float(np.arctan2(-x, y)), float(np.hypot(x, y))
+        if field.rays_suffice:
+            total = np.zeros((wide, wide))
+            for wave, share in field.between(height):
+                across, up = wave.turned(angle).hits / camera.target_pitch
+                down = overlaps(edges[0], -up, wide, 0.0)
+                total += (down * (share * wave.light)[:, None]).T @ overlaps(edges[1], -across, wide, 0.0)
+            return total
+        spread = point_spread(field.lit_wave(height).turned(angle), field.grid)
+        offsets, cell = spread.offsets / camera.target_pitch, spread.cell / camera.target_pitch
+        down, across = (overlaps(each, -offsets, wide, cell) for each in edges)
+        return np.asarray(down.T @ spread.values @ across, dtype=np.float64)
+
+    def quadrant(self, down: FloatArray, across: FloatArray) -> FloatArray:
+        """Return the rows at all pairs of u and v, both 0 or more: (pairs, W, W)."""
+        known: dict[tuple[float, float], FloatArray] = {}
+        for u, v in product(down.tolist(), across.tolist()):
+            known[u, v] = known[v, u].T if (v, u) in known else self.at(u, v)
+        return np.stack(list(known.values()))
+
+
+def _edges(camera: Camera, field: LensField, x: float, y: float) -> FloatArray:
+    """Return the edges of a footprint in pixels of f from the lens's axis, by rows and by columns: (2, 2)."""
+    half = camera.pixel_pitch / 2 * np.array([-1.0, 1.0])
+    across, down = field.centre(x + half, np.full(2, y))[0], field.centre(np.full(2, x), y + half)[1]
+    return -np.stack([down, across]) / camera.target_pitch
+
+
+@lru_cache(maxsize=16)
+def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
+    """H of a lens type with surfaces as designed, as of `surface_matrix.matrix`, by a few kernels.
+
+    Expects a camera for which `Camera.has_kernel` is true. Raises InputError if the surfaces form no image, or kernels
+    do not hold the variation over the field to the tolerance.
+    """
+    fields = tuple((field_of(camera, lens_type, wavelength), weight) for wavelength, weight in bands(camera))
+    for field, _ in fields:
+        check_waves(lens_type, field)
+    rows = _FieldRows(KernelPlaces(camera, lens_type, _margin(camera, lens_type, fields)), fields)
+    cells = rows.places.width**2
+    check_memory(COPIES * 8 * cells * max(CHARTS) ** 2, f"the kernels of lens type {lens_type.name}", "crop the target")
+    worst = np.inf
+    for count, degrees in CHARTS.items():
+        nodes = (1 + np.polynomial.legendre.leggauss(count)[0]) / 2
+        axes = [np.append(nodes[nodes < extent], extent) for extent in rows.places.extent]  # the corner among them
+        field, entries = np.array(list(product(*axes))), rows.quadrant(*axes).reshape(-1, cells)
+        scale = float(entries[0].max())
+        for degree in degrees:
+            polynomials = _fitted(field, entries, rows.places.width, degree)
+            worst = float(np.abs(basis(field, degree) @ polynomials - entries).max()) / scale
+            if worst <= TOLERANCE * (1 - SHARE) or (degree == HIGHEST and worst <= MOST):
+                return _components(rows.places, degree, polynomials, field, scale)
+    raise InputError(
+        f"camera.lens.{lens_type.name}: its images are displaced and blurred over the field by more than kernels hold:"
+        f" an entry of H would be wrong by {worst:.2g} of the largest, expected at most {MOST:g}"
+    )
+
+
+def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[LensField, float], ...]) -> int:
+    """Return by how many pixels of f light reaches beyond a footprint, distortion included."""
+    places = KernelPlaces(camera, lens_type, 0)
+    corner = np.array(places.extent) * places.scale
+    shrink = camera.target_pitch * camera.depth(lens_type) / camera.distance
+    reach = 0.0
+    for field, _ in fields:
+        spot = max(wave.spot_radius for wave in field.nodes[1])
+        wide = spot if field.rays_suffice else field.grid[1]
+        edges = np.sort(_edges(camera, field, float(corner[1] * shrink), float(corner[0] * shrink)), axis=1)
+        moved = np.abs(edges - corner[:, None] - places.width / 2 * np.array([-1.0, 1.0])).max()
+        reach = max(reach, wide / camera.target_pitch + float(moved))
+    return ceil(reach) + 1
+
+
+def _fitted(field: FloatArray, entries: FloatArray, wide: int, degree: int) -> FloatArray:
+    """Return the polynomials of all cells, (P, C), by least squares over a quadrant's rows, (n, C), and their images.
+
+    A mirrored position shows the mirrored row. The even and the odd parts of the rows are polynomials of their own.
+    """
+    every = basis(field, degree)
+    grid = entries.reshape(-1, wide, wide)
+    found = np.zeros((every.shape[1], wide, wide))
+    for down, across in product((0, 1), repeat=2):
+        own = [number for number, (a, b) in enumerate(terms(degree)) if (a % 2, b % 2) == (down, across)]
+        part = (grid + (-1) ** down * grid[:, ::-1]) / 2
+        part = (part + (-1) ** across * part[:, :, ::-1]) / 2
+        solved = np.linalg.lstsq(every[:, own], part.reshape(len(field), -1), rcond=None)[0]
+        found[own] = solved.reshape(-1, wide, wide)
+    return found.reshape(every.shape[1], -1)
+
+
+def _components(
+    places: KernelPlaces, degree: int, polynomials: FloatArray, field: FloatArray, scale: float
+) -> KernelFootprints:
+    """Return the mean kernel and as few components of the variation as hold it. field : (n, 2) of a quadrant"""
+    values = np.concatenate([basis(field * signs, degree) for signs in product((1.0, -1.0), repeat=2)])
+    values[:, 0] = 0.0
+    triangle = np.linalg.cholesky(values[:, 1:].T @ values[:, 1:] / len(values))
+    strong = triangle.T @ polynomials[1:]
+    vectors = np.linalg.eigh(strong @ strong.T)[1][:, ::-1]
+    orthonormal = np.linalg.solve(triangle, values[:, 1:].T).T
+    left, kept = orthonormal @ strong, 0
+    while kept < vectors.shape[1] and max(left.max(), -left.min()) > TOLERANCE * SHARE * scale:
+        left -= np.outer(orthonormal @ vectors[:, kept], vectors[:, kept] @ strong)
+        kept += 1
+    shares = np.linalg.solve(triangle.T, vectors[:, :kept]).T
+    coefficients = np.zeros((1 + kept, len(polynomials)))
+    coefficients[0, 0] = 1.0
+    coefficients[1:, 1:] = shares
+    shown = np.concatenate([polynomials[:1], vectors[:, :kept].T @ strong])
+    shapes = KernelShapes.low_rank(shown.reshape(-1, places.width, places.width), places.width)
+    return KernelFootprints(places, degree, shapes, coefficients, np.zeros((0, 0, len(polynomials))))

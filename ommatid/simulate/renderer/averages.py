@@ -1,0 +1,76 @@
+"""Averages of the picture over the boxes that sensor pixels throw on the target, so that only the blur is sampled.
+
+Behind a thin lens the rays of one point of the pupil, from all of a sensor pixel, meet a box of m x m pixels of f,
+which the point displaces. The average of a picture of even pixels over a box of whole ones is bilinear in the
+displacement between those of whole pixels. So rays from the pixel's middle meet the averages by bilinear interpolation,
+and what is left to chance is the point spread alone. A ratio p / q takes a picture of q x q times as many pixels.
+
+The light of a pixel's corners falls off by other angles: to first order the first moments of the boxes show it.
+"""
+
+# pyright: basic
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
+
+MOST_PIXELS = 64  # of a box along an axis
+MOST_PARTS = 4  # of a pixel of the picture along an axis
+
+
+def has_averages(camera: Camera, lens_type: LensType) -> bool:
+    """Return True if all pixels of a lens type throw equal boxes along the axes of the picture."""
+    optics, ratio = lens_type.optics, lens_type.ratio
+    thin = optics.aperture is not None and optics.surfaces is None and optics.distortion is None
+    small = ratio.numerator <= MOST_PIXELS and ratio.denominator <= MOST_PARTS
+    return thin and small and camera.walls and camera.tolerance is None and not lens_type.is_rotated
+
+
+class Averages:
+    """A picture's averages and first moments over the boxes of a lens type; dark beside the target."""
+
+    def __init__(self, camera: Camera, lens_type: LensType, picture: FloatArray) -> None:
+        """Average a picture, (rows, columns), in the units of radiance."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self._camera, self._box, self._parts = camera, lens_type.ratio.numerator, lens_type.ratio.denominator
+        fine: FloatArray = np.repeat(np.repeat(picture, self._parts, axis=0), self._parts, axis=1)
+        means = np.full(self._box, 1 / self._box)
+        moments = ((np.arange(self._box) + 0.5) / self._box - 0.5) / self._box
+        down, offset_down = (_over_boxes(fine, weights) for weights in (means, moments))
+        layers = [_over_boxes(lines.T, weights).T for lines, weights in ((down, means), (offset_down, means))]
+        layers.append(_over_boxes(down.T, moments).T)
+        self._shape = layers[0].shape
+        data = np.ascontiguousarray(np.stack(layers, axis=-1), dtype=np.float32)
+        texture: Any = mi.Texture2f
+        self._texture = texture(mi.TensorXf(data), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp)
+
+    def light(self, ray: Any, falloff: tuple[Any, Any]) -> Any:
+        """Return the radiance that the pixels of rays from their middles meet.
+
+        falloff : relative change of the light's weight across a pixel, down and across, of each ray
+        """
+        import mitsuba as mi
+
+        camera, along = self._camera, (self._camera.distance - ray.o.z) / ray.d.z
+        middle = [camera.rows / 2 - (ray.o.y + along * ray.d.y) / camera.target_pitch]
+        middle.append(camera.columns / 2 - (ray.o.x + along * ray.d.x) / camera.target_pitch)
+        v, u = (
+            (self._parts * each + self._box / 2 + 0.5) / size for each, size in zip(middle, self._shape, strict=True)
+        )
+        mean, down, across = self._texture.eval(mi.Point2f(u, v))
+        return mean + falloff[0] * down + falloff[1] * across
+
+
+def _over_boxes(lines: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return weighted sums over adjacent lines, from those before the first to those behind the last; 0 beside them."""
+    beside = weights.size
+    padded = np.pad(lines, ((beside, beside), (0, 0)))
+    count = lines.shape[0] + beside + 1
+    return sum((weight * padded[start : start + count] for start, weight in enumerate(weights)), np.zeros(1))

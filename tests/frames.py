@@ -85,7 +85,7 @@ def assert_methods_agree(described: Callable[[str], Scene], methods: Sequence[st
         done = restore(recorded(chosen, image, 1e-2), ideal_model(chosen, camera), image)
         return done.estimate, done.expected.variance
 
-    dense, variance = estimated("information")
+    dense, variance = estimated("auto")
     for method in methods:
         image, error = estimated(method)
         np.testing.assert_allclose(error, variance, rtol=1e-4)

@@ -101,7 +101,7 @@ def test_unsuitable_cameras_are_refused(how: str) -> None:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"method": "tiles"}, "takes a dense form, got estimator.method 'tiles'"),
+        ({"method": "tiles"}, "takes one dense problem, got estimator.method 'tiles'"),
         ({"memory": "1 MB"}, "are allowed; raise estimator.memory"),
     ],
 )

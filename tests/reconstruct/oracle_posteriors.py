@@ -36,7 +36,8 @@ def by_array(problem: Problem, recorded: FloatArray) -> Posterior:
     prior, dense = problem.prior, problem.dense_matrix()
     count = problem.measurements
     above = np.hstack([np.diag(problem.deviation), np.zeros((count, prior.dimension))])
-    triangle: FloatArray = np.linalg.qr(np.vstack([above, np.hstack([dense.T, np.eye(prior.dimension)])]), mode="r")
+    array = np.vstack([above, np.hstack([dense.T, np.eye(prior.dimension)])])
+    triangle = np.asarray(np.linalg.qr(array, mode="r"))
     white = np.linalg.solve(triangle[:count, :count].T, recorded - problem.matrix @ prior.mean)
     u = triangle[:count, count:].T @ white
     roots = prior.apply_root(triangle[count:, count:].T)

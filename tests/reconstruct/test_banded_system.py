@@ -47,7 +47,7 @@ def restored(stack: Stack, image: FloatArray, method: str) -> Reconstruction:
 def test_a_frame_is_the_dense_problem(shape: tuple[int, int], lenses: Lenses) -> None:
     scene = described(shape, lenses, noise={"variance": NOISE})
     stack, image = recorded(scene, np.random.default_rng(0), used=lenses in (ONE, ODD))
-    dense, frame = restored(stack, image, "information"), restored(stack, image, "frame")
+    dense, frame = restored(stack, image, "auto"), restored(stack, image, "frame")
     np.testing.assert_allclose(frame.estimate, dense.estimate, atol=1e-6 * 5461.25**0.5)
     # Its parts are differences of inverses, at a step of 1e-4.
     np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=2e-4)

@@ -175,7 +175,7 @@ def test_the_prediction_of_a_frame_is_that_of_the_dense_problem() -> None:
     camera = derive(scene)
     model = ideal_model(scene, camera)
     prediction = predict_frame(choose_method(scene, camera, exact=True), model, camera, 1e-2)
-    dense = restored_by("information", recorded(scene, drawn(0, SMALL), 1e-2), model, None)
+    dense = restored_by("auto", recorded(scene, drawn(0, SMALL), 1e-2), model, None)
     assert prediction.mse == pytest.approx(dense.expected.mse, rel=1e-3)
     assert prediction.trimmed_mse == pytest.approx(dense.trimmed_mse, rel=1e-3)
     assert prediction.degrees_of_freedom == pytest.approx(dense.expected.degrees_of_freedom, rel=1e-6)

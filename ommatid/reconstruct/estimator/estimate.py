@@ -4,10 +4,10 @@ With g = H f + v, prior mean f0 and covariance P0, and noise covariance Rv,
 
     f^ = f0 + A (g - H f0),   A = P0 H^T (H P0 H^T + Rv)^-1.                      (Eq. 4)
 
-Three implementations compute it (`forms`): Cholesky, of either side, is fast; the square-root form squares nothing; the
-dual form is slow and admits measurements without noise. The Cholesky of the smaller side runs first. If the bound on the
-error of the estimate or of its variances exceeds the tolerance, the next form runs; if none succeeds, InputError is
-raised.
+Three implementations compute it (`forms`): Cholesky, of either side, is fast; the square-root form squares nothing;
+the dual form is slow and admits measurements without noise. The Cholesky of the smaller side runs first. If the bound
+on the error of the estimate or of its variances exceeds the tolerance, the next form runs; if none succeeds,
+InputError is raised.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def by_array(problem: Problem, recorded: FloatArray) -> Posterior:
     count = problem.measurements
     above = np.hstack([np.diag(problem.deviation), np.zeros((count, prior.dimension))])
     array = np.vstack([above, np.hstack([dense.T, np.eye(prior.dimension)])])
-    triangle = np.asarray(np.linalg.qr(array, mode="r"))
+    triangle = np.asarray(np.linalg.qr(array, mode="r"), dtype=np.float64)
     white = np.linalg.solve(triangle[:count, :count].T, recorded - problem.matrix @ prior.mean)
     u = triangle[:count, count:].T @ white
     roots = prior.apply_root(triangle[count:, count:].T)

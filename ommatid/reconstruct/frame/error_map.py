@@ -53,7 +53,7 @@ from .window_variances import (
     stored_stencil,
     whole_variances,
 )
-from .world_map import between, levels, mean_ratios, world_map
+from .world_map import by_levels, levels, mean_ratios, world_map
 
 Pixels = NDArray[np.intp]
 
@@ -71,8 +71,7 @@ EVEN = 1e-3  # relative range of noise variances that count as equal
 HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
 SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
 LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies a thousandfold
-WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
-LEVELS = 4  # of even noise, for a correlated prior
+WORST, MEAN = 2e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
 
 
 @dataclass(frozen=True)
@@ -187,6 +186,7 @@ class ErrorMap:
     """Maps of the expected error of a frame whose estimator is `system`.
 
     actual : (measurements used,) noise;  halo : of windows, in boxes of the widest lens type
+    small_frames : for a correlated prior or kernels
     extrapolated : True for maps of small frames that take the length of the frame into account
     """
 
@@ -194,6 +194,7 @@ class ErrorMap:
     system: FrameSystem
     actual: FloatArray
     halo: int
+    small_frames: SmallFrames | None = None
     extrapolated: bool = False
 
     @classmethod
@@ -203,10 +204,13 @@ class ErrorMap:
         Where that is too large, with a long halo, or the better one of two laws of the length of the frame.
         """
         maps = cls(task, system, actual, HALO if task.model.unknowns <= MANY else SHORT_HALO)
+        if not isinstance(system, BandedSystem) and not maps._is_local:
+            ratios = mean_ratios(task, system.weights, actual)
+            maps = replace(maps, small_frames=SmallFrames(maps._sliding, task.precision_on, ratios))
         check = maps.checked()
         if check.worst <= WORST and check.mean <= MEAN:
             return maps, check
-        if maps.has_small_frames and check.worst > WORST:
+        if maps.small_frames is not None and check.worst > WORST:
             other = replace(maps, extrapolated=True)
             return min((maps, check), (other, other.checked()), key=lambda found: found[1].worst)
         if not maps.has_windows:
@@ -225,11 +229,6 @@ class ErrorMap:
         return not isinstance(self.system, BandedSystem) and self._is_local and not self.is_even
 
     @property
-    def has_small_frames(self) -> bool:
-        """True if the maps come from small frames."""
-        return not isinstance(self.system, BandedSystem) and not self._is_local
-
-    @property
     def _is_local(self) -> bool:
         """True if pixels are independent and H averages over boxes, so that K couples near pixels only."""
         return isinstance(self.system.prior, float) and self._has_boxes
@@ -243,8 +242,8 @@ class ErrorMap:
         """Variances of all pixels."""
         if isinstance(self.system, BandedSystem):
             return self._perturbed_map(self._swept)
-        if not self._is_local:
-            return self._even_map() if self.is_even else self._interpolated_map()
+        if self.small_frames is not None:
+            return self._by_levels(self.small_frames)
         return self._with_corners(self._even_map() if self.is_even else self._perturbed_map(self._windows))
 
     def _with_corners(self, variances: VarianceMap) -> VarianceMap:
@@ -359,40 +358,26 @@ class ErrorMap:
     def _by_pixel(self) -> sparse.csc_array:
         return sparse.csc_array(self.task.model.to_sparse())
 
-    def _even_map(self, scale: float = 1.0) -> VarianceMap:
-        """Variances of noise that is even over each lens type, with all weights times `scale`.
+    def _even_map(self) -> VarianceMap:
+        """Variances of noise that is even over each lens type."""
+        ratios = mean_ratios(self.task, self.system.weights, self.actual)
+        actual = tuple(
+            ratio / weight if weight else 0.0 for ratio, weight in zip(ratios, self._sliding.weights, strict=True)
+        )
+        return sliding_variance_map(self._sliding, actual, posterior_variance)
+
+    def _by_levels(self, small_frames: SmallFrames) -> VarianceMap:
+        """Variances of uneven noise from those of even noise, at the level of the measurements of each pixel.
 
         Of noise that is not even the means are those of the weights, and of the actual noise with squared weights.
         """
-        weights = tuple(scale * weight for weight in self._sliding.weights)
-        actual = tuple(
-            ratio / weight if weight else 0.0 for ratio, weight in zip(self._mean_ratios, weights, strict=True)
-        )
-        posterior = posterior_variance if self._is_local else self._from_small_frames
-        return sliding_variance_map(replace(self._sliding, weights=weights), actual, posterior)
-
-    def _from_small_frames(self, system: SlidingCamera) -> FloatArray:
-        """Return the diagonal of K^-1, (rows, columns), of weights and a prior that are multiples of the system's."""
-        by_prior = float(np.ravel(system.prior)[0]) / float(np.ravel(self._sliding.prior)[0])
-        return self._small_frames.variance(system.weights, by_prior, extrapolated=self.extrapolated)
-
-    @cached_property
-    def _small_frames(self) -> SmallFrames:
-        return SmallFrames(self._sliding, self.task.precision_on)
-
-    @cached_property
-    def _mean_ratios(self) -> tuple[float, ...]:
-        return mean_ratios(self.task, self.system.weights, self.actual)
-
-    def _interpolated_map(self) -> VarianceMap:
-        """Variances of uneven noise from those of even noise, at the level of the measurements of each pixel."""
-
-        def at(value: float) -> list[FloatArray]:
-            even = self._even_map(float(np.exp(value)))
-            return [even.posterior, even.missing, even.noisy]
 
         level = np.log(levels(self.task, self.system.observation, self.system.weights))
-        return VarianceMap(*between(level, LEVELS, at))
+        return by_levels(
+            level,
+            lambda value: small_frames.interior(float(np.exp(value))),
+            lambda value: small_frames.relative(float(np.exp(value)), extrapolated=self.extrapolated),
+        )
 
 
 def window_memory(camera: Camera) -> int:

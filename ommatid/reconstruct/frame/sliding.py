@@ -25,21 +25,36 @@ from ommatid.scenes.optics.boxes import Box
 
 @dataclass(frozen=True)
 class BoxMeans:
-    """All windows of `width` neighbours on an axis of `size` pixels that begin at `first` and end before `end`."""
+    """All windows of `width` neighbours on an axis of `size` pixels that begin at `first` and end before `end`.
+
+    before : pixels of a longer axis with the same ends that lie before those whose kernels the windows have
+    """
 
     width: int
     first: int
     end: int
     size: int
+    before: int = 0
 
     @property
     def count(self) -> int:
         """Number of windows."""
         return self.end - self.first - self.width + 1
 
-    def shortened(self, size: int) -> BoxMeans:
-        """Return the windows of an axis of fewer pixels with the same ends."""
-        return replace(self, end=size - (self.size - self.end), size=size)
+    def shortened(self, size: int, before: int = 0) -> BoxMeans:
+        """Return the windows of an axis of fewer pixels with the same ends, and with the kernels from `before` on."""
+        return replace(self, end=size - (self.size - self.end), size=size, before=before)
+
+    @property
+    def middles(self) -> FloatArray:
+        """The middles of the windows on the longer axis, in pixels: (windows,)."""
+        return self.before + self.first + self.width / 2 + np.arange(self.count, dtype=np.float64)
+
+    @property
+    def places(self) -> IntArray:
+        """The place of each pixel of the axis in each window, `width` beside it: (windows, size)."""
+        place: IntArray = np.arange(self.size) - (self.first + np.arange(self.count))[:, None]
+        return np.where((place >= 0) & (place < self.width), place, self.width)
 
     @cached_property
     def gram(self) -> sparse.csr_array:
@@ -56,39 +71,56 @@ class BoxMeans:
 
 @dataclass(frozen=True)
 class SlidingType:
-    """The readings of a lens type: means over boxes, or correlations with `kernel`, (rows, columns) of a window."""
+    """The readings of a lens type: means over boxes, or correlations with kernels that vary slowly over the field."""
 
     vertical: BoxMeans
     horizontal: BoxMeans
-    kernel: FloatArray | None = None
+    footprints: KernelFootprints | None = None
+
+    @property
+    def kernel(self) -> FloatArray:
+        """The mean of the kernels, (rows, columns) of a window."""
+        if self.footprints is None:
+            shape = self.vertical.width, self.horizontal.width
+            return np.full(shape, 1 / (shape[0] * shape[1]))
+        return self.footprints.mean_kernel
+
+    @property
+    def varies(self) -> bool:
+        """True if the kernel depends on the place."""
+        return self.footprints is not None and self.footprints.degree > 0
+
+    def kernels_at(self, row: float, columns: FloatArray) -> FloatArray:
+        """Return the kernels at places of the frame, in pixels, columns (n,): (n, rows, columns) of a window."""
+        if self.footprints is None:
+            return np.broadcast_to(self.kernel, (columns.size, *self.kernel.shape))
+        return self.footprints.kernels_at(row, columns)
 
     @property
     def axes(self) -> tuple[BoxMeans, BoxMeans]:
         """The windows along columns and along rows of the frame."""
         return self.vertical, self.horizontal
 
-    def shortened(self, shape: tuple[int, int]) -> SlidingType:
-        """Return the same type on a smaller frame with the same edges."""
-        vertical, horizontal = (means.shortened(size) for means, size in zip(self.axes, shape, strict=True))
-        return SlidingType(vertical, horizontal, self.kernel)
+    def shortened(self, shape: tuple[int, int], before: tuple[int, int] = (0, 0)) -> SlidingType:
+        """Return the same type on a smaller frame with the same edges, with the kernels of a part of the whole one."""
+        vertical, horizontal = (means.shortened(*each) for means, *each in zip(self.axes, shape, before, strict=True))
+        return SlidingType(vertical, horizontal, self.footprints)
 
     @cached_property
     def information(self) -> FloatArray:
         """H^T H as a dense matrix, (N, N), of a small frame."""
-        if self.kernel is None:
+        if self.footprints is None:
             return np.asarray(np.kron(self.vertical.gram.toarray(), self.horizontal.gram.toarray()), dtype=np.float64)
-        padded = np.pad(self.kernel, ((0, 1), (0, 1)))  # its last row and column stand for all pixels beside it
-        across = self._places(self.horizontal)
-        total = np.zeros((self.vertical.size * self.horizontal.size,) * 2)
-        for down in self._places(self.vertical):
-            read = padded[down][:, across].swapaxes(0, 1).reshape(self.horizontal.count, -1)
-            total += read.T @ read
+        rows, columns, places = self.vertical.size, self.horizontal.size, self.horizontal.places[:, None]
+        total = np.zeros((rows * columns, rows * columns))
+        for top, middle in enumerate(self.vertical.middles, self.vertical.first):
+            kernels = self.footprints.kernels_at(middle, self.horizontal.middles)
+            seen = slice(max(top, 0), min(top + self.vertical.width, rows))
+            inside = np.pad(kernels[:, seen.start - top : seen.stop - top], ((0, 0), (0, 0), (0, 1)))
+            read = np.take_along_axis(inside, places, axis=2).reshape(len(kernels), -1)
+            pixels = slice(seen.start * columns, seen.stop * columns)
+            total[pixels, pixels] += read.T @ read
         return total
-
-    def _places(self, windows: BoxMeans) -> IntArray:
-        """Return the place of each pixel of an axis in each window, `width` beside it: (windows, size)."""
-        place: IntArray = np.arange(windows.size) - (windows.first + np.arange(windows.count))[:, None]
-        return np.where((place >= 0) & (place < windows.width), place, windows.width)
 
 
 @dataclass(frozen=True)
@@ -110,7 +142,7 @@ class SlidingCamera:
     @property
     def is_sharp(self) -> bool:
         """True if all readings are means over boxes."""
-        return all(each.kernel is None for each in self.types)
+        return all(each.footprints is None for each in self.types)
 
     def widest(self, axis: int) -> int:
         """Return the largest width of a window along an axis."""
@@ -137,7 +169,7 @@ def sliding_camera(observation: Observation, weights: tuple[float, ...], prior: 
                 BoxMeans(wide, int(start.min()), int(start.max()) + wide, size)
                 for start, size in zip(part.places.starts, observation.shape, strict=True)
             ]
-            types.append(SlidingType(axes[0], axes[1], part.mean_kernel))
+            types.append(SlidingType(axes[0], axes[1], part))
         else:
             raise ValueError("expected a lens type of m x m sub-imagers with step 1 and magnification 1/m")
     return SlidingCamera(tuple(types), weights, prior)

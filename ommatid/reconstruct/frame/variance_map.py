@@ -22,27 +22,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import cached_property
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.processors import one_thread, processors
 from ommatid.scenes.camera import Camera
 
 from ..forms.cholesky import factorise_positive
-from .sliding import SlidingCamera
+from .sliding import SlidingCamera, SlidingType
 from .window_variances import box_image, inverse_diagonal
 
 FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
 DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
 STEP = 1e-4  # relative step of a finite difference, and the largest relative error it causes
-SIDE = 44  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
+SIDE = 36  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
 SHORT = 32  # pixels along one axis of another, from which the effect of the length follows
 LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one is at least
-GRID = 128  # pixels of the periodic frame on which shares are computed
+GRID = 128  # pixels of the frame without edges on which shares and the effect of kernels are computed
+PLACES = 5  # along each axis, of whose kernels the effect is computed
 REACH = 32  # pixels beyond which a measurement has no share
 SLAB = 480  # rows that are transformed together
 LARGEST_GAP = 1e-3  # between the two bounds of a variance, relative
@@ -156,58 +159,187 @@ def _strip_variance(system: SlidingCamera, axis: int, part: slice) -> FloatArray
     return inverse_diagonal(len(blocks), block).reshape(length, depth).T
 
 
+@dataclass(frozen=True)
+class _Place:
+    """A place on an axis of a frame whose kernels a small frame has.
+
+    at : from 0, the axis's first end, to 1, its last
+    pixels, share : those of the axis to which it contributes, and how much: (n,)
+    """
+
+    size: int
+    at: float
+    pixels: NDArray[np.intp]
+    share: FloatArray
+
+    def before(self, side: int) -> int:
+        """Return the number of pixels before the small frame."""
+        return round(self.at * max(self.size - side, 0))
+
+    def index(self, side: int) -> NDArray[np.intp]:
+        """Return the pixels of the small frame that stand for `pixels`: (n,)."""
+        return _small_index(self.size, side)[self.pixels]
+
+    @property
+    def kept(self) -> NDArray[np.intp]:
+        """The pixels whose kernels those of the small frame have: (n,)."""
+        return self.before(SIDE) + self.index(min(SIDE, self.size))
+
+
 class SmallFrames:
     """Small frames with the edges of a large one, whose middle represents any interior, for any prior and any kernels.
 
     Errors of waves that some lens types do not see reach from edge to edge. Where an edge has as many such waves in a
-    frame of any length n, their part in the variance of a pixel falls with 1 / n, which two lengths show.
+    frame of any length n, their part in the variance of a pixel falls with 1 / n, which two lengths show. Maps are
+    relative to the variances that transfer functions give far from the edges, for the kernels at the same place: where
+    kernels vary over the field, small frames have those of nine places, edges and corners among them.
 
     precision : from a shape to 1 / P0 of independent pixels, or 1 / the spectrum of the prior on that shape
+    ratios : of the actual to the expected noise variance of each lens type
     """
 
-    def __init__(self, system: SlidingCamera, precision: Callable[[tuple[int, int]], float | FloatArray]) -> None:
+    def __init__(
+        self,
+        system: SlidingCamera,
+        precision: Callable[[tuple[int, int]], float | FloatArray],
+        ratios: tuple[float, ...],
+    ) -> None:
         """Shorten the camera `system` to about SIDE pixels, and along each axis to SHORT."""
         self.shape = system.shape
-        rows, columns = (min(SIDE, size) for size in self.shape)
-        self._whole = _shortened(system, (rows, columns), precision)
-        shorter = ((min(SHORT, rows), columns), (rows, min(SHORT, columns)))
-        self._shorter = [
-            (axis, _shortened(system, shape, precision))
-            for axis, shape in enumerate(shorter)
-            if self.shape[axis] > SIDE
-        ]
+        self._system, self._ratios, self._precision = system, ratios, precision
+        self._varies = any(each.varies for each in system.types)
+        self._types: dict[tuple[int, tuple[int, int]], SlidingType] = {}
+        self._found: dict[tuple[tuple[int, int], tuple[int, int], float], FloatArray] = {}
 
-    def variance(self, weights: tuple[float, ...], by_prior: float, *, extrapolated: bool) -> FloatArray:
-        """Return the diagonal of K^-1, (rows, columns), for weights of the lens types and a prior times a factor.
+    def relative(self, scale: float, *, extrapolated: bool) -> FloatArray:
+        """Return the three maps for all weights times `scale`, relative to those of `interior`: (3, rows, columns).
 
         extrapolated : True to take the law of the length into account
         """
-        whole = enlarged(_variance(self._whole, weights, by_prior), self.shape)
+        total = np.zeros((3, *self.shape))
+        local = self._local(scale)
+        for down, across in product(*(self._places(size) for size in self.shape)):
+            maps = self._at(scale, (down, across), extrapolated=extrapolated)
+            maps /= np.maximum(_interpolated(local, self.shape, down.kept, across.kept), np.finfo(np.float64).tiny)
+            for each, found in zip(total, maps, strict=True):
+                each[np.ix_(down.pixels, across.pixels)] += np.outer(down.share, across.share) * found
+        return total
+
+    def interior(self, scale: float) -> FloatArray:
+        """Return the three maps of a frame without edges for all weights times `scale`: (3, rows, columns)."""
+        return _interpolated(self._local(scale), self.shape, *(np.arange(size) for size in self.shape))
+
+    def _at(self, scale: float, places: tuple[_Place, _Place], *, extrapolated: bool) -> FloatArray:
+        """Return the three maps of the pixels that belong to a place from the small frames there."""
+        rows, columns = (min(SIDE, size) for size in self.shape)
+
+        def enlarged(shape: tuple[int, int]) -> FloatArray:
+            small = self._small(shape, scale, places)
+            down, across = (each.index(side) for each, side in zip(places, shape, strict=True))
+            return small[:, down[:, None], across]
+
+        whole = enlarged((rows, columns))
         total = whole.copy()
-        for axis, system in self._shorter if extrapolated else ():
-            share = (1 / self.shape[axis] - 1 / SIDE) / (1 / SHORT - 1 / SIDE)
-            total += share * (enlarged(_variance(system, weights, by_prior), self.shape) - whole)
+        for axis, shape in enumerate(((min(SHORT, rows), columns), (rows, min(SHORT, columns)))):
+            if extrapolated and self.shape[axis] > SIDE:
+                share = (1 / self.shape[axis] - 1 / SIDE) / (1 / SHORT - 1 / SIDE)
+                total += share * (enlarged(shape) - whole)
         return np.maximum(total, LEAST_SHARE * whole)
 
+    def _small(self, shape: tuple[int, int], scale: float, places: tuple[_Place, _Place]) -> FloatArray:
+        before = places[0].before(shape[0]), places[1].before(shape[1])
+        if (shape, before, scale) not in self._found:
+            types = [
+                each.shortened(shape, before) if each.varies else self._same_everywhere(each, shape)
+                for each in self._system.types
+            ]
+            system = SlidingCamera(tuple(types), self._system.weights, self._precision(shape))
+            self._found[shape, before, scale] = small_map(system, scale, self._ratios)
+        return self._found[shape, before, scale]
 
-def _shortened(
-    system: SlidingCamera, shape: tuple[int, int], precision: Callable[[tuple[int, int]], float | FloatArray]
-) -> SlidingCamera:
-    return SlidingCamera(tuple(each.shortened(shape) for each in system.types), system.weights, precision(shape))
+    def _same_everywhere(self, lens_type: SlidingType, shape: tuple[int, int]) -> SlidingType:
+        """Return a type whose kernel does not vary, whose H^T H is computed once for each shape."""
+        key = self._system.types.index(lens_type), shape
+        if key not in self._types:
+            self._types[key] = lens_type.shortened(shape)
+        return self._types[key]
+
+    def _places(self, size: int) -> list[_Place]:
+        """Return the places along an axis whose kernels small frames have."""
+        if not self._varies or size <= SIDE:
+            return [_Place(size, 0.0, np.arange(size), np.ones(size))]
+        middles = [SIDE // 2, size / 2, size - SIDE // 2]
+        places: list[_Place] = []
+        for at, unit in zip((0.0, 0.5, 1.0), np.eye(3), strict=True):
+            share = np.interp(np.arange(size), middles, unit)
+            pixels = np.flatnonzero(share)
+            places.append(_Place(size, at, pixels, share[pixels]))
+        return places
+
+    def _local(self, scale: float) -> FloatArray:
+        """Return the three variances far from the edges at places of the frame: (places down, places across, 3)."""
+        return np.array([[self._interior(each, scale) for each in line] for line in self._transfers])
+
+    @cached_property
+    def _transfers(self) -> list[list[FloatArray]]:
+        """Squared transfer functions of the types' kernels at PLACES x PLACES places of the frame, or at one."""
+        down, across = (np.linspace(0, size, PLACES if self._varies else 1) for size in self.shape)
+        kernels = [zip(*(each.kernels_at(row, across) for each in self._system.types), strict=True) for row in down]
+        return [[np.array([_transfer(kernel) for kernel in each]) for each in line] for line in kernels]
+
+    def _interior(self, transfers: FloatArray, scale: float) -> FloatArray:
+        """Return the variances far from the edges by transfer functions, as the maps have them: (3,)."""
+        weights, prior = scale * np.asarray(self._system.weights), self._precision((GRID, GRID))
+        squares = 1 / np.square(prior + np.tensordot(weights, transfers, axes=1))
+        missing = np.mean(prior * squares)
+        noisy = np.mean(np.tensordot(weights * self._ratios, transfers, axes=1) * squares)
+        return np.array([np.mean(np.sqrt(squares)), missing, noisy], dtype=np.float64)
 
 
-def _variance(system: SlidingCamera, weights: tuple[float, ...], by_prior: float) -> FloatArray:
-    """Return the diagonal of K^-1 of a small frame: (rows, columns)."""
-    if not isinstance(system.prior, np.ndarray):
-        total = by_prior * system.prior * np.eye(system.shape[0] * system.shape[1])
+def small_map(system: SlidingCamera, scale: float, ratios: tuple[float, ...]) -> FloatArray:
+    """Return the diagonals of C, C P0^-1 C and C S C of a small frame for weights times `scale`: (3, rows, columns)."""
+    shape, count = system.shape, system.shape[0] * system.shape[1]
+    total = np.zeros((count, count))
+    for each, weight in zip(system.types, system.weights, strict=True):
+        total += scale * weight * each.information
+    if isinstance(system.prior, np.ndarray):
+        waves = np.kron(*(np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape))
+        total += waves.T @ (system.prior.ravel()[:, None] * waves)
     else:
-        vertical, horizontal = (np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in system.shape)
-        waves = np.kron(vertical, horizontal)
-        total = waves.T @ (by_prior * system.prior.ravel()[:, None] * waves)
-    for each, weight in zip(system.types, weights, strict=True):
-        total += weight * each.information
+        total[np.diag_indices(count)] += system.prior
     factor, _ = factorise_positive(total)
-    return np.diagonal(factor.inverse()).reshape(system.shape)
+    covariance = factor.inverse()
+    if isinstance(system.prior, np.ndarray):
+        spread = np.asarray(fft.dctn(covariance.reshape(*shape, count), 2, axes=(0, 1), norm="ortho"))
+        missing = np.einsum("rc,rcn->n", system.prior, np.square(spread))
+    else:
+        missing = system.prior * np.square(covariance).sum(axis=0)
+    posterior, first = np.diagonal(covariance), ratios[0]
+    noisy = first * (posterior - missing)
+    for each, weight, ratio in zip(system.types, system.weights, ratios, strict=True):
+        if not np.isclose(ratio, first, rtol=1e-12):
+            share = np.einsum("ij,ij->j", covariance, each.information @ covariance)
+            noisy += (ratio - first) * scale * weight * share
+    return np.array([posterior, missing, noisy], dtype=np.float64).reshape(3, *shape)
+
+
+def _interpolated(
+    local: FloatArray, shape: tuple[int, int], rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> FloatArray:
+    """Return values at places from edge to edge of a frame, (.., .., n), at some of its pixels: (n, rows, columns)."""
+    if local.shape[:2] == (1, 1):
+        return np.broadcast_to(local[0, 0, :, None, None], (local.shape[2], rows.size, columns.size))
+    down, across = (
+        CubicSpline(np.linspace(0, size, PLACES), np.eye(PLACES))(index + 0.5)
+        for size, index in zip(shape, (rows, columns), strict=True)
+    )
+    return np.einsum("ri,ijk,cj->krc", down, local, across, optimize=True)
+
+
+def _transfer(kernel: FloatArray) -> FloatArray:
+    """Return the squared transfer function at the waves of a DCT-II of GRID pixels, of both slants: (2, GRID, GRID)."""
+    spectrum = np.square(np.abs(np.asarray(fft.rfft2(kernel, (2 * GRID, 2 * GRID)))))[:, :GRID]
+    return np.stack([spectrum[:GRID], spectrum[-np.arange(GRID)]])
 
 
 def enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:

@@ -7,7 +7,7 @@ same edges shows how much larger it is near them. Exact solutions for random pix
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,8 +28,11 @@ MOST_READINGS = 3600  # of an image whose map is exact
 COLUMNS = 128  # readings whose covariances are computed at once
 WINDOW, HALO, WINDOWS = 28, 8, 3  # pixels of f of a window and around its core; windows along each axis
 INTERIOR, EDGES = 9, 4  # levels of noise at which the two are computed; others follow from them
+EVEN, EVEN_EDGES = 1e-3, 0.1  # range of levels, logarithms, that count as one
 LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
-EVEN = 1e-3  # relative range of levels that count as one
+
+
+Maps = Callable[[float], Sequence[FloatArray] | FloatArray]  # from the logarithm of a level to three maps
 
 
 @dataclass(frozen=True)
@@ -150,15 +153,27 @@ def _frame_map(bands: Bands, task: EstimationTask, ratios: tuple[float, ...], le
         maps = zip((found.posterior, found.missing, found.noisy), even.variances(level, ratios), strict=True)
         return [enlarged(each / max(mean, np.finfo(float).tiny), bands.shape) for each, mean in maps]
 
-    pairs = zip(between(level, INTERIOR, inside), between(level, EDGES, edges), strict=True)
+    return by_levels(level, inside, edges)
+
+
+def by_levels(level: FloatArray, inside: Maps, edges: Maps) -> VarianceMap:
+    """Return the map of pixels at levels of the noise, logarithms, (rows, columns).
+
+    inside, edges : from a level to the three maps of a frame without edges, and to the ratios of those with edges
+    """
+    pairs = zip(between(level, INTERIOR, EVEN, inside), between(level, EDGES, EVEN_EDGES, edges), strict=True)
     return VarianceMap(*(one * other for one, other in pairs))
 
 
-def between(level: FloatArray, count: int, maps: Callable[[float], list[FloatArray]]) -> list[FloatArray]:
-    """Return maps at each pixel's level, between those of `count` levels, whose logarithms are interpolated."""
+def between(level: FloatArray, most: int, even: float, maps: Maps) -> list[FloatArray]:
+    """Return maps at each pixel's level, between those of at most `most` levels, whose logarithms are interpolated.
+
+    even : range of levels that count as one
+    """
     low, high = float(level.min()), float(level.max())
-    if high - low <= EVEN:
-        return maps((low + high) / 2)
+    if high - low <= even:
+        return list(maps((low + high) / 2))
+    count = min(most, 2 + int((high - low) * most))
     values = np.linspace(low, high, count)
     place = (level - low) / (high - low) * (count - 1)
     total: list[FloatArray] = []

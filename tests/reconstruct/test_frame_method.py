@@ -143,13 +143,13 @@ def test_lenses_that_diffract() -> None:
 
 @pytest.mark.slow
 def test_error_bars_of_two_types_of_lenses() -> None:
-    """Errors of a null space reach from edge to edge; small frames of two lengths give their variances to 3 % here."""
-    shape = 51, 48
+    """Errors of a null space reach from edge to edge; small frames of two lengths give their variances to 4 % here."""
+    shape = 64, 62
     scene, truth = with_apertures(wide(shape, FITTED[:2], noise=NOISE)), drawn(1, shape)
     dense, frame = both(recorded(scene, truth, VARIANCE), ideal_model(scene, derive(scene)), truth)
     assert np.abs(difference(frame, dense)).max() < 1e-4
-    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=0.03)
-    assert frame.solver.variance_bound < 0.03
+    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=0.04)
+    assert frame.solver.variance_bound < 0.04
 
 
 def test_large_cameras_of_lenses_are_applied_without_entries() -> None:

@@ -187,7 +187,6 @@ class ErrorMap:
 
     actual : (measurements used,) noise;  halo : of windows, in boxes of the widest lens type
     small_frames : for a correlated prior or kernels
-    extrapolated : True for maps of small frames that take the length of the frame into account
     """
 
     task: EstimationTask
@@ -195,24 +194,18 @@ class ErrorMap:
     actual: FloatArray
     halo: int
     small_frames: SmallFrames | None = None
-    extrapolated: bool = False
 
     @classmethod
     def of(cls, task: EstimationTask, system: FrameSystem, actual: FloatArray) -> tuple[ErrorMap, MapCheck]:
-        """Return the maps and their error at random pixels.
-
-        Where that is too large, with a long halo, or the better one of two laws of the length of the frame.
-        """
+        """Return the maps and their error at random pixels; those of windows where it is too large with a long halo."""
         maps = cls(task, system, actual, HALO if task.model.unknowns <= MANY else SHORT_HALO)
         if not isinstance(system, BandedSystem) and not maps._is_local:
             ratios = mean_ratios(task, system.weights, actual)
-            maps = replace(maps, small_frames=SmallFrames(maps._sliding, task.precision_on, ratios))
+            far = leaves_null_space(task.model.camera) or bool(unseen_corners(maps._sliding))
+            maps = replace(maps, small_frames=SmallFrames(maps._sliding, task.precision_on, ratios, far=far))
         check = maps.checked()
         if check.worst <= WORST and check.mean <= MEAN:
             return maps, check
-        if maps.small_frames is not None and check.worst > WORST:
-            other = replace(maps, extrapolated=True)
-            return min((maps, check), (other, other.checked()), key=lambda found: found[1].worst)
         if not maps.has_windows:
             return maps, check
         longer = replace(maps, halo=LONG_HALO)
@@ -376,7 +369,7 @@ class ErrorMap:
         return by_levels(
             level,
             lambda value: small_frames.interior(float(np.exp(value))),
-            lambda value: small_frames.relative(float(np.exp(value)), extrapolated=self.extrapolated),
+            lambda value: small_frames.relative(float(np.exp(value))),
         )
 
 

@@ -42,7 +42,7 @@ FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
 DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
 STEP = 1e-4  # relative step of a finite difference, and the largest relative error it causes
 SIDE = 36  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
-SHORT = 32  # pixels along one axis of another, from which the effect of the length follows
+LONG, SHORT = 60, 44  # of those from which the effect of the length follows
 LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one is at least
 GRID = 128  # pixels of the frame without edges on which shares and the effect of kernels are computed
 PLACES = 5  # along each axis, of whose kernels the effect is computed
@@ -161,7 +161,7 @@ def _strip_variance(system: SlidingCamera, axis: int, part: slice) -> FloatArray
 
 @dataclass(frozen=True)
 class _Place:
-    """A place on an axis of a frame whose kernels a small frame has.
+    """A place on an axis of a frame whose kernels small frames have.
 
     at : from 0, the axis's first end, to 1, its last
     pixels, share : those of the axis to which it contributes, and how much: (n,)
@@ -173,17 +173,16 @@ class _Place:
     share: FloatArray
 
     def before(self, side: int) -> int:
-        """Return the number of pixels before the small frame."""
-        return round(self.at * max(self.size - side, 0))
+        """Return the number of pixels before a small frame."""
+        return round(self.at * (self.size - side))
 
     def index(self, side: int) -> NDArray[np.intp]:
-        """Return the pixels of the small frame that stand for `pixels`: (n,)."""
+        """Return the pixels of a small frame that stand for `pixels`: (n,)."""
         return _small_index(self.size, side)[self.pixels]
 
-    @property
-    def kept(self) -> NDArray[np.intp]:
-        """The pixels whose kernels those of the small frame have: (n,)."""
-        return self.before(SIDE) + self.index(min(SIDE, self.size))
+    def kept(self, side: int) -> NDArray[np.intp]:
+        """Return the pixels whose kernels those of a small frame have: (n,)."""
+        return self.before(side) + self.index(side)
 
 
 class SmallFrames:
@@ -196,6 +195,7 @@ class SmallFrames:
 
     precision : from a shape to 1 / P0 of independent pixels, or 1 / the spectrum of the prior on that shape
     ratios : of the actual to the expected noise variance of each lens type
+    far : True if errors reach from edge to edge; kernels are then those of the middle of the frame
     """
 
     def __init__(
@@ -203,24 +203,24 @@ class SmallFrames:
         system: SlidingCamera,
         precision: Callable[[tuple[int, int]], float | FloatArray],
         ratios: tuple[float, ...],
+        *,
+        far: bool,
     ) -> None:
-        """Shorten the camera `system` to about SIDE pixels, and along each axis to SHORT."""
+        """Take a shift-invariant camera whose weights are the means of each lens type."""
         self.shape = system.shape
-        self._system, self._ratios, self._precision = system, ratios, precision
-        self._varies = any(each.varies for each in system.types)
-        self._types: dict[tuple[int, tuple[int, int]], SlidingType] = {}
-        self._found: dict[tuple[tuple[int, int], tuple[int, int], float], FloatArray] = {}
+        self._system, self._ratios, self._precision, self._far = system, ratios, precision, far
+        self._varies = not far and any(each.varies for each in system.types)
+        self._types: dict[tuple[int, tuple[int, ...]], SlidingType] = {}
 
-    def relative(self, scale: float, *, extrapolated: bool) -> FloatArray:
-        """Return the three maps for all weights times `scale`, relative to those of `interior`: (3, rows, columns).
-
-        extrapolated : True to take the law of the length into account
-        """
+    def relative(self, scale: float) -> FloatArray:
+        """Return the three maps for all weights times `scale`, relative to those of `interior`: (3, rows, columns)."""
         total = np.zeros((3, *self.shape))
         local = self._local(scale)
-        for down, across in product(*(self._places(size) for size in self.shape)):
-            maps = self._at(scale, (down, across), extrapolated=extrapolated)
-            maps /= np.maximum(_interpolated(local, self.shape, down.kept, across.kept), np.finfo(np.float64).tiny)
+        sides = [min(LONG if self._far else SIDE, size) for size in self.shape]
+        for places in product(*(self._places(size) for size in self.shape)):
+            down, across = places
+            kept = (each.kept(side) for each, side in zip(places, sides, strict=True))
+            maps = self._at(scale, places) / np.maximum(_interpolated(local, self.shape, *kept), np.finfo(float).tiny)
             for each, found in zip(total, maps, strict=True):
                 each[np.ix_(down.pixels, across.pixels)] += np.outer(down.share, across.share) * found
         return total
@@ -229,49 +229,50 @@ class SmallFrames:
         """Return the three maps of a frame without edges for all weights times `scale`: (3, rows, columns)."""
         return _interpolated(self._local(scale), self.shape, *(np.arange(size) for size in self.shape))
 
-    def _at(self, scale: float, places: tuple[_Place, _Place], *, extrapolated: bool) -> FloatArray:
+    def _at(self, scale: float, places: tuple[_Place, ...]) -> FloatArray:
         """Return the three maps of the pixels that belong to a place from the small frames there."""
-        rows, columns = (min(SIDE, size) for size in self.shape)
+        found: list[FloatArray] = []
+        shares: list[float] = []
+        for lengths in product(*(self._lengths(size) for size in self.shape)):
+            sides = tuple(side for side, _ in lengths)
+            down, across = (each.index(side) for each, side in zip(places, sides, strict=True))
+            found.append(self._small(sides, scale, places)[:, down[:, None], across])
+            shares.append(float(np.prod([share for _, share in lengths])))
+        total = sum(share * each for share, each in zip(shares, found, strict=True))
+        return np.maximum(total, LEAST_SHARE * found[0])
 
-        def enlarged(shape: tuple[int, int]) -> FloatArray:
-            small = self._small(shape, scale, places)
-            down, across = (each.index(side) for each, side in zip(places, shape, strict=True))
-            return small[:, down[:, None], across]
+    def _lengths(self, size: int) -> list[tuple[int, float]]:
+        """Return the sides of small frames along an axis and their shares in the variances of the large one."""
+        if not self._far or size <= LONG:
+            return [(min(LONG if self._far else SIDE, size), 1.0)]
+        share = (1 / size - 1 / LONG) / (1 / SHORT - 1 / LONG)
+        return [(LONG, 1 - share), (SHORT, share)]
 
-        whole = enlarged((rows, columns))
-        total = whole.copy()
-        for axis, shape in enumerate(((min(SHORT, rows), columns), (rows, min(SHORT, columns)))):
-            if extrapolated and self.shape[axis] > SIDE:
-                share = (1 / self.shape[axis] - 1 / SIDE) / (1 / SHORT - 1 / SIDE)
-                total += share * (enlarged(shape) - whole)
-        return np.maximum(total, LEAST_SHARE * whole)
-
-    def _small(self, shape: tuple[int, int], scale: float, places: tuple[_Place, _Place]) -> FloatArray:
-        before = places[0].before(shape[0]), places[1].before(shape[1])
-        if (shape, before, scale) not in self._found:
-            types = [
-                each.shortened(shape, before) if each.varies else self._same_everywhere(each, shape)
-                for each in self._system.types
-            ]
-            system = SlidingCamera(tuple(types), self._system.weights, self._precision(shape))
-            self._found[shape, before, scale] = small_map(system, scale, self._ratios)
-        return self._found[shape, before, scale]
-
-    def _same_everywhere(self, lens_type: SlidingType, shape: tuple[int, int]) -> SlidingType:
-        """Return a type whose kernel does not vary, whose H^T H is computed once for each shape."""
-        key = self._system.types.index(lens_type), shape
-        if key not in self._types:
-            self._types[key] = lens_type.shortened(shape)
-        return self._types[key]
+    def _small(self, shape: tuple[int, ...], scale: float, places: tuple[_Place, ...]) -> FloatArray:
+        rows, columns = shape
+        before = places[0].before(rows), places[1].before(columns)
+        types: list[SlidingType] = []
+        for number, each in enumerate(self._system.types):
+            if self._varies and each.varies:
+                types.append(each.shortened((rows, columns), before))
+                continue
+            if (number, shape) not in self._types:  # H^T H is computed once
+                self._types[number, shape] = each.shortened((rows, columns), before)
+            types.append(self._types[number, shape])
+        system = SlidingCamera(tuple(types), self._system.weights, self._precision((rows, columns)))
+        return small_map(system, scale, self._ratios)
 
     def _places(self, size: int) -> list[_Place]:
         """Return the places along an axis whose kernels small frames have."""
         if not self._varies or size <= SIDE:
-            return [_Place(size, 0.0, np.arange(size), np.ones(size))]
-        middles = [SIDE // 2, size / 2, size - SIDE // 2]
+            return [_Place(size, 0.5, np.arange(size), np.ones(size))]
+        along = np.clip((np.arange(size) - SIDE / 2) / (size - SIDE), 0, 1)
         places: list[_Place] = []
-        for at, unit in zip((0.0, 0.5, 1.0), np.eye(3), strict=True):
-            share = np.interp(np.arange(size), middles, unit)
+        for at, share in (
+            (0.0, (2 * along - 1) * (along - 1)),
+            (0.5, 4 * along * (1 - along)),
+            (1.0, (2 * along - 1) * along),
+        ):
             pixels = np.flatnonzero(share)
             places.append(_Place(size, at, pixels, share[pixels]))
         return places
@@ -282,8 +283,8 @@ class SmallFrames:
 
     @cached_property
     def _transfers(self) -> list[list[FloatArray]]:
-        """Squared transfer functions of the types' kernels at PLACES x PLACES places of the frame, or at one."""
-        down, across = (np.linspace(0, size, PLACES if self._varies else 1) for size in self.shape)
+        """Squared transfer functions of the types' kernels at PLACES x PLACES places of the frame, or at its middle."""
+        down, across = (np.linspace(0, size, PLACES) if self._varies else np.array([size / 2]) for size in self.shape)
         kernels = [zip(*(each.kernels_at(row, across) for each in self._system.types), strict=True) for row in down]
         return [[np.array([_transfer(kernel) for kernel in each]) for each in line] for line in kernels]
 

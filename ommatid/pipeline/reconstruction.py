@@ -236,7 +236,7 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
         return _report_stack(path / STACK, path, progress)
     folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
     if not folders and any((path / name).is_file() for name in (MODEL, result_files.ESTIMATE)):
-        from ommatid.page.document import page_of
+        from ommatid.page.sections import page_of
 
         with occupied(path):
             write_text(path / REPORT, page_of(path))

@@ -28,8 +28,8 @@ from ommatid.analysis.averaging_kernel import ErrorWindow
 from ommatid.bench.table import BenchTable, bench_tables, write
 from ommatid.page import batch_index, data, tables, words
 from ommatid.page.cached import cached_page
-from ommatid.page.document import page, page_of
 from ommatid.page.panels import error_groups, point_response, sensor, time_curves
+from ommatid.page.sections import page, page_of
 from ommatid.reconstruct.measured_error import best_single_sub_image
 from ommatid.reconstruct.output.run_json import (
     DiagnosticsReport,

@@ -161,26 +161,19 @@ def _reports(
     """Yield the frames that are up to date, then the others as they end."""
     with new_folder(folder):
         clear_abandoned(folder)
-        yield from _all_frames(frames, prepared, options, workers, progress)
-
-
-def _all_frames(
-    frames: Sequence[Frame], prepared: Prepared, options: FrameOptions, workers: int | None, progress: Progress
-) -> Reports:
-    missing: list[Frame] = []
-    for frame in frames:
-        report = None if options.force else frame.finished()
-        if report is None:
-            missing.append(frame)
-        else:
-            write_formats(frame.output, options.formats)
-            yield frame, lambda report=report: (report, False)
-    shared = _here(missing, prepared, options)
-    if workers is not None and workers > 1:
-        shared = _in_processes(missing, prepared, options, workers)
-    for number, (frame, work) in enumerate(shared, 1):
-        yield frame, work
-        progress(number / len(missing))
+        missing: list[Frame] = []
+        for frame in frames:
+            report = None if options.force else frame.finished()
+            if report is None:
+                missing.append(frame)
+            else:
+                write_formats(frame.output, options.formats)
+                yield frame, lambda report=report: (report, False)
+        several = workers is not None and workers > 1
+        made = _in_processes(missing, prepared, options, workers or 1) if several else _here(missing, prepared, options)
+        for number, (frame, work) in enumerate(made, 1):
+            yield frame, work
+            progress(number / len(missing))
 
 
 def _here(frames: Sequence[Frame], prepared: Prepared, options: FrameOptions) -> Reports:

@@ -10,14 +10,13 @@ from math import log
 from pathlib import Path
 from typing import Any
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
+from ommatid.figures.saving import COLOURS, MARKERS, SCREEN_PNG, FigureFiles, log_ticks, new_figure, own_style
 from ommatid.runtime.printable import printable_label
 
 from .slopes import TOLERANCE, median_error, median_seconds, pareto_front
 from .table import AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quantiles, Stage
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito
-MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
+MORE_COLOURS = (*COLOURS, "#7A4F9A", "#555555")
 FRONT: dict[str, Any] = {"color": "0.75", "linewidth": 7, "alpha": 0.6, "solid_capstyle": "round"}
 NAMES: dict[Stage, str] = {"render": "Rendering", "calibrate": "Calibration", "reconstruct": "Reconstruction"}
 ERRORS: dict[Stage, str] = {
@@ -97,7 +96,7 @@ def _styles(cells: Sequence[Cell]) -> dict[Key, dict[str, Any]]:
     styles: dict[Key, dict[str, Any]] = {}
     for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in cells):
         index, hollow = ways.index(way), (variant or "").startswith("scalar")
-        colour = COLOURS[index % len(COLOURS)]
+        colour = MORE_COLOURS[index % len(MORE_COLOURS)]
         styles[way, variant] = {
             "color": colour,
             "marker": MARKERS[index % len(MARKERS)],
@@ -110,13 +109,9 @@ def _styles(cells: Sequence[Cell]) -> dict[Key, dict[str, Any]]:
 
 
 def _prepare(panel: Any) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-
     panel.set_xscale("log")
     panel.set_yscale("log")
-    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    panel.xaxis.set_major_formatter("{x:g}")
-    panel.xaxis.set_minor_formatter(NullFormatter())
+    log_ticks(panel.xaxis)
     panel.grid(visible=True, which="major", color="0.9")
     panel.set_axisbelow(True)
 

@@ -168,8 +168,9 @@ def read_zmx(path: Path) -> tuple[Surface, ...]:
         where = f"{path}, line {lines.line}, surface {place}"
         table = _table(lines, where, unit)
         thickness = lines.value("DISZ", where) * unit
-        behind = _medium(table)
-        if _is_dummy(table, before, behind):
+        behind = table.get("glass") or table.get("dispersion") or table.get("index")  # None for air
+        is_flat = not {"radius", "aspheric"} & {*table}
+        if before is None and behind is None and not table["stop"] and is_flat:  # it does nothing
             if read:
                 read[-1]["thickness"] += thickness
         else:
@@ -285,16 +286,6 @@ def _model_glass(words: list[str], where: str) -> dict[str, Any]:
     # (A + B / w^2)^2 as Schott's formula
     coefficients = [level**2, 0.0, 2 * level * slope, slope**2]
     return {"dispersion": {"formula": 1, "coefficients": coefficients, "shortest": "400 nm", "longest": "700 nm"}}
-
-
-def _medium(table: dict[str, Any]) -> object:
-    """Return what stands for the medium behind a surface; None for air."""
-    return table.get("glass") or table.get("dispersion") or table.get("index")
-
-
-def _is_dummy(table: dict[str, Any], before: object, behind: object) -> bool:
-    """True for a surface that does nothing."""
-    return before is None and behind is None and not table["stop"] and not {"radius", "aspheric"} & {*table}
 
 
 def _surface(table: dict[str, Any]) -> Surface:

@@ -168,8 +168,8 @@ def radial_spectrum(image: FloatArray) -> RadialSpectrum:
     """Return the radial spectrum of an image, (rows, columns), about its mean. Missing values count as the mean."""
     known = np.isfinite(image)
     values = np.where(known, image, image[known].mean() if known.any() else 0.0).astype(np.float64)
-    hann: list[FloatArray] = [np.square(np.sin(np.pi * (np.arange(size) + 0.5) / size)) for size in values.shape]
-    weights = hann[0][:, None] * hann[1]
+    across, along = (np.square(np.sin(np.pi * (np.arange(int(size)) + 0.5) / size)) for size in values.shape)
+    weights = np.multiply.outer(across, along)
     values = (values - float((weights * values).sum() / weights.sum())) * weights
     power = np.square(np.abs(np.fft.fft2(values))) / np.square(weights).sum()
     radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(size) for size in values.shape), indexing="ij"))

@@ -203,10 +203,10 @@ def _responses(model: Model, ideal: IdealMatrix | None) -> dict[str, Any]:
 
 
 def _time(run: Run, bench: BenchTable | None) -> dict[str, Any]:
-    curves = time_curves.time_curves(run, bench)
+    curves, curve_words = time_curves.time_curves(run, bench)
     return {
-        "curves": time_curves.figure(curves) if curves else "",
-        "curve_words": time_curves.words(curves) if curves else "",
+        "curves": curves,
+        "curve_words": curve_words,
         "stages": tables.stages(run),
         "more_samples": tables.more_samples(run),
         "time_limit": tables.time_limit(run),

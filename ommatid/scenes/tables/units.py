@@ -136,26 +136,21 @@ def _magnification(value: object) -> Fraction:
     return ratio
 
 
+def _two_ratios(value: object, expected: str) -> tuple[Fraction, Fraction]:
+    """Read a pair of ratios of 0 or more. Raises ValueError that begins with `expected`."""
+    ratios = [_ratio(each) for each in cast(Sequence[object], value)] if isinstance(value, list | tuple) else []
+    if len(ratios) != 2 or min(ratios) < 0:
+        raise ValueError(f"{expected}, got {shortened_repr(cast(object, value))}")
+    return ratios[0], ratios[1]
+
+
 def _step(value: object) -> tuple[Fraction, Fraction]:
-    pair_given = isinstance(value, list | tuple)
-    numbers: tuple[object, ...] = tuple(cast(Sequence[object], value)) if pair_given else (value, value)
-    said = shortened_repr(numbers if pair_given else value)
-    if len(numbers) != 2:
-        raise ValueError(f"expected a step or two, down and across, such as [2, 1], got {said}")
-    down, across = _ratio(numbers[0]), _ratio(numbers[1])
-    if down < 0 or across < 0:
-        raise ValueError(f"expected a step of 0 or more pixels of the target, got {said}")
-    return down, across
+    steps = cast(object, value) if isinstance(value, list | tuple) else (value, value)
+    return _two_ratios(steps, "expected a step of 0 or more pixels of the target, or two such as [2, 1]")
 
 
 def _window(value: object) -> tuple[Fraction, Fraction]:
-    numbers: tuple[object, ...] = tuple(cast(Sequence[object], value)) if isinstance(value, list | tuple) else ()
-    if len(numbers) == 2:
-        row, column = _ratio(numbers[0]), _ratio(numbers[1])
-        if row >= 0 and column >= 0:
-            return row, column
-    said = shortened_repr(cast(object, value))
-    raise ValueError(f'expected a row and a column of the target of 0 or more, such as [12, "7/2"], got {said}')
+    return _two_ratios(value, 'expected a row and a column of the target of 0 or more, such as [12, "7/2"]')
 
 
 def pair(value: object) -> object:

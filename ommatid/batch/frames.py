@@ -43,7 +43,7 @@ SENT = "preconditioner", "errors"  # what the first frame prepared and other pro
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """What the frames have in common: the file of H, changes (KEY=VALUE), names of lens types, regions and formats.
+    """How frames are reconstructed: the file of H, changes (KEY=VALUE), names of lens types, regions and formats.
 
     force : True to reconstruct also frames that are up to date
     """
@@ -59,6 +59,13 @@ class FrameOptions:
         """Read H of the lens types."""
         model = model_file.read(self.model)
         return model.restrict(self.lenses) if self.lenses else model
+
+    def read(self, path: Path) -> tuple[Stack, Model]:
+        """Read a stack, and its model. Raises InputError for wrong files and options."""
+        stack, model = stack_file.read(path), self.read_model()
+        for region in self.regions:
+            check_region(*region, stack.camera.shape)
+        return self.applied(stack, path), model
 
     def applied(self, stack: Stack, path: Path) -> Stack:
         """Return a stack of the lens types, with the changes."""

@@ -119,8 +119,7 @@ def _patch_edges(camera: Camera, sub: SubImager) -> tuple[float, float]:
 
 def _middle(camera: Camera, lens_type: LensType) -> SubImager:
     """Return a sub-imager in the middle of an array."""
-    members = [sub for sub in camera.sub_imagers if sub.type == lens_type]
-    return members[lens_type.array[0] // 2 * lens_type.array[1] + lens_type.array[1] // 2]
+    return camera.sub_imager(camera.types.index(lens_type), lens_type.array[0] // 2, lens_type.array[1] // 2)
 
 
 def _light(camera: Camera, sub: SubImager) -> list[Ray]:

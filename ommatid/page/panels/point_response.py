@@ -102,7 +102,8 @@ def _stored_response(model: Model, rows: slice, column: int, shape: tuple[int, i
     """Return some rows of a column of H, and the standard errors of these entries."""
     matrix = model.matrix
     variances = sparse.csr_array((model.variance, matrix.indices, matrix.indptr), shape=matrix.shape)
-    response, variance = (each[rows][:, [column]].toarray().reshape(shape) for each in (matrix, variances))
+    shown = (each[rows][:, [column]].toarray() for each in (matrix, variances))
+    response, variance = (np.asarray(each, dtype=np.float64).reshape(shape) for each in shown)
     return response, np.sqrt(variance)
 
 

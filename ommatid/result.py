@@ -62,7 +62,7 @@ class Result:
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML page, and return its path. Raises InputError or MachineError."""
         from ommatid.page.data import Run
-        from ommatid.page.document import page
+        from ommatid.page.sections import page
         from ommatid.runtime.files import write_text
         from ommatid.simulate.ideal import matrix_as_designed
 

@@ -10,13 +10,9 @@ from fractions import Fraction
 from math import ceil
 from typing import Any
 
-import numpy as np
-
 from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import derive
-from ommatid.scenes.optics.negligible import ignores_detail
 from ommatid.scenes.scene import Scene, parse
 
 from .prediction_table import DIGITS, json_of
@@ -34,30 +30,40 @@ class DesignCandidate:
     expected: Prediction | None
     reason: str = ""
 
+
+@dataclass(frozen=True)
+class DesignComparison:
+    """The expected error of a scene, and the candidates by theirs, the least first; impossible ones are last."""
+
+    before: Prediction
+    candidates: list[DesignCandidate]
+
     def describe(self) -> dict[str, Any]:
-        """Return the candidate in JSON's types."""
-        expected = None if self.expected is None else json_of(self.expected)
-        return {"magnification": self.magnification, "expected": expected, "reason": self.reason}
+        """Describe the comparison in JSON's types."""
+        candidates = [
+            {
+                "magnification": candidate.magnification,
+                "expected": None if candidate.expected is None else json_of(candidate.expected),
+                "reason": candidate.reason,
+            }
+            for candidate in self.candidates
+        ]
+        return {"before": json_of(self.before), "candidates": candidates}
 
-
-def ranked(candidates: list[DesignCandidate]) -> list[DesignCandidate]:
-    """Sort by expected error, the least first; impossible candidates come last."""
-    return sorted(candidates, key=lambda candidate: np.inf if candidate.expected is None else candidate.expected.mse)
-
-
-def rows(before: Prediction, candidates: list[DesignCandidate]) -> list[tuple[str, str]]:
-    """Return magnification and expected error, one row per candidate after that of the camera itself."""
-    lines = [("unchanged", error_words(before.mse, DIGITS) + _null_space(before, ", "))]
-    for candidate in candidates:
-        after, name = candidate.expected, f"+ {candidate.magnification}"
-        if after is None:
-            lines.append((name, candidate.reason))
-            continue
-        gain = f"{before.mse / after.mse:.3g} times less" if after.mse > 0 else "no error is left"
-        added = after.measurements - before.measurements
-        more = f"{_null_space(after, '')}{', ' if after.null_space is not None else ''}{added} measurements more"
-        lines.append((name, f"{error_words(after.mse, DIGITS)}, {gain}; {more}"))
-    return lines
+    def rows(self) -> list[tuple[str, str]]:
+        """Return magnification and expected error, one row per candidate after that of the camera itself."""
+        before = self.before
+        lines = [("unchanged", error_words(before.mse, DIGITS) + _null_space(before, ", "))]
+        for candidate in self.candidates:
+            after, name = candidate.expected, f"+ {candidate.magnification}"
+            if after is None:
+                lines.append((name, candidate.reason))
+                continue
+            gain = f"{before.mse / after.mse:.3g} times less" if after.mse > 0 else "no error is left"
+            added = after.measurements - before.measurements
+            more = f"{_null_space(after, '')}{', ' if after.null_space is not None else ''}{added} measurements more"
+            lines.append((name, f"{error_words(after.mse, DIGITS)}, {gain}; {more}"))
+        return lines
 
 
 def _null_space(prediction: Prediction, before: str) -> str:
@@ -99,15 +105,6 @@ def with_lens(scene: Scene, magnification: Fraction) -> Scene:
     added = {**optics, "name": name, "magnification": str(magnification), "array": [count, count], "pixels": "fit"}
     camera = {**data["camera"], "lens": [*data["camera"]["lens"], added]}
     return parse({**data, "camera": camera}, scene.source)
-
-
-def check_detail(scene: Scene) -> None:
-    """Raise InputError where the error depends on detail finer than f, of which the scene says nothing."""
-    if ignores_detail(scene, derive(scene)):
-        raise InputError(
-            "not ranked: its sensor pixels divide pixels of f, so its error depends on detail finer than f; set"
-            " target.detail and a correlated prior"
-        )
 
 
 def _between(before: Fraction, last: Fraction, end: Fraction) -> list[Fraction]:

@@ -168,7 +168,8 @@ def radial_spectrum(image: FloatArray) -> RadialSpectrum:
     """Return the radial spectrum of an image, (rows, columns), about its mean. Missing values count as the mean."""
     known = np.isfinite(image)
     values = np.where(known, image, image[known].mean() if known.any() else 0.0).astype(np.float64)
-    weights = np.multiply.outer(*(_hann(size) for size in values.shape))
+    across, along = (np.square(np.sin(np.pi * (np.arange(int(size)) + 0.5) / size)) for size in values.shape)
+    weights = np.multiply.outer(across, along)
     values = (values - float((weights * values).sum() / weights.sum())) * weights
     power = np.square(np.abs(np.fft.fft2(values))) / np.square(weights).sum()
     radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(size) for size in values.shape), indexing="ij"))
@@ -185,7 +186,3 @@ def crossing(signal: RadialSpectrum, error: RadialSpectrum) -> float | None:
     """Return the first frequency at which the error is as strong as the signal, None if it never is."""
     weaker = np.flatnonzero(error.powers >= signal.powers)
     return float(error.frequencies[weaker[0]]) if weaker.size else None
-
-
-def _hann(size: int) -> FloatArray:
-    return np.square(np.sin(np.pi * (np.arange(size) + 0.5) / size))

@@ -43,7 +43,7 @@ SENT = "preconditioner", "errors"  # what the first frame prepared and other pro
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """What the frames have in common: the file of H, changes (KEY=VALUE), names of lens types, regions and formats.
+    """How frames are reconstructed: the file of H, changes (KEY=VALUE), names of lens types, regions and formats.
 
     force : True to reconstruct also frames that are up to date
     """
@@ -59,6 +59,13 @@ class FrameOptions:
         """Read H of the lens types."""
         model = model_file.read(self.model)
         return model.restrict(self.lenses) if self.lenses else model
+
+    def read(self, path: Path) -> tuple[Stack, Model]:
+        """Read a stack, and its model. Raises InputError for wrong files and options."""
+        stack, model = stack_file.read(path), self.read_model()
+        for region in self.regions:
+            check_region(*region, stack.camera.shape)
+        return self.applied(stack, path), model
 
     def applied(self, stack: Stack, path: Path) -> Stack:
         """Return a stack of the lens types, with the changes."""
@@ -161,26 +168,19 @@ def _reports(
     """Yield the frames that are up to date, then the others as they end."""
     with new_folder(folder):
         clear_abandoned(folder)
-        yield from _all_frames(frames, prepared, options, workers, progress)
-
-
-def _all_frames(
-    frames: Sequence[Frame], prepared: Prepared, options: FrameOptions, workers: int | None, progress: Progress
-) -> Reports:
-    missing: list[Frame] = []
-    for frame in frames:
-        report = None if options.force else frame.finished()
-        if report is None:
-            missing.append(frame)
-        else:
-            write_formats(frame.output, options.formats)
-            yield frame, lambda report=report: (report, False)
-    shared = _here(missing, prepared, options)
-    if workers is not None and workers > 1:
-        shared = _in_processes(missing, prepared, options, workers)
-    for number, (frame, work) in enumerate(shared, 1):
-        yield frame, work
-        progress(number / len(missing))
+        missing: list[Frame] = []
+        for frame in frames:
+            report = None if options.force else frame.finished()
+            if report is None:
+                missing.append(frame)
+            else:
+                write_formats(frame.output, options.formats)
+                yield frame, lambda report=report: (report, False)
+        several = workers is not None and workers > 1
+        made = _in_processes(missing, prepared, options, workers or 1) if several else _here(missing, prepared, options)
+        for number, (frame, work) in enumerate(made, 1):
+            yield frame, work
+            progress(number / len(missing))
 
 
 def _here(frames: Sequence[Frame], prepared: Prepared, options: FrameOptions) -> Reports:

@@ -130,17 +130,9 @@ def fastest_process_count(seconds: Sequence[float], most: int, shared: int) -> i
 
     seconds : of each task on one of the `shared` processors
     A single process has all processors, but uses them only for the parallel part of a task. Several have a share each,
-    and the batch takes as long as the last of them, which is long if one task is much larger than the others.
+    and the batch takes at least as long as its largest task.
     """
     if most < 2:
         return 1
     one_process = sum(seconds) * (1 - PARALLEL + PARALLEL / shared)
-    return most if START + _makespan(seconds, most) < one_process else 1
-
-
-def _makespan(seconds: Sequence[float], count: int) -> float:
-    """Return the time at which the last process ends, if each takes the next task as soon as it is free."""
-    busy = [0.0] * count
-    for task in seconds:
-        busy[busy.index(min(busy))] += task
-    return max(busy)
+    return most if START + max(sum(seconds) / most, *seconds) < one_process else 1

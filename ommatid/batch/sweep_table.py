@@ -16,9 +16,12 @@ from math import log
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ommatid.figures.quantity_axis import GREY_LEVELS, QuantityAxis, quantity_axis, spans_decade
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
+from ommatid.figures.saving import COLOURS, MARKERS, SCREEN_PNG, FigureFiles, log_ticks, new_figure, own_style
 from ommatid.reconstruct.output.verdict_words import error_words
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import clear_abandoned, make_folder, write_csv
 from ommatid.runtime.printable import printable_label
 
@@ -32,9 +35,7 @@ TINY = 1e-300
 MOST_CROSSINGS = 6
 WIDEST = 130  # characters of a line of the legend
 SCENE = "scene"
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 LINES = ("-", "--", ":", "-.")
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B", "#56B4E9")  # of names; Okabe and Ito
 HOLLOW: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 1.5}
 WORDS = {
     ("calibration.method", "ideal"): "H as designed, not calibrated",
@@ -242,23 +243,14 @@ def _label_axes(panel: Any, rows: Sequence[SweepRow], axis: QuantityAxis) -> Non
 
 def _label_roots(panel: Any) -> None:
     """Show the root of the error on the right."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    right = panel.secondary_yaxis("right", functions=(_root, _square))
+    right = panel.secondary_yaxis("right", functions=(_root, np.square))
     right.set_ylabel(f"RMS error ({GREY_LEVELS})")
     if panel.get_yscale() == "log":
-        locator: Any = LogLocator(subs=(1, 2, 5))
-        right.yaxis.set_major_locator(locator)
-        right.yaxis.set_major_formatter("{x:g}")
-        right.yaxis.set_minor_formatter(NullFormatter())
+        log_ticks(right.yaxis)
 
 
-def _root(squares: Any) -> Any:
-    return abs(squares) ** 0.5
-
-
-def _square(roots: Any) -> Any:
-    return roots**2
+def _root(squares: FloatArray) -> FloatArray:
+    return np.sqrt(np.abs(squares))
 
 
 def _draw_crossings(

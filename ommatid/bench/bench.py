@@ -26,7 +26,6 @@ from .slopes import curves, recommend
 from .table import AUTO, JSON, STAGES, BenchTable, Cell, SkippedJob
 
 LOCK = ".ommatid-bench.lock"  # runs into folders of this folder do not wait for it
-FLOOR_SHARE = 0.1  # of the time limit, for the noise floor
 
 
 def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
@@ -60,7 +59,7 @@ def _bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tu
     start -= spent_before
     with naming_source(scene.source):
         right = reference(setup)
-        subject = Subject(setup, right, FLOOR_SHARE * seconds)
+        subject = Subject(setup, right)
         listed, never = jobs(subject)
     system = os.uname().sysname, os.uname().release, os.uname().machine  # `platform` runs the command uname
 

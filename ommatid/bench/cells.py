@@ -9,7 +9,7 @@ from functools import cached_property
 from math import inf
 from pathlib import Path
 from time import perf_counter
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -46,23 +46,18 @@ LONG = 1.0  # seconds of a repeat, from which on FEWER_REPEATS are made
 STATUS, CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-class Cost(NamedTuple):
-    """Wall-clock seconds, and peak resident memory of the whole process in bytes, None where it is not reported."""
-
-    seconds: float
-    memory: int | None
-
-
 @dataclass(frozen=True)
 class Repeat:
     """Result of one repeat.
 
+    seconds : on the wall's clock;  memory : peak of the whole process in bytes, None where it is not reported
     mse : mean squared error of the resulting image, None if not computed
     samples : per pixel, of a job with an adaptive number
     """
 
     error: float
-    cost: Cost
+    seconds: float
+    memory: int | None
     mse: float | None
     samples: int | None = None
 
@@ -109,7 +104,7 @@ def cell_from_repeats(job: Job, repeats: Sequence[Repeat]) -> Cell:
     errors = [repeat.error for repeat in repeats]
     mses = [repeat.mse for repeat in repeats if repeat.mse is not None]
     samples = [repeat.samples for repeat in repeats if repeat.samples is not None]
-    memory = [repeat.cost.memory for repeat in repeats if repeat.cost.memory is not None]
+    memory = [repeat.memory for repeat in repeats if repeat.memory is not None]
     return Cell(
         stage=job.stage,
         way=job.way,
@@ -118,7 +113,7 @@ def cell_from_repeats(job: Job, repeats: Sequence[Repeat]) -> Cell:
         setting=job.setting,
         repeats=len(repeats),
         error=Quantiles.of(errors),
-        seconds=Quantiles.of([repeat.cost.seconds for repeat in repeats]),
+        seconds=Quantiles.of([repeat.seconds for repeat in repeats]),
         memory=max(memory, default=None),
         mse=Quantiles.of(mses) if mses else None,
         scatter=float(np.std(np.log(errors), ddof=1)) if len(errors) > 1 and min(errors) > 0 else None,
@@ -127,14 +122,10 @@ def cell_from_repeats(job: Job, repeats: Sequence[Repeat]) -> Cell:
 
 @dataclass(frozen=True)
 class Subject:
-    """The scene that is measured, with its image, and the reference.
-
-    time_limit : seconds after which no more estimates of the noise floor are made
-    """
+    """The scene that is measured, with its image, and the reference."""
 
     setup: Setup
     reference: Reference
-    time_limit: float = inf
 
     @property
     def scene(self) -> Scene:
@@ -204,35 +195,27 @@ class Subject:
 
         This is the noise floor, times the ratio of `mse` to the error with exact light, exact H and the same noise.
         """
-        own = self._exact_mse(repeat)
+        own = self._exact_mses[repeat]
         return mse / own * self.noise_floor if own > 0 else mse
 
     def _mse_with_exact_model(self, stack: Stack) -> float:
         return self.mean_squared_error(method_for(stack, self.reference.model).image)
 
-    def _exact_mse(self, repeat: int) -> float:
-        if repeat not in self._exact_mses:
-            self._exact_mses[repeat] = self._mse_with_exact_model(self.stack(repeat))
-        return self._exact_mses[repeat]
-
     @cached_property
-    def _exact_mses(self) -> dict[int, float]:
-        return {}
+    def _exact_mses(self) -> list[float]:
+        """Mean squared errors with exact light and exact H, by repeat of the noise."""
+        return [self._mse_with_exact_model(self.stack(repeat)) for repeat in range(FEWER_REPEATS)]
 
-    @cached_property
+    @property
     def noise_floor(self) -> float:
         """Median of the mean squared error with exact light and exact H over repeats of the noise."""
-        start, errors = perf_counter(), list[float]()
-        while not errors or (len(errors) < REPEATS and perf_counter() - start < self.time_limit):
-            errors.append(self._exact_mse(len(errors)))
-        return float(np.median(errors))
+        return float(np.median(self._exact_mses))
 
 
 def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
     """Return all cells, and those that cannot be measured on this machine or for this scene, with the reason.
 
-    Few samples come before many, so that the curves of all ways grow together; solvers and an adaptive number of
-    samples come where the curves are half finished.
+    Solvers come first, and few samples before many, so that the curves of all ways grow together.
     """
     reasons = {variant: unusable_reason(variant) for variant in PREFERENCE}
     working = [variant for variant in PREFERENCE if not reasons[variant]]
@@ -240,18 +223,15 @@ def jobs(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
     if not subject.camera.is_ideal_pinhole and "scalar_rgb" in working:
         working.remove("scalar_rgb")
         left_out.append(SkippedJob(what="scalar_rgb", why="lenses other than pinholes need a fast backend"))
-    few: list[Samples] = [*SAMPLES[: len(SAMPLES) // 2]]
-    many: list[Samples] = [*SAMPLES[len(few) :]]
+    counts: list[Samples] = [*SAMPLES]
     try:
         check_noise_target(subject.scene)
-        many.insert(0, AUTO)
+        counts.append(AUTO)
     except InputError as error:
         left_out.append(SkippedJob(what="samples 'auto'", why=str(error)))
     estimates, unsolvable = _estimates(subject)
-    sampled = [[job for samples in counts for job in _sampling(subject, working, samples)] for counts in (few, many)]
-    by_name: dict[str, Job] = {}
-    for job in (*sampled[0], *estimates, *sampled[1]):
-        by_name.setdefault(job.name, job)  # several numbers may be rounded up to the same
+    sampled = [job for samples in counts for job in _sampling(subject, working, samples)]
+    by_name = {job.name: job for job in (*estimates, *sampled)}  # several numbers may be rounded up to the same
     return list(by_name.values()), [*left_out, *unsolvable]
 
 
@@ -287,10 +267,10 @@ def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Sample
 
     def repeated(repeat: int) -> Repeat:
         scene = reference.with_rendering(subject.scene, sampler, variant, samples, subject.seed(name, repeat))
-        rendering, cost = _measured(lambda: reference.render_light(subject.changed(scene)))
+        rendering, seconds, memory = measured(lambda: reference.render_light(subject.changed(scene)))
         error = reference.light_error(rendering, subject.reference)
         mse = subject.rendering_mse(rendering, repeat) if repeat < FEWER_REPEATS else None
-        return Repeat(error, cost, mse, int(rendering.record()["samples"]))
+        return Repeat(error, seconds, memory, mse, int(rendering.record()["samples"]))
 
     return Job("render", sampler, variant, total, setting, repeated)
 
@@ -304,10 +284,10 @@ def _calibration(subject: Subject, variant: str, method: Method, sampler: Sample
         seed = subject.seed(name, repeat)
         scene = reference.with_calibration(subject.scene, method, sampler, variant, samples, seed)
         rule = for_stack(subject.stack(repeat)) if samples == AUTO else None
-        model, cost = _measured(lambda: calibrate(subject.changed(scene), stopping_rule=rule))
+        model, seconds, memory = measured(lambda: calibrate(subject.changed(scene), stopping_rule=rule))
         error = reference.model_error(model, subject.reference)
         mse = subject.model_mse(model, repeat) if repeat < FEWER_REPEATS else None
-        return Repeat(error, cost, mse, int(model.record["samples"]))
+        return Repeat(error, seconds, memory, mse, int(model.record["samples"]))
 
     return Job("calibrate", way, variant, total, setting, repeated)
 
@@ -325,26 +305,24 @@ def _estimates(subject: Subject) -> tuple[list[Job], list[SkippedJob]]:
     def job(setting: SolverSetting) -> Job:
         def repeated(repeat: int) -> Repeat:
             task, exact = solution(repeat)
-            image, cost = _measured(lambda: setting.image(task))
-            return Repeat(exact.error(image), cost, subject.normalised(subject.mean_squared_error(image), repeat))
+            image, seconds, memory = measured(lambda: setting.image(task))
+            mse = subject.mean_squared_error(image)
+            mse = subject.normalised(mse, repeat) if repeat < FEWER_REPEATS else None
+            return Repeat(exact.error(image), seconds, memory, mse)
 
         return Job("reconstruct", setting.method, None, None, setting.setting, repeated)
 
     settings, unsolvable = solver_settings(solution(0)[0])
-    return [job(setting) for setting in settings], [SkippedJob(what=what, why=why) for what, why in unsolvable]
+    return [job(setting) for setting in settings], unsolvable
 
 
-def _measured(work: Callable[[], Result]) -> tuple[Result, Cost]:
+def measured(work: Callable[[], Result]) -> tuple[Result, float, int | None]:
+    """Return the result of `work`, its seconds, and its peak memory if the system reports it."""
     release()
-    return measure_cost(work)
-
-
-def measure_cost(work: Callable[[], Result]) -> tuple[Result, Cost]:
-    """Return the result of `work` and its cost."""
     is_reset = reset_peak_memory()
     start = perf_counter()
     result = work()
-    return result, Cost(perf_counter() - start, resident_memory("VmHWM") if is_reset else None)
+    return result, perf_counter() - start, resident_memory("VmHWM") if is_reset else None
 
 
 def reset_peak_memory() -> bool:

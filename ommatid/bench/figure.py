@@ -5,19 +5,18 @@ Points are medians over seeds, error bars their 10 % and 90 % quantiles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import log
 from pathlib import Path
 from typing import Any
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
+from ommatid.figures.saving import COLOURS, MARKERS, SCREEN_PNG, FigureFiles, log_ticks, new_figure, own_style
 from ommatid.runtime.printable import printable_label
 
 from .slopes import TOLERANCE, median_error, median_seconds, pareto_front
 from .table import AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quantiles, Stage
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4F9A", "#555555")  # Okabe and Ito
-MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
+MORE_COLOURS = (*COLOURS, "#7A4F9A", "#555555")
 FRONT: dict[str, Any] = {"color": "0.75", "linewidth": 7, "alpha": 0.6, "solid_capstyle": "round"}
 NAMES: dict[Stage, str] = {"render": "Rendering", "calibrate": "Calibration", "reconstruct": "Reconstruction"}
 ERRORS: dict[Stage, str] = {
@@ -29,8 +28,6 @@ IMAGES: dict[Stage, str] = {"render": "exact H", "calibrate": "exact light", "re
 IMAGE_ERROR = "mean squared error of the image (grey levels squared)"
 
 Key = tuple[str, str | None]  # way and variant
-Abscissa = Callable[[Cell], float | None]
-Ordinate = Callable[[Cell], Quantiles | None]
 
 
 @own_style()
@@ -47,17 +44,19 @@ def _draw(figure: Any, table: BenchTable, stage: Stage) -> None:
     """Draw error against samples where a stage takes them, error against seconds, and the image's against seconds."""
     figure.suptitle(f"{NAMES[stage]}: {printable_label(table.title)}")
     cells = table.of(stage)
-    axes: list[tuple[Abscissa, Ordinate]] = [(median_seconds, _error), (median_seconds, _mse)]
+    axes = [("seconds", "error"), ("seconds", "mse")]
     if stage != "reconstruct":
-        axes.insert(0, (_samples, _error))
+        axes.insert(0, ("samples", "error"))
     panels = figure.subplots(1, len(axes))
-    for panel, (x_of, y_of) in zip(panels, axes, strict=True):
+    for panel, (across, along) in zip(panels, axes, strict=True):
         _prepare(panel)
-        least = 0.3 * min((y.median for cell in cells if cell.counted and (y := y_of(cell)) and y.median), default=0.0)
+        least = 0.3 * min(
+            (y.median for cell in cells if cell.counted and (y := getattr(cell, along)) and y.median), default=0.0
+        )
         for key, style in _styles(cells).items():
-            _draw_cells(panel, [cell for cell in cells if (cell.way, cell.variant) == key], style, x_of, y_of, least)
-        panel.set_xlabel("samples per pixel" if x_of is _samples else "time (s)")
-        panel.set_ylabel(ERRORS[stage] if y_of is _error else IMAGE_ERROR)
+            _draw_cells(panel, [cell for cell in cells if (cell.way, cell.variant) == key], style, across, along, least)
+        panel.set_xlabel("samples per pixel" if across == "samples" else "time (s)")
+        panel.set_ylabel(ERRORS[stage] if along == "error" else IMAGE_ERROR)
     *first, cost, image = panels
     for panel in first:
         panel.set_title(f"Convergence: slope ± standard error\nReference: {table.against}", fontsize=10)
@@ -79,25 +78,13 @@ def _draw(figure: Any, table: BenchTable, stage: Stage) -> None:
     _draw_legend(figure, table, stage)
 
 
-def _samples(cell: Cell) -> float | None:
-    return cell.samples
-
-
-def _error(cell: Cell) -> Quantiles:
-    return cell.error
-
-
-def _mse(cell: Cell) -> Quantiles | None:
-    return cell.mse
-
-
 def _styles(cells: Sequence[Cell]) -> dict[Key, dict[str, Any]]:
     """Return the options of matplotlib's `plot` for each way: a colour and a marker, hollow for slow backends."""
     ways = list(dict.fromkeys(cell.way for cell in cells))
     styles: dict[Key, dict[str, Any]] = {}
     for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in cells):
         index, hollow = ways.index(way), (variant or "").startswith("scalar")
-        colour = COLOURS[index % len(COLOURS)]
+        colour = MORE_COLOURS[index % len(MORE_COLOURS)]
         styles[way, variant] = {
             "color": colour,
             "marker": MARKERS[index % len(MARKERS)],
@@ -110,27 +97,24 @@ def _styles(cells: Sequence[Cell]) -> dict[Key, dict[str, Any]]:
 
 
 def _prepare(panel: Any) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-
     panel.set_xscale("log")
     panel.set_yscale("log")
-    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    panel.xaxis.set_major_formatter("{x:g}")
-    panel.xaxis.set_minor_formatter(NullFormatter())
+    log_ticks(panel.xaxis)
     panel.grid(visible=True, which="major", color="0.9")
     panel.set_axisbelow(True)
 
 
 def _draw_cells(
-    panel: Any, cells: Sequence[Cell], style: dict[str, Any], x_of: Abscissa, y_of: Ordinate, least: float
+    panel: Any, cells: Sequence[Cell], style: dict[str, Any], across: str, along: str, least: float
 ) -> None:
     """Draw the cells of a way as a curve, those with a setting of their own as single points with its name.
 
+    across, along : names of the numbers at x and y
     least : lower end of the panel: of smaller errors, where only rounding is left, the name states the value
     """
     known: list[tuple[float, Quantiles, Cell]] = []
     for cell in sorted(cells, key=lambda cell: cell.samples or 0):
-        x, y = x_of(cell), y_of(cell)
+        x, y = cell.samples if across == "samples" else cell.seconds.median, getattr(cell, along)
         if x is not None and y is not None and y.median > 0:
             known.append((x, y, cell))
     curve = [(x, y) for x, y, cell in known if cell.counted and cell.samples is not None]

@@ -21,7 +21,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.tables.estimation import TilesTable
 
-from .table import DENSE
+from .table import DENSE, SkippedJob
 
 TILE_SIZES = ((11, 2), (15, 3), (19, 4), (27, 6), (35, 8), (51, 12))  # sides, and widths of the border that is dropped
 ACCURACIES = (1.0, 0.1, 0.01, 1e-3, 1e-4)  # estimator.accuracy of a frame
@@ -68,22 +68,23 @@ def exact_solution(task: EstimationTask, deviation: FloatArray | None = None) ->
     return ExactSolution(method.image, deviation)
 
 
-def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[tuple[str, str]]]:
+def solver_settings(task: EstimationTask) -> tuple[list[SolverSetting], list[SkippedJob]]:
     """Return the settings that can be measured for this task, and those that cannot, with the reason."""
-    measurable, left_out = list[SolverSetting](), list[tuple[str, str]]()
+    measurable, left_out = list[SolverSetting](), list[SkippedJob]()
     has_frame = task.model.camera.is_sliding and bool((task.expected_noise > 0).all())
     if is_dense(task):
         measurable.append(SolverSetting(DENSE, f"tolerance {task.settings.tolerance:g}", _dense_image))
     else:
-        left_out.append((DENSE, f"{task.model.unknowns} pixels, and the limit is {MOST_DENSE}"))
+        left_out.append(SkippedJob(what=DENSE, why=f"{task.model.unknowns} pixels, and the limit is {MOST_DENSE}"))
         if not has_frame:
             why = "too many pixels for one dense problem, and a frame does not apply: there is no exact solution"
-            return [], [("reconstruct", why)]
+            return [], [SkippedJob(what="reconstruct", why=why)]
     measurable += [_tile_setting(size, overlap) for size, overlap in TILE_SIZES if size < min(task.shape)]
     if has_frame:
         measurable += [_frame_setting(accuracy) for accuracy in ACCURACIES]
     else:
-        left_out.append(("frame", "it needs noise in every measurement, and lens types with the same view everywhere"))
+        why = "it needs noise in every measurement, and lens types with the same view everywhere"
+        left_out.append(SkippedJob(what="frame", why=why))
     return measurable, left_out
 
 

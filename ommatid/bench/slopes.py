@@ -57,9 +57,8 @@ def slope(cells: Sequence[Cell]) -> Slope | None:
     repeats = np.array([cell.repeats for cell in known])
     scatter = np.square([cell.scatter or 0.0 for cell in known])
     weight = 1 / (shrink_variances(scatter, int(repeats.min())) * variance_of_median(repeats))
-    center = float(weight @ x / weight.sum())
-    moment = float(weight @ np.square(x - center))
-    return Slope(float(weight @ ((x - center) * y)) / moment, moment**-0.5)
+    line, covariance = np.polyfit(x, y, 1, w=np.sqrt(weight), cov="unscaled")
+    return Slope(float(line[0]), float(covariance[0, 0]) ** 0.5)
 
 
 def curves(cells: Sequence[Cell], camera: Camera) -> list[ConvergenceCurve]:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
+from pydantic import BaseModel, ConfigDict, Field
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_csv, write_text
@@ -24,6 +24,8 @@ DENSE = "dense"  # one dense problem, which estimator.method = "auto" takes wher
 AUTO = "auto"  # the setting of a cell with an adaptive number of samples: a single point, not part of a curve
 QUANTILES = 0.1, 0.5, 0.9
 
+Value = TypeVar("Value")
+OrAbsent = Annotated[Value | None, Field(exclude_if=lambda value: value is None)]  # no value: no key in the file
 Stage = Literal["render", "calibrate", "reconstruct"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 UNITS: dict[Stage, str] = {
@@ -35,14 +37,6 @@ UNITS: dict[Stage, str] = {
 
 class _Record(BaseModel):
     model_config = ConfigDict(frozen=True)
-
-
-class _SparseRecord(_Record):
-    @model_serializer(mode="wrap")
-    def _without_absent(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out optional keys without a value."""
-        required = {name for name, field in type(self).model_fields.items() if field.is_required()}
-        return {key: value for key, value in serialize(self).items() if value is not None or key in required}
 
 
 class Quantiles(_Record):
@@ -116,18 +110,18 @@ class SkippedJob(_Record):
     late: bool = False
 
 
-class RecommendedSetting(_SparseRecord):
+class RecommendedSetting(_Record):
     """Recommended setting of one stage; keys that do not apply to the stage are absent from the file."""
 
     seconds: float
-    method: str | None = None
-    setting: str | None = None
-    sampler: str | None = None
-    variant: str | None = None
-    samples: int | Literal["auto"] | None = None
+    method: OrAbsent[str] = None
+    setting: OrAbsent[str] = None
+    sampler: OrAbsent[str] = None
+    variant: OrAbsent[str] = None
+    samples: OrAbsent[int | Literal["auto"]] = None
 
 
-class Recommendation(_SparseRecord):
+class Recommendation(_Record):
     """Cheapest settings that reach the noise floor; the stages are absent from the file if none was found.
 
     noise_floor : mean squared error of the image with exact light and exact H
@@ -139,9 +133,9 @@ class Recommendation(_SparseRecord):
     mse: float | None
     reached: bool
     why: str
-    render: RecommendedSetting | None = None
-    calibrate: RecommendedSetting | None = None
-    reconstruct: RecommendedSetting | None = None
+    render: OrAbsent[RecommendedSetting] = None
+    calibrate: OrAbsent[RecommendedSetting] = None
+    reconstruct: OrAbsent[RecommendedSetting] = None
 
     def of(self, stage: Stage) -> RecommendedSetting | None:
         """Return the recommended setting of a stage, None if there is none."""

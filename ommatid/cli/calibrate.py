@@ -65,10 +65,11 @@ def calibrate(
     recording = point_recording(points or (), more or (), places, value, settings)
     asked = options.changes(sets, complete, allow_outside), options.lens_names(lens)
     with output.progress_bar("calibrate") as progress:
-        outcome = calibrate_file(scene, file, *asked, recording, progress)
-    output.warn_all(outcome.warnings)
-    output.say_done("calibrate", outcome.made, file)
-    output.print_result({"file": str(file), **outcome.describe()}, [], as_json)
+        model, made, warnings = calibrate_file(scene, file, *asked, recording, progress)
+    output.warn_all(warnings)
+    output.say_done("calibrate", made, file)
+    sizes = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
+    output.print_result({"file": str(file), **sizes, **model.record}, [], as_json)
 
 
 def export_model(
@@ -104,7 +105,8 @@ def import_frames(
     from ommatid.pipeline.camera_files import import_file
 
     settings = options.acquisition(dark, flat, flat_value, origin, upright)
-    outcome = import_file(scene, images, file, settings, options.changes(sets), options.lens_names(lens))
-    output.warn_all(outcome.warnings)
+    asked = options.changes(sets), options.lens_names(lens)
+    description, warnings = import_file(scene, images, file, settings, *asked)
+    output.warn_all(warnings)
     output.say_done("import", True, file)
-    output.print_result({"file": str(file), **outcome.describe()}, [], as_json)
+    output.print_result({"file": str(file), **description}, [], as_json)

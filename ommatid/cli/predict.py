@@ -50,16 +50,20 @@ def predict(
         return
     if folder is not None:
         raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
-    from ommatid.pipeline.descriptions import describe_prediction, predict_with_light
+    from ommatid.analysis.predict import electrons, predict_scene
+    from ommatid.analysis.prediction_table import json_of
     from ommatid.pipeline.sections import prediction_sections
+    from ommatid.runtime.errors import naming_source
     from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
+    from ommatid.scenes.setup import Setup
 
     described = read(scene, *asked)
     output.warn_all(conversions(described))
-    prediction, light = predict_with_light(described, rays=not no_rays)
+    with naming_source(described.source):
+        prediction, light = predict_scene(described, rays=not no_rays), electrons(Setup.from_scene(described))
     sections = prediction_sections(described, prediction, light)
-    document = {"scene": str(scene), **describe_prediction(prediction, light)}
+    document = {"scene": str(scene), **json_of(prediction), **({} if light is None else {"light": light})}
     output.print_result([document], sections, as_json)
 
 

@@ -17,8 +17,6 @@ from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, Verbose
 
 if TYPE_CHECKING:
     from ommatid.batch.frames import Frame, FrameOptions
-    from ommatid.pipeline.reconstruction import ReconstructionRequest
-    from ommatid.reconstruct.output.estimate_formats import Format
     from ommatid.reconstruct.output.run_json import RunReport
     from ommatid.runtime.execution.cluster import Cluster
 
@@ -97,28 +95,26 @@ def reconstruct(
 ) -> None:
     """Reconstruct from files: one frame, or several of one camera."""
     from ommatid.batch.frames import FrameOptions
-    from ommatid.pipeline import reconstruction
     from ommatid.reconstruct.output.estimate_formats import formats_of
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
     *stacks, model = files
     asked = options.changes(sets), options.lens_names(lens), options.regions(region)
+    common = FrameOptions(model, *asked, others, force)
     if len(stacks) != 1:
         if scheduler:
             raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
-        common = FrameOptions(model, *asked, others, force)
         _reconstruct_many(stacks, common, file, workers, strict, None if as_json else detail)
         return
-    request = reconstruction.ReconstructionRequest(stacks[0], model, *asked, force)
     pool = options.cluster(scheduler), workers
-    _reconstruct_one(request, file, pool, others, None if as_json else detail, strict)
+    _reconstruct_one(stacks[0], common, file, pool, None if as_json else detail, strict)
 
 
 def _reconstruct_one(
-    request: ReconstructionRequest,
+    stack: Path,
+    common: FrameOptions,
     file: Path,
     pool: tuple[Cluster | None, int | None],
-    formats: tuple[Format, ...],
     detail: output.Detail | None,
     strict: bool,
 ) -> None:
@@ -131,10 +127,10 @@ def _reconstruct_one(
     whole = reconstruction.is_folder(file)
     with output.progress_bar("reconstruct") as progress:
         if whole:
-            report, made = reconstruction.reconstruct_folder(request, file, progress, *pool)
+            report, made = reconstruction.reconstruct_folder(stack, common, file, progress, *pool)
         else:
-            report, made = reconstruction.reconstruct_files(request, file, progress, *pool, formats), True
-    write_formats(file / "estimate.exr" if whole else file, formats)
+            report, made = reconstruction.reconstruct_files(stack, common, file, progress, *pool), True
+    write_formats(file / "estimate.exr" if whole else file, common.formats)
     if detail != "verdict":
         output.say_done("reconstruct", made, file)
     if detail is None:
@@ -242,11 +238,12 @@ def check(
     Names those that disagree: their H is wrong, or their pixels. Needs no truth.
     """
     from ommatid.analysis import held_out
-    from ommatid.pipeline.reconstruction import ReconstructionRequest, check_held_out_files
+    from ommatid.batch.frames import FrameOptions
+    from ommatid.pipeline.reconstruction import check_held_out_files
 
-    request = ReconstructionRequest(stack, model, options.changes(sets), options.lens_names(lens))
+    common = FrameOptions(model, options.changes(sets), options.lens_names(lens))
     with output.progress_bar("check") as progress:
-        report = check_held_out_files(request, fitted=not scene_prior, progress=progress)
+        report = check_held_out_files(stack, common, fitted=not scene_prior, progress=progress)
     output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", held_out.rows(report))], as_json)
     if strict and report.verdict.trusted is False:
         raise failures.BatchError(failures.NOT_TRUSTED)

@@ -17,26 +17,17 @@ from ommatid.scenes.geometry.optical_terms import LensTerms, OpticalTerms, optic
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Scene
 
-from .saving import FORMATS, SCREEN_PNG, FigureFiles, new_figure, own_style
-from .sensor_drawing import draw_sensor, draw_sub_images, length_words, sensor_aspect, write_beside
+from .saving import COLOURS, FORMATS, INK, SCREEN_PNG, FigureFiles, new_figure, own_style
+from .sensor_drawing import ARROW, draw_sensor, draw_sub_images, length_words, sensor_aspect, write_beside
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
 LEFT, NEAR_WIDTH, FAR_LEFT, FAR_WIDTH = 0.75, 4.7, 6.15, 3.1
 ABOVE, SECTION, BETWEEN, BELOW, LINE = 1.05, 2.5, 1.25, 0.55, 0.21
 LOWEST, HIGHEST = 1.9, 3.4  # height of the drawing of the sensor
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B", "#56B4E9")  # of lens types; legible on dark, too
-INK, GREY = "#000000", "#808080"
+GREY = "#808080"
 NEAR, FAR = 0.45, 0.6  # ends of the broken axis: a share of the deepest sensor, and of the target's distance
 MOST_WALLS = 80
 AIR = 0.12  # between the drawing and its frame, as a share of its width
-ARROW: dict[str, Any] = {
-    "arrowstyle": "<->",
-    "color": INK,
-    "linewidth": 0.8,
-    "shrinkA": 0,
-    "shrinkB": 0,
-    "mutation_scale": 9,
-}
 
 Ray = tuple[tuple[float, float], ...]  # points (z, x)
 
@@ -117,14 +108,7 @@ def _draw_sub_imager(axes: Any, camera: Camera, sub: SubImager, colour: str) -> 
     if aperture is None:
         axes.plot([0], [x], "o", color=colour, markersize=3)
     else:
-        arrow = {
-            "arrowstyle": "<->",
-            "color": colour,
-            "linewidth": 1.2,
-            "shrinkA": 0,
-            "shrinkB": 0,
-            "mutation_scale": 5,
-        }
+        arrow = {**ARROW, "color": colour, "linewidth": 1.2, "mutation_scale": 5}
         axes.annotate("", (0, x - aperture / 2), (0, x + aperture / 2), arrowprops=arrow)
 
 
@@ -135,8 +119,7 @@ def _patch_edges(camera: Camera, sub: SubImager) -> tuple[float, float]:
 
 def _middle(camera: Camera, lens_type: LensType) -> SubImager:
     """Return a sub-imager in the middle of an array."""
-    members = [sub for sub in camera.sub_imagers if sub.type == lens_type]
-    return members[lens_type.array[0] // 2 * lens_type.array[1] + lens_type.array[1] // 2]
+    return camera.sub_imager(camera.types.index(lens_type), lens_type.array[0] // 2, lens_type.array[1] // 2)
 
 
 def _light(camera: Camera, sub: SubImager) -> list[Ray]:
@@ -195,7 +178,9 @@ def _mark_break(near: Any, far: Any, distance: float) -> None:
         middle, before.y0 - 0.56 / figure.get_figheight(), words, ha="center", va="top", fontsize=8, style="italic"
     )
     systems = near.get_xaxis_transform(), far.get_xaxis_transform()
-    figure.add_artist(ConnectionPatch((0, 1.05), (distance, 1.05), *systems, axesA=near, axesB=far, **ARROW))
+    figure.add_artist(
+        ConnectionPatch((0, 1.05), (distance, 1.05), *systems, axesA=near, axesB=far, mutation_scale=9, **ARROW)
+    )
     words = f"{length_words(distance)} from lenses to target"
     figure.text(middle, before.y1 + 0.17 / figure.get_figheight(), words, ha="center", va="bottom", fontsize=9)
 

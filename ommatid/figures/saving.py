@@ -20,6 +20,8 @@ from ommatid.runtime.files import write_whole
 FORMATS = ("png", "svg", "pdf")
 SCREEN, SLIDE = 110, 300  # dots per inch of PNG files
 COARSEST, FINEST = 20, 1200
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B", "#56B4E9")  # Okabe and Ito; legible on dark, too
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 INK = "#000000"  # of text and axes, which a page replaces by its own colour
 # Text stays text, which a drawing program can edit; names in SVG and dates in PDF do not differ from run to run.
 SETTINGS: dict[str, Any] = {"svg.fonttype": "none", "svg.hashsalt": "ommatid", "pdf.fonttype": 42}
@@ -94,6 +96,16 @@ def save_figure(figure: Any, path: Path, formats: Sequence[str] = ("png",), reso
         for name in formats:
             options: dict[str, Any] = {"format": name, "dpi": resolution, "metadata": DATE[name]}
             write_whole(path.with_suffix(f".{name}"), lambda file, options=options: figure.savefig(file, **options))
+
+
+def log_ticks(axis: Any) -> None:
+    """Label 1, 2 and 5 of each decade of a logarithmic Matplotlib axis by plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    locator: Any = LogLocator(subs=(1, 2, 5))
+    axis.set_major_locator(locator)
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def svg_text(figure: Any) -> str:

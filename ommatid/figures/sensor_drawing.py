@@ -13,6 +13,8 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.geometry.optical_terms import OpticalTerms
 from ommatid.scenes.lens_type import LensType, SubImager
 
+from .saving import INK
+
 UNITS = ((1e3, "m"), (1.0, "mm"), (1e-3, "µm"), (1e-6, "nm"))  # in mm
 
 
@@ -29,7 +31,7 @@ def plural(count: int, noun: str) -> str:
 
 MOST_DRAWN = 40  # rows and columns of an array; of larger ones every second, third, ... sub-imager
 MOST_LINES = 100  # rows and columns of a sub-image whose pixels are drawn
-INK = "#000000"
+ARROW: dict[str, Any] = {"arrowstyle": "<->", "color": INK, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0}
 
 
 def draw_sensor(axes: Any, camera: Camera, terms: OpticalTerms, colours: dict[str, str]) -> None:
@@ -125,15 +127,7 @@ def _draw_pitch(axes: Any, camera: Camera) -> None:
     last = camera.types[index].array[0] - 1
     first, second = camera.sub_imager(index, last, 0).lens, camera.sub_imager(index, last, 1).lens
     y = first[1] - 0.75 * camera.lens_pitch
-    arrow: dict[str, Any] = {
-        "arrowstyle": "<->",
-        "color": INK,
-        "linewidth": 0.8,
-        "shrinkA": 0,
-        "shrinkB": 0,
-        "mutation_scale": 6,
-    }
-    axes.annotate("", (first[0], y), (second[0], y), arrowprops=arrow)
+    axes.annotate("", (first[0], y), (second[0], y), arrowprops={**ARROW, "mutation_scale": 6})
     words = f"lens pitch {length_words(camera.lens_pitch)}"
     write_beside(axes, words, (second[0], y), (6, 0), va="center", fontsize=8)
 

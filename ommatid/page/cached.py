@@ -43,7 +43,7 @@ def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
 
     def make() -> str:
         begun = perf_counter()
-        from .document import page
+        from .sections import page
         from .tables import with_page_time
 
         run = read_run(folder, recorded)

@@ -24,6 +24,7 @@ from ommatid.runtime.printable import printable
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 from ommatid.scenes.model import Model
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 
 MOST_PIXELS = 2**16  # of a map on a page: three such maps as float32 are a megabyte of text
@@ -44,7 +45,12 @@ class Run:
     @property
     def title(self) -> str:
         """Title of the scene, or the name of the folder if it has none."""
-        return printable(self.stack.scene.title or real_path(self.folder).name)
+        return title_of(self.stack.scene, self.folder)
+
+
+def title_of(scene: Scene | None, folder: Path) -> str:
+    """Return the title of a scene, or the name of the folder if it has none."""
+    return printable((scene.title if scene is not None else "") or real_path(folder).name)
 
 
 @dataclass(frozen=True)
@@ -91,45 +97,15 @@ def read_run(folder: Path, recorded: Stack | None = None, calibrated: Model | No
     )
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a folder holds of a run; parts that are absent are None."""
-
-    folder: Path
-    report: RunReport | None
-    stack: Stack | None
-    model: Model | None
-    estimate: Float32Array | None
-    variance: Float32Array | None
-    truth: Float32Array | None
-
-    @property
-    def run(self) -> Run | None:
-        """The complete run, None if a part is missing."""
-        parts = self.report, self.stack, self.model, self.estimate, self.variance
-        if any(part is None for part in parts):
-            return None
-        return read_run(self.folder, self.stack, self.model)
-
-    @property
-    def title(self) -> str:
-        """Title of the scene, or the name of the folder if it has none."""
-        described = self.stack or self.model
-        return printable((described.scene.title if described is not None else "") or real_path(self.folder).name)
-
-
-def read_contents(folder: Path) -> Contents:
-    """Read what a folder holds of a run. Raises InputError for damaged files."""
-    channels = exr.read(folder / ESTIMATE)[0].channels if (folder / ESTIMATE).exists() else {}
-    return Contents(
-        folder=folder,
-        report=run_json.read(folder) if (folder / run_json.RUN).exists() else None,
-        stack=stack.read(folder / "stack.exr") if (folder / "stack.exr").exists() else None,
-        model=model_file.read(folder / "model.npz") if (folder / "model.npz").exists() else None,
-        estimate=channels.get("estimate"),
-        variance=channels.get("variance"),
-        truth=channels.get("truth"),
-    )
+def read_parts(folder: Path) -> dict[str, Any]:
+    """Read what a folder holds of a run: those of the fields of `Run` that are there. Raises InputError for damage."""
+    stack_path, model_path = folder / "stack.exr", folder / "model.npz"
+    return {
+        **(exr.read(folder / ESTIMATE)[0].channels if (folder / ESTIMATE).exists() else {}),
+        **({"report": run_json.read(folder)} if (folder / run_json.RUN).exists() else {}),
+        **({"stack": stack.read(stack_path)} if stack_path.exists() else {}),
+        **({"model": model_file.read(model_path)} if model_path.exists() else {}),
+    }
 
 
 def maps(

@@ -1,11 +1,12 @@
-"""Content of the sections of a page, as its template takes it."""
+"""The report of a run as one HTML page, and the content of its sections as the template takes it."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import sqrt
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ommatid.analysis.next_steps import best_other_type, next_steps
 from ommatid.bench.table import BenchTable
 from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.reconstruct.output import verdict_words
+from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -24,13 +26,46 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from . import tables, words
-from .data import Contents, ResultMaps, Run, ShownSubImage, maps, shown_sub_image
+from .data import ResultMaps, Run, ShownSubImage, maps, read_parts, read_run, shown_sub_image, title_of
+from .document import fill
 from .panels import error_groups, point_response, resolution, sensor, time_curves
 from .panels import maps as result_maps
 from .panels.point_response import IdealMatrix
 
 DRAWN_TABLES = ("target", "camera", "world", "light")  # of the scene file, which the drawing shows
 KEPT_DRAWINGS = 8
+LARGEST = 2_950_000  # bytes of a page
+LARGEST_REDUCTION = 4  # of the number of the sensor's values, to keep a page below LARGEST
+
+
+def page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: str) -> str:
+    """Return the report of a run as HTML.
+
+    ideal : H of one sub-imager as designed, None if not known;  bench : results of `ommatid bench` for the camera
+    stamp : fingerprint of the content, by which an up-to-date page is recognised
+    """
+    content, most = of_run(run, ideal, bench), sensor.MOST_VALUES
+    while True:
+        html = fill("page.html", {**content, **of_sensor(run.stack, content["groups"], most), "stamp": stamp})
+        if len(html.encode()) <= LARGEST or most <= sensor.MOST_VALUES // LARGEST_REDUCTION:
+            return html
+        most //= 2
+
+
+def page_of(folder: Path) -> str:
+    """Return a page of what a folder holds: a run, or some of stack.exr, model.npz and estimate.exr.
+
+    Raises InputError where there is none of them, or where one is damaged.
+    """
+    from ommatid.simulate.ideal import matrix_as_designed
+
+    parts = read_parts(folder)
+    if {"report", "stack", "model", "estimate", "variance"} <= parts.keys():
+        run = read_run(folder, parts["stack"], parts["model"])
+        return page(run, partial(matrix_as_designed, run.stack.camera), None, run.report.fingerprint)
+    if not {"stack", "model", "estimate"} & parts.keys():
+        raise InputError(f"{folder}: expected stack.exr, model.npz or estimate.exr, got none; run a scene first")
+    return fill("parts_page.html", {**of_parts(folder, parts), "stamp": ""})
 
 
 def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dict[str, Any]:
@@ -70,25 +105,25 @@ def of_sensor(stack: Stack, groups: list[dict[str, Any]], most: int) -> dict[str
     }
 
 
-def of_contents(contents: Contents) -> dict[str, Any]:
-    """Return the content of the page of a folder without a complete run."""
-    described = next((part for part in (contents.stack, contents.model) if part is not None), None)
+def of_parts(folder: Path, parts: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of the page of a folder without a complete run; parts : of one, as `read_parts` has them."""
+    described: Stack | Model | None = parts.get("stack", parts.get("model"))
+    scene = None if described is None else described.scene
     groups: list[dict[str, Any]] = []
-    content: dict[str, Any] = {"title": contents.title, "words": words.contents(contents), "maps": None}
+    content: dict[str, Any] = {"title": title_of(scene, folder), "words": words.contents(parts), "maps": None}
     content |= {"mosaic": None, "responses": [], "drawing": None, "lenses": None, "scene_text": ""}
-    if contents.estimate is not None:
-        shown = maps(contents.estimate, contents.variance, contents.truth)
-        content |= _images(shown, None, {})
+    if "estimate" in parts:
+        content |= _images(maps(parts["estimate"], parts.get("variance"), parts.get("truth")), None, {})
         groups += content["groups"]
-    if contents.model is not None:
-        responses = _responses(contents.model, None)
+    if "model" in parts:
+        responses = _responses(parts["model"], None)
         groups += responses["groups"]
         content |= responses
     if described is not None:
         content |= _camera(described.scene, described.camera)
         content["scene_text"] = tables.scene_text(described.scene)
     content["document"] = result_maps.document(groups)
-    return content if contents.stack is None else content | of_sensor(contents.stack, groups, sensor.MOST_VALUES)
+    return content | of_sensor(parts["stack"], groups, sensor.MOST_VALUES) if "stack" in parts else content
 
 
 def _head(run: Run) -> dict[str, Any]:
@@ -168,10 +203,10 @@ def _responses(model: Model, ideal: IdealMatrix | None) -> dict[str, Any]:
 
 
 def _time(run: Run, bench: BenchTable | None) -> dict[str, Any]:
-    curves = time_curves.time_curves(run, bench)
+    curves, curve_words = time_curves.time_curves(run, bench)
     return {
-        "curves": time_curves.figure(curves) if curves else "",
-        "curve_words": time_curves.words(curves) if curves else "",
+        "curves": curves,
+        "curve_words": curve_words,
         "stages": tables.stages(run),
         "more_samples": tables.more_samples(run),
         "time_limit": tables.time_limit(run),

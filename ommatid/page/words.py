@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import sqrt
+from typing import Any
 
 from ommatid.reconstruct.output import verdict_words
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import cause, is_trusted, limit
-
-from .data import Contents
 
 SCALE = "on a scale of 0 to 255"
 
@@ -127,11 +127,11 @@ def numbers_beside(report: RunReport) -> dict[str, str]:
     return numbers
 
 
-def contents(contents: Contents) -> str:
-    """Return what a folder without a complete run holds."""
-    parts = {"a stack": contents.stack, "a model of H": contents.model, "an estimate": contents.estimate}
-    held = [name for name, part in parts.items() if part is not None]
-    missing = [name for name, part in parts.items() if part is None]
+def contents(parts: Mapping[str, Any]) -> str:
+    """Return what a folder without a complete run holds; parts : of a run, by the fields of `data.Run`."""
+    names = {"a stack": "stack", "a model of H": "model", "an estimate": "estimate"}
+    held = [words for words, name in names.items() if name in parts]
+    missing = [words for words, name in names.items() if name not in parts]
     words = f"This folder holds {' and '.join(held)}, and no finished run: there is no verdict"
     return f"{words}. Missing: {', '.join([*missing, 'run.json'])}."
 

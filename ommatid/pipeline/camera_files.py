@@ -19,24 +19,9 @@ from ommatid.scenes.hardware.point_sources import RecordedCalibration, from_reco
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.gallery import find_scene
 
 from .stages import calibrated_model
-
-
-@dataclass(frozen=True)
-class ImportOutcome:
-    """The stack, the distance of sub-images from whole pixels of the mosaic (sensor pixels), and warnings."""
-
-    stack: Stack
-    beside: float
-    warnings: list[str]
-
-    def describe(self) -> dict[str, Any]:
-        """Describe the stack in JSON's types."""
-        sub_images = len(self.stack.camera.sub_imagers)
-        return {"sub_images": sub_images, "beside_pixels": self.beside, **self.stack.record}
 
 
 def import_file(
@@ -46,9 +31,10 @@ def import_file(
     settings: AcquisitionSettings,
     changes: Sequence[str],
     lenses: Sequence[str],
-) -> ImportOutcome:
+) -> tuple[dict[str, Any], list[str]]:
     """Cut frames that the camera of the scene in `path` recorded into sub-images, and write the stack to `output`.
 
+    Returns the stack in JSON's types, with its distance from whole pixels of the mosaic in sensor pixels, and warnings.
     Raises InputError for a wrong scene or frame, MachineError for a full disk.
     """
     frames = (*images, *settings.dark, *settings.flat)
@@ -61,7 +47,8 @@ def import_file(
     whole, recorded = import_stack(setup, images, settings)
     kept = whole.restrict(tuple(lenses)) if lenses else whole
     stack.write(output, kept)
-    return ImportOutcome(kept, recorded.layout.beside, import_warnings(recorded))
+    sizes = {"sub_images": len(kept.camera.sub_imagers), "beside_pixels": recorded.layout.beside}
+    return {**sizes, **kept.record}, import_warnings(recorded)
 
 
 @dataclass(frozen=True)
@@ -78,21 +65,6 @@ class PointRecording:
         """All input files."""
         frames = (*self.images, *self.settings.dark, *self.settings.flat)
         return [*(file for path in frames for file in files_in(path)), *([self.positions] if self.positions else [])]
-
-
-@dataclass(frozen=True)
-class CalibrationOutcome:
-    """A model, True if it had to be made, and warnings about the recorded frames."""
-
-    model: Model
-    made: bool
-    warnings: list[str]
-
-    def describe(self) -> dict[str, Any]:
-        """Describe the model in JSON's types."""
-        model = self.model
-        sizes = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
-        return {**sizes, **model.record}
 
 
 def point_recording(
@@ -116,9 +88,10 @@ def calibrate_file(
     lenses: Sequence[str],
     recording: PointRecording | None,
     progress: Progress,
-) -> CalibrationOutcome:
+) -> tuple[Model, bool, list[str]]:
     """Calibrate the scene in `path` and write the model to `output`, unless a model there is up to date.
 
+    Returns the model, True if it had to be made, and warnings about the recorded frames.
     Raises InputError for a wrong scene, option or frame, MachineError for a full disk.
     """
     check_output(output, find_scene(path))
@@ -128,7 +101,7 @@ def calibrate_file(
             raise InputError("--lens: recorded frames are of the whole camera; choose lens types in `reconstruct`")
         return _from_points(setup, output, recording)
     with naming_source(path):
-        return CalibrationOutcome(*calibrated_model(setup, output, progress), warnings=[])
+        return *calibrated_model(setup, output, progress), []
 
 
 def export_matrix(model: Path, output: Path) -> dict[str, int]:
@@ -146,11 +119,11 @@ def export_matrix(model: Path, output: Path) -> dict[str, int]:
     return {"measurements": stored.shape[0], "unknowns": stored.shape[1], "entries": int(stored.nnz)}
 
 
-def _from_points(setup: Setup, output: Path, recording: PointRecording) -> CalibrationOutcome:
+def _from_points(setup: Setup, output: Path, recording: PointRecording) -> tuple[Model, bool, list[str]]:
     check_output(output, *recording.files)
     outcome = from_recorded_points(setup, recording.images, recording.settings, recording.positions, recording.value)
     model_file.write(output, outcome.model)
-    return CalibrationOutcome(outcome.model, True, calibration_warnings(outcome))
+    return outcome.model, True, calibration_warnings(outcome)
 
 
 WORST_OFFSET = 0.1  # sensor pixels between a patch and the whole pixels cut out for it; beyond, the design's H misleads

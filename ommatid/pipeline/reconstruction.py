@@ -11,13 +11,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ommatid.analysis.study import remove_study
+from ommatid.batch.frames import FrameOptions
 from ommatid.page.batch_index import INDEX, cached_index
 from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import result_files, run_json
-from ommatid.reconstruct.output.estimate_formats import Format, check_formats, check_picture, clear_formats
+from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
-from ommatid.reconstruct.restore import check_match, check_region
+from ommatid.reconstruct.restore import check_match
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
@@ -30,7 +31,6 @@ from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
-from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, CalibrationTable, Scene, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
@@ -38,30 +38,6 @@ from ommatid.scenes.tables import toml
 
 STACK, MODEL = "stack.exr", "model.npz"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
-
-
-@dataclass(frozen=True)
-class ReconstructionRequest:
-    """The files of a stack and its model, changes (KEY=VALUE), names of lens types, and regions to average.
-
-    force : True to reconstruct into a folder even if its result is up to date
-    """
-
-    stack: Path
-    model: Path
-    changes: tuple[str, ...] = ()
-    lenses: tuple[str, ...] = ()
-    regions: tuple[Region, ...] = ()
-    force: bool = False
-
-    def read(self) -> tuple[Stack, Model]:
-        """Read both files. Raises InputError for wrong files and options."""
-        recorded, calibrated = stack_file.read(self.stack), model_file.read(self.model)
-        if self.lenses:
-            recorded, calibrated = recorded.restrict(self.lenses), calibrated.restrict(self.lenses)
-        for region in self.regions:
-            check_region(*region, recorded.camera.shape)
-        return result_files.with_estimator_changes(recorded, list(self.changes), self.stack), calibrated
 
 
 def is_folder(output: Path) -> bool:
@@ -76,31 +52,28 @@ def is_folder(output: Path) -> bool:
 
 
 def reconstruct_files(
-    request: ReconstructionRequest,
+    stack: Path,
+    options: FrameOptions,
     output: Path,
     progress: Progress,
     cluster: Cluster | None = None,
     workers: int | None = None,
-    formats: Sequence[Format] = (),
 ) -> RunReport:
-    """Reconstruct a stack with a model, and write the estimate (OpenEXR) and its picture.
+    """Reconstruct a stack with a model, and write the estimate (OpenEXR) and its picture; the caller writes formats.
 
-    formats : that the caller will write beside it
     Returns the content of run.json, with the means of the regions.
     Raises InputError for wrong files and options, and for other files in the way, MachineError for a full disk.
     """
     check_options(cluster, workers)
-    check_output(
-        output, request.stack, request.model, *(request.stack.parent / name for name in (TRUTH, WORLD_PICTURE))
-    )
+    check_output(output, stack, options.model, *(stack.parent / name for name in (TRUTH, WORLD_PICTURE)))
     check_output(output.with_suffix(".png"))
     check_picture(output)
-    check_formats(output, formats)
-    recorded, calibrated = request.read()
-    truth, names = result_files.truth_beside(request.stack, recorded), (request.stack, request.model)
+    check_formats(output, options.formats)
+    recorded, calibrated = options.read(stack)
+    truth, names = result_files.truth_beside(stack, recorded), (stack, options.model)
     with _tile_workers(cluster, workers) as pool:
         result, report = result_files.reconstruct(recorded, calibrated, truth, names, pool, progress)
-    report = report.with_changes(**region_reports(result, request.regions))
+    report = report.with_changes(**region_reports(result, options.regions))
     clear_formats(output)
     result_files.write_estimate(output, result, {"title": recorded.scene.title})
     result_files.write_picture(output.with_suffix(".png"), result.estimate.reshape(result.shape))
@@ -108,7 +81,8 @@ def reconstruct_files(
 
 
 def reconstruct_folder(
-    request: ReconstructionRequest,
+    stack: Path,
+    options: FrameOptions,
     folder: Path,
     progress: Progress,
     cluster: Cluster | None = None,
@@ -120,30 +94,30 @@ def reconstruct_folder(
     for a folder that holds the stack or the model, and MachineError for a full disk.
     """
     check_options(cluster, workers)
-    recorded, calibrated = request.read()
-    check_match(recorded, calibrated, (request.stack, request.model))
-    sources = {real_path(path) for path in (request.stack, request.model, request.stack.parent / TRUTH)}
+    recorded, calibrated = options.read(stack)
+    check_match(recorded, calibrated, (stack, options.model))
+    sources = {real_path(path) for path in (stack, options.model, stack.parent / TRUTH)}
     for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
         if real_path(folder / name) in sources:
             raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
     with occupied(folder, RUN):
         _remove_other_scene(folder, recorded)
-        if result_files.truth_beside(request.stack, recorded) is not None:
+        if result_files.truth_beside(stack, recorded) is not None:
             for name in (TRUTH, WORLD_PICTURE):
-                _copy(request.stack.parent / name, folder / name)
-        if request.changes or request.lenses:
+                _copy(stack.parent / name, folder / name)
+        if options.changes or options.lenses:
             stack_file.write(folder / STACK, recorded)
         else:
-            _copy(request.stack, folder / STACK)
-        if request.lenses:
+            _copy(stack, folder / STACK)
+        if options.lenses:
             model_file.write(folder / MODEL, calibrated)
         else:
-            _copy(request.model, folder / MODEL)
+            _copy(options.model, folder / MODEL)
         with _tile_workers(cluster, workers) as pool:
-            return finish_folder(folder, progress, request.regions, pool, request.force)
+            return finish_folder(folder, progress, options.regions, pool, options.force)
 
 
-def check_held_out_files(request: ReconstructionRequest, *, fitted: bool, progress: Progress) -> HeldOutReport:
+def check_held_out_files(stack: Path, options: FrameOptions, *, fitted: bool, progress: Progress) -> HeldOutReport:
     """Predict every sub-imager of a stack from all others.
 
     fitted : True replaces an independent prior by one fitted to the stack
@@ -151,8 +125,8 @@ def check_held_out_files(request: ReconstructionRequest, *, fitted: bool, progre
     """
     from ommatid.reconstruct.held_out.check import check_held_out
 
-    recorded, calibrated = request.read()
-    check_match(recorded, calibrated, (request.stack, request.model))
+    recorded, calibrated = options.read(stack)
+    check_match(recorded, calibrated, (stack, options.model))
     return check_held_out(recorded, calibrated, fitted=fitted, progress=progress)
 
 
@@ -236,7 +210,7 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
         return _report_stack(path / STACK, path, progress)
     folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
     if not folders and any((path / name).is_file() for name in (MODEL, result_files.ESTIMATE)):
-        from ommatid.page.document import page_of
+        from ommatid.page.sections import page_of
 
         with occupied(path):
             write_text(path / REPORT, page_of(path))
@@ -268,7 +242,7 @@ def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcom
         if not model.is_file():
             model = Path(scratch) / MODEL
             warnings = (_write_designed_model(stack, model, progress),)
-        reconstruct_folder(ReconstructionRequest(stack, model), folder, progress)
+        reconstruct_folder(stack, FrameOptions(model), folder, progress)
     return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
 
 

@@ -24,7 +24,7 @@ from ommatid.scenes import model_file, stack
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables import toml
-from ommatid.scenes.tables.units import duration
+from ommatid.scenes.tables.units import DURATION
 
 from . import stages
 from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, bench_error_curves, error_curve
@@ -59,7 +59,7 @@ def stages_within(
     if scheduler or workers is not None:
         raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
     try:
-        return shared_time(duration(time), [member.folder for member in members], started, say), 1
+        return shared_time(DURATION.read(time), [member.folder for member in members], started, say), 1
     except ValueError as error:
         raise InputError(f"--within: {error}") from error
 

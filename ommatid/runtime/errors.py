@@ -61,9 +61,9 @@ def shortened(text: str) -> str:
     return printable(text, LONGEST_VALUE)
 
 
-def named(names: Iterable[object]) -> str:
+def named(names: Iterable[object], quote: str = "") -> str:
     """Return the first names of a list, shortened, and the count of the others; "none" for an empty list."""
-    known = [shortened(str(name)) for name in names]
+    known = [f"{quote}{shortened(str(name))}{quote}" for name in names]
     more = [f"{len(known) - MOST_NAMED} more"] if len(known) > MOST_NAMED else []
     return ", ".join([*known[:MOST_NAMED], *more]) or "none"
 

@@ -5,12 +5,13 @@ Opening a FIFO waits for a writer, and a device may have no end.
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import stat
 from collections import Counter
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,24 @@ def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
 def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
     """Read a regular UTF-8 file. Raises as `read_bytes` does, and UnicodeDecodeError."""
     return read_bytes(path, largest).decode("utf-8")
+
+
+def read_any_text(path: Path, kind: str, largest: int = LARGEST_TEXT) -> str:
+    """Return the text of a file of other programs, such as a "lens file", in UTF-16, UTF-8 or Latin-1.
+
+    Raises InputError.
+    """
+    try:
+        data = read_bytes(path, largest)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such {kind}; expected one beside the scene file") from error
+    except OSError as error:
+        raise InputError(f"{path}: could not be read as a {kind} ({error.strerror or error})") from error
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for encoding in ("utf-16",) if wide else ("utf-8-sig", "latin-1"):
+        with suppress(UnicodeDecodeError):
+            return data.decode(encoding)
+    raise InputError(f"{path}: could not be read as a {kind}; its UTF-16 is damaged")
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -100,7 +100,7 @@ def check_overlap(
 def _check_all_apart(subs: Sequence[SubImager], pixel_pitch: float, source: Path) -> None:
     """Check every pair of patches; a rotated one counts as the upright box around it."""
     middles = np.array([sub.patch for sub in subs])
-    halves = np.array([_half_extent(sub) for sub in subs]) * pixel_pitch
+    halves = np.array([_half_extent(sub, pixel_pitch) for sub in subs])
     for index, sub in enumerate(subs[:-1]):
         needed = (halves[index + 1 :] + halves[index]) * (1 - 1e-9)
         overlapping = (np.abs(middles[index + 1 :] - middles[index]) < needed).all(axis=1)
@@ -112,11 +112,11 @@ def _check_all_apart(subs: Sequence[SubImager], pixel_pitch: float, source: Path
             )
 
 
-def _half_extent(sub: SubImager) -> tuple[float, float]:
-    """Return half the width and height, in pixels, of the upright box around a patch."""
+def _half_extent(sub: SubImager, pixel_pitch: float) -> tuple[float, float]:
+    """Return half the width and height, mm, of the upright box around a patch."""
     rows, columns = sub.type.pixels
-    along, aside = abs(cos(sub.rotation)), abs(sin(sub.rotation))
-    return (along * columns + aside * rows) / 2, (along * rows + aside * columns) / 2
+    along, aside = abs(cos(sub.rotation)) * pixel_pitch / 2, abs(sin(sub.rotation)) * pixel_pitch / 2
+    return along * columns + aside * rows, along * rows + aside * columns
 
 
 ROUNDING = 1 + 1e-9
@@ -124,9 +124,10 @@ ROUNDING = 1 + 1e-9
 
 def sensor_extent(sub_imagers: Sequence[SubImager], pixel_pitch: float) -> tuple[float, float]:
     """Return height and width of the smallest upright rectangle that holds all patches, in mm."""
-    boxes = [_box(sub, pixel_pitch) for sub in sub_imagers]
-    left, right, bottom, top = (list(ends) for ends in zip(*boxes, strict=True))
-    return max(top) - min(bottom), max(right) - min(left)
+    middles = np.array([sub.patch for sub in sub_imagers])
+    halves = np.array([_half_extent(sub, pixel_pitch) for sub in sub_imagers])
+    width, height = ((middles + halves).max(axis=0) - (middles - halves).min(axis=0)).tolist()
+    return height, width
 
 
 def check_sensor(scene: Scene, sub_imagers: Sequence[SubImager]) -> None:
@@ -143,11 +144,3 @@ def check_sensor(scene: Scene, sub_imagers: Sequence[SubImager]) -> None:
         f"{scene.source}: camera.sensor.size: the sub-images of all arrays, side by side, take {height:.4g} x"
         f" {width:.4g} mm (height x width), but the sensor has {size[0]:.4g} x {size[1]:.4g} mm; {remedy}"
     )
-
-
-def _box(sub: SubImager, pitch: float) -> tuple[float, float, float, float]:
-    """Ends of the upright box around a patch: left, right, bottom, top."""
-    (rows, columns), (x, y) = sub.type.pixels, sub.patch
-    along, aside = abs(cos(sub.rotation)) * pitch / 2, abs(sin(sub.rotation)) * pitch / 2
-    wide, tall = along * columns + aside * rows, along * rows + aside * columns
-    return x - wide, x + wide, y - tall, y + tall

@@ -58,15 +58,13 @@ def posterior_variances(variance: FloatArray, repeats: int) -> FloatArray:
     above -= density / 2
     shrinkage = np.divide(freedom / 2 * step * above, density, out=np.zeros_like(above), where=density > 0)
     # Where the density is small it is uncertain, and the means rise: neighbours are averaged until they do.
-    means = np.exp(middles[0]) * _isotonic(np.exp(middles - middles[0]) * shrinkage, density)
+    rising = optimize.isotonic_regression(
+        np.exp(middles - middles[0]) * shrinkage, weights=np.maximum(density, np.finfo(float).tiny)
+    )
+    means = np.exp(middles[0]) * np.asarray(rising.x)
     result = shrink_variances(variance, repeats)
     result[known] = np.interp(logarithms, middles, means)
     return result
-
-
-def _isotonic(values: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the nearest values that do not fall, by weighted least squares."""
-    return np.asarray(optimize.isotonic_regression(values, weights=np.maximum(weights, np.finfo(float).tiny)).x)
 
 
 def shrink_variances(variance: FloatArray, repeats: int) -> FloatArray:

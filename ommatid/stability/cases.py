@@ -7,7 +7,7 @@ have full rank, `two` a null space although measurements outnumber pixels, `one`
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -43,6 +43,7 @@ class StabilityCase:
     """H, prior, noise and measurements of a case, and the result that is required of the estimator.
 
     required : "solve", "solve or refuse" at the limits of float64, or "refuse"
+    curve : name of H, of a case of the noise sweep
     """
 
     name: str
@@ -51,6 +52,7 @@ class StabilityCase:
     noise_variance: FloatArray
     recorded: FloatArray
     required: Requirement = "solve"
+    curve: str = ""
 
     @property
     def problem(self) -> Problem:
@@ -58,11 +60,12 @@ class StabilityCase:
         return Problem(self.matrix, self.prior, self.noise_variance)
 
 
-def noise_sweep(matrices: Matrices) -> Iterator[tuple[str, float, StabilityCase]]:
-    """Yield cases of every noise variance, with full rank and with a null space: name of H, noise variance, case."""
+def noise_sweep(matrices: Matrices) -> Iterator[StabilityCase]:
+    """Yield cases of every noise variance, with full rank and with a null space."""
     for name in ("three", "two"):
         for noise in NOISES:
-            yield name, noise, _case(f"{name} types, noise {noise:g}", matrices[name], _paper_prior(), noise)
+            case = _case(f"{name} types, noise {noise:g}", matrices[name], _paper_prior(), noise)
+            yield replace(case, curve=name)
 
 
 def extreme_cases(matrices: Matrices) -> Iterator[StabilityCase]:

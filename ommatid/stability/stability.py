@@ -69,45 +69,37 @@ class StabilityOutcome:
     reason: str = ""
 
 
-@dataclass(frozen=True)
-class SweepOutcome:
-    """An outcome of the noise sweep: the name of H, the noise variance and the result."""
-
-    lenses: str
-    noise: float
-    outcome: StabilityOutcome
+Results = list[tuple[StabilityCase, StabilityOutcome]]
 
 
 @own_style()
-def write_figure(
-    path: Path, curves: list[SweepOutcome], table: list[StabilityOutcome], files: FigureFiles = SCREEN_PNG
-) -> None:
+def write_figure(path: Path, results: Results, files: FigureFiles = SCREEN_PNG) -> None:
     """Draw the digits lost against the noise, one panel per H, and the errors of all cases against their bounds."""
     figure = new_figure(14, 5.5, layout="constrained")
     axes = figure.subplots(1, len(TITLES) + 1)
     for panel, (lenses, title) in zip(axes, TITLES.items(), strict=False):
-        _draw_sweep(panel, [point for point in curves if point.lenses == lenses])
+        _draw_sweep(panel, [(case.noise_variance[0], outcome) for case, outcome in results if case.curve == lenses])
         panel.set_title(title, fontsize=10)
-    _draw_bounds(axes[-1], [*(point.outcome for point in curves), *table])
+    _draw_bounds(axes[-1], [outcome for _, outcome in results])
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize=9)
     figure.suptitle("Digits lost by the certified solver, against exact arithmetic")
     files.replace(figure, path)
 
 
-def _draw_sweep(panel: Any, points: list[SweepOutcome]) -> None:
+def _draw_sweep(panel: Any, points: list[tuple[float, StabilityOutcome]]) -> None:
     """Draw the digits lost against the noise variance, the bounds as dashed lines; the form that ran stands below."""
-    solved = [point for point in points if point.outcome.refined is not None]
-    noise = [point.noise for point in solved]
+    solved = [(noise, outcome) for noise, outcome in points if outcome.refined is not None]
+    noises = [noise for noise, _ in solved]
     for field, label, style in QUANTITIES:
-        lost = [FLOAT64_DIGITS - getattr(point.outcome, field) for point in solved]
-        panel.plot(noise, lost, label=label, markersize=5, **style)
+        lost = [FLOAT64_DIGITS - getattr(outcome, field) for _, outcome in solved]
+        panel.plot(noises, lost, label=label, markersize=5, **style)
     for field, label, style in BOUNDS:
-        stated = [FLOAT64_DIGITS - digits(getattr(point.outcome, field)) for point in solved]
-        panel.plot(noise, stated, label=label, linestyle="--", linewidth=1, **style)
-    for point in points:
-        words = point.outcome.form or REFUSED
-        panel.text(point.noise, -0.4, words, rotation=90, ha="center", va="top", fontsize=7, color="0.4")
+        stated = [FLOAT64_DIGITS - digits(getattr(outcome, field)) for _, outcome in solved]
+        panel.plot(noises, stated, label=label, linestyle="--", linewidth=1, **style)
+    for noise, outcome in points:
+        words = outcome.form or REFUSED
+        panel.text(noise, -0.4, words, rotation=90, ha="center", va="top", fontsize=7, color="0.4")
     panel.set_xscale("log")
     panel.set_ylim(-3.8, 12)
     panel.set_yticks(range(0, 13, 2))
@@ -198,20 +190,14 @@ def _relative(error: float, size: float) -> float:
     return error / size if size > 0 else (0.0 if error == 0 else float("inf"))
 
 
-def run(matrices: Matrices, progress: Callable[[float], None]) -> tuple[list[SweepOutcome], list[StabilityOutcome]]:
+def run(matrices: Matrices, progress: Callable[[float], None]) -> Results:
     """Solve the noise sweep and every other case."""
-    sweep, others = list(noise_sweep(matrices)), list(extreme_cases(matrices))
-    total = len(sweep) + len(others)
-    curves: list[SweepOutcome] = []
-    for done, (lenses, noise, case) in enumerate(sweep, start=1):
-        curves.append(SweepOutcome(lenses, noise, assess(case, exact_answer(case.problem, case.recorded))))
-        progress(done / total)
-    table: list[StabilityOutcome] = []
-    for done, case in enumerate(others, start=len(sweep) + 1):
+    cases, results = [*noise_sweep(matrices), *extreme_cases(matrices)], Results()
+    for case in cases:
         exact = None if case.required == "refuse" else exact_answer(case.problem, case.recorded)
-        table.append(assess(case, exact))
-        progress(done / total)
-    return curves, table
+        results.append((case, assess(case, exact)))
+        progress(len(results) / len(cases))
+    return results
 
 
 def write_stability(
@@ -219,18 +205,13 @@ def write_stability(
 ) -> dict[str, Any]:
     """Write stability.csv, stability.md and stability.png; return a summary. Raises InputError or MachineError."""
     with occupied(folder):
-        return _write(folder, *run(matrices, progress), figures)
-
-
-def _write(
-    folder: Path, curves: list[SweepOutcome], table: list[StabilityOutcome], figures: FigureFiles
-) -> dict[str, Any]:
-    outcomes = [point.outcome for point in curves] + table
+        results = run(matrices, progress)
+        outcomes = [outcome for _, outcome in results]
+        columns = [field.name for field in fields(StabilityOutcome)]
+        write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
+        write_text(folder / "stability.md", markdown(outcomes))
+        write_figure(folder / "stability.png", results, figures)
     verdicts = [outcome.verdict for outcome in outcomes]
-    columns = [field.name for field in fields(StabilityOutcome)]
-    write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
-    write_text(folder / "stability.md", markdown(outcomes))
-    write_figure(folder / "stability.png", curves, table, figures)
     return {
         "files": [str(folder / name) for name in ("stability.csv", "stability.md", "stability.png")],
         "verdicts": {verdict: verdicts.count(verdict) for verdict in (RIGHT, REFUSED, FEWER, SILENT)},

@@ -18,13 +18,12 @@ from ommatid.bench.bench import measure, rows
 from ommatid.bench.cells import (
     CLEAR_REFS,
     SAMPLERS,
-    Cost,
     Job,
     Repeat,
     Subject,
     cell_from_repeats,
     jobs,
-    measure_cost,
+    measured,
     name_of,
 )
 from ommatid.bench.figure import write_figures
@@ -125,7 +124,7 @@ def job(samples: int, ran: list[tuple[int, int]], seconds: float = 0.0) -> Job:
         ran.append((samples, repeat))
         if samples == 13:
             raise InputError("thirteen cannot be done")
-        return Repeat(1 / samples + 1e-3 * repeat, Cost(seconds, 2**20), 2.0)
+        return Repeat(1 / samples + 1e-3 * repeat, seconds, 2**20, 2.0)
 
     return Job("render", "independent", None, samples, "", work)
 
@@ -156,7 +155,7 @@ def test_what_does_not_fit_is_left_out() -> None:
 
 
 def test_a_cell_is_median_and_quantiles_of_its_repeats() -> None:
-    repeats = [Repeat(error, Cost(1.0, memory), None) for error, memory in ((1.0, 5), (3.0, 7), (2.0, 6))]
+    repeats = [Repeat(error, 1.0, memory, None) for error, memory in ((1.0, 5), (3.0, 7), (2.0, 6))]
     made = cell_from_repeats(job(4, []), repeats)
     assert made.error.median == 2.0
     assert (made.error.low, made.error.high) == (pytest.approx(1.2), pytest.approx(2.8))
@@ -166,9 +165,9 @@ def test_a_cell_is_median_and_quantiles_of_its_repeats() -> None:
 
 def test_memory_is_the_peak_of_the_work_alone() -> None:
     if not CLEAR_REFS.exists():
-        assert measure_cost(lambda: 1)[1].memory is None
+        assert measured(lambda: 1)[2] is None
         return
-    large, small = (measure_cost(lambda size=size: np.ones(size).sum())[1].memory for size in (2**25, 2**10))
+    large, small = (measured(lambda size=size: np.ones(size).sum())[2] for size in (2**25, 2**10))
     assert large is not None
     assert small is not None
     # 8 bytes per number, released afterwards; the interpreter's own memory varies by less than 2**25.
@@ -282,9 +281,9 @@ def check(table: BenchTable, document: dict[str, object]) -> None:
     assert set(document) >= {"title", "fingerprint", "camera", "machine", "versions", "seconds", "cells", "curves"}
     assert set(document) >= {"recommended", "left_out"}
     assert table.describe() == document
-    for measured in table.cells:
-        assert measured.error.low <= measured.error.median <= measured.error.high
-        assert measured.repeats >= 3
+    for each in table.cells:
+        assert each.error.low <= each.error.median <= each.error.high
+        assert each.repeats >= 3
 
 
 @pytest.fixture

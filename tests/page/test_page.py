@@ -28,8 +28,8 @@ from ommatid.analysis.averaging_kernel import ErrorWindow
 from ommatid.bench.table import BenchTable, bench_tables, write
 from ommatid.page import batch_index, data, tables, words
 from ommatid.page.cached import cached_page
-from ommatid.page.document import page, page_of
 from ommatid.page.panels import error_groups, point_response, sensor, time_curves
+from ommatid.page.sections import page, page_of
 from ommatid.reconstruct.measured_error import best_single_sub_image
 from ommatid.reconstruct.output.run_json import (
     DiagnosticsReport,
@@ -450,10 +450,9 @@ def test_a_bench_of_the_same_camera_is_drawn(run: data.Run) -> None:
     text = page(run, None, table, "0")
     assert 'id="chart-effort"' in text
     assert "Recommendation of the bench: four samples reach the noise floor." in text
-    curves = time_curves.time_curves(run, table)
-    assert curves is not None
-    assert {point.stage for point in curves.run} == {"render", "calibrate", "reconstruct"}
-    assert len(curves.points) == 4, "a cell without a known error is not drawn"
+    figure, words = time_curves.time_curves(run, table)
+    assert all(f"The {stage} stage took" in words for stage in ("render", "reconstruct"))
+    assert figure.count("<title>") == 4 + 2, "a cell without a known error is not drawn"
 
 
 def test_a_bench_serves_the_same_camera_in_the_folder_or_its_parent(run: data.Run, tmp_path: Path) -> None:

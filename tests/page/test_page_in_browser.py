@@ -15,8 +15,8 @@ from playwright.sync_api import Browser, CDPSession, ConsoleMessage, Error, Loca
 from skimage import io
 
 from ommatid.page.data import Run
-from ommatid.page.document import page as page_of
 from ommatid.page.panels import sensor
+from ommatid.page.sections import page as page_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.simulate.ideal import matrix_as_designed
 

@@ -13,7 +13,7 @@ import pytest
 import ommatid as interface
 from ommatid.analysis import held_out
 from ommatid.page.data import read_run
-from ommatid.page.document import page
+from ommatid.page.sections import page
 from ommatid.reconstruct.output import run_json
 from ommatid.scenes import stack as stack_file
 

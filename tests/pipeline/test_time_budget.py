@@ -29,7 +29,7 @@ from ommatid.reconstruct.output.time_spent import time_spent
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.units import duration
+from ommatid.scenes.tables.units import DURATION
 
 from ..bench.tables import bench_table, cell, exactly
 from ..conftest import Command
@@ -277,7 +277,7 @@ def test_every_run_reports_the_gain_from_more_time(here: Path, ommatid: Command)
 
 
 def test_times_are_read_and_wrong_ones_refused(here: Path, ommatid: Command) -> None:
-    assert [duration(text) for text in ("30s", "2 min", "0.5 h")] == pytest.approx([30.0, 120.0, 1800.0])
+    assert [DURATION.read(text) for text in ("30s", "2 min", "0.5 h")] == pytest.approx([30.0, 120.0, 1800.0])
     for options in (["--within", "30"], ["--within", "soon"], ["--within", "3 s", "--workers", "2"]):
         ended = ommatid("run", "tiny.toml", "-o", "out", *options)
         assert (ended.code, "--within" in ended.err) == (2, True)

@@ -11,6 +11,7 @@ import tifffile
 
 from ommatid.pipeline.camera_files import import_file
 from ommatid.runtime.errors import InputError
+from ommatid.scenes import stack
 from ommatid.scenes.formats.picture import LUMINANCE, grey
 from ommatid.scenes.hardware.frames import AcquisitionSettings, FrameNotes, stored_pictures
 
@@ -86,9 +87,9 @@ def test_numbers_that_are_none_are_dead_and_are_said(kind: str, value: float, tm
             frame[18:24, 27:33] = value
         np.save(tmp_path / f"{name}.npy", frame)
     settings = AcquisitionSettings(dark=(tmp_path / "dark.npy",), flat=(tmp_path / "flat.npy",))
-    result = import_file(scene, [tmp_path / "image.npy"], tmp_path / "stack.exr", settings, (), ())
-    numbers = np.concatenate([np.ravel(image) for image in result.stack.images()])
+    _, warnings = import_file(scene, [tmp_path / "image.npy"], tmp_path / "stack.exr", settings, (), ())
+    numbers = np.concatenate([np.ravel(image) for image in stack.read(tmp_path / "stack.exr").images()])
     dead = int(np.sum(~np.isfinite(numbers)))
     assert dead
     np.testing.assert_allclose(numbers[np.isfinite(numbers)], 255 * 50 / 150, rtol=1e-6)
-    assert f"{dead} sensor pixels have NaN, infinite or too large numbers" in "\n".join(result.warnings)
+    assert f"{dead} sensor pixels have NaN, infinite or too large numbers" in "\n".join(warnings)

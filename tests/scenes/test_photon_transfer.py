@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.scenes.hardware.photon_transfer import background, photon_transfer, rounding
+from ommatid.scenes.hardware.point_sources import background, photon_transfer, rounding
 
 GAIN, READ = 0.02, 0.3  # units of f: of one electron, and of the read noise
 

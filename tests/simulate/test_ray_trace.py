@@ -18,7 +18,7 @@ from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses import sharpness
-from ommatid.simulate.lenses.etendue import relative_illumination, solid_angle, solid_angles
+from ommatid.simulate.lenses.etendue import relative_illumination, solid_angles
 from ommatid.simulate.lenses.prescription import Prescription, prescribe, prescription_of
 from ommatid.simulate.lenses.ray_trace import (
     NUMPY,
@@ -32,6 +32,7 @@ from ommatid.simulate.lenses.ray_trace import (
     through,
     trace,
 )
+from ommatid.simulate.lenses.wavefront import wavefront_of
 
 from ..examples import GALLERY, needs
 from ..lenses import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens, turned_round
@@ -182,7 +183,9 @@ def test_on_the_axis_a_wide_cone_gives_pi_times_its_sine_squared(sine: float) ->
     stop = (depth - gap) * sine / sqrt(1 - sine**2)
     one = lens([1e4, -1e4, inf], [0.0, gap], [1.5, 1.0, 1.0], [1e3, 1e3, stop], stop=2)
     disk = exit_disk(one, depth, 0.0)
-    assert solid_angle(one, disk, depth) == pytest.approx(pi * sine**2, rel=0.01)
+    rays = wavefront_of(one, disk, depth, 0.0, 1e3, None)
+    assert rays is not None
+    assert rays.brightness == pytest.approx(pi * sine**2, rel=0.01)
 
 
 def test_a_camera_s_lenses_collect_what_their_f_numbers_say() -> None:

@@ -29,7 +29,7 @@ from ..examples import GALLERY
 MATRICES = {
     name: ideal_matrix(derive(read(GALLERY / "tile19.toml", CHANGES, lenses))) for name, lenses in LENSES.items()
 }
-SWEEP = [case for _, _, case in noise_sweep(MATRICES)]
+SWEEP = list(noise_sweep(MATRICES))
 EXTREMES = list(extreme_cases(MATRICES))
 ALLOWED = {"solve": {RIGHT}, "solve or refuse": {RIGHT, REFUSED}, "refuse": {REFUSED}}
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import Model, designed_observation
@@ -101,14 +101,10 @@ def _applied_response(observation: Observation, rows: slice, column: int) -> Flo
 def _stored_response(model: Model, rows: slice, column: int, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return some rows of a column of H, and the standard errors of these entries."""
     matrix = model.matrix
-    entries = slice(int(matrix.indptr[rows.start]), int(matrix.indptr[rows.stop]))
-    chosen = np.flatnonzero(matrix.indices[entries] == column)
-    counts: IntArray = np.diff(matrix.indptr[rows.start : rows.stop + 1].astype(np.int64))
-    pixel: IntArray = np.repeat(np.arange(counts.size, dtype=np.int64), counts)[chosen]
-    response, variance = np.zeros(counts.size), np.zeros(counts.size)
-    np.add.at(response, pixel, matrix.data[entries][chosen])
-    np.add.at(variance, pixel, model.variance[entries][chosen])
-    return response.reshape(shape), np.sqrt(variance).reshape(shape)
+    variances = sparse.csr_array((model.variance, matrix.indices, matrix.indptr), shape=matrix.shape)
+    shown = (each[rows][:, [column]].toarray() for each in (matrix, variances))
+    response, variance = (np.asarray(each, dtype=np.float64).reshape(shape) for each in shown)
+    return response, np.sqrt(variance)
 
 
 def _ideal_response(ideal: IdealMatrix, sub: SubImager, column: int) -> FloatArray | None:

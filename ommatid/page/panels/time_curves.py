@@ -26,24 +26,16 @@ class TimePoint:
     mse: float
 
 
-@dataclass(frozen=True)
-class TimeCurves:
-    """Points of a bench, points of this run, and the bench's recommendation in words."""
-
-    points: list[TimePoint]
-    run: list[TimePoint]
-    advice: str
-
-
-def time_curves(run: Run, bench: BenchTable | None) -> TimeCurves | None:
-    """Return the points of a bench and of this run, None if there is no bench or no measured error."""
+def time_curves(run: Run, bench: BenchTable | None) -> tuple[Markup | str, str]:
+    """Return the figure and its words, both empty if there is no bench or no measured error."""
     mse = run.report.error.mse
     if bench is None or mse is None:
-        return None
+        return "", ""
     points = [point for cell in bench.cells if (point := _point(cell)) is not None]
     stages = run.report.stages.items()
     own = [TimePoint(name, "this run", stage.seconds, mse) for name, stage in stages if stage.seconds > 0]
-    return TimeCurves(points, own, bench.recommended.why) if points else None
+    said = _words(points, own, bench.recommended.why)
+    return (_figure(points, own, said), said) if points else ("", "")
 
 
 def _point(cell: Cell) -> TimePoint | None:
@@ -54,20 +46,20 @@ def _point(cell: Cell) -> TimePoint | None:
     return TimePoint(cell.stage, setting, cell.seconds.median, cell.mse.median)
 
 
-def figure(curves: TimeCurves) -> Markup:
+def _figure(measured: Sequence[TimePoint], run: Sequence[TimePoint], said: str) -> Markup:
     """Draw mean squared error against time, one colour per stage, with Pareto fronts and this run's points."""
     series: list[ChartSeries] = []
     for stage, colour in COLOURS.items():
-        points = [point for point in curves.points if point.stage == stage]
+        points = [point for point in measured if point.stage == stage]
         if not points:
             continue
         front = pareto_front(points, lambda point: point.seconds, lambda point: point.mse)
-        own = [point for point in curves.run if point.stage == stage]
+        own = [point for point in run if point.stage == stage]
         series.append(ChartSeries("", *_columns(front), "line", colour))
         series.append(ChartSeries(stage, *_columns(points), "dots", colour, tips=_tips(points)))
         series.append(ChartSeries("", *_columns(own), "stars", colour, tips=_tips(own)))
     axes = ChartAxis("time of the stage (s)", True), ChartAxis("mean squared error", True)
-    return chart("effort", *axes, series, words(curves))
+    return chart("effort", *axes, series, said)
 
 
 def _columns(points: Sequence[TimePoint]) -> tuple[list[float], list[float]]:
@@ -78,15 +70,15 @@ def _tips(points: Sequence[TimePoint]) -> list[str]:
     return [f"{point.stage}, {point.setting}: {point.mse:.4g} in {point.seconds:.3g} s" for point in points]
 
 
-def words(curves: TimeCurves) -> str:
+def _words(measured: Sequence[TimePoint], run: Sequence[TimePoint], advice: str) -> str:
     """Return how this run compares with the measured settings, and the recommendation."""
-    sentences = [f"The mean squared error of this run is {curves.run[0].mse:.4g}"] if curves.run else []
-    for own in curves.run:
-        others = [point for point in curves.points if point.stage == own.stage]
+    sentences = [f"The mean squared error of this run is {run[0].mse:.4g}"] if run else []
+    for own in run:
+        others = [point for point in measured if point.stage == own.stage]
         if others:
             sentences.append(_comparison(own, others))
-    if curves.advice:
-        sentences.append(f"Recommendation of the bench: {curves.advice.removesuffix('.')}")
+    if advice:
+        sentences.append(f"Recommendation of the bench: {advice.removesuffix('.')}")
     return ". ".join(sentences) + "."
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from ommatid.runtime.errors import InputError, shortened, shortened_repr
-from ommatid.runtime.input_files import read_text
+from ommatid.runtime.input_files import read_any_text
 
 from ..tables.table import LARGEST
 
@@ -54,14 +54,7 @@ def read_curve(path: Path, largest: float = LARGEST) -> Curve:
 
     The first row may be a heading. Raises InputError that names the file, the row, what was expected and what came.
     """
-    try:
-        lines = read_text(path, MOST_BYTES).splitlines()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; expected a curve of wavelength in nm and value") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected a curve in UTF-8, got other bytes at {error.start}") from error
-    except OSError as error:
-        raise InputError(f"{path}: could not be read as a curve of wavelength and value ({error.strerror})") from error
+    lines = read_any_text(path, "curve of wavelength in nm and value", MOST_BYTES).splitlines()
     rows = [
         (number, words)
         for number, line in enumerate(lines, start=1)

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
-from ommatid.runtime.input_files import read_text, real_path
+from ommatid.runtime.input_files import read_any_text, real_path
 
 from ..tables import glass, toml
 from ..tables.camera import MOST_SURFACES, SURFACES, CameraTable, Surface
@@ -45,14 +45,7 @@ def read_lens(path: Path) -> tuple[Surface, ...]:
     """
     if path.suffix.lower() == ".zmx":
         return _with_one_stop(read_zmx(path), path)
-    try:
-        text = read_text(path, LARGEST)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such lens file; expected one beside the scene file") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected a lens file in UTF-8, got other bytes at {error.start}") from error
-    except OSError as error:
-        raise InputError(f"{path}: could not be read as a lens file ({error.strerror})") from error
+    text = read_any_text(path, "lens file", LARGEST)
     return _with_one_stop(_from_toml(text, path) if path.suffix == ".toml" else _from_rows(text, path), path)
 
 

@@ -117,11 +117,6 @@ def _checked(name: str, given: Header) -> Header:
     return given
 
 
-def array_size(stream: IO[bytes]) -> int:
-    """Bytes of the array whose NPY header begins a stream. Raises ValueError if there is no such header."""
-    return header(stream).size
-
-
 def header(stream: IO[bytes]) -> Header:
     """Shape and dtype of the array whose NPY header begins a stream. Raises ValueError if there is no such header."""
     version = np.lib.format.read_magic(stream)
@@ -142,7 +137,7 @@ def header(stream: IO[bytes]) -> Header:
 def array(path: Path) -> NDArray[Any]:
     """Read an NPY file. Raises ValueError that says why it cannot be read, InputError if memory is too small."""
     with _readable(), open_input(path) as stream:
-        size = array_size(stream)
+        size = header(stream).size
         if size > stream.seek(0, os.SEEK_END):
             raise ValueError("it is cut short")
         check_memory(3 * size, f"{path}: to read it", "take a smaller one, or free some memory")
@@ -159,7 +154,9 @@ def _readable() -> Generator[None]:
     except InputError:
         raise
     except _UNREADABLE as error:
-        raise ValueError(_reason(error)) from error
+        raise ValueError(
+            "it holds pickled objects" if "pickle" in str(error) else str(error) or type(error).__name__
+        ) from error
 
 
 @contextmanager
@@ -168,7 +165,3 @@ def _silenced() -> Generator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
-
-
-def _reason(error: BaseException) -> str:
-    return "it holds pickled objects" if "pickle" in str(error) else str(error) or type(error).__name__

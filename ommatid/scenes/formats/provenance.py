@@ -3,76 +3,53 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from math import isfinite
 from typing import Annotated, Any, cast
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool, TypeAdapter, ValidationError
 
 from ommatid.runtime.errors import shortened_repr
 
-LONGEST_TEXT = 1000  # characters
-LARGEST = 2**64  # of whole numbers
-LONGEST_TIME = 1e15  # seconds
+Text = Annotated[str, Field(max_length=1000)]
+Count = Annotated[int, Field(ge=0, lt=2**64)]
+STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and len(value) <= LONGEST_TEXT
+class _Agreement(BaseModel):
+    """The comparison of H with the ideal one."""
+
+    model_config = {**STRICT, "extra": "forbid"}
+
+    rms_difference_from_ideal: float | None
+    max_z: float | None
+    p_value: float | None
 
 
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < LARGEST
+class _Fit(BaseModel):
+    """The record of a fit: the keys that are printed must have the right types, the others any."""
 
+    model_config = STRICT
 
-def _is_time(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= LONGEST_TIME
-
-
-def _is_table_of(values: Callable[[object], bool]) -> Callable[[object], bool]:
-    def check(table: object) -> bool:
-        return isinstance(table, dict) and all(map(values, cast(dict[str, object], table).values()))
-
-    return check
-
-
-def _is_number(value: object) -> bool:
-    return value is None or (isinstance(value, float) and isfinite(value))
-
-
-def _is_agreement(table: object) -> bool:
-    keys = {"rms_difference_from_ideal", "max_z", "p_value"}
-    return _is_table_of(_is_number)(table) and cast(dict[str, object], table).keys() == keys
-
-
-def _is_fit(table: object) -> bool:
-    """True for the record of a fit: the keys that are printed must have the right types, the others any."""
-    if not isinstance(table, dict):
-        return False
-    fit = cast(dict[str, object], table)
-    refused = fit.get("refused")
-    names = cast(list[object], refused) if isinstance(refused, list) else [None]
-    return _is_count(fit.get("accepted")) and all(map(_is_text, names))
+    accepted: Count
+    refused: list[Text]
 
 
 def _check_fit(table: dict[str, Any]) -> dict[str, Any]:
-    if not _is_fit(table):
-        raise ValueError("expected a table with accepted and refused")
+    _Fit.model_validate(table)
     return table
 
 
 FitRecord = Annotated[dict[str, Any], AfterValidator(_check_fit)]
-CHECKS: dict[str, tuple[str, Callable[[object], bool]]] = {
-    **dict.fromkeys(("method", "fingerprint", "truth", "variant", "sampler"), ("a text", _is_text)),
-    **dict.fromkeys(("versions", "not_reached"), ("a table of texts", _is_table_of(_is_text))),
+CHECKS: dict[str, tuple[str, Any]] = {
+    **dict.fromkeys(("method", "fingerprint", "truth", "variant", "sampler"), ("a text", Text)),
+    **dict.fromkeys(("versions", "not_reached"), ("a table of texts", dict[str, Text])),
     **dict.fromkeys(
-        ("seed", "first_seed", "samples", "fewest_samples", "passes", "rays"),
-        ("a whole number of 0 or more", _is_count),
+        ("seed", "first_seed", "samples", "fewest_samples", "passes", "rays"), ("a whole number of 0 or more", Count)
     ),
-    "reached": ("true or false", lambda value: isinstance(value, bool)),
-    "auto": ("a table", lambda value: isinstance(value, dict)),
-    "agreement": ("a table of numbers", _is_agreement),
-    "fit": ("a table with accepted and refused", _is_fit),
-    "seconds": ("a time of 0 or more", _is_time),
+    "reached": ("true or false", StrictBool),
+    "auto": ("a table", dict[str, Any]),
+    "agreement": ("a table of numbers", Annotated[dict[str, Any], AfterValidator(_Agreement.model_validate)]),
+    "fit": ("a table with accepted and refused", FitRecord),
+    "seconds": ("a time of 0 or more", Annotated[float, Field(ge=0, le=1e15)]),
 }
 
 
@@ -83,9 +60,12 @@ def checked(record: object) -> dict[str, Any]:
     """
     if not isinstance(record, dict):
         raise ValueError("expected a record of how it was made, a table, got something else")
-    checked_record = cast(dict[str, Any], record)
-    for key, (expected, is_right) in CHECKS.items():
-        if key in checked_record and not is_right(checked_record[key]):
-            raise ValueError(f"its record should have {expected} as {key}, got {shortened_repr(checked_record[key])}")
-    json.dumps(checked_record, allow_nan=False)
-    return checked_record
+    known = cast(dict[str, Any], record)
+    for key, (expected, kind) in CHECKS.items():
+        try:
+            if key in known:
+                TypeAdapter[Any](kind, config=STRICT).validate_python(known[key])
+        except ValidationError as error:
+            raise ValueError(f"its record should have {expected} as {key}, got {shortened_repr(known[key])}") from error
+    json.dumps(known, allow_nan=False)
+    return known

@@ -18,7 +18,6 @@ several decades wrote them.
 
 from __future__ import annotations
 
-import codecs
 import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -29,7 +28,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from ommatid.runtime.errors import InputError, shortened
-from ommatid.runtime.input_files import read_bytes
+from ommatid.runtime.input_files import read_any_text
 
 from ..optics.dispersion import COEFFICIENTS, Dispersion
 from ..tables.camera import MOST_SURFACES, Surface
@@ -37,24 +36,6 @@ from ..tables.messages import explain
 
 LARGEST = 2**24  # bytes; the largest catalogues of glass makers have one million
 EXTREME = 1e9  # largest number
-
-
-def read_text(path: Path, kind: str) -> str:
-    """Return the text of a file, such as a "lens file". Raises InputError."""
-    try:
-        data = read_bytes(path, LARGEST)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such {kind}; expected one beside the scene file") from error
-    except OSError as error:
-        raise InputError(f"{path}: could not be read as a {kind} ({error.strerror or error})") from error
-    try:
-        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            return data.decode("utf-16")
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            raise InputError(f"{path}: could not be read as a {kind} ({error})") from error
-        return data.decode("latin-1")
 
 
 def number(word: str, where: str, what: str) -> float:
@@ -114,7 +95,7 @@ def read_catalogue(path: Path) -> Catalogue:
     """Read a glass catalogue. Raises InputError that names the file."""
     entries: dict[str, tuple[int, dict[str, list[str]]]] = {}
     words: dict[str, list[str]] = {}
-    for line, text in enumerate(read_text(path, "glass catalogue").splitlines(), start=1):
+    for line, text in enumerate(read_any_text(path, "glass catalogue", LARGEST).splitlines(), start=1):
         keyword, *rest = text.split(maxsplit=1) or [""]
         if keyword == "NM" and rest:
             words = {"NM": rest[0].split()}
@@ -159,7 +140,7 @@ class Lines:
 
 def read_zmx(path: Path) -> tuple[Surface, ...]:
     """Read the surfaces of a lens. Raises InputError that names the file, the surface and what is not supported."""
-    unit, surfaces = _surfaces(read_text(path, "lens file"), path)
+    unit, surfaces = _surfaces(read_any_text(path, "lens file", LARGEST), path)
     if len(surfaces) < 3:
         raise InputError(f"{path}: expected surfaces between the object and the image (SURF), got none")
     read: list[dict[str, Any]] = []
@@ -168,8 +149,9 @@ def read_zmx(path: Path) -> tuple[Surface, ...]:
         where = f"{path}, line {lines.line}, surface {place}"
         table = _table(lines, where, unit)
         thickness = lines.value("DISZ", where) * unit
-        behind = _medium(table)
-        if _is_dummy(table, before, behind):
+        behind = table.get("glass") or table.get("dispersion") or table.get("index")  # None for air
+        is_flat = not {"radius", "aspheric"} & {*table}
+        if before is None and behind is None and not table["stop"] and is_flat:  # it does nothing
             if read:
                 read[-1]["thickness"] += thickness
         else:
@@ -285,16 +267,6 @@ def _model_glass(words: list[str], where: str) -> dict[str, Any]:
     # (A + B / w^2)^2 as Schott's formula
     coefficients = [level**2, 0.0, 2 * level * slope, slope**2]
     return {"dispersion": {"formula": 1, "coefficients": coefficients, "shortest": "400 nm", "longest": "700 nm"}}
-
-
-def _medium(table: dict[str, Any]) -> object:
-    """Return what stands for the medium behind a surface; None for air."""
-    return table.get("glass") or table.get("dispersion") or table.get("index")
-
-
-def _is_dummy(table: dict[str, Any], before: object, behind: object) -> bool:
-    """True for a surface that does nothing."""
-    return before is None and behind is None and not table["stop"] and not {"radius", "aspheric"} & {*table}
 
 
 def _surface(table: dict[str, Any]) -> Surface:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -170,25 +171,12 @@ def _contrast(frequency: FloatArray) -> FloatArray:
 def gauss(points: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Nodes and weights of Gauss's rule for a discrete measure of sum 1: eigenvalues of its Jacobi matrix.
 
-    Exact for polynomials of degree 2 count - 1 (G. H. Golub, J. H. Welsch, Math. Comp. 23, 221 (1969)); the matrix by
-    Lanczos's iteration with full orthogonalisation.
+    Exact for polynomials of degree 2 count - 1 (G. H. Golub, J. H. Welsch, Math. Comp. 23, 221 (1969)). The matrix is
+    multiplication by x on polynomials that are orthonormal under the measure.
     """
     middle = float(points @ weight)
     spread = float(np.sqrt(np.square(points - middle) @ weight)) or 1.0
-    scaled = (points - middle) / spread
-    basis = [np.sqrt(weight)]
-    diagonal: list[float] = []
-    beside: list[float] = []
-    for _ in range(min(count, points.size)):
-        following = scaled * basis[-1]
-        diagonal.append(float(following @ basis[-1]))
-        for _ in range(2):
-            for vector in basis:
-                following = following - (vector @ following) * vector
-        beside.append(float(np.linalg.norm(following)))
-        if beside[-1] < 1e-9:
-            break
-        basis.append(following / beside[-1])
-    off = np.array(beside[: len(diagonal) - 1])
-    value, vector = np.linalg.eigh(np.diag(diagonal) + np.diag(off, 1) + np.diag(off, -1))
-    return middle + spread * value, np.square(vector[0])
+    scaled, root = (points - middle) / spread, np.sqrt(weight)
+    basis, _ = np.linalg.qr(root[:, None] * legendre.legvander(scaled, min(count, points.size) - 1))
+    value, vector = np.linalg.eigh(basis.T @ (scaled[:, None] * basis))
+    return middle + spread * value, np.square(vector.T @ (basis.T @ root))

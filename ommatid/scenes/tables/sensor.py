@@ -14,7 +14,7 @@ from ommatid.runtime.errors import shortened_repr
 
 from ..formats import curve
 from .table import LARGEST, Table
-from .units import Illuminance, Time, file_name, length
+from .units import LENGTH, Illuminance, Time, file_name
 
 FULL_SCALE = 256.0
 MILLIMETRE = 1e6  # nm
@@ -31,8 +31,8 @@ def _interval(text: str) -> tuple[float, float] | None:
     if match is None:
         return None
     first, last, unit = match.groups()
-    shortest = length(f"{first} {unit}")
-    longest = shortest if last is None else length(f"{last} {unit}")
+    shortest = LENGTH.read(f"{first} {unit}")
+    longest = shortest if last is None else LENGTH.read(f"{last} {unit}")
     if last is not None and longest <= shortest:
         raise ValueError(f'expected the shorter wavelength first, as in "450-650 nm", got {shortened_repr(text)}')
     for end in (shortest, longest):

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
 
-from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.errors import InputError, named, shortened
 
 DEEPEST = 16  # levels of nested tables; a scene has camera.lens[0].surfaces[0].radius
 LARGEST = 4_000_000  # bytes; parsing takes 30 times as much memory
@@ -86,7 +86,6 @@ def check(data: dict[str, Any]) -> None:
             raise ValueError("a whole number does not fit into 64 bits")
 
 
-MOST_NAMED = 10  # lens types in a message
 FILES = {  # first and last part of the keys that name files
     ("target", "image"),
     ("world", "file"),
@@ -130,7 +129,8 @@ def _inside(table: Any, name: str, override: str) -> Any:
     if isinstance(table, list):
         lenses = _by_name(table)  # pyright: ignore[reportUnknownArgumentType]
         if name not in lenses:
-            raise InputError(f"--set {override}: no lens type is called '{name}'; there are {_names(lenses)}")
+            known = named(lenses, "'")
+            raise InputError(f"--set {override}: no lens type is called '{name}'; there are {known}")
         return lenses[name]
     if not isinstance(table, dict):
         raise InputError(f"--set {override}: '{name}' is not in a table")
@@ -171,7 +171,8 @@ def keep_lenses(data: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
     chosen: list[Any] = []
     for index, name in enumerate(names):
         if name not in lenses:
-            raise InputError(f"--lens {','.join(names)}: no lens type is called '{name}'; there are {_names(lenses)}")
+            known = named(lenses, "'")
+            raise InputError(f"--lens {','.join(names)}: no lens type is called '{name}'; there are {known}")
         earlier = names[:index].count(name)
         chosen.append({**lenses[name], "name": name if earlier == 0 else f"{name}-{earlier + 1}"})
     return {**data, "camera": {**camera, "lens": chosen}}  # type: ignore[dict-item]
@@ -179,9 +180,3 @@ def keep_lenses(data: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
 
 def _by_name(lenses: list[Any]) -> dict[str, Any]:
     return {str(lens.get("name")): lens for lens in lenses if isinstance(lens, dict)}  # type: ignore[union-attr]
-
-
-def _names(lenses: Iterable[str]) -> str:
-    known = [f"'{shortened(name)}'" for name in lenses]
-    more = [f"{len(known) - MOST_NAMED} more"] if len(known) > MOST_NAMED else []
-    return ", ".join([*known[:MOST_NAMED], *more]) or "none"

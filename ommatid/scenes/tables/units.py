@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache, partial
+from functools import cache
 from math import isfinite
 from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WithJsonSchema
+from pydantic_core import CoreSchema, core_schema
 
 from ommatid.runtime.errors import shortened_repr
 
@@ -62,24 +64,45 @@ def _quantity(text: str, unit: str) -> float:
     return float(_units().Quantity(text).to(unit).magnitude)
 
 
-def _in_units(value: object, *, unit: str, what: str, examples: tuple[str, str], signed: bool = False) -> float:
-    """Convert a text such as "6 um" to a number of `unit`. Raises ValueError that says what was expected."""
-    if isinstance(value, float | int) and not isinstance(value, bool):
-        example = f"{value} {examples[0].split()[1]}"
-        raise ValueError(f'expected {what} with its unit, such as "{example}", got the bare number {value}')
-    if not isinstance(value, str):
-        raise ValueError(f'expected {what} with its unit, such as "{examples[0]}", got {shortened_repr(value)}')
-    try:
-        number = _quantity(value, unit)
-    except Exception as error:  # pint raises a dozen types, tokenize's among them
-        raise ValueError(
-            f'expected {what} with its unit, such as "{examples[1]}" or "{examples[0]}", got {shortened_repr(value)}'
-        ) from error
-    if number == 0 or not isfinite(number) or (number < 0 and not signed):
-        raise ValueError(f"expected {what} {'other than' if signed else 'above'} zero, got {shortened_repr(value)}")
-    if not 1 / EXTREME <= abs(number) <= EXTREME:
-        raise ValueError(f"expected {what} between {1 / EXTREME:g} and {EXTREME:g} {unit}, got {shortened_repr(value)}")
-    return number
+@dataclass(frozen=True)
+class Quantity:
+    """A number with its unit, which is read from texts such as "6 um" and written with `unit`.
+
+    what, description : in messages and in the schema of scene files;  examples : of texts that are read
+    """
+
+    unit: str
+    what: str
+    examples: tuple[str, str]
+    description: str
+    signed: bool = False
+
+    def read(self, value: object) -> float:
+        """Convert a text to a number of `unit`. Raises ValueError that says what was expected."""
+        what, (first, second), got = self.what, self.examples, shortened_repr(value)
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            example = f"{value} {first.split()[1]}"
+            raise ValueError(f'expected {what} with its unit, such as "{example}", got the bare number {value}')
+        if not isinstance(value, str):
+            raise ValueError(f'expected {what} with its unit, such as "{first}", got {got}')
+        try:
+            number = _quantity(value, self.unit)
+        except Exception as error:  # pint raises a dozen types, tokenize's among them
+            raise ValueError(f'expected {what} with its unit, such as "{second}" or "{first}", got {got}') from error
+        if number == 0 or not isfinite(number) or (number < 0 and not self.signed):
+            raise ValueError(f"expected {what} {'other than' if self.signed else 'above'} zero, got {got}")
+        if not 1 / EXTREME <= abs(number) <= EXTREME:
+            raise ValueError(f"expected {what} between {1 / EXTREME:g} and {EXTREME:g} {self.unit}, got {got}")
+        return number
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], CoreSchema]) -> CoreSchema:
+        """Read and write the quantities of a scene file."""
+        written = core_schema.plain_serializer_function_ser_schema(lambda value: f"{value!r} {self.unit}")
+        return core_schema.no_info_before_validator_function(self.read, handler(source), serialization=written)
+
+    def __get_pydantic_json_schema__(self, *_: object) -> dict[str, Any]:
+        """Describe the texts of a scene file."""
+        return {"type": "string", "description": self.description}
 
 
 def in_unit(text: str, unit: str) -> float:
@@ -89,21 +112,6 @@ def in_unit(text: str, unit: str) -> float:
         return _quantity(text, base) / factor
     except Exception as error:  # pint raises a dozen types
         raise ValueError(f"expected a quantity in {unit}, got {shortened_repr(text)}") from error
-
-
-def duration(text: str) -> float:
-    """Convert a text such as "30 s", "30s" or "2 min" to seconds. Raises ValueError that says what was expected."""
-    return _in_units(text, unit="s", what="a time", examples=("30 s", "2 min"))
-
-
-def length(text: str) -> float:
-    """Convert a text such as "555 nm" to millimetres. Raises ValueError that says what was expected."""
-    return _in_units(text, unit="mm", what="a length", examples=("1 mm", "6 um"))
-
-
-def angle(value: object) -> float:
-    """Convert a text such as "-90 deg" to radians. Raises ValueError that says what was expected."""
-    return _in_units(value, unit="rad", what="an angle", examples=("1 deg", "-2 mrad"), signed=True)
 
 
 def _ratio(value: object) -> Fraction:
@@ -128,26 +136,21 @@ def _magnification(value: object) -> Fraction:
     return ratio
 
 
+def _two_ratios(value: object, expected: str) -> tuple[Fraction, Fraction]:
+    """Read a pair of ratios of 0 or more. Raises ValueError that begins with `expected`."""
+    ratios = [_ratio(each) for each in cast(Sequence[object], value)] if isinstance(value, list | tuple) else []
+    if len(ratios) != 2 or min(ratios) < 0:
+        raise ValueError(f"{expected}, got {shortened_repr(cast(object, value))}")
+    return ratios[0], ratios[1]
+
+
 def _step(value: object) -> tuple[Fraction, Fraction]:
-    pair_given = isinstance(value, list | tuple)
-    numbers: tuple[object, ...] = tuple(cast(Sequence[object], value)) if pair_given else (value, value)
-    said = shortened_repr(numbers if pair_given else value)
-    if len(numbers) != 2:
-        raise ValueError(f"expected a step or two, down and across, such as [2, 1], got {said}")
-    down, across = _ratio(numbers[0]), _ratio(numbers[1])
-    if down < 0 or across < 0:
-        raise ValueError(f"expected a step of 0 or more pixels of the target, got {said}")
-    return down, across
+    steps = cast(object, value) if isinstance(value, list | tuple) else (value, value)
+    return _two_ratios(steps, "expected a step of 0 or more pixels of the target, or two such as [2, 1]")
 
 
 def _window(value: object) -> tuple[Fraction, Fraction]:
-    numbers: tuple[object, ...] = tuple(cast(Sequence[object], value)) if isinstance(value, list | tuple) else ()
-    if len(numbers) == 2:
-        row, column = _ratio(numbers[0]), _ratio(numbers[1])
-        if row >= 0 and column >= 0:
-            return row, column
-    said = shortened_repr(cast(object, value))
-    raise ValueError(f'expected a row and a column of the target of 0 or more, such as [12, "7/2"], got {said}')
+    return _two_ratios(value, 'expected a row and a column of the target of 0 or more, such as [12, "7/2"]')
 
 
 def pair(value: object) -> object:
@@ -207,19 +210,6 @@ def _expected_noise(value: object) -> object:
     raise ValueError(f'expected a variance from 0 to 1e24, or "fit", got {shortened_repr(value)}')
 
 
-def _from_text(unit: str, what: str, *examples: str, signed: bool = False) -> BeforeValidator:
-    first, second = examples
-    return BeforeValidator(partial(_in_units, unit=unit, what=what, examples=(first, second), signed=signed))
-
-
-def _to_text(unit: str) -> PlainSerializer:
-    return PlainSerializer(lambda value: f"{value!r} {unit}")
-
-
-def _text_schema(description: str) -> WithJsonSchema:
-    return WithJsonSchema({"type": "string", "description": description})
-
-
 _RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
 _STEP = WithJsonSchema(
     {
@@ -232,41 +222,20 @@ _STEP = WithJsonSchema(
     }
 )
 
-Length = Annotated[
-    float,
-    _from_text("mm", "a length", "1 mm", "6 um"),
-    _to_text("mm"),
-    _text_schema('a length with its unit, such as "6 um"'),
-]
-Radius = Annotated[
-    float,
-    _from_text("mm", "a radius of curvature", "1 mm", "-800 um", signed=True),
-    _to_text("mm"),
-    _text_schema('a length with its unit and its sign, such as "-0.8 mm"'),
-]
-Time = Annotated[
-    float,
-    _from_text("s", "a time", "10 ms", "0.5 s"),
-    _to_text("s"),
-    _text_schema('a time with its unit, such as "10 ms"'),
-]
-Angle = Annotated[
-    float,
-    _from_text("rad", "an angle", "1 deg", "2 mrad"),
-    _to_text("rad"),
-    _text_schema('an angle with its unit, such as "0.1 deg"'),
-]
-SignedAngle = Annotated[
-    float,
-    _from_text("rad", "an angle", "1 deg", "-2 mrad", signed=True),
-    _to_text("rad"),
-    _text_schema('an angle with its unit and its sign, such as "-1 deg"'),
-]
+LENGTH = Quantity("mm", "a length", ("1 mm", "6 um"), 'a length with its unit, such as "6 um"')
+DURATION = Quantity("s", "a time", ("30 s", "2 min"), 'a time with its unit, such as "30 s"')
+SIGNED_ANGLE = Quantity(
+    "rad", "an angle", ("1 deg", "-2 mrad"), 'an angle with its unit and its sign, such as "-1 deg"', signed=True
+)
+_CURVATURE = "a radius of curvature", ("1 mm", "-800 um"), 'a length with its unit and its sign, such as "-0.8 mm"'
+
+Length = Annotated[float, LENGTH]
+Radius = Annotated[float, Quantity("mm", *_CURVATURE, signed=True)]
+Time = Annotated[float, Quantity("s", "a time", ("10 ms", "0.5 s"), 'a time with its unit, such as "10 ms"')]
+Angle = Annotated[float, Quantity("rad", "an angle", ("1 deg", "2 mrad"), 'an angle with its unit, such as "0.1 deg"')]
+SignedAngle = Annotated[float, SIGNED_ANGLE]
 Illuminance = Annotated[
-    float,
-    _from_text("lux", "an illuminance", "500 lux", "1 klux"),
-    _to_text("lux"),
-    _text_schema('an illuminance, such as "500 lux"'),
+    float, Quantity("lux", "an illuminance", ("500 lux", "1 klux"), 'an illuminance, such as "500 lux"')
 ]
 Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_plain_ratio), _RATIO]
 Step = Annotated[tuple[Fraction, Fraction], BeforeValidator(_step), PlainSerializer(_plain_step), _STEP]

@@ -20,7 +20,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import shortened_repr
 
 from .table import LARGEST, Table
-from .units import FileName, angle
+from .units import SIGNED_ANGLE, FileName
 
 FROM_FILE = "from file"
 MILLIMETRES = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3, "km": 1e6, "in": 25.4, "ft": 304.8}
@@ -71,7 +71,7 @@ def _step_matrix(step: dict[str, object]) -> FloatArray:
     if length == 0:
         raise ValueError("expected an axis to rotate about, got [0, 0, 0]")
     x, y, z = (component / length for component in vector)
-    turn = angle(step["angle"])
+    turn = SIGNED_ANGLE.read(step["angle"])
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     matrix[:3, :3] += sin(turn) * across + (1 - cos(turn)) * across @ across
     return matrix

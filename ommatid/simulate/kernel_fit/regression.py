@@ -17,6 +17,7 @@ from scipy import stats
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.fitted.kernels import basis, terms
 
+from ..calibration.fit.chart import freedom_of
 from .deviations import Chart
 
 Turn = tuple[bool, ...]  # mirrored down, mirrored across, transposed before
@@ -106,14 +107,12 @@ def chance(products: FloatArray) -> float:
     """Return the probability of a sum of squares at least as large as that of the mean if only noise is in it.
 
     products : (1 + B, 1 + B) of the mean and of the deviations of the batches, as of `gram`
-    An F test with the effective degrees of freedom (tr S)^2 / tr S^2 (Bai and Saranadasa 1996, Statistica Sinica 6).
+    An F test with the effective degrees of freedom of the noise, as of `freedom_of`.
     """
     noise, free = products[1:, 1:], len(products) - 2
-    trace, square = float(np.trace(noise)) / free, float(np.square(noise).sum()) / free**2
+    trace, freedom = float(np.trace(noise)) / free, freedom_of(noise)
     if trace <= 0:
         return 1.0
-    squares = free**2 / ((free - 1) * (free + 2)) * (square - trace**2 / free)
-    freedom = max(1.0, trace**2 / max(squares, trace**2 * 1e-9))
     ratio = float(products[0, 0]) / (trace / (free + 1))
     return float(stats.f.sf(ratio, freedom, freedom * free))
 

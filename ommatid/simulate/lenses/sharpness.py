@@ -11,23 +11,20 @@ Spots are those of rays traced from a sensor point to the target, times the magn
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import sqrt
 from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.lens_type import LensType
 
-from .field import field_of
+from .field import LensField, field_of
 from .point_spread import point_spread, strehl_ratio
-from .prescription import Prescription, prescription_of
-from .ray_trace import exit_disk_of, path, reach, spread, trace
+from .prescription import prescription_of
 from .wavefront import Wavefront, thin_wavefront
-
-RAYS = 4096
 
 
 def describe(camera: Camera) -> list[dict[str, Any]]:
@@ -118,11 +115,10 @@ def _thin(camera: Camera, lens_type: LensType, diameter: float) -> dict[str, Any
 def _real(camera: Camera, lens_type: LensType) -> dict[str, Any]:
     lens, depth = prescription_of(camera, lens_type), camera.depth(lens_type)
     entrance, vergence = lens.entrance_pupil, 1 / lens.focal_length - 1 / depth
-    field, _, _ = reach(camera, lens_type)
-    axis, corner = (_bundle(camera, lens_type, lens, height) for height in (0.0, field))
+    field = field_of(camera, lens_type, None)
     before = lens.front_principal - entrance.position
     near, far = depth_of_field(depth, vergence, 2 * entrance.radius, camera.pixel_pitch, before)
-    spots = [_spot(*bundle, camera.distance) for bundle in (axis, corner)]
+    spots = [_spot(field.wave(height, None)) for height in (0.0, field.field)]
     spot_axis, spot_corner = (None if spot is None else spot * (depth / camera.distance) for spot in spots)
     return {
         "lens": lens_type.name,
@@ -134,7 +130,7 @@ def _real(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "spot_axis": spot_axis,
         "spot_corner": spot_corner,
         "focus": 1 / vergence if vergence > 0 else None,
-        "sharpest": _sharpest(*axis),
+        "sharpest": _sharpest(field),
         **_contrasts(camera, depth, *_waves(camera, lens_type)),
     }
 
@@ -164,32 +160,17 @@ def _diffraction(camera: Camera, working: float) -> dict[str, float]:
     return {"working_f_number": working, "airy_diameter": airy, "airy_pixels": airy / camera.pixel_pitch}
 
 
-def _bundle(
-    camera: Camera, lens_type: LensType, lens: Prescription, height: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Trace the rays of a sensor point: (x, y) in the plane of the lenses, (2, rays), their slopes and weights."""
-    numbers = path(lens, exit_disk_of(camera, lens_type, lens))
-    (x, y), (u, v, w), weight = trace(numbers, 0.0, height, *spread(RAYS), camera.depth(lens_type))
-    total = float(weight.sum())
-    return np.array([x, y]), np.array([u / w, v / w]), weight / total if total > 0 else weight
+def _spot(rays: Wavefront | None) -> float | None:
+    """Return the root mean square radius of rays about their centre on the target; None if they carry no light."""
+    return None if rays is None else float(np.sqrt(rays.light @ np.square(rays.hits).sum(axis=0)))
 
 
-def _moment(first: FloatArray, second: FloatArray, weight: FloatArray) -> float:
-    means = (first @ weight)[:, None], (second @ weight)[:, None]
-    return float(np.sum(weight * (first - means[0]) * (second - means[1])))
-
-
-def _spot(points: FloatArray, slopes: FloatArray, weight: FloatArray, distance: float) -> float | None:
-    """Return the root mean square radius of a bundle about its centre, at a distance; None if it carries no light."""
-    if not weight.any():
-        return None
-    hits = points + distance * slopes
-    return sqrt(_moment(hits, hits, weight))
-
-
-def _sharpest(points: FloatArray, slopes: FloatArray, weight: FloatArray) -> float | None:
+def _sharpest(field: LensField) -> float | None:
     """Return the distance z with the smallest spot over z, whose square is a parabola in 1 / z."""
-    if not weight.any():
+    here, beyond = (replace(field, distance=times * field.distance).wave(0.0, None) for times in (1, 2))
+    if here is None or beyond is None:
         return None
-    vergence = -_moment(points, slopes, weight) / _moment(points, points, weight)
+    slopes = (beyond.hits - here.hits) / field.distance
+    points = here.hits - field.distance * slopes  # in the plane of the lenses
+    vergence = -float((points * slopes @ here.light).sum() / (np.square(points) @ here.light).sum())
     return 1 / vergence if vergence > 0 else None

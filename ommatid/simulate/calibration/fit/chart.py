@@ -112,3 +112,16 @@ def chart_rows(camera: Camera, lens_type: LensType, matrix: sparse.csr_array, ba
             ChartRows(down, across, row[part], column[part], dense[0, part], dense[1:, part].astype(np.float32))
         )
     return result
+
+
+def freedom_of(gram: FloatArray) -> float:
+    """Return the effective degrees of freedom (tr S)^2 / tr S^2 of the covariance S, from the Gram matrix of draws.
+
+    tr S^2 without bias from few draws: Bai and Saranadasa 1996, Statistica Sinica 6, 311.
+    """
+    free = len(gram) - 1
+    trace, square = float(np.trace(gram)) / free, float(np.square(gram).sum()) / free**2
+    squares = free**2 / ((free - 1) * (free + 2)) * (square - trace**2 / free)
+    if trace == 0:
+        return 1.0
+    return max(1.0, trace**2 / max(squares, trace**2 * 1e-9))

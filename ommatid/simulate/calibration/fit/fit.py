@@ -25,7 +25,7 @@ from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
 from ..point_sources import Responses, Subsets
-from .chart import ChartRows, chart_of, chart_rows, side_for_kernels
+from .chart import ChartRows, chart_of, chart_rows, freedom_of, side_for_kernels
 from .view_fit import SIGNIFICANCE, ViewFit, fit_views, predicted
 
 if TYPE_CHECKING:
@@ -65,22 +65,9 @@ def explanation(chart: ChartRows, model: FloatArray, rays: int) -> Explanation:
     return Explanation(
         left=float(weights @ np.square(residual)),
         expected=float(np.trace(gram)) / (count * (count - 1)) + floor,
-        freedom=min(_freedom(gram), float(residual.size)),
+        freedom=min(freedom_of(gram), float(residual.size)),
         batches=count,
     )
-
-
-def _freedom(gram: FloatArray) -> float:
-    """Return the effective degrees of freedom (tr S)^2 / tr S^2 of the covariance S, from the Gram matrix of draws.
-
-    tr S^2 without bias from few draws: Bai and Saranadasa 1996, Statistica Sinica 6, 311.
-    """
-    free = len(gram) - 1
-    trace, square = float(np.trace(gram)) / free, float(np.square(gram).sum()) / free**2
-    squares = free**2 / ((free - 1) * (free + 2)) * (square - trace**2 / free)
-    if trace == 0:
-        return 1.0
-    return max(1.0, trace**2 / max(squares, trace**2 * 1e-9))
 
 
 @dataclass(frozen=True)

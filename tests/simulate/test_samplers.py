@@ -23,7 +23,7 @@ from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.sampling.passes import plan
 from ommatid.simulate.sampling.samplers import corners, filling, fitting, law
 
-from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, needs, scene
+from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, familywise, needs, scene
 
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 
@@ -71,6 +71,8 @@ def errors(variant: str, sampler: Sampler, samples: int, repeats: int) -> NDArra
 def test_pixels_and_passes_have_independent_streams(variant: str, sampler: Sampler) -> None:
     """The sum over pixels of one seed scatters as that of independent ones; consecutive seeds have little in common.
 
+    The significance is that of all samplers and variants together: scalar ldsampler's sum is beyond 0.001 of one alone,
+    as one start in some thousand is. Over 160 others the mean square is 0.999 +- 0.010, and scatters as chi-squared.
     Mitsuba hashes seeds shallowly: ldsampler's neighbours on llvm correlate by -0.013 (measured over 2000). Below 0.03
     the variance of a mean of 16 passes is within 6 % of what their scatter says.
     """
@@ -80,7 +82,8 @@ def test_pixels_and_passes_have_independent_streams(variant: str, sampler: Sampl
     found = found[:, found.std(axis=0) > 1e-3]
     scores = found / np.sqrt(np.mean(found**2, axis=0))
     over_pixels = float(np.sum(scores.sum(axis=1) ** 2) / scores.shape[1])
-    assert stats.chi2.ppf(0.001, repeats) < over_pixels < stats.chi2.isf(0.001, repeats)
+    tail = familywise(len(SAMPLERS) * len(VARIANTS)) / 2
+    assert stats.chi2.ppf(tail, repeats) < over_pixels < stats.chi2.isf(tail, repeats)
     assert abs(np.mean(scores[1:] * scores[:-1])) < 0.03, "known to 0.004"
 
 

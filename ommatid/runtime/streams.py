@@ -100,8 +100,12 @@ def sampler_seeds(seed: int, rays: Rays, number: int, passes: int) -> Callable[[
 
 
 def block_seed(seed: int, start: int) -> int:
-    """Return the sampler seed of the block of rays that begins at pixel `start`: the first block has `seed` itself."""
-    return seed if start == 0 else _word(seed, Purpose.BLOCK, start)
+    """Return the sampler seed of the block of rays that begins at pixel `start`, unrelated to all others.
+
+    Mitsuba numbers the streams of rays that start together by their seed plus samples times pixel: seeds a few apart
+    would give a pixel the stream that its neighbour had in an earlier pass.
+    """
+    return _word(seed, Purpose.BLOCK, start)
 
 
 def draw_seed(seed: int, draw: int) -> int:

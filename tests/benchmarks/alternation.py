@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -11,25 +10,6 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 
 Work = Callable[[int], object]  # takes a seed, a different one each time
-VARIANTS = ("llvm_ad_mono", "scalar_rgb")
-
-
-@dataclass(frozen=True)
-class Row:
-    """ommatid's method against another one: seconds of each repeat, target ratio, and difference of the results."""
-
-    variant: str
-    ours: str
-    other: str
-    seconds: FloatArray
-    other_seconds: FloatArray
-    target: float | None
-    check: str
-
-    @property
-    def ratios(self) -> FloatArray:
-        """Time of the other method over that of ommatid's in each repeat."""
-        return self.other_seconds / self.seconds
 
 
 def alternate(methods: Sequence[Work], repeats: int) -> FloatArray:
@@ -41,9 +21,3 @@ def alternate(methods: Sequence[Work], repeats: int) -> FloatArray:
             method(repeat + 1)
             seconds[index, repeat] = perf_counter() - start
     return seconds
-
-
-def difference_words(image: FloatArray, other: FloatArray) -> str:
-    """Return the RMS and the largest difference of two images in words."""
-    difference = image - other
-    return f"pixels differ by {np.sqrt((difference**2).mean()):.2g} RMS, {np.abs(difference).max():.2g} at most, of 255"

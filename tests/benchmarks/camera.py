@@ -3,31 +3,52 @@
 # pyright: basic
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from rich.table import Table
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import read
 from ommatid.simulate.renderer.plugins import film, scene_of, stock_sensor, target_of, texture_of
 from ommatid.simulate.renderer.renderer import Renderer
+from ommatid.simulate.renderer.variant import unusable_reason
 
-from .alternation import Row, alternate, difference_words
+from .alternation import alternate
 
 SAMPLES = (256, 1024)  # of one pass of a scene with 4096 samples, and of a typical rendering without passes
 SAMPLER = "multijitter"
 REPEATS = 9
-TARGET = 3.0
+VARIANTS = ("llvm_ad_mono", "scalar_rgb")
+SCENE = Path(__file__).parents[2] / "scenes" / "tile19.toml"
 
 Reader = Callable[[int], FloatArray]  # from a seed to the values of the sensor pixels, (M,)
 
 
-def camera_rows(scene_file: Path, variant: str, samples: int) -> list[Row]:
-    """Return a row for each of Mitsuba's methods, against the fastest of ommatid's that the variant supports."""
-    scene = read(scene_file)
+def camera_table() -> Table:
+    """Return times of ommatid and of stock Mitsuba, on every variant that works here."""
+    releases = ", ".join(f"{name} {version}" for name, version in versions("mitsuba", "drjit").items())
+    table = Table(title=f"tile19 against stock Mitsuba, on {os.cpu_count()} cores with {releases}", show_lines=True)
+    for name in ("samples", "variant", "A", "B", "time of A", "time of B", "B / A", "difference of the results"):
+        table.add_column(name)
+    reasons = {variant: unusable_reason(variant) for variant in VARIANTS}
+    for variant in VARIANTS:
+        for samples in () if reasons[variant] else SAMPLES:
+            for row in camera_rows(variant, samples):
+                table.add_row(*row)
+    skipped = [f"{variant} was left out: {reason}." for variant, reason in reasons.items() if reason]
+    table.caption = " ".join([f"Medians (minimum to maximum) of {REPEATS} repeats in alternation.", *skipped])
+    return table
+
+
+def camera_rows(variant: str, samples: int) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each of Mitsuba's methods, against the fastest of ommatid's that the variant supports."""
+    scene = read(SCENE)
     camera = derive(scene)
     picture = load(scene)
     ours = _ours(camera, picture, variant, samples)
@@ -40,19 +61,18 @@ def camera_rows(scene_file: Path, variant: str, samples: int) -> list[Row]:
         methods = {"Renderer: all rays at once": ours, stock: loop, f"{len(camera.types)} `batch` sensors": batches}
     images = [method(0) for method in methods.values()]  # also warms them up
     seconds = alternate(list(methods.values()), REPEATS)
-    names = list(methods)
-    return [
-        Row(
-            variant=variant,
-            ours=names[0],
-            other=names[index],
-            seconds=seconds[0],
-            other_seconds=seconds[index],
-            target=TARGET if index == 1 and not variant.startswith("scalar") else None,
-            check=difference_words(images[0], images[index]),
+    first, *others = methods
+    for index, other in enumerate(others, 1):
+        ratios, difference = seconds[index] / seconds[0], images[0] - images[index]
+        yield (
+            str(samples),
+            variant,
+            first,
+            other,
+            *(f"{np.median(spent) * 1e3:.0f} ms" for spent in (seconds[0], seconds[index])),
+            f"{np.median(ratios):.3g} ({ratios.min():.3g} to {ratios.max():.3g})",
+            f"{np.sqrt((difference**2).mean()):.2g} RMS, {np.abs(difference).max():.2g} at most, of 255",
         )
-        for index in range(1, len(methods))
-    ]
 
 
 def _ours(camera: Camera, picture: FloatArray, variant: str, samples: int) -> Reader:

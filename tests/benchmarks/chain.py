@@ -1,6 +1,6 @@
 """The whole chain from picture to page, stage by stage: `python -m tests.benchmarks chain [SIZE...] [--cases NAMES]`.
 
-Every case is a command `ommatid run` in a process of its own, whose time, processor time, peak memory and files are
+Every case is a command `ommatid run` in a process of its own, whose time, peak memory and files are
 measured from outside, and whose stages come from run.json. Frames of 60 k - 1 pixels a side are seen by all three lens
 types to their edges.
 """
@@ -60,12 +60,11 @@ CASES = (
 
 @dataclass(frozen=True)
 class Measurement:
-    """A run of a case: seconds, processor seconds, peak memory and bytes of files, run.json, and why it failed."""
+    """A run of a case: seconds, peak memory and bytes of files, run.json, and why it failed."""
 
     seconds: float
-    processor: float
     memory: float
-    files: dict[str, int]
+    files: int
     report: dict[str, Any]
     failure: str = ""
 
@@ -105,11 +104,11 @@ def measure(case: Case, size: int, changes: Sequence[str] = ()) -> Measurement:
         seconds = perf_counter() - begun
         process.returncode = os.waitstatus_to_exitcode(status)
         made = out / Path(case.scene).stem
-        files = {path.name: path.stat().st_size for path in made.iterdir()} if made.is_dir() else {}
-        report = json.loads((made / "run.json").read_text("utf-8")) if "run.json" in files else {}
+        files = sum(path.stat().st_size for path in made.iterdir()) if made.is_dir() else 0
+        report = json.loads((made / "run.json").read_text("utf-8")) if (made / "run.json").exists() else {}
         failure = errors.decode(errors="replace").strip().splitlines()[-1] if process.returncode else ""
     kilobytes = usage.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
-    return Measurement(seconds, usage.ru_utime + usage.ru_stime, kilobytes * 1024, files, report, failure)
+    return Measurement(seconds, kilobytes * 1024, files, report, failure)
 
 
 def _pixel(case: Case) -> float:
@@ -131,35 +130,18 @@ def picture_of(size: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
 def table(rows: Sequence[tuple[Case, int, Measurement]]) -> Table:
     """Return the measurements as a table."""
     result = Table(title="From picture to page")
-    for name in ("case", "side", "all", "processors", *STAGES, "memory", "files", "stack", "model", "page's file"):
+    for name in ("case", "side", "all", *STAGES, "memory", "files"):
         result.add_column(name, justify="left" if name == "case" else "right")
-    for name in ("error", "promised (99 %)"):
-        result.add_column(name, justify="right")
     for case, size, measured in rows:
         result.add_row(case.name, str(size), *_cells(measured))
     return result
 
 
 def _cells(measured: Measurement) -> list[str]:
-    whole = [f"{measured.seconds:.1f} s", f"{measured.processor:.1f} s"]
+    whole = f"{measured.seconds:.1f} s"
     if measured.failure:
-        return [*whole, measured.failure]
-    stages, error = measured.report["stages"], measured.report["error"]
-    seconds = {name: stage["seconds"] for name, stage in stages.items()}
+        return [whole, measured.failure]
+    seconds = {name: stage["seconds"] for name, stage in measured.report["stages"].items()}
     seconds["start-up"] = measured.report["spent"].get("start_up", 0.0)
-    interval = error.get("expected_given_truth")
-    promised = f"{error['predicted_mse']:.4g}"
-    if interval is not None:
-        promised = f"{interval['mse']:.4g} ({interval['low']:.4g} to {interval['high']:.4g})"
-    sizes = [
-        sum(measured.files.values()),
-        *(measured.files[name] for name in ("stack.exr", "model.npz", "report.html")),
-    ]
-    return [
-        *whole,
-        *(f"{seconds.get(name, 0.0):.1f} s" for name in STAGES),
-        f"{measured.memory / 1e9:.2f} GB",
-        *(f"{size / 1e6:.3g} MB" for size in sizes),
-        f"{error['mse']:.4g}",
-        promised,
-    ]
+    stages = (f"{seconds.get(name, 0.0):.1f} s" for name in STAGES)
+    return [whole, *stages, f"{measured.memory / 1e9:.2f} GB", f"{measured.files / 1e6:.3g} MB"]

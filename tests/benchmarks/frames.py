@@ -6,8 +6,6 @@ solver's default accuracy. That number is determined beforehand and not timed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
@@ -19,7 +17,7 @@ from ommatid.runtime.arrays import FloatArray
 
 from .alternation import alternate
 from .fresh import call, memory_of
-from .rivals import RIVALS, Rival, by_boxes, by_lsmr, factorised
+from .rivals import OURS, RIVALS, by_cg, by_cholesky, by_lsmr
 from .whole import NOISE, SMALL, Whole, compile_all, deviations, stored
 
 SIZE = 539
@@ -28,91 +26,54 @@ REPEATS = 3
 REFERENCE = 1e-6  # accuracy of the solution with which errors are computed
 MOST_STEPS = 5000
 FEW_STEPS = 5  # for the peak of memory, which does not increase with more
-OURS = "our frame solver, unprepared"
-PREPARED = "our frame solver, prepared"
 
 
 class _EnoughError(Exception):
     """Stops an iterative solver from its callback."""
 
 
-@dataclass(frozen=True)
-class FrameRow:
-    """A solver: seconds of every repeat, its own and those of ours; its memory above H and g; its largest error.
-
-    memory, ours_memory : gigabytes, None if not measured
-    """
-
-    name: str
-    steps: int | None
-    seconds: FloatArray
-    ours: FloatArray
-    memory: float | None
-    ours_memory: float | None
-    error: float
-    target: float | None = None
-    memory_target: float | None = None
-
-
-def frame_rows() -> tuple[list[FrameRow], float]:
-    """Return a row per solver, prepared ones last, and the difference of the reference solution from Cholesky's."""
+def frames_table() -> Table:
+    """Return the frame solver against other solvers."""
+    start = perf_counter()
     compile_all()
     whole, errors = Whole.drawn(SIZE), _Errors(SIZE)
     matrix = stored(whole.camera)
     errors.reference = whole.estimate(REFERENCE).image
+    difference = errors.of(by_cholesky(whole, matrix))
     counts = _counts(whole, matrix, errors)
-    frame, factor = whole.frame(), factorised(matrix)
-    right = frame.right_hand_side(whole.residual)
-    difference = errors.of(factor(right))
-    direct = frame.solve(right).steps
-    solvers = [
-        _Solver(OURS, direct, OURS, lambda: whole.estimate().image),
-        *(_Solver.of(rival, counts.get(rival.steps), whole, matrix) for rival in RIVALS),
-        _Solver(PREPARED, direct, PREPARED, lambda: frame.solve(right).image),
-        _Solver("CHOLMOD, factor stored", None, PREPARED, lambda: factor(right)),
-    ]
-    timed = alternate([solver.work for solver in solvers], REPEATS)
-    seconds = {solver.name: timed[index] for index, solver in enumerate(solvers)}
-    memory = {name: _memory(name) for name in (OURS, *(rival.name for rival in RIVALS))}
-    rows = [
-        FrameRow(
-            name=solver.name,
-            steps=solver.steps,
-            seconds=seconds[solver.name],
-            ours=seconds[solver.against],
-            memory=memory.get(solver.name),
-            ours_memory=memory.get(solver.against),
-            error=errors.of(solver.solutions[-1]),
-            target=solver.target,
-            memory_target=solver.memory_target,
+    solutions: dict[str, FloatArray] = {}
+
+    def solve(number: int) -> None:
+        rival = RIVALS[number]
+        solutions[rival.name] = rival.solve(whole, matrix, counts.get(rival.steps, 0), None)
+
+    seconds = alternate([lambda _, number=number: solve(number) for number in range(len(RIVALS))], REPEATS)
+    memory = [_memory(rival.name) for rival in RIVALS]
+    counts[OURS.steps] = whole.estimate().steps
+    table = Table(
+        title=f"A frame of {SIZE} x {SIZE}, noise variance {NOISE:g}, to {ACCURACY:g} posterior standard deviations"
+    )
+    table.add_column("solver", no_wrap=True)
+    for name in ("steps", "time", "time / ours", "memory", "memory / ours", "largest error"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for rival, spent, needs in zip(RIVALS, seconds, memory, strict=True):
+        ratios = spent / seconds[0]
+        table.add_row(
+            rival.name,
+            str(counts[rival.steps]) if rival.steps or rival is OURS else "-",
+            f"{np.median(spent):.3g} s",
+            f"{np.median(ratios):.3g} ({ratios.min():.3g} to {ratios.max():.3g})",
+            f"{needs * 1e3:.3g} MB",
+            f"{needs / memory[0]:.3g}",
+            f"{errors.of(solutions[rival.name]):.3g}",
         )
-        for solver in solvers
-    ]
-    return rows, difference
-
-
-@dataclass(frozen=True)
-class _Solver:
-    """A solver, the name of the solver with which it is compared, and its last solution."""
-
-    name: str
-    steps: int | None
-    against: str
-    solve: Callable[[], FloatArray]
-    target: float | None = None
-    memory_target: float | None = None
-    solutions: list[FloatArray] = field(default_factory=list[FloatArray])
-
-    @staticmethod
-    def of(rival: Rival, steps: int | None, whole: Whole, matrix: sparse.csr_array) -> _Solver:
-        def solve() -> FloatArray:
-            return rival.solve(whole, matrix, steps or 0, None)
-
-        return _Solver(rival.name, steps, OURS, solve, rival.target, rival.memory_target)
-
-    def work(self, seed: int) -> None:
-        del seed
-        self.solutions[:] = [self.solve()]
+    table.caption = (
+        f"Medians (minimum to maximum) of {REPEATS} repeats in alternation. The other solvers take the fewest steps"
+        " that suffice. Storing H beforehand is neither timed nor counted; memory is the peak of a separate interpreter"
+        " above that with H and g. Errors are in posterior standard deviations, against our solver's solution to 1e-6,"
+        f" which differs by {difference:.1g} from that of Cholesky. Total time: {perf_counter() - start:.0f} s."
+    )
+    return table
 
 
 class _Errors:
@@ -157,7 +118,7 @@ def _steps_of_cg(whole: Whole, matrix: sparse.csr_array, errors: _Errors) -> int
             raise _EnoughError
 
     try:
-        by_boxes(whole, matrix, MOST_STEPS, watch)
+        by_cg(whole, matrix, MOST_STEPS, watch)
     except _EnoughError:
         return count
     raise RuntimeError(f"conjugate gradients do not reach {ACCURACY:g} in {MOST_STEPS} steps")
@@ -171,54 +132,8 @@ def _memory(name: str) -> float:
 def needed(name: str, size: int) -> tuple[float, float]:
     """Return the gigabytes of this process with g and, if stored, H, and their peak during one estimate."""
     compile_all()
-    whole = Whole.drawn(size)
-    rival = next((rival for rival in RIVALS if rival.name == name), Rival(OURS, lambda *_: whole.estimate().image))
-    if name != OURS:
-        small = Whole.drawn(SMALL)
-        rival.solve(small, stored(small.camera), FEW_STEPS, None)  # to import its modules
-    matrix = stored(whole.camera) if rival.stored and name != OURS else sparse.csr_array((0, 0))
+    whole, small = Whole.drawn(size), Whole.drawn(SMALL)
+    rival = next(rival for rival in RIVALS if rival.name == name)
+    rival.solve(small, stored(small.camera), FEW_STEPS, None)  # to import its modules
+    matrix = stored(whole.camera) if rival.stored else sparse.csr_array((0, 0))
     return memory_of(lambda: rival.solve(whole, matrix, FEW_STEPS, None))
-
-
-def frames_table() -> Table:
-    """Return the frame solver against other solvers."""
-    start = perf_counter()
-    table = Table(
-        title=f"A frame of {SIZE} x {SIZE}, noise variance {NOISE:g}, to {ACCURACY:g} posterior standard deviations"
-    )
-    table.add_column("solver", no_wrap=True)
-    for name in ("steps", "time", "time / ours", "target", "memory", "memory / ours", "target", "largest error"):
-        table.add_column(name, justify="right", no_wrap=True)
-    rows, difference = frame_rows()
-    for row in rows:
-        if row.memory is None and row.ours is row.seconds:
-            table.add_section()
-        table.add_row(*_cells(row))
-    table.caption = (
-        f"Medians (minimum to maximum) of {REPEATS} repeats in alternation. The lower part is relative to its own first"
-        " line. The other solvers take the fewest steps that suffice. Storing H beforehand is neither timed nor"
-        " counted; memory is the peak of a separate interpreter above that with H and g. Errors are in posterior"
-        " standard deviations, against our solver's solution to 1e-6, which differs by"
-        f" {difference:.1g} from that of Cholesky. Total time: {perf_counter() - start:.0f} s."
-    )
-    return table
-
-
-def _cells(row: FrameRow) -> list[str]:
-    ratios = row.seconds / row.ours
-    memory = ["-", "-", "-"]
-    if row.memory is not None and row.ours_memory is not None:
-        memory = [f"{row.memory * 1e3:.3g} MB", f"{row.memory / row.ours_memory:.3g}", _number(row.memory_target)]
-    return [
-        row.name,
-        _number(row.steps),
-        f"{np.median(row.seconds):.3g} s",
-        f"{np.median(ratios):.3g} ({ratios.min():.3g} to {ratios.max():.3g})",
-        _number(row.target),
-        *memory,
-        f"{row.error:.3g}",
-    ]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:g}"

@@ -72,16 +72,6 @@ def with_nan(path: Path) -> None:
     np.save(path, target)
 
 
-def cut(name: str, part: float) -> Callable[[Path], None]:
-    """Truncate a file, as an interrupted copy does."""
-
-    def prepare(folder: Path) -> None:
-        whole = (folder / name).read_bytes()
-        (folder / name).write_bytes(whole[: int(part * len(whole))])
-
-    return prepare
-
-
 class _WritesFile:
     """Writes a file when it is unpickled."""
 
@@ -142,19 +132,12 @@ PICTURES = [
     picture("nan.npy", with_nan, "nan.npy", "NaN"),
     picture("small.npy", save(np.ones((11, 12))), "target.shape", "12 x 12", "11 x 12"),
     picture("object.npy", save(np.array([[_WritesFile()]], dtype=object)), "could not be read as a picture"),
-    Case(
-        "a picture cut short",
-        (*RUN, "--set", "target.image=out/tiny/overview.png"),
-        ("overview.png", "could not be read as a picture"),
-        cut("out/tiny/overview.png", 0.5),
-    ),
 ]
 
 FILES = [
     Case("a missing scene", ("run", "none.toml", "-o", "new"), ("none.toml", "ommatid init")),
     Case("a folder for a scene", ("run", "out", "-o", "new"), ("out", "scene file")),
     Case("a scene that is not UTF-8", RUN, ("tiny.toml", "UTF-8"), latin_1),
-    Case("a stack cut short", RECONSTRUCT, ("out/tiny/stack.exr",), cut("out/tiny/stack.exr", 0.9)),
     Case("a model with pickled objects", RECONSTRUCT, ("out/tiny/model.npz", "pickled"), pickled),
     Case("a missing stack", RECONSTRUCT, ("out/tiny/stack.exr", "no such file"), removed("out/tiny/stack.exr")),
     Case(

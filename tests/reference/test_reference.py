@@ -16,7 +16,7 @@ from scipy import sparse
 from .__main__ import judgement
 from .cases import Case
 from .checkout import MATRIX, Checkout, Done, NoCheckoutError
-from .comparison import LIMITS
+from .comparison import LIMITS, MODEL
 
 CASE = Case("made-up", (), "out")
 RNG = np.random.default_rng(1)
@@ -46,7 +46,10 @@ def finished(folder: Path, **changes: Any) -> Done:
     image = {"estimate": changes.get("estimate", TRUTH + NOISE[1])}
     image |= {"variance": changes.get("variance", np.full_like(TRUTH, 0.01)), "truth": TRUTH}
     write(folder / "out" / "estimate.exr", estimate=image)
-    sparse.save_npz(folder / MATRIX, changes.get("H", sparse.csr_array(np.eye(40, 30))))
+    matrix = changes.get("H", sparse.csr_array(np.eye(40, 30)))
+    sparse.save_npz(folder / MATRIX, matrix)
+    variances = np.full(matrix.nnz, changes.get("variance_of_H", 0.0))
+    np.savez(folder / "out" / MODEL, data=matrix.data, indices=matrix.indices, indptr=matrix.indptr, variance=variances)
     report = json.loads(json.dumps(REPORT))
     for path, value in changes.get("report", {}).items():
         *keys, last = path.split(".")
@@ -147,6 +150,26 @@ def test_another_draw_of_the_noise_is_statistically_the_same_and_a_bias_is_not(b
     ]
     for change, quantity in biased:
         assert compared(before, statistical=True, **(again | change)).startswith(quantity)
+
+
+def test_two_draws_of_h_are_as_far_apart_as_their_variances_say(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    truth = rng.uniform(0.1, 1, (40, 30))
+
+    def draw(deviation: float, bias: float = 0.0) -> Any:
+        return sparse.csr_array(truth + bias + rng.normal(0, deviation, truth.shape))
+
+    before = finished(tmp_path / "before", H=draw(0.1), variance_of_H=0.01)
+
+    def said(matrix: Any, variance: float) -> str:
+        return compared(before, statistical=True, H=matrix, variance_of_H=variance)
+
+    assert said(draw(0.1), 0.01) == ""
+    assert said(draw(0.3), 0.09) == ""
+    assert said(draw(0.1, bias=0.3), 0.01).startswith("scatter")
+    assert said(draw(0.3), 0.01).startswith("scatter")
+    assert said(draw(0.1), 0.09).startswith("scatter"), "an overstated one"
+    assert said(sparse.csr_array(truth), 0.0) == "", "of a side without variances"
 
 
 PROGRAM = """

@@ -69,8 +69,7 @@ def test_seeds_of_samplers_end_within_32_bits_and_stay_apart() -> None:
 
 
 def test_blocks_and_draws_have_seeds_of_their_own() -> None:
-    assert block_seed(11, 0) == 11
-    seeds = [11, *(block_seed(11, start) for start in range(1, 100)), *(draw_seed(11, draw) for draw in range(1, 100))]
+    seeds = [11, *(block_seed(11, start) for start in range(100)), *(draw_seed(11, draw) for draw in range(1, 100))]
     assert len(set(seeds)) == len(seeds)
     assert all(0 <= seed < 2**32 for seed in seeds)
     assert np.ptp(seeds) > 2**31, "all over the 32 bits"

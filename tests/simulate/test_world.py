@@ -45,7 +45,8 @@ def test_an_emissive_checkerboard_equals_the_flat_target_with_that_picture(tmp_p
     assert_student(seen.mean - ideal_matrix(camera) @ picture.ravel(), floored(seen), seen.passes)
     assert_student(seen.mean - shown.mean, floored(seen) + floored(shown), seen.passes)
     exact = truth(Setup(described, camera))
-    np.testing.assert_allclose(exact.image, picture, rtol=1e-5)
+    ray = 1.01 * np.ptp(picture) / exact.samples  # that float32 puts into the square beside it, for 1 seed of 40
+    np.testing.assert_allclose(exact.image, picture, rtol=1e-5, atol=ray)
     np.testing.assert_allclose(exact.depth, Z, rtol=1e-6)
 
 

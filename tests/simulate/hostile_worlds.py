@@ -6,21 +6,10 @@ Each family yields a world that has to be refused, whatever the number is.
 from __future__ import annotations
 
 import random
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-PLY_TYPES = {
-    "char": "b",
-    "uchar": "B",
-    "short": "h",
-    "ushort": "H",
-    "int": "i",
-    "uint": "I",
-    "float": "f",
-    "double": "d",
-}
+from ..fuzz.families.worlds import PLY, serialized_mesh
 
 
 def scene(content: str, version: str = "3.0.0") -> str:
@@ -32,49 +21,18 @@ def mesh(name: str) -> str:
     return scene(f'<shape type="{kind}"><string name="filename" value="{name}"/></shape>')
 
 
-def ply(vertices: int, faces: list[tuple[int, ...]], order: str, index: str = "int", count: str = "uchar") -> bytes:
-    """Return a PLY file; the counts of its header are those of its content."""
-    name = {"=": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
-    header = (
-        f"ply\nformat {name} 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\nproperty float z\n"
+def meshes(rng: random.Random, folder: Path) -> str:
+    """Indices beyond the vertices, and files that are cut off or damaged; Mitsuba reads negative indices as 0."""
+    beyond = str(rng.choice([4, 5, 4 + rng.randrange(10**6), 2**31 - 1])).encode()
+    good = serialized_mesh()
+    name, content = rng.choice(
+        [
+            ("m.ply", PLY.replace(b"3 0 1 2", b"3 0 %s 1" % beyond)),
+            *(("m.serialized", bad) for bad in (good[:20], b"", good[:10] + b"\xff" * 9 + good[19:])),
+        ]
     )
-    header += f"element face {len(faces)}\nproperty list {count} {index} vertex_index\nend_header\n"
-    points = [(float(i), float(i * i), 1.0) for i in range(vertices)]
-    if order == "=":
-        rows = [" ".join(map(str, row)) for row in (*points, *((len(face), *face) for face in faces))]
-        return (header + "\n".join(rows) + "\n").encode()
-    content = b"".join(struct.pack(f"{order}3f", *point) for point in points)
-    for face in faces:
-        content += struct.pack(f"{order}{PLY_TYPES[count]}{len(face)}{PLY_TYPES[index]}", len(face), *face)
-    return header.encode() + content
-
-
-def serialized(vertices: int, faces: list[tuple[int, int, int]], says: int | None = None) -> bytes:
-    content = struct.pack("<I", 0x1000) + b"name\0" + struct.pack("<QQ", says or vertices, len(faces))
-    content += b"".join(struct.pack("<3f", i, i * i, 1) for i in range(vertices))
-    content += b"".join(struct.pack("<3I", *face) for face in faces)
-    return struct.pack("<HH", 0x041C, 4) + zlib.compress(content) + struct.pack("<QI", 0, 1)
-
-
-def _index(rng: random.Random, vertices: int) -> int:
-    return rng.choice([vertices, vertices + 1, vertices + rng.randrange(10**6), 2**31 - 1])
-
-
-def indices_of_ply(rng: random.Random, folder: Path) -> str:
-    """Indices beyond the vertices; Mitsuba reads negative ones as 0."""
-    vertices, order = rng.randrange(3, 9), rng.choice("=<>")
-    faces = [(0, 1, 2)] * rng.randrange(4)
-    faces.insert(rng.randrange(len(faces) + 1), (0, _index(rng, vertices), 1))
-    (folder / "m.ply").write_bytes(ply(vertices, faces, order))
-    return mesh("m.ply")
-
-
-def serialized_mesh(rng: random.Random, folder: Path) -> str:
-    good = serialized(4, [(0, 1, 2)])
-    bad = [serialized(4, [(0, 1, _index(rng, 4))]), serialized(4, [(0, 1, 2)], says=rng.choice([5, 10**9, 2**40]))]
-    bad += [good[:20], b"", good[:10] + b"\xff" * 9 + good[19:]]
-    (folder / "m.serialized").write_bytes(rng.choice(bad))
-    return mesh("m.serialized")
+    (folder / name).write_bytes(content)
+    return mesh(name)
 
 
 def laughs(rng: random.Random, folder: Path) -> str:
@@ -139,8 +97,7 @@ def outside(rng: random.Random, folder: Path) -> str:
 FAMILIES: dict[str, Callable[[random.Random, Path], str]] = {
     make.__name__: make
     for make in (
-        indices_of_ply,
-        serialized_mesh,
+        meshes,
         laughs,
         cycles,
         plugins,

@@ -14,7 +14,8 @@ from ommatid.simulate.renderer.worlds.trial import try_world
 
 from ..conftest import TINY, Command
 from ..examples import GALLERY
-from .hostile_worlds import FAMILIES, hostile_world, mesh, ply, scene, serialized
+from ..fuzz.families.worlds import PLY, serialized_mesh
+from .hostile_worlds import FAMILIES, hostile_world, mesh, scene
 
 WHERE = "test.toml: world.file"
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 1 2 3\n"
@@ -36,12 +37,8 @@ def test_hostile_worlds_are_refused_in_one_short_sentence(tmp_path: Path) -> Non
 
 
 def test_sound_meshes_are_read(tmp_path: Path) -> None:
-    kinds = {f"{index}{n}.ply": (order, index) for n, order in enumerate("=<>") for index in ("int", "uchar", "short")}
-    for name, (order, index) in kinds.items():
-        (tmp_path / name).write_bytes(ply(4, [(0, 1, 2), (1, 2, 3)], order, index))
-    (tmp_path / "m.obj").write_text(OBJ, encoding="utf-8")
-    (tmp_path / "m.serialized").write_bytes(serialized(4, [(0, 1, 2), (1, 2, 3)]))
-    for name in (*kinds, "m.obj", "m.serialized"):
+    for name, content in (("m.ply", PLY), ("m.obj", OBJ.encode()), ("m.serialized", serialized_mesh())):
+        (tmp_path / name).write_bytes(content)
         path = tmp_path / "world.xml"
         path.write_text(mesh(name), encoding="utf-8")
         checked = check_world_files(path, WHERE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -109,12 +108,6 @@ def test_an_array_smaller_than_its_header_states_is_refused(tmp_path: Path) -> N
         model_file.read(tmp_path / "a.npz")
 
 
-def png_of(rows: int, columns: int) -> bytes:
-    """Return a PNG file whose header states a size, with almost no pixels."""
-    header = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
-    return made.png_of(made.chunk(b"IHDR", header), made.chunk(b"IDAT", bytes(99)))
-
-
 # Memory
 
 
@@ -179,7 +172,7 @@ raise SystemExit
 
 
 def test_a_request_beyond_the_memory_is_refused(here: Path, ommatid: Command) -> None:
-    (here / "huge.png").write_bytes(png_of(100000, 100000))
+    (here / "huge.png").write_bytes(made.png_of(made.header(100000, 100000), made.chunk(b"IDAT", bytes(99))))
     for command, changes in CASES[-3:-1]:
         ended = ommatid(*command, *(word for change in changes for word in ("--set", change)))
         assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1)
@@ -189,7 +182,7 @@ def test_a_request_beyond_the_memory_is_refused(here: Path, ommatid: Command) ->
 
 @pytest.mark.slow
 def test_requests_beyond_the_memory_are_refused_before_allocation(here: Path) -> None:
-    (here / "huge.png").write_bytes(png_of(100000, 100000))
+    (here / "huge.png").write_bytes(made.png_of(made.header(100000, 100000), made.chunk(b"IDAT", bytes(99))))
     (here / "world.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>', encoding="utf-8")
     commands = [[*command, *(word for change in changes for word in ("--set", change))] for command, changes in CASES]
     (here / "commands.json").write_text(json.dumps(commands), encoding="utf-8")

@@ -26,11 +26,16 @@ def png(
     """A PNG of (rows, columns, numbers of a pixel), whose rows are filtered in all five ways in turn."""
     pixels = samples.reshape(*samples.shape[:2], SAMPLES[colour])
     passes = [pixels[row::down, column::across] for row, column, down, across in ADAM7] if interlaced else [pixels]
-    data = b"".join(_filtered(part, bits) for part in passes if part.size)
-    header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], bits, colour, 0, 0, int(interlaced))
+    data = b"".join(filtered(part, bits) for part in passes if part.size)
+    start = header(pixels.shape[0], pixels.shape[1], colour, bits, interlaced=interlaced)
     deflated = zlib.compress(data)
     halves = deflated[: len(deflated) // 2], deflated[len(deflated) // 2 :]
-    return png_of(chunk(b"IHDR", header), before, *(chunk(b"IDAT", half) for half in halves), after)
+    return png_of(start, before, *(chunk(b"IDAT", half) for half in halves), after)
+
+
+def header(rows: int, columns: int, colour: int = 0, bits: int = 8, *, interlaced: bool = False) -> bytes:
+    """The first chunk of a PNG."""
+    return chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, colour, 0, 0, int(interlaced)))
 
 
 def png_of(*chunks: bytes) -> bytes:
@@ -38,7 +43,8 @@ def png_of(*chunks: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks) + chunk(b"IEND", b"")
 
 
-def _filtered(pixels: NDArray[Any], bits: int) -> bytes:
+def filtered(pixels: NDArray[Any], bits: int) -> bytes:
+    """The rows of (rows, columns, numbers of a pixel), filtered in all five ways in turn."""
     rows, columns, count = pixels.shape
     if bits == 16:
         raw = pixels.astype(">u2").view(np.uint8).reshape(rows, -1)

@@ -21,15 +21,14 @@ import numpy as np
 from ommatid.scenes import scene
 from ommatid.scenes.formats import picture
 
+from ...scenes import picture_bytes as made
 from ..damage import damaged, damaged_near
 from ..family import SCENE, FileType
 
 LUMINANCE = np.array((0.2125, 0.7154, 0.0721))  # docs/pictures.md
 CLOSE = 2e-3  # of 255: half a step of 16 bits
 GREY, RGB, PALETTE, GREY_ALPHA, RGBA = 0, 2, 3, 4, 6  # types of colour of PNG
-CHANNELS = {GREY: 1, RGB: 3, PALETTE: 1, GREY_ALPHA: 2, RGBA: 4}
 DEPTHS = {GREY: (1, 2, 4, 8, 16), RGB: (8, 16), PALETTE: (1, 2, 4, 8), GREY_ALPHA: (8, 16), RGBA: (8, 16)}
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_MARKS = (b"IHDR", b"PLTE", b"tRNS", b"acTL", b"fcTL", b"eXIf", b"IDAT")
 ROWS, COLUMNS = 20, 24
 BOMB = 6000  # pixels along a side of a picture that is a few kilobytes large
@@ -82,43 +81,14 @@ def oriented(values: Any, orientation: int) -> Any:
     return turns.get(orientation, lambda image: image)(values)
 
 
-def exif(orientation: int, order: str = "<") -> bytes:
-    """Return a TIFF header with the tag of orientation alone."""
-    mark = b"II*\0" if order == "<" else b"MM\0*"
-    return mark + struct.pack(f"{order}IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
-
-
-def chunk(kind: bytes, content: bytes) -> bytes:
-    """Return a chunk of PNG."""
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-
-def _rows_of_png(rng: Random, values: Any, depth: int) -> bytes:
-    """Return the filtered rows of (rows, columns, channels) numbers."""
-    if depth == 16:
-        packed = values.astype(">u2").reshape(values.shape[0], -1).view(np.uint8)
-    elif depth == 8:
-        packed = values.astype(np.uint8).reshape(values.shape[0], -1)
-    else:
-        bits = np.unpackbits(values.astype(np.uint8).reshape(values.shape[0], -1, 1), axis=2)[..., 8 - depth :]
-        packed = np.packbits(bits.reshape(values.shape[0], -1), axis=1)
-    rows: list[bytes] = []
-    before = np.zeros_like(packed[0])
-    for row in packed:
-        up = rng.random() < 0.5
-        rows.append(bytes([2]) + (row - before).tobytes() if up else bytes([0]) + row.tobytes())
-        before = row
-    return b"".join(rows)
-
-
 def png(rng: Random, _: bytes) -> bytes:
     """Return a PNG file of a random kind."""
     if rng.random() < 0.03:
         return _png_bomb(rng)
-    colour = rng.choice(sorted(CHANNELS))
+    colour = rng.choice(sorted(DEPTHS))
     depth = rng.choice(DEPTHS[colour])
     numbers = np.random.default_rng(rng.randrange(1 << 32))
-    values = numbers.integers(0, 1 << depth, (ROWS, COLUMNS, CHANNELS[colour]))
+    values = numbers.integers(0, 1 << depth, (ROWS, COLUMNS, made.SAMPLES[colour]))
     pixels, chunks = _luminance(values, (1 << depth) - 1), b""
     if colour in (GREY_ALPHA, RGBA):
         if rng.random() < 0.5:
@@ -128,37 +98,32 @@ def png(rng: Random, _: bytes) -> bytes:
             pixels = NEVER
     if colour == PALETTE:
         table = numbers.integers(0, 256, (1 << depth, 3), dtype=np.uint8)
-        chunks += chunk(b"PLTE", table.tobytes())
+        chunks += made.chunk(b"PLTE", table.tobytes())
         pixels = _luminance(table[values[..., 0]].astype(float), 255)
     if colour in (GREY, RGB, PALETTE) and rng.random() < 0.15:
         transparent = values[0, 0]
-        chunks += chunk(
+        chunks += made.chunk(
             b"tRNS", bytes([0, 255]) * (1 << depth - 1) if colour == PALETTE else transparent.astype(">u2").tobytes()
         )
         pixels = NEVER
     turned = rng.choice((0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9))
     if turned:
-        chunks += chunk(b"eXIf", exif(turned, rng.choice("<>")))
+        chunks += made.chunk(b"eXIf", made.exif(turned, rng.choice("<>")))
         grey = pixels.values
         pixels = NEVER if grey is None else Pixels(oriented(grey[..., np.newaxis], turned)[..., 0])
     frame_count = rng.choice((0, 0, 0, 0, 1, 2, 1000))
-    data = zlib.compress(_rows_of_png(rng, values, depth))
+    data = zlib.compress(made.filtered(values, depth))
     if frame_count:
         control = struct.pack(">IIIIIHHBB", 0, COLUMNS, ROWS, 0, 0, 1, 10, 0, 0)
-        chunks += chunk(b"acTL", struct.pack(">II", frame_count, 0)) + chunk(b"fcTL", control)
+        chunks += made.chunk(b"acTL", struct.pack(">II", frame_count, 0)) + made.chunk(b"fcTL", control)
         pixels = pixels if frame_count == 1 else NEVER
     more = b""
     if frame_count > 1:
         control = struct.pack(">IIIIIHHBB", 1, COLUMNS, ROWS, 0, 0, 1, 10, 0, 0)
-        more = chunk(b"fcTL", control) + chunk(b"fdAT", struct.pack(">I", 2) + data)
-    content = (
-        SIGNATURE + _header(COLUMNS, ROWS, depth, colour) + chunks + chunk(b"IDAT", data) + more + chunk(b"IEND", b"")
-    )
+        more = made.chunk(b"fcTL", control) + made.chunk(b"fdAT", struct.pack(">I", 2) + data)
+    header = made.header(ROWS, COLUMNS, colour, depth)
+    content = made.png_of(header, chunks, made.chunk(b"IDAT", data), more)
     return _perhaps_damaged(rng, content, pixels, PNG_MARKS)
-
-
-def _header(columns: int, rows: int, depth: int, colour: int) -> bytes:
-    return chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, depth, colour, 0, 0, 0))
 
 
 def _png_bomb(rng: Random) -> bytes:
@@ -166,17 +131,11 @@ def _png_bomb(rng: Random) -> bytes:
     zeros = zlib.compress(bytes(BOMB * (BOMB + 1)), 9)
     if rng.random() < 0.5:
         side = rng.choice((BOMB, 100000, 2**31 - 1))
-        return SIGNATURE + _header(side, side, 8, GREY) + chunk(b"IDAT", zeros) + chunk(b"IEND", b"")
+        return made.png_of(made.header(side, side), made.chunk(b"IDAT", zeros))
     text = rng.choice((b"zTXt", b"iTXt", b"iCCP"))
-    header = {b"zTXt": b"k\0\0", b"iTXt": b"k\0\1\0\0\0", b"iCCP": b"k\0\0"}[text]
+    start = {b"zTXt": b"k\0\0", b"iTXt": b"k\0\1\0\0\0", b"iCCP": b"k\0\0"}[text]
     rows = zlib.compress(bytes(ROWS * (COLUMNS + 1)))
-    return (
-        SIGNATURE
-        + _header(COLUMNS, ROWS, 8, GREY)
-        + chunk(text, header + zeros)
-        + chunk(b"IDAT", rows)
-        + chunk(b"IEND", b"")
-    )
+    return made.png_of(made.header(ROWS, COLUMNS), made.chunk(text, start + zeros), made.chunk(b"IDAT", rows))
 
 
 def _perhaps_damaged(rng: Random, content: bytes, pixels: Pixels, marks: tuple[bytes, ...]) -> bytes:
@@ -200,7 +159,7 @@ def jpeg(rng: Random, _: bytes) -> bytes:
     stream = io.BytesIO()
     options: dict[str, Any] = {
         "quality": rng.choice((30, 90)),
-        "exif": b"Exif\0\0" + exif(turned, rng.choice("<>")) if turned else b"",
+        "exif": b"Exif\0\0" + made.exif(turned, rng.choice("<>")) if turned else b"",
     }
     several = rng.random() < 0.15
     if several:

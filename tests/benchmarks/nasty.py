@@ -7,15 +7,12 @@ anything else is right or refused with a reason.
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -30,6 +27,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from ..exact_rationals import RationalAnswer, rational_answer, relative_error, worst_relative_error
+from ..journal import append, entries
 
 EACH = 6667  # problems of every family of the whole campaign
 LEAST_ERROR = 1e-9  # an error below it is never silent
@@ -315,12 +313,7 @@ def nasty_table(folder: Path, start: int = 0, each: int = EACH) -> Table:
     Every hundred seeds of a family are one line of `folder`/nasty.jsonl, which are not repeated.
     """
     begin, path = perf_counter(), folder / "nasty.jsonl"
-    folder.mkdir(parents=True, exist_ok=True)
-    done: dict[tuple[str, int, int], dict[str, Any]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-        with suppress(ValueError):  # interrupted while it was written
-            entry = json.loads(line)
-            done[entry["family"], entry["start"], entry["stop"]] = entry
+    done = {(entry["family"], entry["start"], entry["stop"]): entry for entry in entries(path)}
     counts: dict[str, Counter[str]] = {name: Counter() for name in FAMILIES}
     losses: list[str] = []
     for name in FAMILIES:
@@ -332,8 +325,7 @@ def nasty_table(folder: Path, start: int = 0, each: int = EACH) -> Table:
                     counted, lost = campaign(range(*key[1:]), [name])
                 words = [f"{one.family}, seed {one.seed}: {one.error:.1e}, stated {one.bound:.1e}" for one in lost]
                 done[key] = {"family": name, "start": key[1], "stop": key[2], "counts": counted[name], "losses": words}
-                with path.open("a", encoding="utf-8") as stream:
-                    stream.write(f"\n{json.dumps(done[key])}\n")
+                append(path, done[key])
             counts[name] += Counter(done[key]["counts"])
             losses += done[key]["losses"]
     table = Table(title=f"{each * len(counts)} problems that leave float64 few digits, against rational numbers")

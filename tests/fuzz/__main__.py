@@ -6,14 +6,17 @@ A campaign that was stopped goes on with the families that its journal lacks.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
+from rich.console import Console
+from rich.table import Column, Table
+
 from ..conftest import TINY, shell
+from ..journal import append, entries
 from .campaign import campaign, command_for
 from .families import FAMILIES, inputs_of
 from .family import SCENE
@@ -21,6 +24,7 @@ from .verdicts import REFUSED, UNCHANGED, VALID
 from .worker import Result
 
 COLUMNS = ("type of input", "damaged", REFUSED, UNCHANGED, VALID, "wrong", "seconds", "slowest")
+WIDTH = 120
 
 
 def finished_run(folder: Path) -> Path:
@@ -58,32 +62,23 @@ def main() -> None:
             print(*campaign({names[0]: [options.only]}, options.seed, finished), sep="\n")
             return
         numbers = inputs_of(names, options.inputs) if options.kind is None else {names[0]: range(options.inputs)}
-        every = _journal(options.journal)
+        every = [Result(**entry) for entry in entries(options.journal)] if options.journal else []
         left = [name for name in names if name not in {result.kind for result in every}]
         with ThreadPoolExecutor(options.workers) as threads:
             for results in threads.map(lambda name: campaign({name: numbers[name]}, options.seed, finished), left):
                 every += results
                 if options.journal is not None:
-                    with options.journal.open("a", encoding="utf-8") as stream:
-                        stream.writelines(f"{json.dumps(asdict(result))}\n" for result in results)
+                    append(options.journal, *map(asdict, results))
     _print({name: [result for result in every if result.kind == name] for name in names}, options.seed)
     sys.exit(any(result.wrong for result in every))
 
 
-def _journal(path: Path | None) -> list[Result]:
-    """Return the results of a journal; none if there is no such file."""
-    if path is None or not path.exists():
-        return []
-    return [Result(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
 def _print(results: dict[str, list[Result]], seed: int) -> None:
     every = [result for group in results.values() for result in group]
-    rows = [COLUMNS, *(row(name, group) for name, group in results.items()), row("all", every)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for first, *cells in rows:
-        numbers = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-        print("  ".join((first.ljust(widths[0]), *numbers)))
+    table = Table(*(Column(name, justify="right" if number else "left") for number, name in enumerate(COLUMNS)))
+    for name, group in [*results.items(), ("all", every)]:
+        table.add_row(*row(name, group))
+    Console(width=WIDTH).print(table)
     for result in every:
         if result.wrong:
             print(f"{command_for(result, seed)}\n    {result.verdict}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.pose import Misalignment
 from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
 
@@ -155,3 +157,21 @@ def mean_weights(renderer: Renderer, group: str, samples: int) -> NDArray[np.flo
 def as_table(misalignments: tuple[Misalignment, ...]) -> FloatArray:
     """Return misalignments as an array: (sub-imagers, 6)."""
     return np.array([[*each.position, *each.tilt, each.rotation, each.focal_length] for each in misalignments])
+
+
+PAIR: Lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
+POSITION = {"position": "40 nm"}  # of lenses 1 and 2 mm before the sensor: 0.01 to 0.03 pixels of f
+TOLERANCES = {**POSITION, "tilt": "1 deg", "rotation": "3 mrad", "focal_length": 2e-3}
+
+
+def misaligned_camera(
+    side: int = 12, tolerance: Mapping[str, Any] = POSITION, lenses: Lenses = PAIR, *, seed: int = 0
+) -> Camera:
+    """A small camera with a tolerance."""
+    table = ToleranceTable.model_validate({"seed": seed, **tolerance})
+    return replace(derive(scene((side, side), lenses)), tolerance=table)
+
+
+def drawn_from(prior: Prior, rng: np.random.Generator) -> FloatArray:
+    """An image drawn from a prior: (N,)."""
+    return prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))

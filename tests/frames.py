@@ -64,6 +64,11 @@ def precision(matrix: sparse.csr_array, weights: FloatArray, prior: float) -> Fl
     return (matrix.T @ (matrix.multiply(weights[:, None]))).toarray() + prior * np.eye(matrix.shape[1])
 
 
+def drawn(shape: tuple[int, int], seed: int = 0) -> FloatArray:
+    """An image of independent pixels drawn from the prior: (N,)."""
+    return 127.5 + np.random.default_rng(seed).normal(0, P0**0.5, shape[0] * shape[1])
+
+
 def recorded(
     described: Scene, truth: FloatArray, variance: float | FloatArray, seed: int = 0, matrix: Any = None
 ) -> Stack:

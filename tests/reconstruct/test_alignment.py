@@ -20,22 +20,14 @@ from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix, tol
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.pose import misalignments
-from ommatid.scenes.tables.camera import ToleranceTable
 
-from ..examples import as_table, familywise, scene
+from ..examples import POSITION, TOLERANCES, as_table, drawn_from, familywise, misaligned_camera
 
 NOISE = 1e-3
 SIGNIFICANCE = 0.01
 SIDE = 12
-TWO = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
-POSITION = {"position": "40 nm"}  # of lenses 1 and 2 mm before the sensor: 0.01 to 0.03 pixels of f
-
-
-def misaligned_camera(side: int = SIDE, seed: int = 0, tolerance: dict[str, Any] = POSITION) -> Camera:
-    camera = derive(scene((side, side), TWO))
-    return replace(camera, tolerance=ToleranceTable.model_validate({"seed": seed, **tolerance}))
 
 
 def true_table(camera: Camera) -> FloatArray:
@@ -45,10 +37,6 @@ def true_table(camera: Camera) -> FloatArray:
 def recorded(camera: Camera, image: FloatArray, rng: np.random.Generator, table: FloatArray) -> FloatArray:
     light = misaligned_matrix(camera, table) @ image
     return light + NOISE**0.5 * rng.standard_normal(light.size)
-
-
-def drawn(prior: Prior, rng: np.random.Generator) -> FloatArray:
-    return prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
 
 
 def fitted(camera: Camera, values: FloatArray, prior: Prior) -> Alignment:
@@ -65,16 +53,15 @@ PRIORS = {
     "independent": independent(127.5, 5461.25, SIDE * SIDE),
     "exponential": exponential(127.5, 5461.25, (SIDE, SIDE), 8.0),
 }
-ALL = {"position": "40 nm", "tilt": "1 deg", "rotation": "3 mrad", "focal_length": 2e-3}
 
 
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    [("exponential", POSITION), *(pytest.param(name, ALL, marks=pytest.mark.slow) for name in PRIORS)],
+    [("exponential", POSITION), *(pytest.param(name, TOLERANCES, marks=pytest.mark.slow) for name in PRIORS)],
 )
 def test_derivatives_agree_with_differences_of_the_value(name: str, tolerance: dict[str, Any]) -> None:
     camera, rng, prior = misaligned_camera(tolerance=tolerance), np.random.default_rng(1), PRIORS[name]
-    values = recorded(camera, drawn(prior, rng), rng, true_table(camera))
+    values = recorded(camera, drawn_from(prior, rng), rng, true_table(camera))
     recording = misaligned_recording(camera, values, rng.uniform(0.5, 2.0, values.size), prior)
     point = likelihood_at(recording, rng.standard_normal(len(recording.free)))
     step, indices = 1e-4, rng.choice(len(recording.free), 3, replace=False)
@@ -116,7 +103,7 @@ def test_errors_over_images_of_the_prior_are_as_large_as_expected() -> None:
     numbers: list[int] = []
     for seed in range(5):
         camera = misaligned_camera(seed=seed)
-        image = drawn(prior, rng)
+        image = drawn_from(prior, rng)
         values = recorded(camera, image, rng, true_table(camera))
         fit = fitted(camera, values, prior)
         point = estimate_with(camera, values, prior, as_table(fit.misalignments))
@@ -133,7 +120,7 @@ def test_errors_over_images_of_the_prior_are_as_large_as_expected() -> None:
 
 def test_an_aligned_camera_is_fitted_as_aligned() -> None:
     camera, rng, prior = misaligned_camera(), np.random.default_rng(4), PRIORS["exponential"]
-    fit = fitted(camera, recorded(camera, drawn(prior, rng), rng, 0 * true_table(camera)), prior)
+    fit = fitted(camera, recorded(camera, drawn_from(prior, rng), rng, 0 * true_table(camera)), prior)
     z = as_table(fit.misalignments)[tuple(fit.numbers.T)] / as_table(fit.deviations)[tuple(fit.numbers.T)]
     assert np.abs(z).max() < stats.norm.isf(familywise(z.size) / 2)
     assert (as_table(fit.deviations) < tolerances(camera) + 1e-12).all(), "a stack adds information to the tolerance"
@@ -141,7 +128,7 @@ def test_an_aligned_camera_is_fitted_as_aligned() -> None:
 
 def test_without_information_the_tolerance_remains() -> None:
     camera, rng, prior = misaligned_camera(), np.random.default_rng(5), PRIORS["exponential"]
-    values = recorded(camera, drawn(prior, rng), rng, true_table(camera))
+    values = recorded(camera, drawn_from(prior, rng), rng, true_table(camera))
     fit = align(camera, values, np.full(values.size, 1e8), prior)
     np.testing.assert_allclose(as_table(fit.deviations), tolerances(camera), rtol=1e-3)
     assert np.abs(as_table(fit.misalignments)).max() < 0.01 * tolerances(camera).max()
@@ -150,7 +137,7 @@ def test_without_information_the_tolerance_remains() -> None:
 @pytest.mark.slow
 def test_pixels_left_out_act_as_pixels_of_infinite_noise() -> None:
     camera, rng, prior = misaligned_camera(), np.random.default_rng(6), PRIORS["exponential"]
-    values = recorded(camera, drawn(prior, rng), rng, true_table(camera))
+    values = recorded(camera, drawn_from(prior, rng), rng, true_table(camera))
     used = rng.random(values.size) < 0.9
     noise = np.where(used, NOISE, 1e12)
     masked, drowned = align(camera, values[used], noise[used], prior, used), align(camera, values, noise, prior)
@@ -160,7 +147,7 @@ def test_pixels_left_out_act_as_pixels_of_infinite_noise() -> None:
 
 def test_variance_of_a_sum_of_one_pixel_is_that_of_the_pixel() -> None:
     camera, rng, prior = misaligned_camera(), np.random.default_rng(7), PRIORS["exponential"]
-    fit = fitted(camera, recorded(camera, drawn(prior, rng), rng, true_table(camera)), prior)
+    fit = fitted(camera, recorded(camera, drawn_from(prior, rng), rng, true_table(camera)), prior)
     assert fit.variance_of_sum(np.eye(prior.mean.size)[5]) == pytest.approx(fit.variance[5])
 
 

@@ -21,7 +21,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..frames import FITTED, P0, blurred, recorded, wide, with_apertures
+from ..frames import FITTED, blurred, drawn, recorded, wide, with_apertures
 
 ROOT = Path(__file__).parents[2]
 SHAPE = (52, 47)
@@ -49,10 +49,6 @@ def difference(frame: Reconstruction, dense: Reconstruction) -> FloatArray:
     return ((frame.estimate - dense.estimate) / np.sqrt(dense.expected.variance)).reshape(dense.shape)
 
 
-def drawn(seed: int = 0, shape: tuple[int, int] = SHAPE) -> FloatArray:
-    return 127.5 + np.random.default_rng(seed).normal(0, P0**0.5, shape[0] * shape[1])
-
-
 CASES = {
     "exact H": ({"noise": NOISE}, 0.0),
     "exact H, other expected noise": ({"noise": NOISE, "estimator": {"noise_variance": 1.0}}, 0.0),
@@ -72,7 +68,7 @@ def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str, shape: tup
     sqrt(2) |C_n| / trace(C_n), at most 0.085 here; four of them are allowed.
     """
     tables, uncertainty = CASES[case]
-    scene, truth = wide(shape, FITTED, **tables), drawn(0, shape)
+    scene, truth = wide(shape, FITTED, **tables), drawn(shape, 0)
     model, true = blurred(scene, uncertainty) if uncertainty else (ideal_model(scene, derive(scene)), None)
     dense, frame = both(recorded(scene, truth, VARIANCE, matrix=true), model, truth)
     assert np.abs(difference(frame, dense)).max() < 1e-4
@@ -98,7 +94,7 @@ def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str, shape: tup
 
 @pytest.mark.slow
 def test_dead_and_saturated_pixels() -> None:
-    scene, truth = wide(SHAPE, noise={"variance": 1e-2, "saturation": 180.0}), drawn(2)
+    scene, truth = wide(SHAPE, noise={"variance": 1e-2, "saturation": 180.0}), drawn(SHAPE, 2)
     stack = recorded(scene, truth, 1e-2)
     values = np.minimum(stack.values, 180.0)
     values[::97] = np.nan
@@ -121,7 +117,7 @@ def test_dead_and_saturated_pixels() -> None:
 def test_a_prior_of_correlated_pixels_is_that_of_the_dense_problem(
     prior: dict[str, Any], shape: tuple[int, int]
 ) -> None:
-    scene, truth = wide(shape, noise={"variance": 1.0}, prior=prior | {"variance": 2000.0}), drawn(3, shape)
+    scene, truth = wide(shape, noise={"variance": 1.0}, prior=prior | {"variance": 2000.0}), drawn(shape, 3)
     dense, frame = both(recorded(scene, truth, 1.0), ideal_model(scene, derive(scene)), truth)
     assert np.abs(difference(frame, dense)).max() < 1e-3
     np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=1e-3)
@@ -130,7 +126,7 @@ def test_a_prior_of_correlated_pixels_is_that_of_the_dense_problem(
 def test_lenses_that_diffract() -> None:
     """Kernels wider than the frame, by the dense problem: the image, error bars at every pixel, and the interval."""
     shape = 33, 31
-    scene, truth = with_apertures(wide(shape, noise=NOISE)), drawn(1, shape)
+    scene, truth = with_apertures(wide(shape, noise=NOISE)), drawn(shape, 1)
     camera = derive(scene)
     dense, frame = both(recorded(scene, truth, VARIANCE), ideal_model(scene, camera), truth)
     assert np.abs(difference(frame, dense)).max() < 1e-4
@@ -145,7 +141,7 @@ def test_lenses_that_diffract() -> None:
 def test_error_bars_of_two_types_of_lenses() -> None:
     """Errors of a null space reach from edge to edge; small frames of two lengths give their variances to 4 % here."""
     shape = 64, 62
-    scene, truth = with_apertures(wide(shape, FITTED[:2], noise=NOISE)), drawn(1, shape)
+    scene, truth = with_apertures(wide(shape, FITTED[:2], noise=NOISE)), drawn(shape, 1)
     dense, frame = both(recorded(scene, truth, VARIANCE), ideal_model(scene, derive(scene)), truth)
     assert np.abs(difference(frame, dense)).max() < 1e-4
     np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=0.04)
@@ -163,7 +159,7 @@ def test_large_cameras_of_lenses_are_applied_without_entries() -> None:
     tiles = scene.model_copy(update={"estimator": scene.estimator.model_copy(update={"method": "tiles"})})
     with pytest.raises(InputError, match="blurred lenses have too many for 7021 pixels; set it to 'auto' or 'frame'"):
         choose_method(tiles, camera, camera.is_applied)
-    truth = drawn(2, camera.shape)
+    truth = drawn(camera.shape, 2)
     done = restore(recorded(scene, truth, VARIANCE, matrix=ideal_matrix(camera)), model, truth)
     assert done.verdict.trusted
     assert done.interval is not None
@@ -175,7 +171,7 @@ def test_the_prediction_of_a_frame_is_that_of_the_dense_problem() -> None:
     camera = derive(scene)
     model = ideal_model(scene, camera)
     prediction = predict_frame(choose_method(scene, camera, exact=True), model, camera, 1e-2)
-    dense = restored_by("auto", recorded(scene, drawn(0, SMALL), 1e-2), model, None)
+    dense = restored_by("auto", recorded(scene, drawn(SMALL, 0), 1e-2), model, None)
     assert prediction.mse == pytest.approx(dense.expected.mse, rel=1e-3)
     assert prediction.trimmed_mse == pytest.approx(dense.trimmed_mse, rel=1e-3)
     assert prediction.degrees_of_freedom == pytest.approx(dense.expected.degrees_of_freedom, rel=1e-6)
@@ -192,7 +188,7 @@ def test_peak_memory_is_below_the_stated_one() -> None:
         pytest.skip("needs /proc")
     script = (
         "from tests.reconstruct.test_frame_method import *\n"
-        "shape = (420, 400); scene = wide(shape, noise=NOISE); truth = drawn(0, shape)\n"
+        "shape = (420, 400); scene = wide(shape, noise=NOISE); truth = drawn(shape, 0)\n"
         "camera = derive(scene); stack = recorded(scene, truth, VARIANCE)\n"
         "allowed = choose_method(scene, camera, exact=True).memory\n"
         "restore(stack, ideal_model(scene, camera), truth)\n"
@@ -220,7 +216,7 @@ def test_cameras_and_noise_that_the_frame_cannot_handle_are_refused(
     tables: dict[str, Any], lenses: Any, message: str
 ) -> None:
     scene = wide(SHAPE, lenses, **tables, estimator={"method": "frame"})
-    stack = recorded(scene, drawn(), 0.0)
+    stack = recorded(scene, drawn(SHAPE), 0.0)
     with pytest.raises(InputError, match=message):
         restore(stack, ideal_model(scene, stack.camera))
 

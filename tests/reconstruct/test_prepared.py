@@ -22,7 +22,7 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..frames import P0, precision, recorded, wide
+from ..frames import P0, drawn, precision, recorded, wide
 
 SHAPE = (37, 34)
 VARIANCE = 1e-2
@@ -41,14 +41,10 @@ def described(shape: tuple[int, int] = SHAPE, **tables: Any) -> tuple[Scene, Mod
     return scene, ideal_model(scene, derive(scene))
 
 
-def drawn(seed: int, shape: tuple[int, int] = SHAPE) -> FloatArray:
-    return 127.5 + np.random.default_rng(seed).normal(0, P0**0.5, shape[0] * shape[1])
-
-
 def frames(scene: Scene, count: int, rendering: float = 0.0) -> list[Stack]:
     """Stacks of different images, with rendering variances that are estimates of `rendering` from 17 passes."""
     shape = derive(scene).shape
-    stacks = [recorded(scene, drawn(seed, shape), VARIANCE, seed) for seed in range(count)]
+    stacks = [recorded(scene, drawn(shape, seed), VARIANCE, seed) for seed in range(count)]
     draws = np.random.default_rng(9)
     return [replace(stack, variance=rendering * draws.chisquare(16, stack.values.size) / 16) for stack in stacks]
 
@@ -69,7 +65,7 @@ def test_frames_of_the_same_noise_are_those_of_single_runs(method: str, known: b
     scene, model = described((19, 17), estimator=METHODS[method])
     prepared = Prepared(model)
     for number, stack in enumerate(frames(scene, 3)):
-        truth = drawn(number, (19, 17)) if known else None
+        truth = drawn((19, 17), number) if known else None
         shared = restore(stack, model, truth, prepared=prepared)
         assert_same(shared, restore(stack, model, truth))
         reused = shared.result.noise_difference

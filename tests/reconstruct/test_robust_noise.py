@@ -24,23 +24,16 @@ from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.pose import misalignments
-from ommatid.scenes.tables.camera import Surface, ToleranceTable
+from ommatid.scenes.tables.camera import Surface
 
-from ..examples import Lenses, as_table, scene
+from ..examples import POSITION, TOLERANCES, as_table, drawn_from, misaligned_camera
 
 NOISE = 1e-2
 SIGNIFICANCE = 0.01
 SIDE = 12
-TWO = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
-SMALL = {"position": "40 nm"}
-ALL = {"position": "40 nm", "tilt": "1 deg", "rotation": "3 mrad", "focal_length": 2e-3}
-
-
-def misaligned_camera(side: int = SIDE, tolerance: dict[str, Any] = SMALL, lenses: Lenses = TWO) -> Camera:
-    return replace(derive(scene((side, side), lenses)), tolerance=ToleranceTable.model_validate(tolerance))
 
 
 def priors(side: int = SIDE) -> dict[str, Prior]:
@@ -48,10 +41,6 @@ def priors(side: int = SIDE) -> dict[str, Prior]:
         "independent": independent(127.5, 5461.25, side * side),
         "exponential": exponential(127.5, 5461.25, (side, side), 20.0),
     }
-
-
-def drawn(prior: Prior, rng: np.random.Generator) -> FloatArray:
-    return prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
 
 
 def drawn_matrix(camera: Camera, rng: np.random.Generator) -> Any:
@@ -84,7 +73,7 @@ def test_a_parameter_has_the_same_distribution_whatever_others_there_are() -> No
 def test_tables_hold_the_drawn_misalignments() -> None:
     scores: list[FloatArray] = []
     for seed in range(20):
-        camera = misaligned_camera(tolerance=ALL | {"seed": seed})
+        camera = misaligned_camera(tolerance=TOLERANCES | {"seed": seed})
         drawn = misalignments(camera)
         assert as_misalignments(as_table(drawn)) == drawn
         scores.append(as_table(drawn) / tolerances(camera))
@@ -94,9 +83,9 @@ def test_tables_hold_the_drawn_misalignments() -> None:
 @pytest.mark.parametrize(
     ("name", "tolerance"),
     [
-        ("independent", SMALL),
+        ("independent", POSITION),
         pytest.param("exponential", {"position": "600 nm"}, marks=pytest.mark.slow),
-        pytest.param("exponential", ALL, marks=pytest.mark.slow),
+        pytest.param("exponential", TOLERANCES, marks=pytest.mark.slow),
     ],
     ids=["0.03 pixels", "0.4 pixels", "all"],
 )
@@ -105,7 +94,7 @@ def test_moments_agree_with_random_cameras_and_images(name: str, tolerance: dict
     misaligned, draws = robust_noise(camera, prior), 300
     residuals = np.empty((draws, camera.measurements))
     for draw in range(draws):
-        residuals[draw] = (drawn_matrix(camera, rng) - misaligned.matrix) @ drawn(prior, rng)
+        residuals[draw] = (drawn_matrix(camera, rng) - misaligned.matrix) @ drawn_from(prior, rng)
     for rows, covariance in zip(camera.slices(), misaligned.covariances, strict=True):
         of_sub = residuals[:, rows]
         # Along the eigenvectors, so that independent numbers of expected square 1 are compared.
@@ -130,7 +119,7 @@ def test_error_over_images_and_cameras_is_as_expected_and_below_that_of_trust(na
     expected = robust_error(robust, white, {"noise": noise})
     errors: list[tuple[float, float]] = []
     for _ in range(120):
-        image = drawn(prior, rng)
+        image = drawn_from(prior, rng)
         values = drawn_matrix(camera, rng) @ image + NOISE**0.5 * rng.standard_normal(noise.size)
         by_robust = prior.mean + robust.gain(white.vector(values - misaligned.matrix @ prior.mean))
         by_trust = prior.mean + trust.gain(values - ideal @ prior.mean)

@@ -18,7 +18,7 @@ from ommatid.runtime.execution.pool import worker_pool
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_model
 
-from ..frames import P0, recorded, wide
+from ..frames import drawn, recorded, wide
 
 NOISE = 1e-2
 
@@ -29,10 +29,6 @@ def task_of(scene: Scene, truth: FloatArray, seed: int = 0) -> EstimationTask:
     used = np.ones(stack.values.size, dtype=np.bool_)
     model = ideal_model(scene, stack.camera)
     return EstimationTask(model, stack.values, used, expected, scene.prior, scene.estimator, scene.tiles)
-
-
-def drawn(scene: Scene, shape: tuple[int, int], seed: int = 0) -> FloatArray:
-    return scene.prior.mean + np.random.default_rng(seed).normal(0, P0**0.5, shape[0] * shape[1])
 
 
 @given(st.integers(1, 150), st.integers(1, 150), st.integers(4, 40), st.integers(0, 19))
@@ -53,7 +49,7 @@ def test_cores_partition_the_frame(rows: int, columns: int, size: int, overlap: 
 
 def test_one_tile_is_the_dense_estimate() -> None:
     scene = wide((30, 28))
-    truth = drawn(scene, (30, 28))
+    truth = drawn((30, 28))
     task = task_of(scene, truth)
     noise = {"noise": task.expected_noise}
     dense, tiled = (method(task, Execution()).result(noise, truth) for method in (DenseMethod, TileMethod))
@@ -71,7 +67,7 @@ def test_one_tile_is_the_dense_estimate() -> None:
 
 def test_separate_factorisations_give_the_same_image() -> None:
     scene = wide((40, 36), tiles={"size": 20, "overlap": 4})
-    task = task_of(scene, drawn(scene, (40, 36)))
+    task = task_of(scene, drawn((40, 36)))
     calibrated = replace(task, model=replace(task.model, record={"method": "points"}))
     shared, separate = (TileMethod(variant, Execution()).image for variant in (task, calibrated))
     np.testing.assert_allclose(separate, shared, rtol=1e-9)
@@ -86,14 +82,14 @@ def test_the_error_of_tiles_is_the_expected_one() -> None:
     sums: list[float] = []
     weights = np.zeros(shape)
     weights[10:22, 5:35] = 1 / 360
-    truth = drawn(scene, shape)
+    truth = drawn(shape)
     task = task_of(scene, truth)
     rendering = np.broadcast_to(0.3 * NOISE, task.expected_noise.shape)
     result = TileMethod(task, Execution()).result({"noise": 0.7 * task.expected_noise, "rendering": rendering}, truth)
     assert result.interval is not None
     assert result.interval.low < np.mean((result.image - truth) ** 2) < result.interval.high
     for seed in range(count):
-        truth = drawn(scene, shape, seed)
+        truth = drawn(shape, seed)
         error = TileMethod(task_of(scene, truth, seed), Execution()).image - truth
         squares.append(float(np.mean(error**2)))
         sums.append(float(weights.ravel() @ error) ** 2)
@@ -107,7 +103,7 @@ def test_the_error_of_tiles_is_the_expected_one() -> None:
 @pytest.mark.slow
 def test_threads_and_processes_give_identical_results() -> None:
     scene = wide((75, 67))
-    truth = drawn(scene, (75, 67))
+    truth = drawn((75, 67))
     task = task_of(scene, truth)
     task = replace(task, expected_noise=NOISE * np.random.default_rng(0).uniform(1, 2, task.expected_noise.size))
     noise = {"noise": task.expected_noise}
@@ -125,7 +121,7 @@ def test_threads_and_processes_give_identical_results() -> None:
 
 def test_dead_pixels_are_skipped() -> None:
     scene = wide((50, 47), tiles={"size": 30, "overlap": 6})
-    truth = drawn(scene, (50, 47))
+    truth = drawn((50, 47))
     task = task_of(scene, truth)
     used = np.random.default_rng(0).uniform(size=task.used.size) > 0.02
     recorded_values = np.where(used, task.recorded, np.nan)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -13,23 +11,12 @@ from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix, mis
 from ommatid.reconstruct.prior import independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.tables.camera import ToleranceTable
+from ommatid.scenes.camera import Camera
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..conftest import Command
-from ..examples import GALLERY, scene
+from ..examples import GALLERY, misaligned_camera
 from ..runs import document
-
-
-def drawn_to(position: str, seed: int = 0) -> Camera:
-    camera = derive(scene((12, 12), (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))))
-    return replace(camera, tolerance=ToleranceTable.model_validate({"position": position, "seed": seed}))
-
-
-def tolerated(tolerance: dict[str, float | str]) -> Camera:
-    """A small camera with two lens types and a tolerance."""
-    return replace(drawn_to("1 nm"), tolerance=ToleranceTable.model_validate(tolerance))
 
 
 def cost_of(camera: Camera, variance: float = 1e-2) -> float:
@@ -76,7 +63,7 @@ def random_misalignments(camera: Camera, groups: int, cameras: int) -> FloatArra
 )
 def test_the_cost_of_one_tolerance_is_that_of_random_cameras(tolerance: dict[str, float | str]) -> None:
     """Points whose second moments are a quarter too large fail."""
-    camera = tolerated(tolerance)
+    camera = misaligned_camera(tolerance=tolerance)
     mean, error = mean_over(camera, random_misalignments(camera, 10, 12))
     assert cost_of(camera) == pytest.approx(mean, abs=3 * error)
     assert error < 0.03 * mean, "too few cameras to tell"

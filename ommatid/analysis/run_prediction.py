@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_for, with_fallback
-from ommatid.reconstruct.detail.detail_method import DetailMethod
 from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
 from ommatid.reconstruct.measured_error import TRIM, trimmed_mean
 from ommatid.reconstruct.method_choice import METHODS, MethodChoice
@@ -142,7 +141,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
 
 
 def _dense(outcome: _Outcome) -> bool:
-    return isinstance(outcome.assumed.method, DenseMethod | DetailMethod)
+    return outcome.choice.method in ("dense", "detail")
 
 
 def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) -> _Mismatch | None:

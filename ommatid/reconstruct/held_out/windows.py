@@ -28,7 +28,7 @@ from ..detail.detailed_model import DetailedModel
 from ..fitting.evidence import Evidence
 from ..fitting.prior_fit import MIN_MEASUREMENTS, fit_prior
 from ..methods.method import EstimationTask, Execution
-from ..misalignment.robust_noise import robust_noise, whitening
+from ..misalignment.misaligned_methods import RobustMethod
 from ..prior import Prior, covariance_root
 from ..problem import Problem
 from .block_errors import block_errors
@@ -225,13 +225,9 @@ def _whole_detailed(task: EstimationTask) -> WindowProblem:
 
 def _whole_robust(task: EstimationTask) -> WindowProblem:
     """Whiten each sub-imager by its own covariance; its errors then count in units of that covariance."""
-    camera, used, prior = task.model.camera, np.flatnonzero(task.used), task.prior_on(task.shape)
-    misaligned = robust_noise(camera, prior)
-    white = whitening(camera, misaligned, task.expected_noise, task.used)
-    problem = white.problem(misaligned.matrix[used], prior)
-    return WindowProblem(
-        problem, white.vector(task.recorded[used]), _sub_imager_of(camera, used), len(camera.sub_imagers)
-    )
+    camera, method = task.model.camera, RobustMethod(task, Execution())
+    sub_imager = _sub_imager_of(camera, np.flatnonzero(task.used))
+    return WindowProblem(method.problem, method.recorded, sub_imager, len(camera.sub_imagers))
 
 
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:

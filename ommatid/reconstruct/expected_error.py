@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +130,14 @@ class ExpectedError:
 
         The side of the square of pixels that share one degree of freedom (after Purser and Huang 1993).
         """
-        return kernel_widths(self.resolved)
+        root = np.sqrt(np.maximum(self.resolved, 0.0))
+        return np.divide(1.0, root, out=np.full_like(root, np.inf), where=root > 0)
+
+    @property
+    def median_width(self) -> float | None:
+        """Median of `resolution`, None where nothing is resolved."""
+        width = float(np.median(self.resolution))
+        return width if isfinite(width) else None
 
 
 @dataclass(frozen=True)
@@ -234,12 +242,6 @@ def interval(mean: float, variance: float, count: int) -> Interval:
     shape, scale = mean**2 / variance, variance / mean
     low, high = (float(special.gammaincinv(shape, level)) * scale for level in COVERAGE)
     return Interval(mean / count, low / count, high / count, variance / count**2)
-
-
-def kernel_widths(resolved: FloatArray) -> FloatArray:
-    """Return 1 / sqrt((A H)_ii), infinite where nothing is seen: (N,)."""
-    root = np.sqrt(np.maximum(resolved, 0.0))
-    return np.divide(1.0, root, out=np.full_like(root, np.inf), where=root > 0)
 
 
 def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, FloatArray, FloatArray]]:

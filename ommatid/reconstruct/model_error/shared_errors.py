@@ -21,7 +21,6 @@ from scipy import ndimage, sparse
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.formats.picture import averaged
-from ommatid.scenes.model import Model
 
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
@@ -84,11 +83,6 @@ class SharedErrors:
             for image in combined
         )
         return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
-
-
-def has_shared_errors(model: Model) -> bool:
-    """Return True if entries of H follow from few numbers with errors."""
-    return model.error_variance(np.zeros(model.unknowns)) is not None
 
 
 def whitened(residual: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> FloatArray:

@@ -19,13 +19,12 @@ from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import DetailedModel, model_of_f
 from .detail.world_fit import fit_world
-from .expected_error import interval
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
 from .methods.method import Execution, Method, MethodResult, total_variance
 from .model_error.attenuation import can_be_corrected, with_attenuation
-from .model_error.contrast import Contrast, true_contrast, without_noise
+from .model_error.contrast import Contrast, true_contrast
 from .model_error.shared_errors import NEGLIGIBLE as NEGLIGIBLE_PART
 from .model_error.shared_errors import bound, with_shared_errors
 from .noise import (
@@ -113,8 +112,9 @@ class Assumptions:
         if result.interval is None or not unknown:
             return result
         given, count = result.interval, result.image.size
-        wider = interval(count * given.mse, count**2 * (given.variance + unknown**2), count)
-        return replace(result, interval=wider if given.variance else given)
+        return replace(
+            result, interval=given.with_added(0.0, (count * unknown) ** 2, count) if given.variance else given
+        )
 
 
 def method_for(stack: Stack, model: Model) -> Method:
@@ -202,7 +202,7 @@ def _assumptions(
         method = method_with(observation, noise, image)
     contrast = _true_contrast(method, noise)
     if contrast is not None:
-        noise, image = noise | {"calibration": contrast.calibration}, contrast.image
+        noise, image = noise | {"calibration": contrast.calibration(method, noise)}, contrast.image
     shared = _shared_image(method, noise, image)
     if shared is not None:
         noise = observation.with_shared(noise, shared)
@@ -222,7 +222,7 @@ def _shared_image(method: Method, noise: Noise, image: FloatArray | None) -> Flo
     operators = method.operators()
     if float(noise[SHARED].sum()) <= NEGLIGIBLE * float(actual.sum()) or operators is None:
         return method.image if image is None else image
-    return without_noise(method, operators, actual)
+    return true_contrast(method, operators, actual, attenuated=False).image
 
 
 def _true_contrast(method: Method, noise: Noise) -> Contrast | None:
@@ -233,7 +233,7 @@ def _true_contrast(method: Method, noise: Noise) -> Contrast | None:
     if float(noise["calibration"].sum()) <= NEGLIGIBLE * float(actual.sum()):
         return None
     operators = method.operators()
-    return None if operators is None else true_contrast(method, operators, noise)
+    return None if operators is None else true_contrast(method, operators, actual, attenuated=True)
 
 
 def _fit(observation: ObservedStack, noise: Noise) -> PriorFit | None:

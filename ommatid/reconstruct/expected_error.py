@@ -152,6 +152,10 @@ class Interval:
     high: float
     variance: float = 0.0
 
+    def with_added(self, mean: float, variance: float, count: int) -> Interval:
+        """Return the interval with another error, whose sum over `count` pixels has this mean and variance."""
+        return interval(max(count * self.mse + mean, 0.0), count**2 * self.variance + variance, count)
+
 
 @dataclass(frozen=True)
 class CorrelatedNoise:

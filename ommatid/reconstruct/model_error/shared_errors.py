@@ -22,7 +22,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.formats.picture import averaged
 
-from ..expected_error import ExpectedError, Interval, interval
+from ..expected_error import ExpectedError, Interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
 from ..prior import spectrum_of
 from ..verdict.residual_power import ResidualPower, SharedResidual, squared_trace
@@ -197,7 +197,7 @@ def _wider(
         image = task.finer**2 * task.of_unknowns(truth)
     bias = task.of_f(operators.hidden(image - task.prior.mean))
     added = errors.variance_of_square(bias, actual, task, operators)
-    return interval(count * without.mse + float(errors.variance.sum()), count**2 * without.variance + added, count)
+    return without.with_added(float(errors.variance.sum()), added, count)
 
 
 def _with_residuals(

@@ -14,7 +14,7 @@ from ..methods.dense_method import DRAWS, DenseMethod, residuals
 from ..methods.method import total_variance
 from ..problem import Whitening
 from ..verdict.residual_power import ResidualInputs, ResidualPower
-from .detailed_model import CAUSE, DetailedModel
+from .detailed_model import CAUSE, DetailedModel, detailed
 from .world_prior import averaging
 
 NEEDS_NOISE = (
@@ -28,10 +28,7 @@ class DetailMethod(DenseMethod):
 
     @property
     def _model(self) -> DetailedModel:
-        model = self.task.model
-        if not isinstance(model, DetailedModel):
-            raise TypeError("expected a model of a world finer than f")
-        return model
+        return detailed(self.task.model)
 
     @cached_property
     def observation(self) -> tuple[sparse.csr_array, CorrelatedNoise]:

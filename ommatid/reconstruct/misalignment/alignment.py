@@ -57,7 +57,6 @@ class Alignment:
     covariance: FloatArray
     numbers: NDArray[np.intp]
     shifts: FloatArray
-    converged: bool
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -82,7 +81,7 @@ def align(
     chosen = np.ones(camera.measurements, dtype=np.bool_) if used is None else used
     numbers = np.argwhere(spread > 0)
     scores, deviation = np.zeros(len(numbers)), np.ones(len(numbers))
-    image, variance, converged = prior.mean, prior.variance, False
+    image, variance = prior.mean, prior.variance
     joint = np.eye(prior.dimension + len(numbers))  # posterior covariance of u and of the scores
     for iteration in range(MAX_ITERATIONS):
         matrix = misaligned_matrix(camera, _table(spread, scores))[chosen]
@@ -94,9 +93,9 @@ def align(
         pixels, step = joint[: prior.dimension, : prior.dimension], mean[prior.dimension :] - scores
         image, variance = prior.mean + prior.apply_root(mean[: prior.dimension]), _variance(pixels, prior)
         narrower = np.clip(np.sqrt(np.diagonal(joint)[prior.dimension :]), MIN_STEP, 1.0)
-        converged = bool((np.abs(step) <= CONVERGED * narrower).all() and (narrower > NARROWING * deviation).all())
+        settled = (np.abs(step) <= CONVERGED * narrower) & (narrower > NARROWING * deviation)
         scores, deviation = scores + min(1.0, WHOLE_STEPS / (iteration + 1)) * step, narrower
-        if converged:
+        if settled.all():
             break
     scale, covariance = spread[tuple(numbers.T)], joint[prior.dimension :, prior.dimension :]
     both = prior.apply_root(joint[: prior.dimension, prior.dimension :])
@@ -108,7 +107,6 @@ def align(
         covariance * np.outer(scale, scale),
         numbers,
         np.linalg.solve(covariance, both.T).T / scale,
-        converged,
     )
 
 
@@ -154,8 +152,9 @@ def _changes(
     middle, width = (_table(spread, values) for values in around)
     numbers = np.argwhere(spread > 0)
     changes, uncertainty = np.zeros((owner.size, len(numbers))), np.zeros(owner.size)
-    for parameter in np.unique(numbers[:, 1]):
-        step = np.where(np.arange(spread.shape[1]) == parameter, width, 0.0)
+    for parameter in sorted(set(numbers[:, 1].tolist())):
+        step = np.zeros_like(width)
+        step[:, parameter] = width[:, parameter]
         # Every row changes with its own sub-imager alone.
         ends = (misaligned_matrix(camera, middle + sign * step)[chosen] for sign in (1.0, -1.0))
         change = sparse.csr_array(0.5 * (next(ends) - next(ends)))

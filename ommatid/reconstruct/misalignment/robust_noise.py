@@ -206,16 +206,12 @@ def mismatch_of_image(
 
     moments : of H and of what it sees of this image, so that their prior is this image, without variance
     """
-    shift, problem = _shift(form, used, moments), form.problem
+    problem = form.problem
     difference = image - problem.prior.mean
     bias = form.gain(problem.matrix @ difference) - difference
-    seen = form.gain(shift @ image)
-    added = np.square(seen) + 2 * bias * seen
-    parts = _used_blocks(used, moments, slices)
-    for chunk, _, _, negative in solved_columns(form, np.arange(problem.unknowns)):
-        for rows, block in parts:
-            added[chunk] += np.sum(negative[rows] * (block @ negative[rows]), axis=0)
-    return added
+    of_image = Prior(image, np.zeros(image.size))
+    squares = mismatch_variance(form, used, moments, slices, of_image)
+    return squares + 2 * bias * form.gain(_shift(form, used, moments) @ image)
 
 
 def _shift(form: Form, used: BoolArray, moments: MisalignmentNoise) -> sparse.csr_array:

@@ -177,11 +177,11 @@ def check(stack: Stack, model: Model, *, fitted: bool = True) -> HeldOutReport:
     Raises InputError if stack and model are of different cameras, or if a measurement has no noise.
     """
     from ommatid.reconstruct.held_out.check import check_held_out
-    from ommatid.reconstruct.restore import check_match
+    from ommatid.reconstruct.restore import check_camera
 
     check_type("stack", stack, Stack, "read_stack")
     check_type("model", model, Model, "read_model")
-    check_match(stack, model, ("the stack", "the model"))
+    check_camera(stack.camera, model, ("the stack", "the model"))
     return check_held_out(stack, model, fitted=fitted)
 
 

@@ -12,9 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_for, with_fallback
-from ommatid.reconstruct.detail.detail_method import DetailMethod
 from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
-from ommatid.reconstruct.measured_error import TRIM, trimmed_mean
 from ommatid.reconstruct.method_choice import METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import Execution, MethodResult
@@ -25,7 +23,7 @@ from ommatid.reconstruct.misalignment.robust_noise import (
     mismatch_variance,
     robust_noise,
 )
-from ommatid.reconstruct.prediction import Prediction, median_width, observability
+from ommatid.reconstruct.prediction import Prediction, observability
 from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.restore import BUDGET, truth_for
 from ommatid.runtime.arrays import FloatArray
@@ -116,17 +114,12 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
     if camera.unknowns <= MOST_DENSE and outcome.choice.method != "robust":
         of_pixels = model_of_f(recording.certain, camera, PriorTable())
         seen = observability(of_pixels.matrix[outcome.assumed.usable.used])
-    return Prediction(
+    return Prediction.of(
+        variance,
+        expected,
+        seen,
+        camera.shape,
         measurements=int(outcome.assumed.usable.used.sum()),
-        unknowns=camera.unknowns,
-        rank=None if seen is None else seen.rank,
-        null_space=None if seen is None else seen.null_space,
-        condition=None if seen is None else seen.condition,
-        mse=float(variance.mean()),
-        trimmed_mse=trimmed_mean(variance, camera.shape),
-        trim=TRIM,
-        degrees_of_freedom=expected.degrees_of_freedom,
-        resolution=median_width(expected.resolved),
         method=outcome.result.solver.method,
         misalignment=budget.get(CAUSE),
         prior_variance=setup.scene.prior_ratio * outcome.assumed.prior.variance,
@@ -142,7 +135,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
 
 
 def _dense(outcome: _Outcome) -> bool:
-    return isinstance(outcome.assumed.method, DenseMethod | DetailMethod)
+    return outcome.choice.method in ("dense", "detail")
 
 
 def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) -> _Mismatch | None:

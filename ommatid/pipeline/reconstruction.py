@@ -18,7 +18,7 @@ from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
-from ommatid.reconstruct.restore import check_match
+from ommatid.reconstruct.restore import check_camera
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
@@ -95,7 +95,7 @@ def reconstruct_folder(
     """
     check_options(cluster, workers)
     recorded, calibrated = options.read(stack)
-    check_match(recorded, calibrated, (stack, options.model))
+    check_camera(recorded.camera, calibrated, (stack, options.model))
     sources = {real_path(path) for path in (stack, options.model, stack.parent / TRUTH)}
     for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
         if real_path(folder / name) in sources:
@@ -126,7 +126,7 @@ def check_held_out_files(stack: Path, options: FrameOptions, *, fitted: bool, pr
     from ommatid.reconstruct.held_out.check import check_held_out
 
     recorded, calibrated = options.read(stack)
-    check_match(recorded, calibrated, (stack, options.model))
+    check_camera(recorded.camera, calibrated, (stack, options.model))
     return check_held_out(recorded, calibrated, fitted=fitted, progress=progress)
 
 

@@ -19,97 +19,34 @@ from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import DetailedModel, model_of_f
 from .detail.world_fit import fit_world
-from .expected_error import interval
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
-from .methods.method import EstimationTask, Execution, Method, MethodResult, total_variance
+from .methods.method import Execution, Method, MethodResult, total_variance
 from .model_error.attenuation import can_be_corrected, with_attenuation
-from .model_error.contrast import Contrast, true_contrast, without_noise
+from .model_error.contrast import Contrast, true_contrast
 from .model_error.shared_errors import NEGLIGIBLE as NEGLIGIBLE_PART
-from .model_error.shared_errors import bound, has_shared_errors, with_shared_errors
+from .model_error.shared_errors import bound, with_shared_errors
 from .noise import (
-    CERTAIN,
     ROUNDS,
-    SATURATION,
     SHARED,
     Noise,
+    ObservedStack,
     UsablePixels,
     censored,
+    certain,
     check_noise_fit,
     depends_on_light,
+    fitted_noise,
     has_converged,
-    initial_noise,
-    noise_for_image,
-    uniform,
+    has_shared_errors,
     usable_pixels,
-    with_shared_noise,
 )
 
 Result = TypeVar("Result")
 
 NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
 RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
-
-
-@dataclass(frozen=True)
-class ObservedStack:
-    """A stack with the prior of f, and the model that this prior makes of H where the world is finer than f."""
-
-    stack: Stack
-    model: Model
-    usable: UsablePixels
-    prior: PriorTable
-
-    def with_prior(self, prior: PriorTable, model: Model) -> ObservedStack:
-        """Return the same stack under another prior; model : as calibrated."""
-        return replace(self, prior=prior, model=model_of_f(model, self.stack.camera, prior))
-
-    def initial_noise(self) -> Noise:
-        """Return the noise before there is an estimate."""
-        return initial_noise(self.stack, self.model, self.usable, self.prior)
-
-    def noise_for(self, image: FloatArray, noise: Noise) -> Noise:
-        """Return the noise with the parts that depend on the light for an estimate, (N,)."""
-        return noise_for_image(image, self.stack, self.model, self.usable, noise)
-
-    @property
-    def detail_variance(self) -> FloatArray | float:
-        """Variance of detail on the pixels used, (pixels used,)."""
-        return self.model.detail_variance[self.usable.used] if isinstance(self.model, DetailedModel) else 0.0
-
-    def expected_noise(self, noise: Noise) -> FloatArray:
-        """Return the variance that the estimator assumes, (pixels used,)."""
-        setting = self.stack.scene.estimator.noise_variance
-        if not isinstance(setting, float):
-            return total_variance(noise)
-        return uniform(setting, int(self.usable.used.sum())) + noise.get(SATURATION, 0.0)
-
-    @property
-    def expects_fixed_noise(self) -> bool:
-        """True if the scene fixes the expected noise to a number."""
-        return isinstance(self.stack.scene.estimator.noise_variance, float)
-
-    def task(self, expected_noise: FloatArray, shared_image: FloatArray | None = None) -> EstimationTask:
-        """Return the task of an estimation method; the offset of detail's mean is taken off the measurements.
-
-        shared_image : (N,) whose errors by few numbers of H are part of the expected noise; None: they are not
-        """
-        scene, model, recorded = self.stack.scene, self.model, self.stack.values
-        if isinstance(model, DetailedModel):
-            recorded = recorded - model.offset
-        return EstimationTask(
-            model,
-            recorded,
-            self.usable.used,
-            expected_noise,
-            self.prior,
-            scene.estimator,
-            scene.tiles,
-            scene.prior_ratio,
-            shared_image,
-            model.camera.rows // self.stack.camera.rows,
-        )
 
 
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:
@@ -175,8 +112,9 @@ class Assumptions:
         if result.interval is None or not unknown:
             return result
         given, count = result.interval, result.image.size
-        wider = interval(count * given.mse, count**2 * (given.variance + unknown**2), count)
-        return replace(result, interval=wider if given.variance else given)
+        return replace(
+            result, interval=given.with_added(0.0, (count * unknown) ** 2, count) if given.variance else given
+        )
 
 
 def method_for(stack: Stack, model: Model) -> Method:
@@ -245,17 +183,17 @@ def _assumptions(
         expected = observation.expected_noise(noise) + observation.detail_variance
         return METHODS["dense"](observation.task(expected), execution)
 
-    observation, noise, method, image = first, first.initial_noise(), None, None
+    observation, noise, method, image = first, first.noise(), None, None
     if depends_on_light(stack, model) or SHARED in noise:
         method = preliminary(first, noise)
         image = method.image
-        noise = first.noise_for(image, noise)
+        noise = first.noise(image, shared=SHARED in noise)
     fit = _fit(first, noise)
     if fit is not None and (model.variance.any() or SHARED in noise):
         # The uncertainty of H was taken at an image that the first prior had left noisy.
         better, fitted = _with_fit(first, model, noise, fit)
         image = preliminary(better, fitted).image
-        noise = better.noise_for(image, noise)
+        noise = better.noise(image, shared=SHARED in noise)
         fit = _fit(first, noise)
     if fit is not None:
         observation, noise = _with_fit(first, model, noise, fit)
@@ -264,10 +202,10 @@ def _assumptions(
         method = method_with(observation, noise, image)
     contrast = _true_contrast(method, noise)
     if contrast is not None:
-        noise, image = noise | {"calibration": contrast.calibration}, contrast.image
+        noise, image = noise | {"calibration": contrast.calibration(method, noise)}, contrast.image
     shared = _shared_image(method, noise, image)
     if shared is not None:
-        noise = with_shared_noise(shared, observation.model, usable, noise)
+        noise = observation.with_shared(noise, shared)
     if not fixed and (contrast is not None or SHARED in noise):
         method = method_with(observation, noise, shared)
     return Assumptions(method, observation.usable, observation.prior, noise, fit, contrast, shared)
@@ -284,7 +222,7 @@ def _shared_image(method: Method, noise: Noise, image: FloatArray | None) -> Flo
     operators = method.operators()
     if float(noise[SHARED].sum()) <= NEGLIGIBLE * float(actual.sum()) or operators is None:
         return method.image if image is None else image
-    return without_noise(method, operators, actual)
+    return true_contrast(method, operators, actual, attenuated=False).image
 
 
 def _true_contrast(method: Method, noise: Noise) -> Contrast | None:
@@ -295,11 +233,7 @@ def _true_contrast(method: Method, noise: Noise) -> Contrast | None:
     if float(noise["calibration"].sum()) <= NEGLIGIBLE * float(actual.sum()):
         return None
     operators = method.operators()
-    return None if operators is None else true_contrast(method, operators, noise)
-
-
-def _certain(noise: Noise) -> Noise:
-    return {name: noise[name] for name in CERTAIN if name in noise}
+    return None if operators is None else true_contrast(method, operators, actual, attenuated=True)
 
 
 def _fit(observation: ObservedStack, noise: Noise) -> PriorFit | None:
@@ -308,7 +242,7 @@ def _fit(observation: ObservedStack, noise: Noise) -> PriorFit | None:
     prior_known, noise_known = scene.prior.kind != "fit", scene.estimator.noise_variance != "fit"
     if not observation.usable.used.any() or (noise_known and prior_known):
         return None
-    known = observation.expected_noise(noise) if noise_known else total_variance(_certain(noise))
+    known = observation.expected_noise(noise) if noise_known else total_variance(certain(noise))
     task = observation.task(known)
     if isinstance(task.model, DetailedModel) and noise_known and not prior_known:
         return fit_world(task)
@@ -324,6 +258,4 @@ def _with_fit(observation: ObservedStack, model: Model, noise: Noise, fit: Prior
         update = {"kind": "exponential", "variance": fit.variance}
         update["correlation_length"] = fit.length * observation.stack.camera.target_pitch
         observation = observation.with_prior(observation.prior.model_copy(update=update), model)
-    if fit.noise_variance is not None:
-        noise = {**_certain(noise), "noise": uniform(fit.noise_variance, noise["rendering"].size)}
-    return observation, noise
+    return observation, fitted_noise(noise, fit)

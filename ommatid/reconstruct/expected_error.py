@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from ommatid.runtime.errors import InputError
 from .estimator.certificate import exact_sums, refine
 from .estimator.residuals import ExactResiduals, exact
 from .forms.form import Form
+from .problem import Whitening
 
 Pixels = NDArray[np.intp]
 
@@ -128,7 +130,14 @@ class ExpectedError:
 
         The side of the square of pixels that share one degree of freedom (after Purser and Huang 1993).
         """
-        return kernel_widths(self.resolved)
+        root = np.sqrt(np.maximum(self.resolved, 0.0))
+        return np.divide(1.0, root, out=np.full_like(root, np.inf), where=root > 0)
+
+    @property
+    def median_width(self) -> float | None:
+        """Median of `resolution`, None where nothing is resolved."""
+        width = float(np.median(self.resolution))
+        return width if isfinite(width) else None
 
 
 @dataclass(frozen=True)
@@ -143,11 +152,34 @@ class Interval:
     high: float
     variance: float = 0.0
 
+    def with_added(self, mean: float, variance: float, count: int) -> Interval:
+        """Return the interval with another error, whose sum over `count` pixels has this mean and variance."""
+        return interval(max(count * self.mse + mean, 0.0), count**2 * self.variance + variance, count)
 
-def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | None = None) -> ExpectedError:
+
+@dataclass(frozen=True)
+class CorrelatedNoise:
+    """Noise of a form's problem that is correlated between measurements, so that they were whitened.
+
+    cause : to which the error is put down that measurements bring beyond their independent noise
+    excess : (M,) by which the independent part of what was whitened exceeds the actual noise
+    """
+
+    white: Whitening
+    cause: str
+    excess: FloatArray
+
+
+def expected_error(
+    form: Form,
+    noise: dict[str, FloatArray],
+    pixels: Pixels | None = None,
+    correlated: CorrelatedNoise | None = None,
+) -> ExpectedError:
     """Return Eq. 5 for the actual noise.
 
     noise : named (M,) variances, the diagonal of Rvm in parts;  pixels : whose error is returned, absent: all
+    correlated : what the problem of the form was whitened by; None if its noise is independent
     """
     problem = form.problem
     pixels = np.arange(problem.unknowns) if pixels is None else pixels
@@ -161,12 +193,17 @@ def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | No
         products = by_column[:, chosen].multiply(negative)
         resolved[chunk] = -np.asarray(products.sum(axis=0)).ravel()
         leverage -= np.asarray(products.sum(axis=1)).ravel()
-        squared = np.square(negative)
-        noisy[chunk] = total @ squared
+        squared = np.square(negative if correlated is None else correlated.white.multipliers(negative))
+        if correlated is None:
+            noisy[chunk] = total @ squared
+        else:
+            noisy[chunk] = np.square(negative).sum(axis=0) - correlated.excess @ squared
         weights += squared.sum(axis=1) / count
-    as_expected = np.array_equal(total, problem.noise_variance)
+    as_expected = correlated is None and np.array_equal(total, problem.noise_variance)
     variance = form.variance()[pixels] if as_expected else missing + noisy
     parts = {name: float(weights @ values) for name, values in noise.items()}
+    if correlated is not None:
+        parts[correlated.cause] = max(float(noisy.mean()) - sum(parts.values()), 0.0)
     all_pixels = count == problem.unknowns
     return ExpectedError(variance, float(missing.mean()), parts, resolved, leverage if all_pixels else None)
 
@@ -182,20 +219,21 @@ def expected_given(form: Form, truth: FloatArray, noise_variance: FloatArray) ->
 
 
 def squared_error(
-    form: Form, bias: FloatArray, noise_variance: FloatArray, pixels: Pixels
+    form: Form, bias: FloatArray, noise_variance: FloatArray, pixels: Pixels, white: Whitening | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean and variance of the sum of squared errors of some pixels, (t,) each, for the biases of t images.
 
     With K = A Rvm A^T of these pixels, the quadratic form |b|^2 + trace(K) has the variance 4 b^T K b + 2 trace(K^2).
 
-    bias : (pixels, t) (I - A H)(f - f0)
+    bias : (pixels, t) (I - A H)(f - f0);  noise_variance : (M,) of the measurements before they were whitened
     """
     trace = squares = 0.0
     along = np.zeros(bias.shape[1])
     for chunk, _, _, negative in solved_columns(form, pixels):
-        weighted = noise_variance[:, None] * negative
-        covariance = -form.gain(weighted)[pixels]
-        trace += float(np.sum(weighted * negative))
+        gain = negative if white is None else white.multipliers(negative)
+        weighted = noise_variance[:, None] * gain
+        covariance = -form.gain(weighted if white is None else white.vector(weighted))[pixels]
+        trace += float(np.sum(weighted * gain))
         squares += float(np.square(covariance).sum())
         along += np.sum((covariance.T @ bias) * bias[chunk], axis=0)
     return np.square(bias).sum(axis=0) + trace, 4 * along + 2 * squares
@@ -208,12 +246,6 @@ def interval(mean: float, variance: float, count: int) -> Interval:
     shape, scale = mean**2 / variance, variance / mean
     low, high = (float(special.gammaincinv(shape, level)) * scale for level in COVERAGE)
     return Interval(mean / count, low / count, high / count, variance / count**2)
-
-
-def kernel_widths(resolved: FloatArray) -> FloatArray:
-    """Return 1 / sqrt((A H)_ii), infinite where nothing is seen: (N,)."""
-    root = np.sqrt(np.maximum(resolved, 0.0))
-    return np.divide(1.0, root, out=np.full_like(root, np.inf), where=root > 0)
 
 
 def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, FloatArray, FloatArray]]:

@@ -27,8 +27,9 @@ from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
+from .detail.detailed_model import DetailedModel, model_of_f
 from .fitting.prior_fit import PriorFit
-from .methods.method import is_uniform, total_variance
+from .methods.method import EstimationTask, is_uniform, total_variance
 from .prior import coloured, spectrum_of
 
 Noise = dict[str, FloatArray]  # variances by cause
@@ -82,11 +83,15 @@ def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
     return UsablePixels(alive & ~full, int(np.sum(~alive)), full)
 
 
-def known_noise(stack: Stack) -> Noise:
-    """Return the variances, (M,), known before anything is estimated; absent effects have no entry."""
+def known_noise(stack: Stack, light: FloatArray | None = None) -> Noise:
+    """Return the variances, (M,), of rendering and sensor; absent effects have no entry.
+
+    light : (M,) that an estimate predicts, absent: the readings near each pixel
+    """
     noise = {"rendering": stack.variance if stack.variance.any() else uniform(0.0, stack.values.size)}
     if stack.recording is not None:
-        return noise | stack.recording.noise(stack.recording.smoothed_light(stack.camera))
+        light = stack.recording.smoothed_light(stack.camera) if light is None else light
+        return noise | stack.recording.noise(light)
     table = stack.scene.noise
     if table is not None and table.variance > 0:
         noise["noise"] = uniform(table.variance, stack.values.size)
@@ -95,57 +100,120 @@ def known_noise(stack: Stack) -> Noise:
     return noise
 
 
-def initial_noise(stack: Stack, model: Model, usable: UsablePixels, prior: PriorTable) -> Noise:
-    """Return the variances, (pixels used,), before there is an estimate; that of H is for images of the prior."""
-    noise = {name: at_used(variances, usable.used) for name, variances in known_noise(stack).items()}
-    if model.variance.any():
-        from_prior = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
-        noise["calibration"] = from_prior[usable.used]
-    if usable.censoring is not None:
-        noise[SATURATION] = usable.censoring[usable.used]
-    return noise | _shared_noise_of_prior(model, usable, prior, noise)
+def noise_at(stack: Stack, model: Model, image: FloatArray) -> Noise:
+    """Return the variances, (M,), at an estimate, (N,), with that by the uncertainty of H."""
+    noise = known_noise(stack, None if stack.recording is None else model.light(image))
+    return noise | {"calibration": model.variance_from_model(image)} if model.variance.any() else noise
 
 
-def noise_for_image(image: FloatArray, stack: Stack, model: Model, usable: UsablePixels, noise: Noise) -> Noise:
-    """Return the same noise with the parts that depend on the light replaced by those for an estimate, (N,)."""
-    noise = dict(noise)
-    if stack.recording is not None:
-        recorded = stack.recording.noise(model.light(image))
-        noise |= {name: at_used(variances, usable.used) for name, variances in recorded.items()}
-    if model.variance.any():
-        noise["calibration"] = model.variance_from_model(image)[usable.used]
-    return noise if SHARED not in noise else with_shared_noise(image, model, usable, noise)
+def fitted_noise(noise: Noise, fit: PriorFit | None) -> Noise:
+    """Return the noise whose part that is not CERTAIN is replaced by the fitted one, if one was fitted."""
+    if fit is None or fit.noise_variance is None:
+        return noise
+    return {**certain(noise), "noise": uniform(fit.noise_variance, noise["rendering"].size)}
 
 
-def with_shared_noise(image: FloatArray, model: Model, usable: UsablePixels, noise: Noise) -> Noise:
-    """Return the noise with the variance by errors of few numbers of H for an image, (N,), unless it is negligible.
-
-    The estimator takes these errors for independent, and `model_error.shared_errors` computes what they do together.
-    """
-    others = {name: values for name, values in noise.items() if name != SHARED}
-    variance = model.error_variance(image)
-    return others if variance is None else others | _notable(variance[usable.used], others)
+def certain(noise: Noise) -> Noise:
+    """Return the noise that stays known when the rest of it is to be fitted."""
+    return {name: noise[name] for name in CERTAIN if name in noise}
 
 
-def _shared_noise_of_prior(model: Model, usable: UsablePixels, prior: PriorTable, noise: Noise) -> Noise:
-    """Return the same variance for an image drawn from the prior, averaged over each sub-imager; {} if negligible."""
-    camera = model.camera
-    if model.error_variance(np.full(camera.unknowns, prior.mean)) is None:
-        return {}
-    spectrum = spectrum_of(prior, camera.shape, camera.target_pitch, camera.detail)
-    drawn = coloured(spectrum, probe(Purpose.SHARED_PRIOR).normal(size=camera.shape))
-    variance = model.error_variance(prior.mean + drawn.ravel())
-    if variance is None:
-        return {}
-    mean = np.concatenate([np.full(part.stop - part.start, variance[part].mean()) for part in camera.slices()])
-    return _notable(mean[usable.used], noise)
+def has_shared_errors(model: Model) -> bool:
+    """Return True if entries of H follow from few numbers with errors."""
+    return model.error_variance(np.zeros(model.unknowns)) is not None
 
 
-def _notable(variance: FloatArray, others: Noise) -> Noise:
-    """Return a variance by its cause, {} where it is a thousandth of the other noise or less, on average."""
-    rest = total_variance(others)
-    share = np.divide(variance, rest, out=np.where(variance > 0, np.inf, 0.0), where=rest > 0)
-    return {SHARED: variance} if share.size and float(share.mean()) > SHARED_NOTABLE else {}
+@dataclass(frozen=True)
+class ObservedStack:
+    """A stack with the prior of f, and the model that this prior makes of H where the world is finer than f."""
+
+    stack: Stack
+    model: Model
+    usable: UsablePixels
+    prior: PriorTable
+
+    def with_prior(self, prior: PriorTable, model: Model) -> ObservedStack:
+        """Return the same stack under another prior; model : as calibrated."""
+        return replace(self, prior=prior, model=model_of_f(model, self.stack.camera, prior))
+
+    def noise(self, image: FloatArray | None = None, *, shared: bool = True) -> Noise:
+        """Return the variances, (pixels used,), at an estimate, (N,), or for images of the prior before there is one.
+
+        shared : False leaves the errors of few numbers of H out
+        """
+        model, prior = self.model, self.prior
+        noise = known_noise(self.stack) if image is None else noise_at(self.stack, model, image)
+        if image is None and model.variance.any():
+            variances = np.full(model.unknowns, prior.variance)
+            noise["calibration"] = model.prior_variance_from_model(variances, prior.mean)
+        if self.usable.censoring is not None:
+            noise[SATURATION] = self.usable.censoring
+        noise = {name: at_used(variances, self.usable.used) for name, variances in noise.items()}
+        return self.with_shared(noise, image) if shared else noise
+
+    def with_shared(self, noise: Noise, image: FloatArray | None) -> Noise:
+        """Return the noise with the variance by errors of few numbers of H, unless it is a thousandth of it or less.
+
+        The estimator takes these errors for independent; `model_error.shared_errors` computes what they do together.
+
+        image : (N,), or None for one drawn from the prior, and the variance averaged over each sub-imager
+        """
+        others, model = {name: values for name, values in noise.items() if name != SHARED}, self.model
+        if not has_shared_errors(model):
+            return others
+        variance = model.error_variance(self._drawn() if image is None else image)
+        if variance is None:
+            return others
+        if image is None:
+            parts = model.camera.slices()
+            variance = np.concatenate([np.full(part.stop - part.start, variance[part].mean()) for part in parts])
+        variance, rest = variance[self.usable.used], total_variance(others)
+        share = np.divide(variance, rest, out=np.where(variance > 0, np.inf, 0.0), where=rest > 0)
+        return others | {SHARED: variance} if share.size and float(share.mean()) > SHARED_NOTABLE else others
+
+    def _drawn(self) -> FloatArray:
+        """Draw an image from the prior: (N,)."""
+        camera = self.model.camera
+        spectrum = spectrum_of(self.prior, camera.shape, camera.target_pitch, camera.detail)
+        return self.prior.mean + coloured(spectrum, probe(Purpose.SHARED_PRIOR).normal(size=camera.shape)).ravel()
+
+    @property
+    def detail_variance(self) -> FloatArray | float:
+        """Variance of detail on the pixels used, (pixels used,)."""
+        return self.model.detail_variance[self.usable.used] if isinstance(self.model, DetailedModel) else 0.0
+
+    def expected_noise(self, noise: Noise) -> FloatArray:
+        """Return the variance that the estimator assumes, (pixels used,)."""
+        setting = self.stack.scene.estimator.noise_variance
+        if not isinstance(setting, float):
+            return total_variance(noise)
+        return uniform(setting, int(self.usable.used.sum())) + noise.get(SATURATION, 0.0)
+
+    @property
+    def expects_fixed_noise(self) -> bool:
+        """True if the scene fixes the expected noise to a number."""
+        return isinstance(self.stack.scene.estimator.noise_variance, float)
+
+    def task(self, expected_noise: FloatArray, shared_image: FloatArray | None = None) -> EstimationTask:
+        """Return the task of an estimation method; the offset of detail's mean is taken off the measurements.
+
+        shared_image : (N,) whose errors by few numbers of H are part of the expected noise; None: they are not
+        """
+        scene, model, recorded = self.stack.scene, self.model, self.stack.values
+        if isinstance(model, DetailedModel):
+            recorded = recorded - model.offset
+        return EstimationTask(
+            model,
+            recorded,
+            self.usable.used,
+            expected_noise,
+            self.prior,
+            scene.estimator,
+            scene.tiles,
+            scene.prior_ratio,
+            shared_image,
+            model.camera.rows // self.stack.camera.rows,
+        )
 
 
 def depends_on_light(stack: Stack, model: Model) -> bool:
@@ -182,8 +250,9 @@ def censored(
 
     usable : of the stack as recorded;  fit : of its noise, if any
     """
-    light, variance = model.light(image), _variance(stack, model, image, fit)
-    deviation = np.sqrt(variance)
+    noise, shared = noise_at(stack, model, image), model.error_variance(image)
+    variance = total_variance(fitted_noise(noise if shared is None else noise | {SHARED: shared}, fit))
+    light, deviation = model.light(image), np.sqrt(variance)
     with np.errstate(invalid="ignore", divide="ignore"):
         below = (_limit(stack) - light) / deviation
     ratio = np.exp(-0.5 * below**2 - special.log_ndtr(-below)) / (2 * np.pi) ** 0.5
@@ -199,22 +268,6 @@ def has_converged(before: FloatArray, after: FloatArray, stack: Stack, usable: U
     """Return True if the light on saturated pixels, (M,), changed by little of the noise."""
     change, noise = np.abs(after - before)[usable.full], total_variance(known_noise(stack))[usable.full]
     return bool((change <= UNCHANGED * np.sqrt(noise)).all())
-
-
-def _variance(stack: Stack, model: Model, image: FloatArray, fit: PriorFit | None) -> FloatArray:
-    """Return the variance of a reading under the light of an image before it is clipped, (M,)."""
-    noise = known_noise(stack)
-    if stack.recording is not None:
-        noise |= stack.recording.noise(model.light(image))
-    if model.variance.any():
-        noise["calibration"] = model.variance_from_model(image)
-    shared = model.error_variance(image)
-    if shared is not None:
-        noise[SHARED] = shared
-    if fit is not None and fit.noise_variance is not None:
-        noise = {name: noise[name] for name in CERTAIN if name in noise}
-        noise["noise"] = uniform(fit.noise_variance, stack.values.size)
-    return total_variance(noise)
 
 
 def _limit(stack: Stack) -> FloatArray | float:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from math import isfinite
+from dataclasses import astuple, dataclass
+from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
@@ -16,7 +16,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import EstimatorTable
 
 from .estimator.estimate import factorise
-from .expected_error import expected_error, kernel_widths
+from .expected_error import ExpectedError, expected_error
 from .forms.form import Form
 from .measured_error import TRIM, trimmed_mean
 from .method_choice import METHODS, MethodChoice
@@ -75,6 +75,30 @@ class Prediction:
     as_designed: float | None = None
     calibrated: float | None = None
 
+    @classmethod
+    def of(
+        cls,
+        variance: FloatArray,
+        expected: ExpectedError,
+        seen: Observability | None,
+        shape: tuple[int, int],
+        **others: Any,
+    ) -> Prediction:
+        """Return the prediction of an estimate; variance : (N,) with all that adds to Eq. 5; seen : None for frames."""
+        rank, null_space, condition = (None, None, None) if seen is None else astuple(seen)
+        return cls(
+            unknowns=variance.size,
+            rank=rank,
+            null_space=null_space,
+            condition=condition,
+            mse=float(variance.mean()),
+            trimmed_mse=trimmed_mean(variance, shape),
+            trim=TRIM,
+            degrees_of_freedom=expected.degrees_of_freedom,
+            resolution=expected.median_width,
+            **others,
+        )
+
     @property
     def recovers_nothing(self) -> bool:
         """True if the error is that of the prior alone, to a tenth."""
@@ -125,20 +149,15 @@ def predict(
     if misalignment_variance is not None and form.problem.noisy:
         added = misalignment_variance(form, used)
         variance = variance + added
-    return Prediction(
-        noise.size,
-        prior.mean.size,
-        seen.rank,
-        seen.null_space,
-        seen.condition,
-        float(variance.mean()),
-        trimmed_mean(variance, shape),
-        TRIM,
-        expected.degrees_of_freedom,
-        median_width(expected.resolved),
-        solver.method,
-        None if added is None else float(added.mean()),
-        prior_ratio * float(prior.variance.mean()),
+    return Prediction.of(
+        variance,
+        expected,
+        seen,
+        shape,
+        measurements=noise.size,
+        method=solver.method,
+        misalignment=None if added is None else float(added.mean()),
+        prior_variance=prior_ratio * float(prior.variance.mean()),
     )
 
 
@@ -171,17 +190,12 @@ def predict_frame(choice: MethodChoice, model: Model, camera: Camera, actual: fl
     )
     result = METHODS[choice.method](task, Execution()).result({"noise": noise}, None)
     seen = observability(model.matrix[used]) if choice.method in ("dense", "detail") else None
-    return Prediction(
+    return Prediction.of(
+        result.expected.variance,
+        result.expected,
+        seen,
+        camera.shape,
         measurements=noise.size,
-        unknowns=camera.unknowns,
-        rank=None if seen is None else seen.rank,
-        null_space=None if seen is None else seen.null_space,
-        condition=None if seen is None else seen.condition,
-        mse=result.expected.mse,
-        trimmed_mse=trimmed_mean(result.expected.variance, camera.shape),
-        trim=TRIM,
-        degrees_of_freedom=result.expected.degrees_of_freedom,
-        resolution=median_width(result.expected.resolved),
         method=result.solver.method,
         prior_variance=scene.prior.variance,
         budget={"null_space": result.expected.missing, **result.expected.parts} if camera.has_detail else None,
@@ -199,9 +213,3 @@ def _noises(
     used = np.isfinite(noise)
     noise = at_used(noise, used)
     return noise, noise if setting is None else uniform(setting, noise.size), used
-
-
-def median_width(resolved: FloatArray) -> float | None:
-    """Return the median width of the averaging kernels in pixels of f, None where nothing is resolved."""
-    width = float(np.median(kernel_widths(resolved)))
-    return width if isfinite(width) else None

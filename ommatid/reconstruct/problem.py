@@ -6,12 +6,13 @@ of lenses that diffract, is multiplied a hundred times faster as a dense one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -110,3 +111,55 @@ class Problem:
     def _factor(self) -> sparse.csr_array | FloatArray:
         """H as products take it: with its zeros where they are few."""
         return self.matrix.toarray() if is_dense(self.matrix) else self.matrix
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """Cholesky factors K of the blocks of a block-diagonal Rv; K^-1 g has unit noise."""
+
+    slices: tuple[slice, ...]
+    factors: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(cls, blocks: Sequence[tuple[slice, FloatArray]], noise_variance: FloatArray, refusal: str) -> Whitening:
+        """Factorise blocks of covariance, each of some rows, with the independent noise of these, (M,).
+
+        Raises InputError with the words of `refusal` where noise is missing, so that a block is singular.
+        """
+        try:
+            factors = [
+                np.asarray(linalg.cholesky(block + np.diag(noise_variance[rows]), lower=True)) for rows, block in blocks
+            ]
+        except linalg.LinAlgError:
+            raise InputError(refusal) from None
+        return cls(tuple(rows for rows, _ in blocks), tuple(factors))
+
+    def vector(self, recorded: FloatArray) -> FloatArray:
+        """Return K^-1 g: (M,) or (M, q)."""
+        white = np.empty_like(recorded)
+        for rows, factor in zip(self.slices, self.factors, strict=True):
+            white[rows] = linalg.solve_triangular(factor, recorded[rows], lower=True, check_finite=False)
+        return white
+
+    def matrix(self, matrix: sparse.csr_array) -> sparse.csr_array:
+        """Return K^-1 H: (M, N); every row has entries at all pixels that its sub-imager sees."""
+        parts: list[sparse.csr_array] = []
+        for rows, factor in zip(self.slices, self.factors, strict=True):
+            part = sparse.csc_array(matrix[rows])
+            seen = np.flatnonzero(np.diff(part.indptr))
+            white = linalg.solve_triangular(factor, part[:, seen].toarray(), lower=True, check_finite=False)
+            starts = np.arange(0, white.size + 1, seen.size)
+            indices = np.tile(seen, white.shape[0])
+            parts.append(sparse.csr_array((np.asarray(white).ravel(), indices, starts), shape=part.shape))
+        return sparse.csr_array(sparse.vstack(parts, format="csr"))
+
+    def multipliers(self, white: FloatArray) -> FloatArray:
+        """Return K^-T l, (M,) or (M, q): multipliers of the problem from those of the whitened one."""
+        multipliers = np.empty_like(white)
+        for rows, factor in zip(self.slices, self.factors, strict=True):
+            multipliers[rows] = linalg.solve_triangular(factor, white[rows], trans="T", lower=True, check_finite=False)
+        return multipliers
+
+    def problem(self, matrix: sparse.csr_array, prior: Prior) -> Problem:
+        """Return the whitened problem, K^-1 H with unit noise, for measurements K^-1 g."""
+        return Problem(self.matrix(matrix), prior, np.ones(matrix.shape[0]))

@@ -196,11 +196,6 @@ def check_region(corner: tuple[int, int], size: tuple[int, int], shape: tuple[in
         )
 
 
-def check_match(stack: Stack, model: Model, names: tuple[Path | str, Path | str]) -> None:
-    """Raise InputError, naming the first difference, unless a stack and a model are of one camera and target grid."""
-    check_camera(stack.camera, model, names)
-
-
 def check_camera(camera: Camera, model: Model, names: tuple[Path | str, Path | str]) -> None:
     """Raise InputError, naming the first difference, unless a stack's camera is the model's."""
     rows, columns = camera.with_grid_of_matrix.shape

@@ -192,17 +192,6 @@ def test_a_prior_is_fitted_behind_kernels_wider_than_the_target() -> None:
     assert np.abs(logs / np.array(result.fit.spread)).max() < 4
 
 
-def test_the_covariance_of_a_lag_is_averaged_over_places() -> None:
-    """Pixels beyond the edge are those of the mirror image."""
-    shown = case("misaligned")
-    covariance = shown.covariance.reshape(22, 22, 22, 22)
-    places = np.abs(np.arange(-5, 27) + 0.5).astype(int)
-    mirrored = np.where(places > 21, 43 - places, places)
-    at, row, column = np.arange(22), mirrored[5 + 3 : 27 + 3], mirrored[5 - 2 : 27 - 2]
-    mean = covariance[at[:, None], at[None, :], row[:, None], column[None, :]].mean()
-    assert WorldPrior.of(shown.scene.prior, (11, 11), 1.0, 2).lags((4, 3))[3, 2] == pytest.approx(mean)
-
-
 @pytest.mark.slow
 def test_random_worlds_have_the_covariance_of_the_prior() -> None:
     """Variances of a weighted sum and of what f leaves open, over draws, against P and P - B A P."""

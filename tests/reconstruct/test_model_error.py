@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 
 from ommatid.reconstruct.methods.dense_method import DenseMethod
-from ommatid.reconstruct.methods.method import EstimationTask, Execution, PosteriorOperators
+from ommatid.reconstruct.methods.method import EstimationTask, Execution, PosteriorOperators, total_variance
 from ommatid.reconstruct.methods.tile_method import iterative_operators
 from ommatid.reconstruct.model_error.attenuation import Attenuation
 from ommatid.reconstruct.model_error.contrast import Waves, continued, likeliest_share, true_contrast
@@ -183,9 +183,9 @@ def test_the_noise_of_an_estimate_is_not_taken_for_contrast(contrast: float) -> 
         recorded = exact.matrix @ image + NOISE**0.5 * rng.normal(size=noise.size)
         method = _method(model, recorded, noise)
         by_cause = {"noise": np.full(noise.size, NOISE), "calibration": noise - NOISE}
-        contrasts = true_contrast(method, _operators(method), by_cause)
+        contrasts = true_contrast(method, _operators(method), total_variance(by_cause), attenuated=True)
         true += float(model.variance_from_model(image).sum())
-        stated += float(contrasts.calibration.sum())
+        stated += float(contrasts.calibration(method, by_cause).sum())
         plain += float(model.variance_from_model(method.image).sum())
     chance = 0.2 * plain if contrast < 1 else 0.0
     assert stated == pytest.approx(true, rel=0.1, abs=chance)

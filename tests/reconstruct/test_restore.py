@@ -11,7 +11,7 @@ from ommatid.analysis import run_table
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.output.result_files import with_estimator_changes
-from ommatid.reconstruct.restore import Reconstruction, check_match, restore
+from ommatid.reconstruct.restore import Reconstruction, check_camera, restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
@@ -93,7 +93,7 @@ def test_a_model_serves_stacks_of_other_pictures_and_seeds() -> None:
     model = ideal_model(described, camera)
     other = scene(lenses=THREE, render={"seed": 9, "samples": 64}, noise={"variance": 2.0})
     stack = render(Setup(other, camera, np.full((19, 19), 50.0)))
-    check_match(stack, model, ("a", "b"))
+    check_camera(stack.camera, model, ("a", "b"))
     restoration = restore(stack, model, np.full(361, 50.0))
     assert restoration.interval is not None
     assert restoration.error is not None
@@ -113,10 +113,10 @@ def test_a_stack_and_a_model_of_different_cameras_are_refused(other: Scene, key:
     camera = derive(described)
     stack = render(Setup(described, camera))
     with pytest.raises(InputError, match=key):
-        check_match(stack, ideal_model(other, derive(other)), ("stack.exr", "model.npz"))
+        check_camera(stack.camera, ideal_model(other, derive(other)), ("stack.exr", "model.npz"))
     wider = replace(ideal_model(described, camera), camera=replace(camera, pixel_pitch=0.007))
     with pytest.raises(InputError, match=r"camera\.pixel_pitch is 0\.006 in the stack and 0\.007"):
-        check_match(stack, wider, ("stack.exr", "model.npz"))
+        check_camera(stack.camera, wider, ("stack.exr", "model.npz"))
 
 
 def test_without_the_truth_there_is_no_measured_error() -> None:

@@ -10,12 +10,13 @@ import pytest
 from scipy import linalg, stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
+from ommatid.reconstruct.expected_error import CorrelatedNoise, expected_error
 from ommatid.reconstruct.misalignment.robust_noise import (
+    CAUSE,
     MisalignmentNoise,
     as_misalignments,
     misaligned_matrix,
     points_of,
-    robust_error,
     robust_noise,
     tolerances,
     whitening,
@@ -116,7 +117,8 @@ def test_error_over_images_and_cameras_is_as_expected_and_below_that_of_trust(na
     robust = estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form
     ideal = misaligned_matrix(camera, np.zeros_like(tolerances(camera)))
     trust = estimate(Problem(ideal, prior, noise), noise).form
-    expected = robust_error(robust, white, {"noise": noise})
+    correlated = CorrelatedNoise(white, CAUSE, np.zeros(noise.size))
+    expected = expected_error(robust, {"noise": noise}, correlated=correlated)
     errors: list[tuple[float, float]] = []
     for _ in range(120):
         image = drawn_from(prior, rng)
@@ -136,9 +138,9 @@ def test_parts_of_the_error_agree_with_dense_matrices() -> None:
     noise = np.random.default_rng(3).uniform(0.01, 0.1, camera.measurements)
     misaligned = robust_noise(camera, prior)
     white = whitening(camera, misaligned, noise)
-    expected = robust_error(
-        estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form, white, {"noise": noise}
-    )
+    form = estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form
+    correlated = CorrelatedNoise(white, CAUSE, np.zeros(noise.size))
+    expected = expected_error(form, {"noise": noise}, correlated=correlated)
     block, h = linalg.block_diag(*misaligned.covariances), misaligned.matrix.toarray()
     p = prior.root @ prior.root.T
     a = np.linalg.solve(h @ p @ h.T + block + np.diag(noise), h @ p).T

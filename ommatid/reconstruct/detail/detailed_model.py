@@ -153,6 +153,13 @@ class DetailedModel(Model):
         return first, second
 
 
+def detailed(model: Model) -> DetailedModel:
+    """Return a model whose world is known to be finer than f as what it is. Raises TypeError for others."""
+    if not isinstance(model, DetailedModel):
+        raise TypeError("expected a model of a world finer than f")
+    return model
+
+
 def detail_memory(camera: Camera) -> int:
     """Return the bytes of the exact moments: B, P A^T and P Hf^T, R_detail, its sum with the noise, and its factor."""
     world, measurements = camera.world.unknowns, camera.measurements

@@ -22,7 +22,7 @@ from ommatid.scenes.tables.estimation import PriorTable
 
 from ..fitting.prior_fit import MAX_LENGTH, MIN_LENGTH, MIN_MEASUREMENTS, RANGE, PriorFit
 from ..methods.method import EstimationTask
-from .detailed_model import DetailedModel
+from .detailed_model import detailed
 from .world_prior import WorldPrior
 
 LENGTHS = (0.5, 1.5, 4.0, 10.0, 25.0, 60.0)  # pixels of f, from which the search starts
@@ -119,9 +119,7 @@ def fit_world(task: EstimationTask) -> PriorFit:
 
 def world_evidence(task: EstimationTask) -> WorldEvidence:
     """Return the evidence of the measurements inside a window in the middle of the image, MOST of them at most."""
-    model = task.model
-    if not isinstance(model, DetailedModel):
-        raise TypeError("expected a model of a world finer than f")
+    model = detailed(task.model)
     if not (task.expected_noise > 0).all():
         raise InputError(
             "a prior cannot be fitted to measurements without noise; set estimator.noise_variance to a number above 0"

@@ -49,14 +49,6 @@ class WorldPrior:
         vertical, horizontal = (np.square(cosine_waves(size)) for size in self.fine_shape)
         return np.asarray(vertical @ self.spectrum @ horizontal.T).ravel()
 
-    def lags(self, shape: tuple[int, int]) -> FloatArray:
-        """Return the covariance of pixels so far apart, averaged over the image: (rows, columns) from lag 0."""
-        vertical, horizontal = (
-            np.cos(np.pi * np.outer(np.arange(lags), np.arange(size)) / size)
-            for lags, size in zip(shape, self.fine_shape, strict=True)
-        )
-        return vertical @ self.spectrum @ horizontal.T / self.spectrum.size
-
     def apply(self, images: FloatArray) -> FloatArray:
         """Return P X: (pixels of the world, q) to (pixels of the world, q)."""
         product = np.empty(images.shape)

@@ -14,7 +14,7 @@ open; conjugate gradients with a preconditioner serve larger ones, and kernels o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
@@ -224,13 +224,10 @@ def mean_accuracy(task: EstimationTask) -> float:
     return max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5 / task.finer)
 
 
-def posterior_operators(system: FrameSystem, task: EstimationTask) -> PosteriorOperators:
-    """Return A, C and their kin for means over the frame."""
-    accuracy = mean_accuracy(task)
-
-    def posterior(image: FloatArray) -> FloatArray:
-        return system.solve(image, accuracy).image
-
+def posterior_operators(
+    system: FrameSystem, task: EstimationTask, posterior: Callable[[FloatArray], FloatArray]
+) -> PosteriorOperators:
+    """Return A, C and their kin from C, `posterior`."""
     return PosteriorOperators(
         gain=lambda values: posterior(system.right_hand_side(task.on_all_measurements(values, 0.0))),
         posterior=posterior,

@@ -125,7 +125,7 @@ class FrameMethod(Method):
 
     def operators(self) -> PosteriorOperators:
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
-        return posterior_operators(self.system, self.task)
+        return posterior_operators(self.system, self.task, self._solve)
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""

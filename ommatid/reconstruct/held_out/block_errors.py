@@ -26,14 +26,13 @@ from scipy import linalg, sparse
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
-from ..forms.cholesky import factorise_positive, information
+from ..forms.cholesky import information
 from ..forms.form import NotSolvableError
 from ..problem import Problem
 
 EPS = float(np.finfo(np.float64).eps)
 MOST_EXACT = 1000  # measurements up to which S itself is factorised, which keeps ten digits or more
 MOST_ROOT = 6000  # measurements up to which that is possible
-EXACT = 1e-11  # relative error up to which S is factorised by Cholesky instead of QR
 PRECISION = 1e-6  # of whitened errors by W = I - T T^T, by a cautious estimate; else S itself is factorised
 LEAST_PRECISION = 1e-3  # where that is not possible
 SAFETY = 30.0  # factor on the relative error of T T^T
@@ -113,13 +112,15 @@ def _by_unknowns(
             raise _ImpreciseError from error
         if SAFETY * relative > precision * float(np.diagonal(lower).min(initial=1.0)) ** 2:
             raise _ImpreciseError
-        result.append(_block(lower, _solve_lower(lower, residual[block]), problem.deviation[block]))
+        whitened = np.asarray(linalg.solve_triangular(lower, residual[block], lower=True, check_finite=False))
+        result.append(_block(lower, whitened, problem.deviation[block]))
     return result
 
 
 def _by_measurements(problem: Problem, white: FloatArray, blocks: Sequence[IntArray]) -> list[BlockErrors]:
     """Use F = C^-1 of C^T C = I + B B^T."""
-    upper = _inverse_root(_upper_root(problem))
+    inverse, _ = linalg.lapack.dtrtri(_upper_root(problem))
+    upper = np.triu(inverse)
     y = upper.T @ white
     qr: Any = linalg.qr
     result: list[BlockErrors] = []
@@ -130,31 +131,12 @@ def _by_measurements(problem: Problem, white: FloatArray, blocks: Sequence[IntAr
 
 
 def _upper_root(problem: Problem) -> FloatArray:
-    """Return the upper C of C^T C = I + B B^T: by Cholesky where that keeps enough digits, else by QR of [I; B^T]."""
+    """Return the upper C of C^T C = I + B B^T, by QR of [I; B^T], which squares nothing."""
     dense = problem.dense_matrix()
     dense /= problem.deviation[:, None]
-    root = _cholesky_root(dense)
-    if root is not None:
-        return root
     panel = min(PANEL, problem.measurements)
     triangle, *_ = linalg.lapack.dtpqrt(0, panel, np.eye(problem.measurements, order="F"), np.asfortranarray(dense.T))
     return np.triu(triangle)
-
-
-def _cholesky_root(dense: FloatArray) -> FloatArray | None:
-    """Return the same by Cholesky, None where that fails or loses digits, since it squares B."""
-    covariance = dense @ dense.T
-    covariance[np.diag_indices_from(covariance)] += 1.0
-    try:
-        factor, condition = factorise_positive(covariance)
-    except NotSolvableError:
-        return None
-    return np.ascontiguousarray((np.tril(factor.root) * factor.scale[:, None]).T) if condition * EPS <= EXACT else None
-
-
-def _inverse_root(upper: FloatArray) -> FloatArray:
-    inverse, _ = linalg.lapack.dtrtri(upper)
-    return np.triu(inverse)
 
 
 def _block(lower: FloatArray, z: FloatArray, deviation: FloatArray) -> BlockErrors:
@@ -162,7 +144,3 @@ def _block(lower: FloatArray, z: FloatArray, deviation: FloatArray) -> BlockErro
     solve: Any = linalg.solve_triangular
     error = deviation * np.asarray(solve(lower, z, lower=True, trans="T", check_finite=False))
     return BlockErrors(z, error, np.square(lower).sum(axis=1) / np.square(deviation))
-
-
-def _solve_lower(lower: FloatArray, right: FloatArray) -> FloatArray:
-    return np.asarray(linalg.solve_triangular(lower, right, lower=True, check_finite=False))

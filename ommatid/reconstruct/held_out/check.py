@@ -106,11 +106,11 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
 
 def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: bool) -> HeldOutReport:
     shown, total = windows(task, robust)
-    rounds = _Rounds(task, robust, execution)
-    first = rounds.sums(())
+    first = held_out_sums(task, robust, execution)
     disagreeing = _disagreeing(first)
-    named, last = _culprits(rounds, first)
-    sums = rounds.shown(named, last)
+    named, sums = _culprits(task, robust, execution, first)
+    for index, before in named.items():
+        sums = sums.replaced(index, before)
     subs = tuple(
         _sub_imager(sub, index, sums, bool(disagreeing[index]), index in named)
         for index, sub in enumerate(task.model.camera.sub_imagers)
@@ -152,47 +152,28 @@ def quick_check(task: EstimationTask, method: str) -> HeldOutReport | None:
         return None
 
 
-def _culprits(rounds: _Rounds, first: HeldOutSums) -> tuple[list[int], HeldOutSums]:
-    """Return the sub-imagers after whose removal all others agree, none if there are no such, and the others' sums."""
-    named: list[int] = []
+def _culprits(
+    task: EstimationTask, robust: bool, execution: Execution, first: HeldOutSums
+) -> tuple[dict[int, HeldOutSums], HeldOutSums]:
+    """Return the sub-imagers after whose removal all others agree, none if there are no such, and the others' sums.
+
+    Of each that is removed, the sums are those before its removal.
+    """
+    named: dict[int, HeldOutSums] = {}
     last = first
     while (disagreeing := _disagreeing(last)).any():
         if len(named) == MOST_NAMED:
-            return [], first
+            return {}, first
         excess = _excess(last)
-        named.append(int(np.argmax(np.where(disagreeing, excess, -np.inf))))
-        last = rounds.sums(tuple(named))
+        named[int(np.argmax(np.where(disagreeing, excess, -np.inf)))] = last
+        last = held_out_sums(_without(task, tuple(named)), robust, execution)
         remaining = _excess(last)[_disagreeing(last)].sum()
         if remaining > (1 - LEAST_PROGRESS) * excess[disagreeing].sum():
-            return [], first
+            return {}, first
     return named, last
 
 
-class _Rounds:
-    """The sums after leaving out more and more sub-imagers."""
-
-    def __init__(self, task: EstimationTask, robust: bool, execution: Execution) -> None:
-        self._task, self._robust, self._execution = task, robust, execution
-        self._when_named: dict[int, HeldOutSums] = {}
-        self._last: HeldOutSums | None = None
-
-    def sums(self, left_out: tuple[int, ...]) -> HeldOutSums:
-        """Predict without the measurements of these sub-imagers; sums are 0 where there is nothing to predict from."""
-        if left_out and self._last is not None:
-            self._when_named[left_out[-1]] = self._last
-        self._last = held_out_sums(_without(self._task, left_out), self._robust, self._execution)
-        return self._last
-
-    def shown(self, named: list[int], last: HeldOutSums) -> HeldOutSums:
-        """Return the sums of `last`, and of the named sub-imagers those before they were left out."""
-        for index in named:
-            last = last.replaced(index, self._when_named[index])
-        return last
-
-
 def _without(task: EstimationTask, left_out: tuple[int, ...]) -> EstimationTask:
-    if not left_out:
-        return task
     kept: BoolArray = task.used.copy()
     slices = task.model.camera.slices()
     for index in left_out:

@@ -28,7 +28,7 @@ from ..detail.detailed_model import DetailedModel
 from ..fitting.evidence import Evidence
 from ..fitting.prior_fit import MIN_MEASUREMENTS, fit_prior
 from ..methods.method import EstimationTask, Execution
-from ..misalignment.robust_noise import robust_noise, whitening
+from ..misalignment.misaligned_methods import RobustMethod
 from ..prior import Prior, covariance_root
 from ..problem import Problem
 from .block_errors import block_errors
@@ -135,9 +135,11 @@ def held_out_sums(task: EstimationTask, robust: bool, execution: Execution) -> H
     Sums are 0 where there are no others to predict from.
     robust : True if the noise holds the misalignment that the camera's tolerance allows
     """
+    if robust or _knows_detail(task):
+        return _sums(_whole_robust(task) if robust else _whole_detailed(task))
     chosen, _ = windows(task, robust)
     if len(chosen) == 1:
-        return _sums(_whole_robust(task) if robust else _whole_detailed(task) if _knows_detail(task) else _whole(task))
+        return _sums(next(_problems(task, chosen)))
     with one_thread(), worker_pool(threads=processors()) as pool:
         parts = pool.map(_sums, _problems(task, chosen), execution.progress, len(chosen))
     total = parts[0]
@@ -159,41 +161,6 @@ def _evenly(intervals: list[slice]) -> list[slice]:
 def _sub_imager_of(camera: Camera, measurements: IntArray) -> IntArray:
     starts = np.array([pixels.start for pixels in camera.slices()])
     return np.searchsorted(starts, measurements, side="right") - 1
-
-
-def _whole(task: EstimationTask) -> WindowProblem:
-    camera, used = task.model.camera, np.flatnonzero(task.used)
-    shared = _SharedErrors(task)
-    matrix, noise = task.model.matrix[used], task.expected_noise
-    problem = shared.problem(matrix, task.prior_on(task.shape), noise, np.arange(used.size))
-    return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
-
-
-class _SharedErrors:
-    """Errors of few numbers of H, which measurements of a sub-imager share: unknowns of variance 1 beside the pixels.
-
-    So a sub-imager whose readings are all off by what the numbers allow does not disagree with the others.
-    """
-
-    def __init__(self, task: EstimationTask) -> None:
-        directions = task.shared_directions
-        self._directions = None if directions is None else sparse.csr_array(directions)
-        self._independent = without_shared(task)
-
-    def problem(self, matrix: sparse.csr_array, prior: Prior, noise: FloatArray, index: IntArray) -> Problem:
-        """Return the problem of some measurements; index : of them among those used."""
-        if self._directions is None:
-            return Problem(matrix, prior, noise)
-        directions = sparse.csc_array(self._directions[index])
-        directions = directions[:, np.flatnonzero(np.diff(directions.indptr))]
-        count = directions.shape[1]
-        joined = sparse.csr_array(sparse.hstack([matrix, directions], format="csr"))
-        mean = np.concatenate([prior.mean, np.zeros(count)])
-        if prior.independent:
-            root: FloatArray = np.concatenate([prior.root, np.ones(count)])
-        else:
-            root = np.asarray(linalg.block_diag(prior.root, np.eye(count)))
-        return Problem(joined, Prior(mean, root, prior.rounding), self._independent[index])
 
 
 def without_shared(task: EstimationTask) -> FloatArray:
@@ -225,28 +192,41 @@ def _whole_detailed(task: EstimationTask) -> WindowProblem:
 
 def _whole_robust(task: EstimationTask) -> WindowProblem:
     """Whiten each sub-imager by its own covariance; its errors then count in units of that covariance."""
-    camera, used, prior = task.model.camera, np.flatnonzero(task.used), task.prior_on(task.shape)
-    misaligned = robust_noise(camera, prior)
-    white = whitening(camera, misaligned, task.expected_noise, task.used)
-    problem = white.problem(misaligned.matrix[used], prior)
-    return WindowProblem(
-        problem, white.vector(task.recorded[used]), _sub_imager_of(camera, used), len(camera.sub_imagers)
-    )
+    camera, method = task.model.camera, RobustMethod(task, Execution())
+    sub_imager = _sub_imager_of(camera, np.flatnonzero(task.used))
+    return WindowProblem(method.problem, method.recorded, sub_imager, len(camera.sub_imagers))
 
 
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:
-    """Yield the problem of every window, one at a time to bound memory."""
-    camera, shared, used = task.model.camera, _SharedErrors(task), np.flatnonzero(task.used)
+    """Yield the problem of every window, one at a time to bound memory.
 
-    @cache
-    def prior_on(shape: tuple[int, int]) -> Prior:
-        return task.prior_on(shape)
-
+    Errors of few numbers of H, which measurements of a sub-imager share, are unknowns of variance 1 beside the pixels.
+    So a sub-imager whose readings are all off by what the numbers allow does not disagree with the others.
+    """
+    camera, used, prior_on = task.model.camera, np.flatnonzero(task.used), cache(task.prior_on)
+    directions = None if task.shared_directions is None else sparse.csr_array(task.shared_directions)
     for rows, columns in chosen:
         window = task.window(rows, columns)
-        problem = shared.problem(window.matrix, prior_on(window.shape), window.expected_noise, window.index)
+        matrix, prior, noise = window.matrix, prior_on(window.shape), window.expected_noise
+        if directions is not None:
+            matrix, prior = _with_unknowns(matrix, prior, sparse.csc_array(directions[window.index]))
+            noise = without_shared(task)[window.index]
         sub_imager = _sub_imager_of(camera, used[window.index])
-        yield WindowProblem(problem, window.recorded, sub_imager, len(camera.sub_imagers))
+        yield WindowProblem(Problem(matrix, prior, noise), window.recorded, sub_imager, len(camera.sub_imagers))
+
+
+def _with_unknowns(
+    matrix: sparse.csr_array, prior: Prior, directions: sparse.csc_array
+) -> tuple[sparse.csr_array, Prior]:
+    """Return H and the prior with an unknown of variance 1 for every column of L, (m, q), that is not 0."""
+    directions = directions[:, np.flatnonzero(np.diff(directions.indptr))]
+    count = directions.shape[1]
+    if prior.independent:
+        root: FloatArray = np.concatenate([prior.root, np.ones(count)])
+    else:
+        root = np.asarray(linalg.block_diag(prior.root, np.eye(count)))
+    joined = sparse.csr_array(sparse.hstack([matrix, directions], format="csr"))
+    return joined, Prior(np.concatenate([prior.mean, np.zeros(count)]), root, prior.rounding)
 
 
 def _sums(window: WindowProblem) -> HeldOutSums:

@@ -8,13 +8,11 @@ measurements and the previous mean m,
 
     B = S^-1 H T,    T (I + B^T B)^-1 T^T,    m + T (I + B^T B)^-1 B^T S^-1 (g - H m)
 
-are the updated covariance and mean. I + B^T B differs from I in as many directions as B has independent rows, a small
-part of a tile's pixels, and only these are factorised.
+are the updated covariance and mean: those of a problem whose prior has the root T, in the square-root form.
 
-Variances are accurate to a relative 1e-14 at any noise. Where single tiles leave a direction undetermined, rounding
-errors of T, 1e-16 of the prior's standard deviation, exceed a small noise: means were accurate to 1e-13 of that
-standard deviation at a noise variance of 1e-2, to 2e-12 at 1e-6 and to 3e-9 at 1e-10 (the paper's lenses, up to five
-tiles of 19 x 19).
+Where single tiles leave a direction undetermined, rounding errors of T, 1e-16 of the prior's standard deviation, exceed
+a small noise: means were accurate to 1e-13 of that standard deviation at a noise variance of 1e-2, to 2e-12 at 1e-6 and
+to 3e-9 at 1e-10 (the paper's lenses).
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import product
-from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
@@ -31,12 +28,10 @@ from scipy import linalg, sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 
-from ..forms.square_root import Indices, sorted_qr
+from ..forms.form import NotSolvableError
+from ..forms.square_root import Indices, square_root
+from ..prior import Prior
 from ..problem import Problem
-
-ROUNDING = 64 * float(np.finfo(np.float64).eps)  # of sums of products, including earlier losses in T
-LARGEST = 1e150  # whose square is finite
-BLOCK = 64  # columns that LAPACK processes together
 
 
 @dataclass(frozen=True)
@@ -126,25 +121,25 @@ def _inside(problem: Problem, pixels: Indices) -> BoolArray:
 def _updated(before: Posterior, problem: Problem, recorded: FloatArray, numbers: Indices) -> Posterior:
     """Return the posterior after the measurements `numbers`, by the equations of the module docstring."""
     _check_measurements(problem, recorded, numbers)
-    rows = sparse.csr_array(problem.matrix[numbers][:, before.pixels])
-    deviation = problem.deviation[numbers]
-    with np.errstate(all="ignore"):  # overflow is refused below
-        residual = (recorded[numbers] - rows @ before.mean) / deviation
-        whitened, rounding = _whitened(rows, before.root, deviation)
-    for values in (residual, whitened, rounding):
-        if not np.abs(values).max(initial=0.0) < LARGEST:
-            raise InputError(
-                "the noise is too small relative to the prior or the measurements for double precision; raise it"
-            )
-    triangle, projected, order = _independent_rows(whitened, np.linalg.norm(rounding, axis=0), residual)
-    rank = projected.size
-    if rank == 0:
+    if not numbers.size:
         return before
-    rotated, narrow = _rotated(before.root[:, order], triangle)
-    normal = sorted_qr(np.vstack([narrow.T, np.eye(rank)]))
-    step = normal.solve(np.concatenate([projected, np.zeros(rank)])[:, None])[:, 0]
-    root = np.hstack([rotated[:, :rank] @ normal.inverse(), rotated[:, rank:]])
-    return Posterior(before.pixels, before.mean + rotated[:, :rank] @ step, root)
+    rows = sparse.csr_array(problem.matrix[numbers][:, before.pixels])
+    part = Problem(rows, Prior(before.mean, before.root), problem.noise_variance[numbers])
+    residual = recorded[numbers] - rows @ before.mean
+    try:
+        with np.errstate(all="ignore"):  # overflow is refused below
+            form = square_root(part)
+            step, _ = form.solve(np.zeros((part.prior.dimension, 1)), residual[:, None])
+            after = Posterior(
+                before.pixels, before.mean + before.root @ step[:, 0], before.root @ form.normal.inverse()
+            )
+    except NotSolvableError:
+        after = None
+    if after is None or not (np.isfinite(after.mean).all() and np.isfinite(after.variance).all()):
+        raise InputError(
+            "the noise is too small relative to the prior or the measurements for double precision; raise it"
+        )
+    return after
 
 
 def _check_measurements(problem: Problem, recorded: FloatArray, numbers: Indices) -> None:
@@ -154,43 +149,3 @@ def _check_measurements(problem: Problem, recorded: FloatArray, numbers: Indices
         )
     if not (problem.noise_variance[numbers] > 0).all():
         raise InputError("merging tiles needs measurements with noise only; set estimator.noise_variance above 0")
-
-
-def _whitened(rows: sparse.csr_array, root: FloatArray, deviation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return B, (q, K), and bounds on the rounding errors of its entries; entries below the bound are 0 in both.
-
-    A single tile leaves directions undetermined in which H T is exactly 0. Its rounding error there is negligible
-    beside the prior but not beside a small noise, and would act as a measurement.
-    """
-    whitened = np.asarray(rows @ root) / deviation[:, None]
-    rounding = ROUNDING * np.asarray(abs(rows) @ np.abs(root)) / deviation[:, None]
-    zero = np.abs(whitened) <= rounding
-    whitened[zero] = 0.0
-    rounding[zero] = 0.0
-    return whitened, rounding
-
-
-def _independent_rows(
-    whitened: FloatArray, rounding: FloatArray, residual: FloatArray
-) -> tuple[FloatArray, FloatArray, Indices]:
-    """Reduce measurements to independent rows: R, (r, K), Q^T S^-1 (g - H m), (r,), and the order of columns.
-
-    B = Q R with its columns in that order, by pivoting, so that directions of large variance come first. A remaining
-    column below its (K,) `rounding` error is set to 0; this keeps undetermined directions apart from well-determined
-    ones, which are far smaller.
-    """
-    qr = sorted_qr(whitened)
-    remaining = np.sqrt(np.cumsum(np.square(qr.triangle)[::-1], axis=0)[::-1])
-    triangle = np.where(remaining > rounding[qr.pivots], qr.triangle, 0.0)
-    significant = np.diagonal(triangle) != 0
-    rank = min(whitened.shape) if significant.all() else int(np.argmin(significant))
-    return triangle[:rank], qr.orthogonal[:, :rank].T @ residual[qr.rows], qr.pivots
-
-
-def _rotated(root: FloatArray, triangle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return T Q, (n, K), and W, (r, r), of R^T = Q [W; 0]; Q is not formed, so this costs 4 n K r operations."""
-    qr: Any = linalg.qr
-    lapack: Any = linalg.lapack
-    (reflectors, factors), narrow = qr(triangle.T, mode="raw", check_finite=False)
-    rotated, _, _ = lapack.dormqr("R", "N", reflectors, factors, root, BLOCK * root.shape[0])
-    return rotated, narrow[: triangle.shape[0]]

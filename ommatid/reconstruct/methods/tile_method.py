@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from scipy import fft, linalg, sparse
+from scipy import linalg, sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 from ommatid.runtime.arrays import FloatArray
@@ -23,7 +23,13 @@ from ommatid.runtime.processors import one_thread, processors
 from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, interval
-from ..frame.conjugate_gradients import Indices, banded_cholesky, shorter_side_first
+from ..frame.conjugate_gradients import (
+    FrameSystem,
+    Indices,
+    banded_cholesky,
+    posterior_operators,
+    shorter_side_first,
+)
 from ..output.run_json import SolverReport
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .method import (
@@ -111,35 +117,18 @@ def _variances(precision: sparse.csr_array, shape: tuple[int, int], pixels: Indi
 
 def iterative_operators(task: EstimationTask) -> PosteriorOperators:
     """Return the operators of a task whose every measurement has noise."""
-    matrix = task.model.matrix if task.complete else sparse.csr_array(task.model.matrix[task.used])
-    weights, precision = 1 / task.expected_noise, task.precision_on(task.shape)
-    count = task.model.unknowns
-
-    def apply(image: FloatArray) -> FloatArray:
-        product: FloatArray = matrix.T @ (weights * (matrix @ image))
-        return product + _precision(image, precision, task.shape)
-
-    diagonal = np.asarray(matrix.power(2).T @ weights) + float(np.mean(precision))
-    system = LinearOperator((count, count), matvec=apply, dtype=np.float64)
-    scaled = LinearOperator((count, count), matvec=lambda image: image / diagonal, dtype=np.float64)
+    weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
+    system = FrameSystem(task.model.applied, weights, task.precision_on(task.shape))
+    diagonal = np.asarray(task.model.matrix.power(2).T @ weights) + float(np.mean(system.prior))
+    shape = (diagonal.size, diagonal.size)
+    precision = LinearOperator(shape, matvec=system.apply, dtype=np.float64)
+    scaled = LinearOperator(shape, matvec=lambda image: image / diagonal, dtype=np.float64)
 
     def posterior(image: FloatArray) -> FloatArray:
-        solution: Any = cast(Any, cg)(system, image, rtol=RESIDUAL, maxiter=MAX_STEPS, M=scaled)[0]
+        solution: Any = cast(Any, cg)(precision, image, rtol=RESIDUAL, maxiter=MAX_STEPS, M=scaled)[0]
         return np.asarray(solution, dtype=np.float64)
 
-    return PosteriorOperators(
-        gain=lambda values: posterior(matrix.T @ (weights * values)),
-        posterior=posterior,
-        weigh=lambda values: weights * values,
-        hidden=lambda image: posterior(_precision(image, precision, task.shape)),
-    )
-
-
-def _precision(image: FloatArray, precision: float | FloatArray, shape: tuple[int, int]) -> FloatArray:
-    if isinstance(precision, float):
-        return precision * image
-    waves = precision * np.asarray(fft.dctn(image.reshape(shape), 2, norm="ortho"))
-    return np.asarray(fft.idctn(waves, 2, norm="ortho")).ravel()
+    return posterior_operators(system, task, posterior)
 
 
 class TileMethod(Method):
@@ -168,16 +157,19 @@ class TileMethod(Method):
         image, variance, resolved = (np.empty(task.shape) for _ in range(3))
         missing, parts, sums = 0.0, dict.fromkeys(noise, 0.0), np.zeros(2)
         for tiles, solved in zip(groups, results, strict=True):
-            share = solved.variance.size / image.size
+            if solved.expected is None:
+                raise RuntimeError("actual noise was given, but no error was computed")
+            expected = solved.expected
+            share = expected.variance.size / image.size
             for index, tile in enumerate(tiles):
                 shape = image[tile.core].shape
                 image[tile.core] = solved.image[:, index].reshape(shape)
-                variance[tile.core] = solved.variance.reshape(shape)
-                resolved[tile.core] = solved.resolved.reshape(shape)
+                variance[tile.core] = expected.variance.reshape(shape)
+                resolved[tile.core] = expected.resolved.reshape(shape)
                 if solved.responses is not None:
                     responses[tile.core] = solved.responses[:, index].reshape(*shape, -1)
-                missing += share * solved.missing
-                parts = {name: part + share * solved.parts[name] for name, part in parts.items()}
+                missing += share * expected.missing
+                parts = {name: part + share * expected.parts[name] for name, part in parts.items()}
                 sums += 0.0 if solved.given is None else solved.given[:, index]
         self.image = image.ravel()
         cost = tile_cost(task, variance) if np.allclose(total_variance(noise), task.expected_noise, rtol=1e-9) else None

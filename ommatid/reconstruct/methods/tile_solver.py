@@ -19,7 +19,7 @@ from ommatid.runtime.processors import one_thread
 from ommatid.scenes.tables.estimation import EstimatorTable
 
 from ..estimator.estimate import estimate
-from ..expected_error import expected_error, squared_error
+from ..expected_error import ExpectedError, expected_error, squared_error
 from ..forms.form import Form
 from ..output.run_json import SolverReport
 from ..prior import Prior
@@ -97,20 +97,17 @@ class TileTask:
 
 @dataclass(frozen=True)
 class SolvedTiles:
-    """Images of the kept pixels, (kept, tiles), and their error, the same for all tiles of a task.
+    """Images of the kept pixels, (kept, tiles), and their error.
 
-    variance, resolved : (kept,) Eq. 5 and the diagonal of A H;  missing, parts : means of the parts of Eq. 5
+    expected : Eq. 5 of the kept pixels, the same for all tiles of a task; None where images alone were asked for
     given : (2, tiles) sums over the pixels of the expected error for the true image, and their variances
     responses : (kept, tiles, columns) A applied to the deviations of the task
     """
 
     image: FloatArray
     solver: SolverReport
-    variance: FloatArray
-    resolved: FloatArray
-    missing: float
-    parts: dict[str, float]
-    given: FloatArray | None
+    expected: ExpectedError | None = None
+    given: FloatArray | None = None
     responses: FloatArray | None = None
 
 
@@ -123,13 +120,11 @@ def solve_tiles(task: TileTask) -> SolvedTiles:
         residual = task.recorded - (problem.matrix @ problem.prior.mean)[:, None]
         image = (problem.prior.mean[:, None] + first.form.gain(residual))[task.kept]
     if not task.noise:
-        return SolvedTiles(image, first.solver, np.zeros(0), np.zeros(0), 0.0, {}, None)
+        return SolvedTiles(image, first.solver)
     expected = expected_error(first.form, task.noise, pixels=task.kept)
     given = None if task.truth is None else _error_given(task, first.form, task.truth)
     responses = None if task.deviations is None else _responses(first.form, task.deviations, task.kept)
-    return SolvedTiles(
-        image, first.solver, expected.variance, expected.resolved, expected.missing, expected.parts, given, responses
-    )
+    return SolvedTiles(image, first.solver, expected, given, responses)
 
 
 def _responses(form: Form, deviations: FloatArray, kept: NDArray[np.intp]) -> FloatArray:

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
@@ -37,10 +37,10 @@ from ommatid.scenes.optics.blur import blur_of
 from ommatid.scenes.optics.footprints import matrix as footprints
 from ommatid.scenes.pose import Misalignment, pose_of
 
-from ..expected_error import CHUNK, ExpectedError, solved_columns
+from ..expected_error import solved_columns
 from ..forms.form import Form
 from ..prior import Prior
-from ..problem import Problem
+from ..problem import Whitening
 
 # |t| at a quarter of the points each, in standard deviations: the solution of three equations for the mean of |t|,
 # t^2 and |t|^3 with two equal levels. E t^4 is 2.78 instead of 3: no four real levels have all four moments.
@@ -51,6 +51,10 @@ ORDER = 8  # of the Galois field, and number of signed levels
 MODULUS = 0b1011  # x^3 + x + 1
 PARAMETERS = 6  # position x and y, tilt about x and about y, rotation, focal length: the columns of every table here
 CAUSE = "misalignment"  # in the error budget
+NEEDS_NOISE = (
+    "estimator.misalignment = 'robust' needs noise in every measurement, got some without; set noise.variance or"
+    " estimator.noise_variance to a number above 0"
+)
 
 
 def points_of(free: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -137,44 +141,6 @@ def robust_noise(camera: Camera, prior: Prior) -> MisalignmentNoise:
     return MisalignmentNoise(sparse.csr_array(mean), tuple(blocks))
 
 
-@dataclass(frozen=True)
-class Whitening:
-    """Cholesky factors K of the blocks of a block-diagonal Rv; K^-1 g has unit noise."""
-
-    slices: tuple[slice, ...]
-    factors: tuple[FloatArray, ...]
-
-    def vector(self, recorded: FloatArray) -> FloatArray:
-        """Return K^-1 g: (M,) or (M, q)."""
-        white = np.empty_like(recorded)
-        for rows, factor in zip(self.slices, self.factors, strict=True):
-            white[rows] = linalg.solve_triangular(factor, recorded[rows], lower=True, check_finite=False)
-        return white
-
-    def matrix(self, matrix: sparse.csr_array) -> sparse.csr_array:
-        """Return K^-1 H: (M, N); every row has entries at all pixels that its sub-imager sees."""
-        parts: list[sparse.csr_array] = []
-        for rows, factor in zip(self.slices, self.factors, strict=True):
-            part = sparse.csc_array(matrix[rows])
-            seen = np.flatnonzero(np.diff(part.indptr))
-            white = linalg.solve_triangular(factor, part[:, seen].toarray(), lower=True, check_finite=False)
-            starts = np.arange(0, white.size + 1, seen.size)
-            indices = np.tile(seen, white.shape[0])
-            parts.append(sparse.csr_array((np.asarray(white).ravel(), indices, starts), shape=part.shape))
-        return sparse.csr_array(sparse.vstack(parts, format="csr"))
-
-    def multipliers(self, white: FloatArray) -> FloatArray:
-        """Return K^-T l, (M,) or (M, q): multipliers of the problem from those of the whitened one."""
-        multipliers = np.empty_like(white)
-        for rows, factor in zip(self.slices, self.factors, strict=True):
-            multipliers[rows] = linalg.solve_triangular(factor, white[rows], trans="T", lower=True, check_finite=False)
-        return multipliers
-
-    def problem(self, matrix: sparse.csr_array, prior: Prior) -> Problem:
-        """Return the whitened problem, K^-1 H with unit noise, for measurements K^-1 g."""
-        return Problem(self.matrix(matrix), prior, np.ones(matrix.shape[0]))
-
-
 def whitening(
     camera: Camera, misaligned: MisalignmentNoise, noise_variance: FloatArray, used: BoolArray | None = None
 ) -> Whitening:
@@ -184,60 +150,7 @@ def whitening(
     Raises InputError where some noise is missing, so that a block is singular.
     """
     chosen = np.ones(camera.measurements, dtype=np.bool_) if used is None else used
-    slices: list[slice] = []
-    factors: list[FloatArray] = []
-    start = 0
-    for rows, covariance in zip(camera.slices(), misaligned.covariances, strict=True):
-        mask = chosen[rows]
-        among_used = slice(start, start + int(mask.sum()))
-        block = covariance[np.ix_(mask, mask)] + np.diag(noise_variance[among_used])
-        try:
-            factors.append(np.asarray(linalg.cholesky(block, lower=True)))
-        except linalg.LinAlgError:
-            raise InputError(
-                "estimator.misalignment = 'robust' needs noise in every measurement, got some without;"
-                " set noise.variance or estimator.noise_variance to a number above 0"
-            ) from None
-        slices.append(among_used)
-        start = among_used.stop
-    return Whitening(tuple(slices), tuple(factors))
-
-
-def robust_error(
-    form: Form,
-    white: Whitening,
-    noise: dict[str, FloatArray],
-    cause: str = CAUSE,
-    excess: FloatArray | None = None,
-) -> ExpectedError:
-    """Return Eq. 5 of a form of the whitened problem, on average over images and what is correlated in their noise.
-
-    noise : named (pixels used,) variances, together the independent part of what was whitened; the rest of the error
-        that measurements bring is put down to `cause`
-    excess : (pixels used,) by which the independent part of what was whitened exceeds `noise`; absent: not at all
-    """
-    count = form.problem.unknowns
-    by_column = sparse.csc_array(form.problem.matrix)
-    variance, resolved = np.zeros(count), np.zeros(count)
-    missing = from_measurements = 0.0
-    weights, leverage = np.zeros(form.problem.measurements), np.zeros(form.problem.measurements)
-    for start in range(0, count, CHUNK):
-        pixels = np.arange(start, min(start + CHUNK, count))
-        u, negative = form.pixel_solutions(pixels)
-        prior, noisy = np.square(u).sum(axis=0), np.square(negative).sum(axis=0)
-        gain = np.square(white.multipliers(negative))
-        if excess is not None:
-            noisy -= excess @ gain
-        variance[pixels] = prior + noisy
-        missing += float(prior.sum()) / count
-        from_measurements += float(noisy.sum()) / count
-        products = by_column[:, pixels].multiply(negative)
-        resolved[pixels] = -np.asarray(products.sum(axis=0)).ravel()
-        leverage -= np.asarray(products.sum(axis=1)).ravel()
-        weights += gain.sum(axis=1) / count
-    parts = {name: float(weights @ values) for name, values in noise.items()}
-    rest = max(from_measurements - sum(parts.values()), 0.0)
-    return ExpectedError(variance, missing, {**parts, cause: rest}, resolved, leverage)
+    return Whitening.of(_used_blocks(chosen, misaligned, camera.slices()), noise_variance, NEEDS_NOISE)
 
 
 def _add_squares(
@@ -293,16 +206,12 @@ def mismatch_of_image(
 
     moments : of H and of what it sees of this image, so that their prior is this image, without variance
     """
-    shift, problem = _shift(form, used, moments), form.problem
+    problem = form.problem
     difference = image - problem.prior.mean
     bias = form.gain(problem.matrix @ difference) - difference
-    seen = form.gain(shift @ image)
-    added = np.square(seen) + 2 * bias * seen
-    parts = _used_blocks(used, moments, slices)
-    for chunk, _, _, negative in solved_columns(form, np.arange(problem.unknowns)):
-        for rows, block in parts:
-            added[chunk] += np.sum(negative[rows] * (block @ negative[rows]), axis=0)
-    return added
+    of_image = Prior(image, np.zeros(image.size))
+    squares = mismatch_variance(form, used, moments, slices, of_image)
+    return squares + 2 * bias * form.gain(_shift(form, used, moments) @ image)
 
 
 def _shift(form: Form, used: BoolArray, moments: MisalignmentNoise) -> sparse.csr_array:

@@ -21,7 +21,7 @@ from scipy import ndimage, sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.streams import Purpose, probe
 
-from ..expected_error import ExpectedError, Interval, interval
+from ..expected_error import ExpectedError, Interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
 from ..verdict.residual_power import ResidualPower
 
@@ -217,5 +217,4 @@ def _shifted(
         return None
     along = operators.weigh(method.task.observe(operators.posterior((first + second) / 2)))
     unknown = UNCERTAINTY * (effect.added + count * result.expected.parts.get("calibration", 0.0))
-    variance = count**2 * without.variance + 4 * float(actual @ np.square(along)) + unknown**2
-    return interval(max(count * without.mse + effect.added, 0.0), variance, count)
+    return without.with_added(effect.added, 4 * float(actual @ np.square(along)) + unknown**2, count)

@@ -39,56 +39,45 @@ FEW = 10_000  # pixels below which four are taken
 class Contrast:
     """An image, (N,), with the contrast of the true one, and noise images as the estimate's, (N,) each.
 
-    calibration : (measurements used,) variance that the uncertainty of H adds for the true image
+    attenuation : of the estimate by errors of H's entries, None where these were left out
     """
 
     image: FloatArray
     noise: tuple[FloatArray, ...]
-    calibration: FloatArray
+    attenuation: Attenuation | None
+
+    def calibration(self, method: Method, by_cause: dict[str, FloatArray]) -> FloatArray:
+        """Return the variance, (measurements used,), that the uncertainty of H adds for the true image.
+
+        by_cause : (measurements used,) noise variances, with those that the uncertainty of H adds as "calibration"
+        """
+        task = method.task
+        first, second = (values[task.used] for values in _placements(task.model, method.image, self.image, self.noise))
+        share = 0.5
+        if task.model.camera.detail == 1 and self.attenuation is not None:  # else the residual shows detail, too
+            rest = np.maximum(total_variance(by_cause) - by_cause["calibration"], 0.0)
+            squares = _residual(method) / np.maximum(self.attenuation.residual_share, LEAST)
+            share = likeliest_share(squares, rest, first, second)
+        return (1 - share) * first + share * second
 
 
-def true_contrast(method: Method, operators: PosteriorOperators, by_cause: dict[str, FloatArray]) -> Contrast:
+def true_contrast(method: Method, operators: PosteriorOperators, actual: FloatArray, *, attenuated: bool) -> Contrast:
     """Return the contrast of the image that a method has estimated.
 
-    by_cause : (measurements used,) noise variances, with those that the uncertainty of H adds as "calibration"
+    actual : (measurements used,) noise variances;  attenuated : True if entries of H have errors of their own
     """
-    task, actual = method.task, total_variance(by_cause)
-    rng, waves = probe(Purpose.CONTRAST), Waves(task.shape)
-    root = np.sqrt(actual)
+    task, waves = method.task, Waves(method.task.shape)
+    rng, root = probe(Purpose.CONTRAST), np.sqrt(actual)
     whites = _white_noise(task, rng)
     noise = tuple(operators.gain(root * white) for white in whites)
     deviation = method.image - task.prior.mean
     excess, determined = _excess(waves, deviation, noise)
-    first = continued(waves.frequencies, excess, determined)
-    attenuation = Attenuation.of(method, operators, whites, noise, root)
-    if attenuation.strength(noise[0]) <= FIRST_ORDER:
-        excess = excess / _transfer(waves, _placed(waves, deviation, noise, first), operators, attenuation)
+    attenuation = Attenuation.of(method, operators, whites, noise, root) if attenuated else None
+    if attenuation is None or attenuation.strength(noise[0]) <= FIRST_ORDER:
+        first = _placed(waves, deviation, noise, continued(waves.frequencies, excess, determined))
+        excess = excess / _transfer(waves, first, operators, attenuation)
     spectrum = continued(waves.frequencies, excess, determined)
-    image = task.prior.mean + _placed(waves, deviation, noise, spectrum)
-    first, second = (values[task.used] for values in _placements(task.model, method.image, image, noise))
-    if task.model.camera.detail > 1:  # the residual shows detail, too
-        share = 0.5
-    else:
-        rest = np.maximum(actual - by_cause["calibration"], 0.0)
-        share = likeliest_share(_residual(method) / np.maximum(attenuation.residual_share, LEAST), rest, first, second)
-    return Contrast(image, noise, (1 - share) * first + share * second)
-
-
-def without_noise(method: Method, operators: PosteriorOperators, actual: FloatArray) -> FloatArray:
-    """Return an image with the contrast of the true one, (N,), for a model whose entries have no errors of their own.
-
-    actual : (measurements used,) noise variances
-    """
-    task, waves = method.task, Waves(method.task.shape)
-    rng, root = probe(Purpose.CONTRAST), np.sqrt(actual)
-    noise = tuple(operators.gain(root * white) for white in _white_noise(task, rng))
-    deviation = method.image - task.prior.mean
-    excess, determined = _excess(waves, deviation, noise)
-    image = _placed(waves, deviation, noise, continued(waves.frequencies, excess, determined))
-    whole, seen = waves.power(image), waves.power(image - operators.hidden(image))
-    transfer = np.divide(seen, whole, out=np.ones_like(whole), where=whole > FAINT * whole.max())
-    spectrum = continued(waves.frequencies, excess / np.clip(transfer, *TRANSFER), determined)
-    return task.prior.mean + _placed(waves, deviation, noise, spectrum)
+    return Contrast(task.prior.mean + _placed(waves, deviation, noise, spectrum), noise, attenuation)
 
 
 def _white_noise(task: EstimationTask, rng: np.random.Generator) -> list[FloatArray]:
@@ -159,16 +148,14 @@ def _local_mean(squares: FloatArray) -> FloatArray:
 
 
 def _transfer(
-    waves: Waves,
-    image: FloatArray,
-    operators: PosteriorOperators,
-    attenuation: Attenuation,
+    waves: Waves, image: FloatArray, operators: PosteriorOperators, attenuation: Attenuation | None
 ) -> FloatArray:
-    """Return the power transfer from an image to its estimate with noisy H, by bin of frequency."""
+    """Return the power transfer from an image to its estimate, with noisy H if it attenuates, by bin of frequency."""
     seen = image - operators.hidden(image)
-    first, second = attenuation.halves(image)
-    power = waves.power(seen) - waves.power(seen, first + second) + waves.power(first, second)
-    whole = waves.power(image)
+    power, whole = waves.power(seen), waves.power(image)
+    if attenuation is not None:
+        first, second = attenuation.halves(image)
+        power += waves.power(first, second) - waves.power(seen, first + second)
     return np.clip(np.divide(power, whole, out=np.ones_like(whole), where=whole > FAINT * whole.max()), *TRANSFER)
 
 

@@ -21,9 +21,8 @@ from scipy import ndimage, sparse
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.formats.picture import averaged
-from ommatid.scenes.model import Model
 
-from ..expected_error import ExpectedError, Interval, interval
+from ..expected_error import ExpectedError, Interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
 from ..prior import spectrum_of
 from ..verdict.residual_power import ResidualPower, SharedResidual, squared_trace
@@ -84,11 +83,6 @@ class SharedErrors:
             for image in combined
         )
         return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
-
-
-def has_shared_errors(model: Model) -> bool:
-    """Return True if entries of H follow from few numbers with errors."""
-    return model.error_variance(np.zeros(model.unknowns)) is not None
 
 
 def whitened(residual: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> FloatArray:
@@ -203,7 +197,7 @@ def _wider(
         image = task.finer**2 * task.of_unknowns(truth)
     bias = task.of_f(operators.hidden(image - task.prior.mean))
     added = errors.variance_of_square(bias, actual, task, operators)
-    return interval(count * without.mse + float(errors.variance.sum()), count**2 * without.variance + added, count)
+    return without.with_added(float(errors.variance.sum()), added, count)
 
 
 def _with_residuals(

@@ -7,8 +7,6 @@ from math import isfinite
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
 from ommatid.runtime.versions import versions
 from ommatid.scenes.model import Model
 from ommatid.scenes.optics.negligible import SkippedEffect, assumptions, skipped_effects
@@ -108,7 +106,6 @@ def _error(restoration: Reconstruction, stack: Stack) -> ErrorReport:
 
 
 def _diagnostics(restoration: Reconstruction) -> DiagnosticsReport:
-    width = float(np.median(restoration.expected.resolution))
     fit = restoration.fit
     fitted: dict[str, Any] = {}
     if fit is not None:
@@ -129,7 +126,7 @@ def _diagnostics(restoration: Reconstruction) -> DiagnosticsReport:
         pixels_dead=restoration.usable.dead,
         pixels_saturated=restoration.usable.saturated,
         degrees_of_freedom=restoration.expected.degrees_of_freedom,
-        resolution=width if isfinite(width) else None,
+        resolution=restoration.expected.median_width,
         chi_squared=restoration.residual,
         **fitted,
     )

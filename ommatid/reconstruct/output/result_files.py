@@ -23,7 +23,7 @@ from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, with_changes
 from ommatid.scenes.stack import Stack
 
 from ..methods.prepared import Prepared
-from ..restore import Reconstruction, check_match, restore
+from ..restore import Reconstruction, check_camera, restore
 from . import run_json
 from .estimate_formats import format_file
 from .overview import ESTIMATE, OVERVIEW, write_overview
@@ -90,7 +90,7 @@ def reconstruct(
     names : of the files of stack and model, for error messages;  prepared : what frames of this model share
     Raises InputError if stack and model do not belong together.
     """
-    check_match(stack, model, names)
+    check_camera(stack.camera, model, names)
     restoration = restore(stack, model, truth, workers, progress, prepared)
     return restoration, report_of(stack, model, restoration)
 

@@ -19,7 +19,7 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray, IntArray
 
 from ..lens_type import LensType
-from ..observation import Back, ObservationPart, Seen, cosines, density, repetition
+from ..observation import Back, ObservationPart, Seen, cosines, density, on_lines, repetition
 
 if TYPE_CHECKING:
     from ..camera import Camera
@@ -94,27 +94,18 @@ class Box(ObservationPart):
         """Largest number of rows or of columns of f that a measurement spans."""
         return max(self.down.width, self.across.width)
 
-    @property
-    def _order(self) -> tuple[int, int, int, int]:
-        """Rows and columns of sub-imagers, rows and columns of their pixels."""
-        return (*self.lens_type.array, *self.lens_type.pixels)
-
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements,)."""
-        lines = self.across.shares @ np.ascontiguousarray((self.down.shares @ seen.image).T)
-        sub_rows, sub_columns, rows, columns = self._order
-        parts = lines.T.reshape(sub_rows, rows, sub_columns, columns)
-        out.reshape(self._order)[:] = parts.swapaxes(1, 2)
+        out[:] = self.lens_type.in_order(on_lines(self.down.shares, self.across.shares, seen.image))
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements,)."""
-        lines = readings.reshape(self._order).swapaxes(1, 2).reshape(self.down.shares.shape[0], -1)
-        back.image += self.down.shares.T @ (lines @ self.across.shares)
+        back.image += self.down.shares.T @ (self.lens_type.by_lines(readings) @ self.across.shares)
 
     def to_sparse(self) -> sparse.csr_array:
         """Return H as a matrix: (measurements, N)."""
         intervals = np.arange(self.down.shares.shape[0]), np.arange(self.across.shares.shape[0])
-        order = np.argsort(self._numbers(*intervals), kind="stable")
+        order = np.argsort(self.numbers(*intervals), kind="stable")
         return sparse.csr_array(sparse.kron(self.down.shares, self.across.shares, format="csr"))[order]
 
     def coarser(self, camera: Camera, detail: int) -> Box:
@@ -127,16 +118,16 @@ class Box(ObservationPart):
             axis.shares.sort_indices()
         return Box(self.lens_type.finer(Fraction(1, detail)), down, across)
 
-    def _numbers(self, down: IntArray, across: IntArray) -> IntArray:
+    def numbers(self, down: IntArray, across: IntArray) -> IntArray:
         """Indices of the measurements of all pairs of intervals along the two axes: (pairs,)."""
         k, i = np.divmod(down, self.lens_type.pixels[0])
         l, j = np.divmod(across, self.lens_type.pixels[1])  # noqa: E741
-        _, sub_columns, rows_each, columns_each = self._order
+        sub_columns, (rows_each, columns_each) = self.lens_type.array[1], self.lens_type.pixels
         return (((k[:, None] * sub_columns + l) * rows_each + i[:, None]) * columns_each + j).ravel()
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Indices of the measurements inside a window of f, by their first pixel: (m,)."""
-        return self._numbers(_inside(self.down, rows), _inside(self.across, columns))
+        return self.numbers(_inside(self.down, rows), _inside(self.across, columns))
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """H from the window to the measurements inside it: (m, pixels of the window)."""

@@ -6,7 +6,7 @@ before its stages, which can be wrapped: to make everything again, and to write 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -110,7 +110,7 @@ class Batch:
         """Yield scenes as they end; the processes write to the scenes' own folders."""
         with worker_pool(count=count) as pool:
             ended = pool.each(partial(_run_in_process, self.open, self.stages), members)
-            yield from self._collected(ended, members, list(members))
+            yield from self._collected(ended, members)
 
     def _on_cluster(self, members: Sequence[Member], cluster: Cluster) -> Runs:
         """Yield scenes with errors that show already here, then the others as they end."""
@@ -130,33 +130,30 @@ class Batch:
             return
         with worker_pool(cluster) as pool:
             pool.check_versions(partial(self.versions, auto_variant))
-            packages = _ScenePackages(self.open, tuple(waiting))
-            ended = pool.each(partial(carry_out, self.stages), packages)
-            yield from self._collected(ended, packages.sent, waiting, packages.failed)
+            packages = map(self._packed, waiting)  # as workers become free: all images might not fit into memory
+            yield from self._collected(pool.each(partial(carry_out, self.stages), packages), waiting)
 
-    def _collected(
-        self,
-        tasks: Iterable[Completed[SceneOutcome]],
-        sent: Sequence[Member],
-        waiting: list[Member],
-        failed: dict[Member, Exception] | None = None,
-    ) -> Runs:
-        """Yield the scenes of tasks as they end, then those left over if connection or processes are lost.
+    def _packed(self, member: Member) -> ScenePackage | SceneOutcome:
+        """Return the package of a scene, or why there is none."""
+        try:
+            return packed(self.open(member), member.folder)
+        except Exception as error:  # a file was removed since it was checked
+            return SceneOutcome({}, {}, {}, error)
 
-        sent : scenes by the tasks' indices;  waiting : all scenes;  failed : those that could not be sent
-        """
-        failed = {} if failed is None else failed
+    def _collected(self, tasks: Iterable[Completed[SceneOutcome]], members: Sequence[Member]) -> Runs:
+        """Yield the scenes of tasks as they end, then those left over if connection or processes are lost."""
+        waiting = dict.fromkeys(range(len(members)))
+        failed: dict[Member, Exception] = {}
         try:
             for ended in tasks:
                 if ended.loss is not None:
                     raise ended.loss
-                member = sent[ended.index]
-                waiting.remove(member)
-                yield member, partial(self._collect, member, ended)
+                del waiting[ended.index]
+                yield members[ended.index], partial(self._collect, members[ended.index], ended)
         except MachineError as error:
-            failed |= _unfinished([member for member in waiting if member not in failed], error)
-        for member in waiting:
-            yield member, partial(_raise, failed[member])
+            failed = _unfinished([members[index] for index in waiting], error)
+        for member, error in failed.items():
+            yield member, partial(_raise, error)
 
     def _collect(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
         """Write the files that a worker returned, and report its stages. Raises the worker's error.
@@ -191,26 +188,6 @@ def _unfinished(members: Sequence[Member], error: MachineError) -> dict[Member, 
 def _run_in_process(open_member: Callable[[Member], Setup], stages: Stages, member: Member) -> SceneOutcome:
     """Run a scene in another process of this machine, which reads its files and writes to its folder."""
     return outcome_of(lambda observer: stages(open_member(member), member.folder, observer))
-
-
-class _ScenePackages:
-    """Packages of a batch, made one by one as workers become free: all target images might not fit into memory."""
-
-    def __init__(self, open_member: Callable[[Member], Setup], members: Sequence[Member]) -> None:
-        self.sent: list[Member] = []
-        self.failed: dict[Member, Exception] = {}
-        self._open = open_member
-        self._members = members
-
-    def __iter__(self) -> Iterator[ScenePackage]:
-        for member in self._members:
-            try:
-                package = packed(self._open(member), member.folder)
-            except Exception as error:  # a file was removed since it was checked
-                self.failed[member] = error
-                continue
-            self.sent.append(member)
-            yield package
 
 
 def check_files(setup: Setup, folder: Path) -> None:

@@ -97,8 +97,13 @@ def packed(setup: Setup, folder: Path) -> ScenePackage:
     return ScenePackage(tables, source, setup.picture, str(folder), _contents(folder), command(), world)
 
 
-def carry_out(stages: Stages, package: ScenePackage) -> SceneOutcome:
-    """Execute `stages` in a temporary folder; a failure keeps the files made before it."""
+def carry_out(stages: Stages, package: ScenePackage | SceneOutcome) -> SceneOutcome:
+    """Execute `stages` in a temporary folder; a failure keeps the files made before it.
+
+    package : an outcome, of a scene that could not be packed, is returned as it is
+    """
+    if isinstance(package, SceneOutcome):
+        return package
     with TemporaryDirectory(prefix="ommatid-", dir=scratch_folder()) as temporary:
         folder = Path(temporary)
         for path, content in [(path_inside(folder, name), content) for name, content in package.files.items()]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from ommatid.batch.sweep_row import NUMBERS, read_rows
+from ommatid.batch.sweep_row import NUMBERS, SweepRow, read_rows
 from ommatid.batch.sweep_table import PICTURE as SWEEP_PICTURE
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import PICTURE
@@ -76,20 +76,7 @@ class BatchEntry:
 
     def url(self, file: str) -> str:
         """Return the address of a file of the run, relative to the index."""
-        return quote(os.fsencode(f"{self.name}/{file}"))
-
-
-@dataclass(frozen=True)
-class SweepTable:
-    """Varied keys, and for each scene the link to its page, the values, measured and predicted error.
-
-    The link is empty for a failed scene.
-    picture : name of the figure's file, empty without one
-    """
-
-    keys: tuple[str, ...]
-    rows: list[tuple[str, tuple[str, ...], float | None, float | None]]
-    picture: str = ""
+        return url(self.name, file)
 
 
 def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
@@ -103,14 +90,14 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     check_index(output)
     others = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
     entries = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *others)]
-    sweep = read_sweep(output / NUMBERS)
+    sweep, picture = read_sweep(output / NUMBERS), output / SWEEP_PICTURE
     described = [
         [entry.name, entry.failure, entry.sensor_area, entry.report and entry.report.plain()] for entry in entries
     ]
-    content = [described, None if sweep is None else asdict(sweep)]
-    stamp = fingerprint([content, sources_digest()])
+    drawn = SWEEP_PICTURE if picture.is_file() else ""
+    stamp = fingerprint([described, [row.flat() for row in sweep], drawn, sources_digest()])
     name = real_path(output).name
-    return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, name, stamp), write_text)[1]
+    return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, drawn, name, stamp), write_text)[1]
 
 
 def check_index(output: Path) -> None:
@@ -140,35 +127,32 @@ def _sensor_area(path: Path) -> float | None:
         return None
 
 
-def read_sweep(path: Path) -> SweepTable | None:
-    """Return the content of sweep.json, None if the file is missing or damaged."""
+def url(folder: str, file: str) -> str:
+    """Return the address of a file of a run, relative to the index, from the path of its folder."""
+    return quote(os.fsencode(f"{Path(folder).name}/{file}"))
+
+
+def read_sweep(path: Path) -> list[SweepRow]:
+    """Return the rows of sweep.json, none if the file is missing or damaged."""
     try:
-        scenes = read_rows(path)
+        return read_rows(path)
     except InputError:
-        return None
-    keys = tuple(dict.fromkeys(key for scene in scenes for key in scene.values))
-    rows = [
-        (
-            ""
-            if scene.failed is not None or scene.folder is None
-            else quote(os.fsencode(f"{Path(scene.folder).name}/{REPORT}")),
-            tuple(str(scene.values.get(key, "")) for key in keys),
-            scene.mse,
-            scene.predicted_mse,
-        )
-        for scene in scenes
-    ]
-    picture = SWEEP_PICTURE if path.with_name(SWEEP_PICTURE).is_file() else ""
-    return SweepTable(keys, rows, picture) if keys and rows else None
+        return []
 
 
-def page(entries: list[BatchEntry], sweep: SweepTable | None, name: str, stamp: str) -> str:
-    """Return the index as HTML; without figures if there is nothing to compare."""
+def page(entries: list[BatchEntry], sweep: list[SweepRow], drawn: str, name: str, stamp: str) -> str:
+    """Return the index as HTML; without figures if there is nothing to compare.
+
+    drawn : name of the file with the figure of the sweep, empty without one
+    """
     from .document import fill
 
     content: dict[str, Any] = {
         "entries": entries,
         "sweep": sweep,
+        "sweep_keys": list(dict.fromkeys(key for row in sweep for key in row.values)),
+        "sweep_picture": drawn,
+        "url": url,
         "title": f"Batch: {name}",
         "words": words(entries),
         "page_file": REPORT,

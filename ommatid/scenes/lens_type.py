@@ -14,6 +14,7 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from .tables.camera import Surface
@@ -113,6 +114,16 @@ class LensType:
     def measurements(self) -> int:
         """Number of sensor pixels of all sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
+
+    def in_order(self, lines: FloatArray) -> FloatArray:
+        """Return readings by (sensor rows, sensor columns) in the order of measurements."""
+        (down, across), (rows, columns) = self.array, self.pixels
+        return lines.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()
+
+    def by_lines(self, readings: FloatArray) -> FloatArray:
+        """Return readings, in the order of measurements, as (sensor rows, sensor columns)."""
+        (down, across), (rows, columns) = self.array, self.pixels
+        return readings.reshape(down, across, rows, columns).swapaxes(1, 2).reshape(down * rows, across * columns)
 
     def finer(self, detail: int | Fraction) -> LensType:
         """The same lens type on a grid of the target that is `detail` times finer along both axes."""

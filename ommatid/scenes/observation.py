@@ -321,6 +321,11 @@ def repetition(size: int, detail: int) -> sparse.csr_array:
     return sparse.csr_array(sparse.kron(sparse.eye_array(size), np.ones((detail, 1)), format="csr"))
 
 
+def on_lines(rows: sparse.csr_array, columns: sparse.csr_array, image: FloatArray) -> FloatArray:
+    """Return rows @ image @ columns^T."""
+    return (columns @ np.ascontiguousarray((rows @ image).T)).T
+
+
 def on_window(matrix: sparse.csr_array, width: int, rows: slice, columns: slice) -> sparse.csr_array:
     """Return rows of H that see nothing outside a window, (m, N), on the window: (m, pixels of the window).
 

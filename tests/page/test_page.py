@@ -624,4 +624,4 @@ def test_an_index_of_a_sweep_shows_its_values_errors_and_figure(finished: Path, 
     assert '<img src="sweep.png"' in (tmp_path / "index.html").read_text(encoding="utf-8")
     for damaged in ("{}", "[{}]", "nothing"):
         (tmp_path / "sweep.json").write_text(damaged, encoding="utf-8")
-        assert batch_index.read_sweep(tmp_path / "sweep.json") is None
+        assert batch_index.read_sweep(tmp_path / "sweep.json") == []

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics import boxes
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import THREE, Lenses, camera, scene
@@ -62,16 +61,6 @@ def test_windows_of_one_signature_have_the_same_h() -> None:
     assert cam.signature(*first) == cam.signature(*second)
     assert (cam.submatrix(*first) - cam.submatrix(*second)).nnz == 0
     assert cam.signature(*first) != cam.signature(*edge)
-
-
-def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    cam = camera((150, 140), CAMERAS[1][1])
-    image, readings = np.random.default_rng(1).normal(size=cam.unknowns), np.ones(cam.measurements)
-    forward, adjoint = observed(cam).forward(image), observed(cam).adjoint(readings)
-    monkeypatch.setattr(boxes, "processors", lambda: 1)
-    np.testing.assert_array_equal(observed(cam).forward(image), forward)
-    np.testing.assert_array_equal(observed(cam).adjoint(readings), adjoint)
-    assert boxes.ROWS_AT_ONCE < 150, "otherwise there is only one task"
 
 
 @pytest.mark.parametrize(

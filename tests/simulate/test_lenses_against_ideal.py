@@ -106,8 +106,7 @@ def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str)
     total = sparse.csr_array((rows.stop - rows.start, camera.unknowns))
     (block,) = renderer.blocks(group, work.samples)
     for number in range(work.passes):
-        where, values, _ = one_pass(renderer, group, block, work, number, described.render.seed)
-        total = total + sparse.csr_array((values, np.divmod(where, camera.unknowns)), shape=total.shape)
+        total = total + one_pass(renderer, group, block, work, number, described.render.seed).matrix
     found = scores(sparse.csr_array(total / work.passes), ideal_matrix(camera)[rows], SAMPLES)
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)

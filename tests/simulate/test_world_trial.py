@@ -30,11 +30,11 @@ ENDS = {
 
 
 @pytest.fixture
-def alone(monkeypatch: pytest.MonkeyPatch) -> trial.WorldTrials:
-    """Trials of this test alone, which knows no world."""
-    trials = trial.WorldTrials()
-    monkeypatch.setattr(trial, "_trials", trials)
-    return trials
+def built(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Knowledge of this test alone, which begins without any world."""
+    worlds = set[str]()
+    monkeypatch.setattr(trial, "_built", worlds)
+    return worlds
 
 
 def checked(folder: Path, content: str) -> CheckedWorld:
@@ -45,41 +45,31 @@ def checked(folder: Path, content: str) -> CheckedWorld:
 
 @pytest.mark.parametrize("end", ENDS)
 def test_the_file_is_named_that_ends_the_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alone: trial.WorldTrials, end: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: set[str], end: str
 ) -> None:
     monkeypatch.setattr(trial, "MODULE", "tests.simulate.dying_process")
     with pytest.raises(InputError, match=ENDS[end]):
         trial.try_world(checked(tmp_path, f"<!-- --><bsdf type='diffuse' id='{end}'/>"), "scalar_rgb", "w", seconds=1.0)
-    assert alone.process is None
-    assert not alone.built
+    assert not built
 
 
-def test_a_world_is_tried_once_and_its_process_serves_the_next(tmp_path: Path, alone: trial.WorldTrials) -> None:
+def test_a_world_is_tried_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: set[str]) -> None:
     sphere = checked(tmp_path, '<shape type="sphere"/>')
     trial.try_world(sphere, "scalar_rgb", "w")
-    process = alone.process
-    assert process is not None
-    trial.try_world(checked(tmp_path, '<shape type="cube"/>'), "scalar_rgb", "w")
-    assert alone.process is process
-    assert len(alone.built) == 2
-    alone.stop()
+    assert len(built) == 1
+    monkeypatch.setattr(trial, "MODULE", "tests.simulate.dying_process")
     trial.try_world(sphere, "scalar_rgb", "w")
-    assert alone.process is None
-    process = alone.start()
-    process.kill()  # as if it had ended since nothing came
-    process.wait()
-    trial.try_world(checked(tmp_path, '<shape type="disk"/>'), "scalar_rgb", "w")
+
+
+def test_a_world_that_mitsuba_refuses_is_named_with_the_line(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r'w is no scene that Mitsuba can build: in world.xml \(line 1\): could not .* "x"'
     ):
         trial.try_world(checked(tmp_path, '<float name="a" value="x"/>'), "scalar_rgb", "w")
-    alone.stop()
 
 
 @pytest.mark.slow
-def test_pictures_and_volumes_that_are_none_or_too_large_are_refused_in_one_sentence(
-    tmp_path: Path, alone: trial.WorldTrials
-) -> None:
+def test_pictures_and_volumes_that_are_none_or_too_large_are_refused_in_one_sentence(tmp_path: Path) -> None:
     """Mitsuba reads them in the process that may die: nothing walks through their headers before."""
     png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 2**31 - 1, 10**6) + b"\x08\0\0\0\0"
     pictures = [png, b"BM" + b"\0" * 16 + struct.pack("<ii", 10**6, 10**6), b"P5\n1000000 1000000\n255\n", b"egg", b""]
@@ -92,7 +82,6 @@ def test_pictures_and_volumes_that_are_none_or_too_large_are_refused_in_one_sent
             trial.try_world(checked(tmp_path, kind), "scalar_rgb", "w")
         assert str(refused.value).isprintable()
         assert len(str(refused.value)) <= 300
-    alone.stop()
 
 
 @pytest.mark.parametrize(

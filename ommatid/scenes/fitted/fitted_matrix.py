@@ -6,6 +6,7 @@ over pixels. To first order a displaced view reads H f' along the displacement, 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -197,35 +198,13 @@ class FittedMatrix:
 
     def directions(self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]) -> sparse.csc_array:
         """Return L, (M, q), such that the error of H f is L xi; gradients : H f' down and across, (M,) each."""
-        blocks: list[sparse.csc_array] = []
-        for lens, views, subs, slices in self._types:
-            if lens.name in self.kernels:
-                blocks.append(self.kernels[lens.name].error_directions(image))
-                continue
-            own, shared = views.own.shape[2], views.shared.shape[2]
-            parts, common = list[FloatArray](), list[FloatArray]()
-            for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
-                moves = self._moves(sub, gradients, place)
-                parts.append(moves @ views.own[number])
-                common.append(moves @ views.shared[number])
-            columns = [sparse.csc_array((lens.measurements, 0), dtype=np.float64)]
-            columns += [sparse.csc_array(sparse.block_diag([sparse.csc_array(part) for part in parts]))] if own else []
-            columns += [sparse.csc_array(np.concatenate(common))] if shared else []
-            blocks.append(sparse.csc_array(sparse.hstack(columns)))
-        return sparse.csc_array(sparse.block_diag(blocks))
+        return sparse.csc_array(sparse.block_diag([of_type for _, of_type in self._directions(image, gradients)]))
 
     def error_variance(self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]) -> FloatArray:
         """Return the variance of each measurement by the errors of the numbers, (M,): the diagonal of L L^T."""
         variance = np.zeros(self.camera.measurements)
-        for lens, views, subs, slices in self._types:
-            if lens.name in self.kernels:
-                directions = self.kernels[lens.name].error_directions(image)
-                variance[slices[0].start : slices[-1].stop] = np.asarray(directions.power(2).sum(axis=1)).ravel()
-                continue
-            for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
-                moves = self._moves(sub, gradients, place)
-                for factor in (views.own[number], views.shared[number]):
-                    variance[place] += np.square(moves @ factor).sum(axis=1)
+        for place, directions in self._directions(image, gradients):
+            variance[place] = np.asarray(directions.power(2).sum(axis=1)).ravel()
         return variance
 
     def error_draw(
@@ -233,17 +212,25 @@ class FittedMatrix:
     ) -> FloatArray:
         """Return a random error of H f, L xi: (M,)."""
         drawn = np.zeros(self.camera.measurements)
-        for lens, views, subs, slices in self._types:
-            if lens.name in self.kernels:
-                directions = self.kernels[lens.name].error_directions(image)
-                drawn[slices[0].start : slices[-1].stop] = directions @ rng.normal(size=directions.shape[1])
-                continue
-            common = rng.normal(size=(views.shared.shape[2],))
-            for number, (sub, place) in enumerate(zip(subs, slices, strict=True)):
-                alone = rng.normal(size=(views.own.shape[2],))
-                error = views.own[number] @ alone + views.shared[number] @ common
-                drawn[place] = self._moves(sub, gradients, place) @ error
+        for place, directions in self._directions(image, gradients):
+            drawn[place] = directions @ rng.normal(size=directions.shape[1])
         return drawn
+
+    def _directions(
+        self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]
+    ) -> Iterator[tuple[slice, sparse.csc_array]]:
+        """Yield the measurements of each lens type, and its block of L: what its sub-imagers share, then their own."""
+        for lens, views, subs, slices in self._types:
+            measurements = slice(slices[0].start, slices[-1].stop)
+            if lens.name in self.kernels:
+                yield measurements, self.kernels[lens.name].error_directions(image)
+                continue
+            moves = [self._moves(sub, gradients, place) for sub, place in zip(subs, slices, strict=True)]
+            shared, own = (
+                [sparse.csc_array(move @ factor) for move, factor in zip(moves, factors, strict=True)]
+                for factors in (views.shared, views.own)
+            )
+            yield measurements, sparse.csc_array(sparse.hstack([sparse.vstack(shared), sparse.block_diag(own)]))
 
     def _moves(self, sub: SubImager, gradients: tuple[FloatArray, FloatArray], place: slice) -> FloatArray:
         """Return the change of a sub-imager's readings per unit of each number: (pixels, 5)."""

@@ -28,7 +28,7 @@ from ommatid.runtime.processors import processors
 
 from ..camera import Camera
 from ..lens_type import LensType
-from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density
+from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density, on_lines
 from .kernel_shapes import KernelShapes, Numbers
 
 VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
@@ -185,13 +185,13 @@ class KernelFootprints(ObservationPart):
         readings = self._correlated(seen, self._transfers_on(seen.padded))
         for every, weight in zip(readings, self._weights(self.coefficients), strict=True):
             total += weight * every
-        out[:] = self._in_order(total)
+        out[:] = self.places.lens_type.in_order(total)
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements of the type,)."""
-        lines, (rows, columns) = self._by_lines(readings), self._gather(back.padded)
+        lines, (rows, columns) = self.places.lens_type.by_lines(readings), self._gather(back.padded)
         for transfer, weight in zip(self._transfers_on(back.padded), self._weights(self.coefficients), strict=True):
-            placed = _on_lines(sparse.csr_array(rows.T), sparse.csr_array(columns.T), lines * weight)
+            placed = on_lines(sparse.csr_array(rows.T), sparse.csr_array(columns.T), lines * weight)
             spectrum = np.asarray(fft.rfft2(placed, back.padded, workers=processors(), overwrite_x=True))
             spectrum *= np.conj(transfer)
             back.add_spectrum(spectrum)
@@ -202,17 +202,7 @@ class KernelFootprints(ObservationPart):
         for transfer in transfers:
             product = seen.spectrum * transfer
             every = cast(FloatArray, fft.irfft2(product, seen.padded, workers=processors(), overwrite_x=True))
-            yield _on_lines(rows, columns, every)
-
-    def _in_order(self, lines: FloatArray) -> FloatArray:
-        """Return readings by (sensor rows, sensor columns) in the order of measurements."""
-        down, across = self.places.lens_type.array
-        return lines.reshape(down, -1, across, self.places.lens_type.pixels[1]).swapaxes(1, 2).ravel()
-
-    def _by_lines(self, readings: FloatArray) -> FloatArray:
-        """Return readings, in the order of measurements, as (sensor rows, sensor columns)."""
-        order = (*self.places.lens_type.array, *self.places.lens_type.pixels)
-        return readings.reshape(order).swapaxes(1, 2).reshape(order[0] * order[2], order[1] * order[3])
+            yield on_lines(rows, columns, every)
 
     def _transfers_on(self, padded: tuple[int, int]) -> ComplexArray:
         """Return the transfer function of each kernel on a padded grid: (S, rows, columns / 2 + 1)."""
@@ -376,7 +366,9 @@ class KernelFootprints(ObservationPart):
         for number, every in enumerate(self._correlated(seen, transfers)):
             for read, weights in zip(lines, shares, strict=True):
                 read += weights[number] * every
-        return sparse.csc_array(np.array([self._in_order(read) for read in lines]).reshape(len(lines), -1).T)
+        return sparse.csc_array(
+            np.array([self.places.lens_type.in_order(read) for read in lines]).reshape(len(lines), -1).T
+        )
 
     @property
     def description(self) -> dict[str, Any]:
@@ -408,11 +400,6 @@ def _near(starts: IntArray, wide: int, part: slice) -> tuple[IntArray, FloatArra
     pixels: IntArray = np.asarray(range(part.start, part.stop), dtype=np.int64)
     index = pixels - near[:, None]
     return np.where((index >= 0) & (index < wide), index, wide), np.sqrt(counts)
-
-
-def _on_lines(rows: sparse.csr_array, columns: sparse.csr_array, image: FloatArray) -> FloatArray:
-    """Return rows @ image @ columns^T."""
-    return cast(FloatArray, (columns @ (rows @ image).T).T)
 
 
 def _chosen(index: IntArray, size: int) -> sparse.csr_array:

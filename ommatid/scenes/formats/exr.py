@@ -105,24 +105,18 @@ def read_picture(path: Path) -> StoredPicture:
     the stored one.
     """
     header = _picture_header(path)
-    sampling = {channel.name: (channel.xSampling, channel.ySampling) for channel in header["channels"]}
-    grey, colours = "Y" in sampling, {"R", "G", "B"} <= sampling.keys()
+    stored = [channel.name for channel in header["channels"]]
+    grey, colours = "Y" in stored, {"R", "G", "B"} <= set(stored)
     if grey == colours:
-        names = printable(", ".join(sampling), longest=100)
+        names = printable(", ".join(stored), longest=100)
         raise InputError(f"{path} has channels {names}; expected Y, or R, G and B, not both")
-    used = [*("Y" if grey else "RGB"), *("A" if "A" in sampling else "")]
-    for name in used:
-        if sampling[name] != (1, 1):
-            across, down = sampling[name]
-            raise InputError(
-                f"{path}: expected all values of channel {name}, got one for {across} x {down} pixels; save it whole"
-            )
+    used = [*("Y" if grey else "RGB"), *("A" if "A" in stored else "")]
     channels = _parts(path)[0].channels
     pixels = [np.asarray(channels[name].pixels) for name in used]
     rows, columns = _extent(header["dataWindow"])
     if any(values.shape != (rows, columns) for values in pixels):
         raise InputError(f"{path}: expected {rows} x {columns} values of every channel, got fewer; make the file again")
-    unused = printable(", ".join(name for name in sampling if name not in used), longest=100)
+    unused = printable(", ".join(name for name in stored if name not in used), longest=100)
     notes = (f"has channels that are not used: {unused}",) if unused else ()
     return StoredPicture(pixels[0] if len(pixels) == 1 else np.stack(pixels, axis=-1), notes=notes)
 

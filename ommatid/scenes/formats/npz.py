@@ -64,7 +64,7 @@ def read(path: Path, check: Callable[[Headers], None] | None = None) -> dict[str
             check(headers)
         check_memory(sum(header.size for header in headers.values()), f"{path}: to read it", "close other programs")
         stream.seek(0)
-        with _silenced(), np.load(stream, allow_pickle=False) as file:
+        with warnings.catch_warnings(action="ignore"), np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
 
 
@@ -125,7 +125,7 @@ def header(stream: IO[bytes]) -> Header:
     if int.from_bytes(length, "little") > LONGEST_HEADER:  # numpy would read it whole before it refuses it
         raise ValueError("the description of an array is too long")
     described = io.BytesIO(length + stream.read(int.from_bytes(length, "little")))
-    with _silenced():
+    with warnings.catch_warnings(action="ignore"):
         shape, _, dtype = read_header(described)
     if any(count < 0 for count in shape):
         raise ValueError(f"a shape of {shape}")
@@ -142,7 +142,7 @@ def array(path: Path) -> NDArray[Any]:
             raise ValueError("it is cut short")
         check_memory(3 * size, f"{path}: to read it", "take a smaller one, or free some memory")
         stream.seek(0)
-        with _silenced():
+        with warnings.catch_warnings(action="ignore"):
             return np.load(stream, allow_pickle=False)
 
 
@@ -157,11 +157,3 @@ def _readable() -> Generator[None]:
         raise ValueError(
             "it holds pickled objects" if "pickle" in str(error) else str(error) or type(error).__name__
         ) from error
-
-
-@contextmanager
-def _silenced() -> Generator[None]:
-    """Suppress numpy's warnings about headers of old formats."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield

@@ -113,6 +113,5 @@ def _silenced() -> Generator[None]:
     if not log.handlers:
         log.addHandler(logging.NullHandler())
     log.propagate = False
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         yield

@@ -122,21 +122,15 @@ def _read(stream: BinaryIO, path: Path, found: list[Any]) -> list[StoredPicture]
 def _check_kind(path: Path, page: Any) -> None:
     """Raise InputError if a page is of a kind that is not read."""
     name = str(getattr(page.photometric, "name", page.photometric)) if 262 in page.tags else ""
-    alpha, count = len(page.extrasamples), int(page.samplesperpixel)
-    stored = f"the kind {name}" if name and name not in CHANNELS else None
-    if stored is None and count - alpha != CHANNELS.get(name, count - alpha):
-        stored = f"{count} numbers per pixel of the kind {name}"
-    if stored is not None:
-        raise InputError(f"{path}: expected grey or RGB, got {stored}; save it as one of these")
+    colours, bits = int(page.samplesperpixel) - len(page.extrasamples), page.bitspersample
     compression = getattr(page.compression, "name", page.compression)
-    if page.compression not in (UNCOMPRESSED, *DEFLATE, PACKBITS):
-        raise InputError(f"{path}: its compression {compression} is not read; save it without, or with Deflate")
-    if page.predictor not in PREDICTORS:
-        raise InputError(f"{path}: its predictor {int(page.predictor)} is not read; save it without a predictor")
-    if page.bitspersample not in BITS or page.dtype is None:
+    is_known = not name or CHANNELS.get(name) == colours
+    is_packed = page.compression in (UNCOMPRESSED, *DEFLATE, PACKBITS) and page.predictor in PREDICTORS
+    if not is_known or not is_packed or bits not in BITS or page.dtype is None:
         raise InputError(
-            f"{path}: expected 8, 16 or 32 bits per number, all alike, got {str(page.bitspersample)[:20]}; save it"
-            " with 16"
+            f"{path}: expected grey or RGB, got {colours} numbers per pixel of the kind {name}, {str(bits)[:20]} bits"
+            f" each, compression {compression}, predictor {int(page.predictor)}; save it as one of"
+            " these, with 8, 16 or 32 bits per number, uncompressed or with Deflate"
         )
     if page.ndim > 3 or not prod(page.shape):
         raise ValueError(f"its shape is {page.shape}")

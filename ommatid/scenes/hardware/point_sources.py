@@ -30,26 +30,13 @@ from ..camera import Camera
 from ..constants import WHITE
 from ..lens_type import LensType
 from ..model import RECORDED, Model
+from ..optics.boxes import Box, designed_box
 from ..scene import Scene
 from ..setup import Setup
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
 
 ROUNDS = 20  # of weights, at most, in a fit of noise
 TIE = 1e-9  # pixels of f, below which a distance to the edge of a footprint counts as 0
-
-
-@dataclass(frozen=True)
-class FootprintInterval:
-    """Footprints of a type's (sub-imagers x pixels) along one axis: `middle`, (S,), and `half` their length, in f."""
-
-    middle: FloatArray
-    half: float
-
-    def near(self, position: int, margin: float) -> tuple[IntArray, FloatArray]:
-        """Indices of the intervals within `margin` of pixel `position` of f, and the distances of their middles."""
-        distance = np.abs(self.middle - (position + 0.5))
-        near = np.flatnonzero(distance < self.half + margin + 0.5 - TIE)
-        return near, distance[near]
 
 
 @dataclass(frozen=True)
@@ -60,8 +47,12 @@ class FootprintAssignment:
     margin: float
 
     @cached_property
-    def _axes(self) -> list[tuple[FootprintInterval, FootprintInterval]]:
-        return [(_interval(lens_type, 0), _interval(lens_type, 1)) for lens_type in self.camera.on_grids.types]
+    def _parts(self) -> list[tuple[slice, Box, list[FloatArray]]]:
+        """Measurements of each lens type, its footprints, and their middles along both axes, (S,) each."""
+        types = self.camera.on_grids.types
+        boxes = [designed_box(self.camera.shape, lens_type) for lens_type in types]
+        middles = [[_middles(lens_type, axis) for axis in (0, 1)] for lens_type in types]
+        return list(zip(self.camera.on_grids.type_slices(), boxes, middles, strict=True))
 
     def reached(self, row: int, column: int) -> tuple[IntArray, FloatArray]:
         """Sensor pixels that a source may reach, and the distances of their footprints: (n,) each.
@@ -70,18 +61,12 @@ class FootprintAssignment:
         """
         pixels: list[IntArray] = []
         distances: list[FloatArray] = []
-        for lens_type, first, (down, across) in zip(
-            self.camera.on_grids.types, self.camera.on_grids.type_slices(), self._axes, strict=True
-        ):
-            (rows, row_distance), (columns, column_distance) = (
-                down.near(row, self.margin),
-                across.near(column, self.margin),
-            )
-            k, i = np.divmod(rows, lens_type.pixels[0])
-            l, j = np.divmod(columns, lens_type.pixels[1])  # noqa: E741
-            pixel = ((k[:, None] * lens_type.array[1] + l) * lens_type.pixels[0] + i[:, None]) * lens_type.pixels[1] + j
-            pixels.append(first.start + pixel.ravel())
-            distances.append(np.maximum(row_distance[:, None], column_distance).ravel() - down.half)
+        for measurements, box, middles in self._parts:
+            half = float(box.lens_type.ratio) / 2
+            down, across = (np.abs(of - (at + 0.5)) for of, at in zip(middles, (row, column), strict=True))
+            rows, columns = (np.flatnonzero(of < half + self.margin + 0.5 - TIE) for of in (down, across))
+            pixels.append(measurements.start + box.numbers(rows, columns))
+            distances.append(np.maximum(down[rows][:, None], across[columns]).ravel() - half)
         return np.concatenate(pixels), np.concatenate(distances)
 
     def nearest_sources(self, positions: IntArray, file: Path) -> tuple[IntArray, IntArray]:
@@ -110,22 +95,19 @@ class FootprintAssignment:
         return pixel[nearest], unknown[source[nearest]]
 
 
-def _interval(lens_type: LensType, axis: int) -> FootprintInterval:
-    """The footprints of a lens type along rows (axis 0) or columns (1) of f."""
-    starts = [float(start) for start in lens_type.starts(axis)]
-    ratio = float(lens_type.ratio)
-    middles = np.array(starts)[:, None] + ratio * (np.arange(lens_type.pixels[axis], dtype=np.float64) + 0.5)
-    return FootprintInterval(np.asarray(middles.ravel(), dtype=np.float64), ratio / 2)
+def _middles(lens_type: LensType, axis: int) -> FloatArray:
+    """Middles of a lens type's footprints along rows (axis 0) or columns (1) of f, (S,)."""
+    starts = np.array([float(start) for start in lens_type.starts(axis)])
+    middles = starts[:, None] + float(lens_type.ratio) * (np.arange(lens_type.pixels[axis]) + 0.5)
+    return np.asarray(middles.ravel(), dtype=np.float64)
 
 
 def unrecorded(camera: Camera, positions: IntArray) -> IntArray:
     """Indices of the pixels of f that lie in some footprint but are not in `positions`, (n, 2) rows and columns."""
     seen = np.zeros(camera.shape, dtype=bool)
     for lens_type in camera.on_grids.types:
-        down, across = _interval(lens_type, 0), _interval(lens_type, 1)
-        rows = [bool(down.near(row, 0.0)[0].size) for row in range(camera.rows)]
-        columns = [bool(across.near(column, 0.0)[0].size) for column in range(camera.columns)]
-        seen |= np.outer(rows, columns)
+        box = designed_box(camera.shape, lens_type)
+        seen |= np.outer(box.down.shares.sum(axis=0) > 0, box.across.shares.sum(axis=0) > 0)
     seen[positions[:, 0], positions[:, 1]] = False
     return np.flatnonzero(seen)
 

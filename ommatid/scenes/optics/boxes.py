@@ -6,8 +6,7 @@ intervals with pixels are computed in integers and are exact for any ratio.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Hashable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -18,15 +17,12 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.processors import processors
 
 from ..lens_type import LensType
-from ..observation import Back, ObservationPart, Seen, cosines, density, repetition
+from ..observation import Back, ObservationPart, Seen, cosines, density, on_lines, repetition
 
 if TYPE_CHECKING:
     from ..camera import Camera
-
-ROWS_AT_ONCE = 64  # per task; fixed, so that results do not depend on the number of threads
 
 
 def overlap(ratio: Fraction, pixels: int, start: Fraction, size: int) -> sparse.csr_array:
@@ -51,20 +47,6 @@ class BoxAxis:
 
     shares: sparse.csr_array
 
-    @cached_property
-    def start(self) -> IntArray:
-        """The first pixel of f in each row of the table `share`, such that all of the row lies on the axis: (S,)."""
-        first = self.shares.indices[self.shares.indptr[:-1]].astype(np.int64)
-        return np.minimum(first, self.shares.shape[1] - self.width)
-
-    @cached_property
-    def share(self) -> FloatArray:
-        """Shares of the pixels of f from `start` on: (S, largest number of pixels in an interval)."""
-        table = np.zeros((self.start.size, self.width))
-        rows = np.repeat(np.arange(self.start.size), np.diff(self.shares.indptr))
-        table[rows, self.shares.indices - self.start[rows]] = self.shares.data
-        return table
-
     @property
     def width(self) -> int:
         """Largest number of pixels in an interval."""
@@ -82,11 +64,6 @@ class BoxAxis:
         starts = self.shares @ np.arange(size)  # their middles serve as well
         lags = np.array([self.gram.diagonal(lag).sum() for lag in range(min(self.width, size))])
         return cosines(size, lags.size) @ lags * (density(starts, self.width, size) / starts.size)
-
-    @cached_property
-    def order(self) -> IntArray:
-        """Intervals sorted by their first pixel, so that memory is accessed in order: (S,)."""
-        return np.argsort(self.start, kind="stable")
 
 
 @dataclass(frozen=True)
@@ -117,39 +94,18 @@ class Box(ObservationPart):
         """Largest number of rows or of columns of f that a measurement spans."""
         return max(self.down.width, self.across.width)
 
-    @property
-    def _order(self) -> tuple[int, int, int, int]:
-        """Rows and columns of sub-imagers, rows and columns of their pixels."""
-        return (*self.lens_type.array, *self.lens_type.pixels)
-
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements,)."""
-        from .box_kernels import average  # pyright: ignore[reportUnknownVariableType]
-
-        image, down, across, target = seen.image, self.down, self.across, out.reshape(self._order)
-        down_share, across_share = down.share, across.share  # computed here, not in threads
-
-        def work(first: int, last: int) -> None:
-            average(image, down.order, down.start, down_share, across.start, across_share, target, first, last)
-
-        by_rows(down.start.size, work)
+        out[:] = self.lens_type.in_order(on_lines(self.down.shares, self.across.shares, seen.image))
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements,)."""
-        from .box_kernels import spread  # pyright: ignore[reportUnknownVariableType]
-
-        down, across, source, out = self.down, self.across, readings.reshape(self._order), back.image
-        down_share, across_share = down.share, across.share  # computed here, not in threads
-
-        def work(first: int, last: int) -> None:
-            spread(source, down.order, down.start, down_share, across.start, across_share, out, first, last)
-
-        by_rows(out.shape[0], work)
+        back.image += self.down.shares.T @ (self.lens_type.by_lines(readings) @ self.across.shares)
 
     def to_sparse(self) -> sparse.csr_array:
         """Return H as a matrix: (measurements, N)."""
         intervals = np.arange(self.down.shares.shape[0]), np.arange(self.across.shares.shape[0])
-        order = np.argsort(self._numbers(*intervals), kind="stable")
+        order = np.argsort(self.numbers(*intervals), kind="stable")
         return sparse.csr_array(sparse.kron(self.down.shares, self.across.shares, format="csr"))[order]
 
     def coarser(self, camera: Camera, detail: int) -> Box:
@@ -162,16 +118,16 @@ class Box(ObservationPart):
             axis.shares.sort_indices()
         return Box(self.lens_type.finer(Fraction(1, detail)), down, across)
 
-    def _numbers(self, down: IntArray, across: IntArray) -> IntArray:
+    def numbers(self, down: IntArray, across: IntArray) -> IntArray:
         """Indices of the measurements of all pairs of intervals along the two axes: (pairs,)."""
         k, i = np.divmod(down, self.lens_type.pixels[0])
         l, j = np.divmod(across, self.lens_type.pixels[1])  # noqa: E741
-        _, sub_columns, rows_each, columns_each = self._order
+        sub_columns, (rows_each, columns_each) = self.lens_type.array[1], self.lens_type.pixels
         return (((k[:, None] * sub_columns + l) * rows_each + i[:, None]) * columns_each + j).ravel()
 
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Indices of the measurements inside a window of f, by their first pixel: (m,)."""
-        return self._numbers(_inside(self.down, rows), _inside(self.across, columns))
+        return self.numbers(_inside(self.down, rows), _inside(self.across, columns))
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """H from the window to the measurements inside it: (m, pixels of the window)."""
@@ -220,14 +176,3 @@ def _inside(axis: BoxAxis, window: slice) -> IntArray:
 def _pattern(axis: BoxAxis, window: slice) -> bytes:
     shares = axis.shares[_inside(axis, window)]
     return shares.indptr.tobytes() + (shares.indices - window.start).tobytes() + shares.data.tobytes()
-
-
-def by_rows(rows: int, work: Callable[[int, int], None]) -> None:
-    """Run `work` on ranges of rows, which do not depend on the number of threads, on all processors."""
-    tasks = [(first, min(first + ROWS_AT_ONCE, rows)) for first in range(0, rows, ROWS_AT_ONCE)]
-    if len(tasks) == 1:
-        work(*tasks[0])
-        return
-    with ThreadPoolExecutor(processors()) as threads:
-        for _ in threads.map(work, *zip(*tasks, strict=True)):
-            pass

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import MachineError
 from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.scenes.camera import Camera
@@ -29,6 +29,7 @@ from ..sampling.samplers import expected_exponent, fitting
 from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model
 from .point_sources import Plans, same_plans
+from .ray_transport import positions_of
 
 MOST_RAYS = 2**26  # of a pilot: some seconds
 FEWEST_SAMPLES = 16  # per pixel in a pass
@@ -71,7 +72,7 @@ class Pilot:
         the true H would be another error.
         """
         model, columns = self.model, self.model.unknowns
-        old, new = _cells(model.matrix, columns), _cells(matrix, columns)
+        old, new = positions_of(model.matrix), positions_of(matrix)
         cells = np.sort(np.concatenate([old, new]))
         cells = cells[np.concatenate([[True], np.diff(cells) > 0])]
         at_old, at_new = np.searchsorted(cells, old), np.searchsorted(cells, new)
@@ -154,13 +155,6 @@ def pilot(setup: Setup, plans: Plans) -> Pilot:
         rows[pixels] = few.passes / all_.passes * (few.samples / all_.samples) ** exponent
     extrapolated = any(traced[name].samples < work.samples for name, work in plans.items())
     return Pilot(model, rows, extrapolated)
-
-
-def _cells(matrix: sparse.csr_array, columns: int) -> IntArray:
-    """Return the positions of the entries in the flattened H, rising."""
-    matrix.sort_indices()
-    rows = np.repeat(np.arange(matrix.shape[0], dtype=np.int64), np.diff(matrix.indptr))
-    return rows * columns + matrix.indices
 
 
 def _fast_variant(requested: str) -> str:

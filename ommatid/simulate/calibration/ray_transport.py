@@ -14,7 +14,6 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
-from ommatid.runtime.library_caches import compiled
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.setup import Setup
@@ -27,49 +26,10 @@ if TYPE_CHECKING:
     from ..renderer.renderer import Renderer
 
 
-@compiled
-def sums_by_texel(texels: IntArray, weights: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """Sum the weights, (P, S), by texel for every pixel, without texels below 0: counts (P,), texels and sums.
-
-    Texels rise within a pixel. A pixel sees few of them again and again, so each ray is looked up by bisection among
-    the previous ones.
-    """
-    pixels, samples = texels.shape
-    counts = np.zeros(pixels, dtype=np.int64)
-    known = np.empty(texels.size, dtype=np.int64)
-    sums = np.empty(texels.size, dtype=np.float64)
-    start = 0
-    for pixel in range(pixels):
-        stop = start
-        for sample in range(samples):
-            texel = texels[pixel, sample]
-            if texel < 0 or weights[pixel, sample] == 0.0:
-                continue
-            low, high = start, stop
-            while low < high:
-                middle = (low + high) // 2
-                if known[middle] < texel:
-                    low = middle + 1
-                else:
-                    high = middle
-            if low == stop or known[low] != texel:
-                for index in range(stop, low, -1):
-                    known[index] = known[index - 1]
-                    sums[index] = sums[index - 1]
-                known[low] = texel
-                sums[low] = 0.0
-                stop += 1
-            sums[low] += weights[pixel, sample]
-        counts[pixel] = stop - start
-        start = stop
-    return counts, known[:start].copy(), sums[:start].copy()
-
-
 class TracedEntries(NamedTuple):
-    """Entries of H from one pass: `where`, pixel * N + texel, rising, and their values; (pixels,) without any light."""
+    """Rows of H from one pass, and (pixels,) True for those without any light."""
 
-    where: IntArray
-    values: FloatArray
+    matrix: sparse.csr_array
     dark: BoolArray
 
 
@@ -113,11 +73,20 @@ def one_pass(
     seeds = sampler_seeds(seed, "calibration", number, work.passes)
     texels, weights = renderer.hits(group, work.samples, seeds, block, subset)
     weights = np.ones(texels.shape) if weights is None else weights
-    counts, columns, sums = sums_by_texel(texels, weights)
-    pixel = np.repeat(np.arange(counts.size), counts)
     total = weights.sum(axis=1)
-    values = sums * (renderer.captured(group) / total[pixel])
-    return TracedEntries(pixel * renderer.camera.unknowns + columns, values, total == 0)
+    matrix = sums_by_texel(texels, weights, renderer.camera.unknowns)
+    matrix.data *= np.repeat(renderer.captured(group) / np.where(total > 0, total, 1.0), np.diff(matrix.indptr))
+    return TracedEntries(matrix, total == 0)
+
+
+def sums_by_texel(texels: IntArray, weights: FloatArray, unknowns: int) -> sparse.csr_array:
+    """Sum the weights, (P, S), by texel for every pixel, without texels below 0: (P, unknowns)."""
+    hit = (texels >= 0) & (weights != 0)
+    starts = np.concatenate([[0], np.cumsum(hit.sum(axis=1))])
+    rays = sparse.csr_array((weights[hit], texels[hit], starts), shape=(len(texels), unknowns))
+    summed = sparse.csr_array(rays @ sparse.eye_array(unknowns, format="csr"))  # in the order of the rays
+    summed.sort_indices()
+    return summed
 
 
 def _joined(passes: list[TracedEntries], shape: tuple[int, int]) -> Part:
@@ -126,30 +95,30 @@ def _joined(passes: list[TracedEntries], shape: tuple[int, int]) -> Part:
     A pixel that gets no light at all in some pass has no entries, since nothing is known of it.
     """
     dark = np.logical_or.reduce([entries.dark for entries in passes])
+    matrices = [entries.matrix for entries in passes]
     if dark.any():
-        passes = [_without(entries, dark[entries.where // shape[1]]) for entries in passes]
+        lit = sparse.csr_array(sparse.diags_array(np.where(dark, 0.0, 1.0)))
+        lit.eliminate_zeros()
+        matrices = [sparse.csr_array(lit @ matrix) for matrix in matrices]
     matrix = sparse.csr_array(shape, dtype=np.float64)
-    for entries in passes:
-        matrix = sparse.csr_array(matrix + _matrix(entries, shape))
+    for of_pass in matrices:
+        matrix = sparse.csr_array(matrix + of_pass)
     matrix.data /= len(passes)
     mean: FloatArray = matrix.data
-    cells = np.repeat(np.arange(shape[0]), np.diff(matrix.indptr)) * shape[1] + matrix.indices
+    cells = positions_of(matrix)
     squares = np.zeros(cells.size)
     batches = np.zeros((BATCHES, cells.size))
-    for number, (where, values, _) in enumerate(passes):
-        index = np.searchsorted(cells, where)
-        batches[number % BATCHES, index] += values * (BATCHES / len(passes))
+    for number, of_pass in enumerate(matrices):
+        index = np.searchsorted(cells, positions_of(of_pass))
+        batches[number % BATCHES, index] += of_pass.data * (BATCHES / len(passes))
         deviation = -mean
-        deviation[index] += values
+        deviation[index] += of_pass.data
         squares += np.square(deviation)
     return matrix, squares / (len(passes) * (len(passes) - 1)), (batches - mean).astype(np.float32)
 
 
-def _matrix(entries: TracedEntries, shape: tuple[int, int]) -> sparse.csr_array:
-    pixel, texel = np.divmod(entries.where, shape[1])
-    starts = np.concatenate([[0], np.cumsum(np.bincount(pixel, minlength=shape[0]))])
-    return sparse.csr_array((entries.values, texel, starts), shape=shape)
-
-
-def _without(entries: TracedEntries, removed: BoolArray) -> TracedEntries:
-    return TracedEntries(entries.where[~removed], entries.values[~removed], entries.dark)
+def positions_of(matrix: sparse.csr_array) -> IntArray:
+    """Return the positions of the entries in the flattened matrix, rising."""
+    matrix.sort_indices()
+    rows = np.repeat(np.arange(matrix.shape[0], dtype=np.int64), np.diff(matrix.indptr))
+    return rows * matrix.shape[1] + matrix.indices

@@ -1,26 +1,22 @@
 """Worlds are built once in a process of their own, which may die; only then in this one.
 
-Mitsuba trusts its files: a damaged one may end the process, take all memory, or never end. The process stays for a
-while, so that further worlds do not wait for the start of Mitsuba, which takes most of the time. It reads a line from
-stdin for every world, a JSON object {variant, text, files, memory}; the answers are JSON lines too: {"at": FILE} before
-each file, and {"built": true} or {"reason": TEXT} at the end. It ends with its stdin, or when nothing came for a while.
+Mitsuba trusts its files: a damaged one may end the process, take all memory, or never end. The process reads a JSON
+object {variant, text, files, memory} from stdin, and answers by JSON lines: {"at": FILE} before each file, and
+{"built": true} or {"reason": TEXT} at the end.
 """
 
 # pyright: basic
 from __future__ import annotations
 
-import atexit
 import json
 import os
 import resource
-import select
 import signal
 import subprocess
-from dataclasses import dataclass, field
+import sys
 from itertools import count
 from pathlib import Path
-from time import monotonic
-from typing import IO, Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -36,43 +32,12 @@ LONGEST = 600.0  # seconds that a world may take
 RESERVE = 100_000_000  # bytes that a world may take even if less are free
 SHOWN = 100
 MODULE = __name__  # of the `main` that a process runs
-IDLE = 20  # seconds without a world after which the process ends
 PICTURES = ("bitmap", "envmap", "projector")
 MESHES = ("ply", "obj", "serialized")
 FARTHEST = 1e30  # of a vertex
 
 
-@dataclass
-class WorldTrials:
-    """The process that tries worlds, None while there is none, and the fingerprints of those that it built."""
-
-    process: subprocess.Popen[bytes] | None = None
-    built: set[str] = field(default_factory=lambda: set[str]())
-
-    def start(self) -> subprocess.Popen[bytes]:
-        """Return the process, started if it has ended."""
-        if self.process is None or self.process.poll() is not None:
-            self.stop()
-            self.process = subprocess.Popen(
-                python_command(f"from {MODULE} import main; main()"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                cwd="/",
-                env=python_environment(),
-            )
-        return self.process
-
-    def stop(self) -> None:
-        """End the process, if there is one."""
-        if self.process is not None:
-            self.process.kill()
-            self.process.communicate()
-            self.process = None
-
-
-_trials = WorldTrials()
-atexit.register(_trials.stop)
+_built: set[str] = set()  # fingerprints of worlds that another process built
 
 
 def try_world(world: CheckedWorld, variant: str, where: str, seconds: float = LONGEST) -> None:
@@ -84,52 +49,47 @@ def try_world(world: CheckedWorld, variant: str, where: str, seconds: float = LO
     named = [[str(path), plugin] for path, plugin in world.checked.items()]
     files = [[*names, *_version(Path(names[0]))] for names in named]
     key = fingerprint([world.text, files, variant])
-    if key in _trials.built:
+    if key in _built:
         return
     most = max(free_memory(), RESERVE)
     task = {"variant": variant, "text": world.text, "files": named, "memory": most}
-    try:
-        reason = _answer(task, where, seconds)
-    except BaseException:
-        _trials.stop()
-        raise
+    reason = _reason(task, where, seconds)
     if reason is not None:
-        _trials.stop()  # which may have changed what the next world finds
         if "bad_alloc" in reason or "MemoryError" in reason or "out of memory" in reason.lower():
             raise InputError(f"{where} needs more memory than the {most / 1e9:.3g} GB that are free; make it smaller")
         raise InputError(f"{where} is no scene that Mitsuba can build: {reason_of(reason, world)}")
-    _trials.built.add(key)
+    _built.add(key)
 
 
-def _answer(task: dict[str, Any], where: str, seconds: float) -> str | None:
+def _reason(task: dict[str, Any], where: str, seconds: float) -> str | None:
     """Return why Mitsuba refuses a world, None if it builds it. Raises InputError if the process dies of it."""
-    message, end, at, rest = json.dumps(task).encode() + b"\n", monotonic() + seconds, "", b""
-    process = _trials.start()
-    stdin, stdout = cast(IO[bytes], process.stdin), cast(IO[bytes], process.stdout)  # both are pipes
+    code = None
     try:
-        stdin.write(message)
-        stdin.flush()
-    except BrokenPipeError:  # it was about to end, since nothing came
-        _trials.stop()
-        process = _trials.start()
-        return _answer(task, where, seconds)
-    while True:
-        if not select.select([stdout], [], [], max(end - monotonic(), 0.0))[0]:
-            raise InputError(f"{where}: Mitsuba takes longer than {seconds:g} s to build {_shown(at)}; make it smaller")
-        part = os.read(stdout.fileno(), 65536)
-        if not part:
-            raise InputError(f"{where}: {_death(process)} while it built {_shown(at)}; correct or remove it")
-        *lines, rest = (rest + part).split(b"\n")
-        for line in lines:
-            words = json.loads(line)
-            if "at" in words:
-                at = str(words["at"])
-            else:
-                return None if words.get("built") else str(words.get("reason"))
+        ended = subprocess.run(
+            python_command(f"from {MODULE} import main; main()"),
+            input=json.dumps(task).encode(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            env=python_environment(),
+            timeout=seconds,
+            check=False,
+        )
+        answers, code = ended.stdout, ended.returncode
+    except subprocess.TimeoutExpired as late:
+        answers = late.stdout or b""
+    at = ""
+    for line in answers.split(b"\n")[:-1]:
+        words = json.loads(line)
+        if "at" not in words:
+            return None if words.get("built") else str(words.get("reason"))
+        at = str(words["at"])
+    if code is None:
+        raise InputError(f"{where}: Mitsuba takes longer than {seconds:g} s to build {_shown(at)}; make it smaller")
+    raise InputError(f"{where}: {_death(code)} while it built {_shown(at)}; correct or remove it")
 
 
-def _death(process: subprocess.Popen[bytes]) -> str:
-    code = process.wait()
+def _death(code: int) -> str:
     if code >= 0:
         return f"Mitsuba's process ended with code {code}"
     try:
@@ -148,7 +108,7 @@ def _version(path: Path) -> list[int]:
 
 
 def main() -> None:
-    """Answer until stdin ends."""
+    """Try the world of stdin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # libraries print there
@@ -156,26 +116,11 @@ def main() -> None:
     def answer(**words: object) -> None:
         print(json.dumps(words), file=answers, flush=True)
 
-    with os.fdopen(0, "rb", buffering=0, closefd=False) as stdin:
-        while select.select([stdin], [], [], IDLE)[0]:
-            line = _line(stdin)
-            if not line:
-                break
-            try:
-                _try_world(json.loads(line), answer)
-                answer(built=True)
-            except (RuntimeError, TypeError, ValueError, MemoryError) as error:
-                answer(reason=str(error) or type(error).__name__)
-
-
-def _line(stdin: Any) -> bytes:
-    parts = list[bytes]()
-    while not parts or not parts[-1].endswith(b"\n"):
-        part = stdin.read(2**20)
-        if not part:
-            return b""
-        parts.append(part)
-    return b"".join(parts)
+    try:
+        _try_world(json.load(sys.stdin), answer)
+        answer(built=True)
+    except (RuntimeError, TypeError, ValueError, MemoryError) as error:
+        answer(reason=str(error) or type(error).__name__)
 
 
 def _try_world(world: dict[str, Any], answer: Any) -> None:

@@ -341,7 +341,7 @@ def _transfer(kernel: FloatArray) -> FloatArray:
     """Return the squared transfer function at the waves of a DCT-II of GRID pixels, of both slants: (2, GRID, GRID)."""
     period = 2 * GRID
     padded = np.pad(kernel, [(0, -size % period) for size in kernel.shape])  # a wider kernel is folded
-    folded = padded.reshape(padded.shape[0] // period, period, -1, period).sum(axis=(0, 2))
+    folded: FloatArray = padded.reshape(padded.shape[0] // period, period, -1, period).sum(axis=(0, 2))
     spectrum = np.square(np.abs(np.asarray(fft.rfft2(folded))))[:, :GRID]
     return np.stack([spectrum[:GRID], spectrum[-np.arange(GRID)]])
 

@@ -117,7 +117,7 @@ def main() -> None:
         print(json.dumps(words), file=answers, flush=True)
 
     try:
-        _try_world(json.load(sys.stdin), answer)
+        _try_world(json.loads(sys.stdin.read()), answer)
         answer(built=True)
     except (RuntimeError, TypeError, ValueError, MemoryError) as error:
         answer(reason=str(error) or type(error).__name__)

@@ -64,10 +64,11 @@ def _draw(figure: Any, table: BenchTable, stage: Stage) -> None:
         panel.minorticks_off()
     cost.set_title("Cost", fontsize=10)
     image.set_title(f"Error of the image with {IMAGES[stage]}", fontsize=10)
-    front = pareto_front(cells, median_seconds, median_error)
+    front = [cell for cell in pareto_front(cells, median_seconds, median_error) if median_error(cell) > 0]
     least = 0.3 * min((median_error(cell) for cell in cells if cell.counted), default=0.0)
-    errors = [max(median_error(cell), least) for cell in front]
-    cost.plot([median_seconds(cell) for cell in front], errors, zorder=1, **FRONT)
+    if front:  # an exact answer is no point of a logarithmic axis
+        errors = [max(median_error(cell), least) for cell in front]
+        cost.plot([median_seconds(cell) for cell in front], errors, zorder=1, **FRONT)
     if stage == "render" and table.noise_deviation > 0:
         for panel in (*first, cost):
             _draw_level(panel, table.noise_deviation, f"noise of the sensor, {table.noise_deviation:.2g}")

@@ -320,7 +320,8 @@ def test_every_method_states_the_same_part(method: str) -> None:
         assert found.interval is not None
         assert dense.interval is not None
         assert found.interval.mse == pytest.approx(dense.interval.mse, rel=0.01)
-        assert found.interval.variance == pytest.approx(dense.interval.variance, rel=0.05)
+        # A trace by one random image: of 361 pixels its deviation is 7 % or more.
+        assert found.interval.variance == pytest.approx(dense.interval.variance, rel=0.2)
 
 
 @pytest.mark.slow

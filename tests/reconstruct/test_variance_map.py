@@ -109,7 +109,7 @@ def test_a_small_frame_is_the_dense_answer(correlated: bool) -> None:
 
 
 def test_kernels_that_vary_over_the_field() -> None:
-    """To 1.6 % of a deviation where the light varies by a quarter, at corners, edges and elsewhere: exact solutions."""
+    """To 0.5 % of a deviation where the light varies by a quarter, at corners, edges and elsewhere: exact solutions."""
     shape = 83, 90
     observation = over_the_field(shape)
     system = sliding_camera(observation, (100.0,) * 3, 1 / P0)
@@ -120,4 +120,4 @@ def test_kernels_that_vary_over_the_field() -> None:
         unit = np.zeros(shape)
         unit[place] = 1.0
         solved = exact.solve(unit.ravel(), 1e-6).image.reshape(shape)
-        assert variance[place] == pytest.approx(solved[place], rel=0.032), place
+        assert variance[place] == pytest.approx(solved[place], rel=0.01), place

@@ -2,8 +2,8 @@
 
 Even noise and an ideal H of boxes are served by the transfer function, any other noise and H of boxes by windows side
 by side, lens types that leave a null space by one sweep over the frame. A correlated prior and kernels take the maps of
-even noise from a small frame with the same edges, at several levels, between which each pixel finds that of the
-measurements near it.
+even noise from transfer functions and from small frames with the same edges, at several levels, between which each
+pixel finds that of the measurements near it.
 
 The error of a map is measured at random pixels by exact solutions of the frame's own system. With x = C z, z random
 signs at pixels k far from one another and 0 elsewhere, z_k x_k is C_kk: what the others add falls with the distance as
@@ -71,7 +71,7 @@ EVEN = 1e-3  # relative range of noise variances that count as equal
 HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
 SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
 LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies a thousandfold
-WORST, MEAN = 2e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
+WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
 
 
 @dataclass(frozen=True)
@@ -364,7 +364,6 @@ class ErrorMap:
 
         Of noise that is not even the means are those of the weights, and of the actual noise with squared weights.
         """
-
         level = np.log(levels(self.task, self.system.observation, self.system.weights))
         return by_levels(
             level,

@@ -41,7 +41,7 @@ from .window_variances import box_image, inverse_diagonal
 FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
 DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
 STEP = 1e-4  # relative step of a finite difference, and the largest relative error it causes
-SIDE = 36  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
+SIDE = 40  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
 LONG, SHORT = 60, 44  # of those from which the effect of the length follows
 LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one is at least
 GRID = 128  # pixels of the frame without edges on which shares and the effect of kernels are computed
@@ -288,9 +288,13 @@ class SmallFrames:
         kernels = [zip(*(each.kernels_at(row, across) for each in self._system.types), strict=True) for row in down]
         return [[np.array([_transfer(kernel) for kernel in each]) for each in line] for line in kernels]
 
+    @cached_property
+    def _prior(self) -> float | FloatArray:
+        return self._precision((GRID, GRID))
+
     def _interior(self, transfers: FloatArray, scale: float) -> FloatArray:
         """Return the variances far from the edges by transfer functions, as the maps have them: (3,)."""
-        weights, prior = scale * np.asarray(self._system.weights), self._precision((GRID, GRID))
+        weights, prior = scale * np.asarray(self._system.weights), self._prior
         squares = 1 / np.square(prior + np.tensordot(weights, transfers, axes=1))
         missing = np.mean(prior * squares)
         noisy = np.mean(np.tensordot(weights * self._ratios, transfers, axes=1) * squares)

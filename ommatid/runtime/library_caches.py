@@ -1,20 +1,14 @@
-"""Folders in which libraries keep what they compile: Numba functions, Dr.Jit kernels, and matplotlib its list of fonts.
+"""Folders in which libraries keep what they make: Dr.Jit its kernels, and Matplotlib its list of fonts.
 
-They lie beside the program and in the home folder. Where neither can be written, Numba raises an exception, and the
-others print messages and work without.
+They lie in the home folder. Where it cannot be written, the libraries print messages and work without.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-PACKAGE = Path(__file__).parents[1]
 
 
 @contextmanager
@@ -23,7 +17,11 @@ def library_caches() -> Generator[None]:
 
     Processes that are started inside inherit it. Without any writable folder for it, nothing is named.
     """
-    missing = [name for name, folders in _default_folders().items() if name not in os.environ and not _usable(folders)]
+    missing = [
+        name
+        for name, folders in _default_folders().items()
+        if name not in os.environ and not all(map(_writable, folders))
+    ]
     if not missing:
         yield
         return
@@ -45,29 +43,15 @@ def library_caches() -> Generator[None]:
                 os.environ.pop(name, None)
 
 
-def compiled(function: Function) -> Function:
-    """Compile a function of numbers with Numba, and keep the machine code for later processes where that is possible.
-
-    It runs without Python's lock.
-    """
-    import numba
-
-    try:
-        return numba.njit(cache=True, nogil=True)(function)  # pyright: ignore
-    except RuntimeError:  # no folder can be written
-        return numba.njit(nogil=True)(function)  # pyright: ignore
-
-
-def _default_folders() -> dict[str, list[list[Path]]]:
-    """For each variable that names a cache, the groups of folders without it, of which one group must be usable."""
+def _default_folders() -> dict[str, list[Path]]:
+    """For each variable that names a cache, the folders without it, which must all be usable."""
     named = os.environ.get("HOME", "")
     home = _home()
     config = Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
     return {
-        "DRJIT_CACHE_DIR": [[Path(named, ".drjit")]] if named else [],
-        "MPLCONFIGDIR": [[config / "matplotlib", cache / "matplotlib"]],
-        "NUMBA_CACHE_DIR": [[PACKAGE / "__pycache__"], [cache / "numba"]],
+        "DRJIT_CACHE_DIR": [Path(named or os.devnull, ".drjit")],
+        "MPLCONFIGDIR": [config / "matplotlib", cache / "matplotlib"],
     }
 
 
@@ -77,10 +61,6 @@ def _home() -> Path:
         return Path.home() if os.environ.get("HOME") != "" else Path(os.devnull)  # empty: would be the root folder
     except RuntimeError:
         return Path(os.devnull)
-
-
-def _usable(groups: list[list[Path]]) -> bool:
-    return any(all(_writable(folder) for folder in group) for group in groups)
 
 
 def _writable(folder: Path) -> bool:

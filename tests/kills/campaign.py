@@ -59,7 +59,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
 # Forks commands from a process that has imported everything, so that each begins its work at once.
 STARTER = """
 import os, sys
-import mitsuba, numba, scipy.linalg, skimage.metrics, matplotlib.backends.backend_agg
+import mitsuba, scipy.linalg, skimage.metrics, matplotlib.backends.backend_agg
 import ommatid.pipeline.stages, ommatid.analysis.depth_error, ommatid.analysis.study, ommatid.batch.sweep_table
 import ommatid.reconstruct.output.run_json, ommatid.reconstruct.output.result_files
 from ommatid.cli import app

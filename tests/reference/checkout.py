@@ -20,7 +20,7 @@ INHERITED = ("PATH", "LANG", "LC_ALL", "DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")
 VERSIONS = """
 import importlib.metadata, pathlib, sys
 import ommatid
-needed = ("numpy", "scipy", "mitsuba", "drjit", "numba", "OpenEXR", "scikit-image")
+needed = ("numpy", "scipy", "mitsuba", "drjit", "OpenEXR", "scikit-image")
 print(pathlib.Path(ommatid.__file__).resolve().parent)
 print(sys.version, *(importlib.metadata.version(name) for name in needed))
 """
@@ -56,7 +56,7 @@ class Checkout:
         home = self.store / "home"
         inherited = {name: os.environ[name] for name in INHERITED if name in os.environ}
         caches = {"XDG_CACHE_HOME": "cache", "XDG_CONFIG_HOME": "config", "XDG_DATA_HOME": "data"}
-        caches |= {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "TMPDIR": "tmp"}
+        caches |= {"MPLCONFIGDIR": "matplotlib", "TMPDIR": "tmp"}
         for name in caches.values():
             (home / name).mkdir(parents=True, exist_ok=True)
         own = {variable: str(home / name) for variable, name in caches.items()}

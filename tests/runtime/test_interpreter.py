@@ -37,7 +37,7 @@ def hook(event, arguments):
 sys.addaudithook(hook)
 """
 TRAPS = ("json", "numpy", "signal", "pathlib", "re", "typer", "simulate", "scenes", "ommatid_x", "typing", "__future__")
-SETTINGS = {"matplotlibrc": "axes.facecolor: red\nfont.size: 31\n", ".numba_config.yaml": "cache_dir: trap\n"}
+SETTINGS = {"matplotlibrc": "axes.facecolor: red\nfont.size: 31\n"}
 
 
 @pytest.fixture(scope="module")
@@ -110,8 +110,8 @@ def test_the_current_folder_is_left_under_all_its_names(tmp_path: Path, monkeypa
 
 @pytest.mark.slow
 def test_settings_in_the_current_folder_are_ignored(hostile: Path) -> None:
-    code = "import matplotlib, numba; print(matplotlib.rcParams['font.size'], numba.config.CACHE_DIR or '-')"
-    assert run(python_command(code), hostile) == "10.0 -\n"
+    code = "import matplotlib; print(matplotlib.rcParams['font.size'])"
+    assert run(python_command(code), hostile) == "10.0\n"
     assert set(SETTINGS) == CONFIGURATIONS
 
 

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from ommatid.runtime import library_caches
-from ommatid.runtime.library_caches import compiled
 from tests.conftest import shell
 
-VARIABLES = ("DRJIT_CACHE_DIR", "MPLCONFIGDIR", "NUMBA_CACHE_DIR")
+VARIABLES = ("DRJIT_CACHE_DIR", "MPLCONFIGDIR")
 NO_HOME = "/dev/null/home"  # not even root can write below a device
 
 
@@ -40,7 +39,6 @@ def test_folders_that_can_be_written_are_left_alone(
 @pytest.mark.parametrize("home", [NO_HOME, "/dev/null", ""])
 def test_a_temporary_folder_takes_the_place_of_a_home(bare: Path, monkeypatch: pytest.MonkeyPatch, home: str) -> None:
     monkeypatch.setenv("HOME", home)
-    monkeypatch.setattr(library_caches, "PACKAGE", Path(NO_HOME))
     with library_caches.library_caches():
         assert set(named()) == set(VARIABLES)
         for folder in named().values():
@@ -56,11 +54,6 @@ def test_a_cache_that_the_user_names_is_kept(bare: Path, monkeypatch: pytest.Mon
     with library_caches.library_caches():
         assert named()["MPLCONFIGDIR"] == str(bare)
     assert named() == {"MPLCONFIGDIR": str(bare)}
-
-
-def test_functions_are_compiled_where_no_machine_code_can_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("numba.core.caching.CompileResultCacheImpl._locator_classes", [])
-    assert compiled(lambda x: 2 * x + 1)(3) == 7
 
 
 @pytest.mark.slow

@@ -172,7 +172,7 @@ def test_a_texels_column_is_the_area_of_its_image(
         uv = np.abs(image_on_patch(pose, tangents)).reshape(19, 10, 19, 10, 2).max(axis=(1, 3))
         inside = (uv < np.array(sub.type.pixels[::-1]) / 2 * cam.pixel_pitch - 0.5 * cam.pixel_pitch).all(axis=2)
         assert inside.sum() >= 9
-        np.testing.assert_allclose(columns[inside], area[inside], rtol=1e-12)
+        np.testing.assert_allclose(columns[inside], area[inside], rtol=1e-7 if any(k) else 1e-12)
 
 
 def test_a_steep_patch_has_valid_shares() -> None:

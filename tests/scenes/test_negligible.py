@@ -177,7 +177,7 @@ def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
         "print(*sys.modules)"
     )
     ended = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
-    optics = ("blur", "diffraction", "radial_density", "footprints", "footprint_kernels", "distortion", "radiometry")
+    optics = ("blur", "diffraction", "radial_density", "footprints", "distortion", "radiometry")
     simulated = (
         "lenses.prescription",
         "lenses.ray_trace",

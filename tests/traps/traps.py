@@ -11,7 +11,7 @@ from pathlib import Path
 MODULES = (
     "json", "numpy", "scipy", "signal", "simulate", "scenes", "reconstruct", "ommatid", "mitsuba", "drjit",
     "matplotlib", "typing", "pickle", "sitecustomize", "usercustomize", "conftest", "__init__", "setup", "noxfile",
-    "__main__", "random", "struct", "tempfile", "socket", "psutil", "typer", "rich", "pydantic", "numba", "tifffile",
+    "__main__", "random", "struct", "tempfile", "socket", "psutil", "typer", "rich", "pydantic", "tifffile",
     "OpenEXR", "tomllib", "evil", "threading", "_bootlocale", "readline", "zlib", "dask", "distributed", "skimage",
     "PIL", "defusedxml",
 )  # fmt: skip
@@ -26,7 +26,6 @@ SCRIPTS = (
 )  # fmt: skip
 SETTINGS = {
     "matplotlibrc": "backend: module://evil\naxes.formatter.min_exponent: 9\n",
-    ".numba_config.yaml": "opt: evil\ndisable_jit: evil\n",
     ".env": "PYTHONSTARTUP=evil.py\nPYTHONPATH=.\n",
     "evil.pth": "import evil\n",
     "evil.start": "evil:main\n",

@@ -9,9 +9,8 @@ A folder of scenes may hold a file json.py. Python puts the current folder first
 import os
 import sys
 
-# Matplotlib and Numba read these from the current folder, without an option that forbids it. Numba's names the folder
-# of its cache, whose files are pickles.
-CONFIGURATIONS = frozenset({"matplotlibrc", ".numba_config.yaml"})
+# Matplotlib reads it from the current folder, without an option that forbids it.
+CONFIGURATIONS = frozenset({"matplotlibrc"})
 
 _FLAGS = {"isolated": "-I", "ignore_environment": "-E", "no_user_site": "-s", "dont_write_bytecode": "-B"}
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv.pop(1))"

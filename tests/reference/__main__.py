@@ -6,7 +6,8 @@
     python -m tests.reference main . --statistical
 
 BEFORE and AFTER are folders with a checkout, or revisions of this repository. Quantities without a tolerance have to be
-the same bit for bit. Keys of run.json that one side does not know are not compared.
+the same bit for bit. Keys of run.json that one side does not know are not compared. In one run of 10, one ray of
+`corridor` meets the other of two walls at the same distance, so that both differ without a cause.
 """
 
 from __future__ import annotations

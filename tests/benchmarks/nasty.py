@@ -1,4 +1,4 @@
-"""Random problems that leave float64 few digits, each against Eq. 4 and 5 in rational numbers.
+"""Random problems that leave float64 few digits, each against the exact answer of Eq. 4 and 5.
 
 `python -m tests.benchmarks nasty FOLDER` solves 100,000 of them. It continues where it was interrupted; a folder is for
 one version of the program. An answer is silently wrong if its error exceeds ten times its stated bound and 1e-9;
@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from scipy import sparse
+from scipy.linalg import norm
 
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import estimate
@@ -25,8 +26,8 @@ from ommatid.reconstruct.prior import Prior, exponential
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.stability.exact_answer import ExactNumbers, exact_answer
 
-from ..exact_rationals import RationalAnswer, rational_answer, relative_error, worst_relative_error
 from ..journal import append, entries
 
 EACH = 6667  # problems of every family of the whole campaign
@@ -267,7 +268,7 @@ def assess(family: str, seed: int) -> NastyOutcome:
         return NastyOutcome(family, seed, SILENT, reason=f"{type(error).__name__}: {error}")
     problem, solver = nasty.problem, solution.solver
     variance = solution.form.variance()
-    exact = _answer_met(nasty, solution.coefficients)
+    exact = exact_answer(problem, nasty.recorded)
     error = relative_error(solution.coefficients, exact.coefficients)
     variance_error = worst_relative_error(variance, exact.variance, NEGLIGIBLE_VARIANCE * problem.prior.variance)
     bound = float("nan") if solver.bound is None else solver.bound
@@ -283,15 +284,23 @@ def _stated(error: float, bound: float) -> bool:
     return error <= LEAST_ERROR or error <= ALLOWED_EXCESS * bound
 
 
-def _answer_met(nasty: NastyProblem, computed: FloatArray) -> RationalAnswer:
-    """Return the exact answer; where measurements contradict one another, of four bases the nearest one's."""
-    exact = rational_answer(nasty.problem, nasty.recorded)
-    if exact.contradiction == 0:
-        return exact
-    rng = np.random.default_rng(0)
-    orders = [rng.permutation(nasty.problem.measurements).tolist() for _ in range(3)]
-    answers = [exact, *(rational_answer(nasty.problem, nasty.recorded, order) for order in orders)]
-    return min(answers, key=lambda answer: relative_error(computed, answer.coefficients))
+def relative_error(computed: FloatArray, exact: ExactNumbers) -> float:
+    """Return |computed - exact| / |exact| of two vectors; infinite where that is no number."""
+    difference, size = norm(exact.difference(computed), check_finite=False), norm(exact.high)
+    return float(difference / size) if size and np.isfinite(difference) else (float("inf") if difference else 0.0)
+
+
+def worst_relative_error(computed: FloatArray, exact: ExactNumbers, negligible: FloatArray) -> float:
+    """Return the largest |computed - exact| / exact of a set of variances.
+
+    negligible : (N,); a variance of 0 is right if the exact one is smaller than this
+    """
+    if not np.isfinite(computed).all() or (computed < 0).any():
+        return float("inf")
+    error = np.abs(exact.difference(computed))
+    error[((computed == 0) | (exact.high == 0)) & (error <= negligible)] = 0
+    with np.errstate(divide="ignore"):
+        return float(np.divide(error, exact.high, out=np.zeros_like(error), where=error > 0).max(initial=0.0))
 
 
 def campaign(seeds: range, families: list[str] | None = None) -> tuple[dict[str, Counter[str]], list[NastyOutcome]]:
@@ -328,7 +337,7 @@ def nasty_table(folder: Path, start: int = 0, each: int = EACH) -> Table:
                 append(path, done[key])
             counts[name] += Counter(done[key]["counts"])
             losses += done[key]["losses"]
-    table = Table(title=f"{each * len(counts)} problems that leave float64 few digits, against rational numbers")
+    table = Table(title=f"{each * len(counts)} problems that leave float64 few digits, against exact answers")
     for name in ("family", RIGHT, REFUSED, SILENT):
         table.add_column(name, justify="left" if name == "family" else "right")
     for name, count in [*counts.items(), ("all", sum(counts.values(), Counter[str]()))]:

@@ -1,4 +1,4 @@
-"""The estimator's silent losses: problems at the limits of float64 against rational numbers and other exact methods."""
+"""The estimator's silent losses: problems at the limits of float64 against exact answers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ommatid.reconstruct.forms.cholesky import covariance
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.errors import InputError
+from ommatid.stability.exact_answer import exact_answer
 
-from ..benchmarks.nasty import FAMILIES, SILENT, assess
-from ..exact_rationals import rational_answer, relative_error
+from ..benchmarks.nasty import FAMILIES, SILENT, assess, relative_error
 
 REFUSED = -1.0  # in place of an error
 EACH, FEW = 334, 12  # problems of every family: 5,010 of the long form
@@ -48,7 +48,7 @@ def _excess(problem: Problem, recorded: np.ndarray) -> float:
         solution = estimate(problem, recorded)
     except InputError:
         return REFUSED
-    exact = rational_answer(problem, recorded)
+    exact = exact_answer(problem, recorded)
     bound = solution.solver.bound
     assert bound is not None
     return relative_error(solution.coefficients, exact.coefficients) / max(10 * bound, 1e-9)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
+import flint
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,7 +25,6 @@ from ommatid.stability.cases import CHANGES, LENSES, StabilityCase, extreme_case
 from ommatid.stability.exact_answer import exact_answer
 from ommatid.stability.stability import DIGITS, FEWER, REFUSED, RIGHT, SILENT, assess
 
-from ..exact_rationals import rational_answer
 from ..examples import GALLERY
 
 MATRICES = {
@@ -87,6 +88,35 @@ def case_of(problem: Problem, g: FloatArray) -> StabilityCase:
     return StabilityCase("random", problem.matrix, problem.prior, problem.noise_variance, g)
 
 
+def rationals(problem: Problem, g: FloatArray) -> list[list[Fraction]]:
+    """The image and the variances of independent pixels in rational numbers, from the first independent rows."""
+
+    def exact(values: FloatArray) -> Any:
+        ratios = (value.as_integer_ratio() for value in values.ravel().tolist())
+        rows, columns = values.shape
+        return flint.fmpq_mat(rows, columns, [flint.fmpq(*ratio) for ratio in ratios])
+
+    h, noise, rows = (
+        problem.matrix.toarray(),
+        problem.noise_variance,
+        np.flatnonzero(problem.noise_variance > 0).tolist(),
+    )
+    free = list[int]()
+    for row in np.flatnonzero(noise == 0).tolist():
+        if exact((h * problem.prior.root)[[*free, row]]).rank() > len(free):
+            free.append(row)
+    rows += free
+    observed, prior, mean = exact(h[rows]), exact(np.diag(problem.prior.root)), exact(problem.prior.mean[:, None])
+    cross = prior * prior * observed.transpose()
+    gain = (observed * cross + exact(np.diag(noise[rows]))).inv() if rows else exact(np.empty((0, 0)))
+    image = mean + cross * gain * (exact(g[rows, None]) - observed * mean)
+    posterior = prior * prior - cross * gain * cross.transpose()
+    return [
+        [Fraction(int(entry.p), int(entry.q)) for entry in entries]
+        for entries in (image.entries(), [posterior[k, k] for k in range(posterior.nrows())])
+    ]
+
+
 @given(st.integers(0, 10**6))
 @settings(max_examples=20, deadline=None, derandomize=True)
 def test_the_exact_answer_is_the_rational_one(seed: int) -> None:
@@ -94,10 +124,7 @@ def test_the_exact_answer_is_the_rational_one(seed: int) -> None:
     answer = exact_answer(problem, g)
     if answer.contradiction > 0:  # the rounding of g without noise: the answer would depend on the order of rows
         return
-    rationals = rational_answer(problem, g)
-    prior = zip(problem.prior.mean.tolist(), problem.prior.root.tolist(), rationals.coefficients, strict=True)
-    image = [Fraction(mean) + Fraction(root) * coefficient for mean, root, coefficient in prior]
-    for exact, rational in ((answer.image, image), (answer.variance, rationals.variance)):
+    for exact, rational in zip((answer.image, answer.variance), rationals(problem, g), strict=True):
         largest = max(abs(value) for value in rational)
         for high, low, value in zip(exact.high.tolist(), exact.low.tolist(), rational, strict=True):
             assert abs(Fraction(high) + Fraction(low) - value) <= Fraction(1, 10**25) * largest

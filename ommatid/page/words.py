@@ -30,7 +30,11 @@ def sentence(report: RunReport) -> str:
 def grounds(report: RunReport) -> list[str]:
     """Return what the verdict rests on, one sentence for each reason or passed check."""
     verdict = report.verdict
-    listed = [verdict_words.grounds(report)] if verdict is None else list(verdict.reasons or verdict.passed)
+    listed = (
+        [verdict_words.grounds(report)]
+        if verdict is None
+        else list(verdict.reasons or (*verdict.doubts, *verdict.passed))
+    )
     return [_sentence(words) for words in listed or [verdict_words.grounds(report)]]
 
 

@@ -20,7 +20,7 @@ from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.reconstruct.verdict.residual_parts import WhitenedResidual, regions, residual_parts
 from ommatid.reconstruct.verdict.residual_power import ResidualPower
-from ommatid.reconstruct.verdict.verdict import error_p_value, excesses
+from ommatid.reconstruct.verdict.verdict import error_p_value, excesses, with_gain
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.stack import Stack
@@ -230,6 +230,14 @@ def test_a_dead_sub_imager_is_a_note() -> None:
     found = verdict(changed(stack_of(), "A.00.00", lambda values: np.full_like(values, np.nan)))
     assert found.trusted
     assert "sub-imager (0, 0) of type A gives no usable pixel and is left out" in found.notes
+
+
+def test_a_result_worse_than_a_sub_image_is_amber() -> None:
+    good = VerdictReport(trusted=True, reasons=())
+    for gain, prior, level in ((0.1, "fit", "green"), (None, "fit", "green"), (-0.1, "fit", "amber")):
+        assert with_gain(good, gain, prior).level == level
+    assert "set prior.kind to 'fit'" in with_gain(good, -2.0, "independent").doubts[0]
+    assert with_gain(VerdictReport(trusted=False, reasons=("no",)), -2.0, "fit").level == "red"
 
 
 def test_without_any_pixel_there_is_no_trust() -> None:

@@ -28,7 +28,7 @@ LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.55, 1.25, 0.55  # inches around all panels; a
 MOST_IN_A_ROW = 6
 MOST_SHOWN = 480  # rows and columns of a map that a panel can show
 LEAST_PART = 1e-4  # of the expected error; smaller parts are not drawn
-GOOD, BAD = "#17734a", "#b3261e"  # of the verdict
+GOOD, DOUBT, BAD = "#17734a", "#8a5a00", "#b3261e"  # of the verdict
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def _write_headline(figure: Any, title: str, report: RunReport) -> None:
     height = figure.get_figheight()
     figure.text(0.5, 1 - 0.28 / height, printable_label(title), fontsize=13, ha="center", va="center")
     heading = verdict_words.heading(report)
-    colour = {"trusted": GOOD, "not to be trusted": BAD}.get(heading, "#000000")
+    colour = {"trusted": GOOD, "trusted with a doubt": DOUBT, "not to be trusted": BAD}.get(heading, "#000000")
     style: dict[str, Any] = {"fontsize": 12, "va": "center", "color": colour}
     words = f"{heading[:1].upper()}{heading[1:]}: {headline(report)}"
     figure.text(0.5, 1 - 0.58 / height, words, ha="center", fontweight="bold", **style)

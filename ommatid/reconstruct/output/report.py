@@ -15,6 +15,7 @@ from ommatid.scenes.stack import STRAIGHT, Stack
 from ..held_out.check import quick_check, with_fitted_prior
 from ..measured_error import best_single_sub_image
 from ..restore import Reconstruction
+from ..verdict.verdict import with_gain
 from .run_json import (
     BaselineReport,
     DiagnosticsReport,
@@ -42,7 +43,7 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
     as_run = stack.scene.model_copy(update={"calibration": model.scene.calibration})
     return RunReport(
         title=stack.scene.title,
-        verdict=restoration.verdict,
+        verdict=with_gain(restoration.verdict, error.gain, stack.scene.prior.kind),
         measurements=model.measurements,
         unknowns=stack.camera.unknowns,
         stages=stages,

@@ -123,15 +123,23 @@ class ResidualPart(Record):
 class VerdictReport(Record):
     """Whether the error bars of a run can be trusted: reasons why not, checks that found nothing wrong, and notes.
 
+    doubts : why the result is of little use although its error bars can be trusted
     p_value : of the residual in all and by part together, None if it was not checked
     """
 
     trusted: bool
     reasons: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
     passed: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     p_value: float | None = None
     parts: tuple[ResidualPart, ...] = ()
+
+    @computed_field
+    @property
+    def level(self) -> Literal["green", "amber", "red"]:
+        """Red for error bars that are not to be trusted, amber for doubts."""
+        return "red" if not self.trusted else "amber" if self.doubts else "green"
 
 
 class FittedNumber(Record):

@@ -39,8 +39,8 @@ def heading(report: RunReport) -> str:
     """Return the verdict in two or three words."""
     if report.verdict is None:
         return "no verdict"
-    if not report.verdict.trusted:
-        return "not to be trusted"
+    if report.verdict.level != "green":
+        return "not to be trusted" if report.verdict.level == "red" else "trusted with a doubt"
     return "trusted" if report.verdict.passed else "not checked"
 
 
@@ -49,7 +49,11 @@ def grounds(report: RunReport) -> str:
     verdict = report.verdict
     if verdict is None:
         return "the results are of an earlier version; run the scene again"
-    return "; ".join(verdict.reasons or verdict.passed or ("neither the residual nor the error could be checked",))
+    return "; ".join(
+        verdict.reasons
+        or (*verdict.doubts, *verdict.passed)
+        or ("neither the residual nor the error could be checked",)
+    )
 
 
 def limit(report: RunReport) -> str:

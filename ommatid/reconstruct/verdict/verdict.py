@@ -30,6 +30,7 @@ FEW = 0.2  # share of the sub-imagers that are few
 MOST_NAMED = 5  # sub-imagers in one sentence
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
+ROUGH = 0.05  # relative error of a map of variances from which it is a doubt
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
 UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
@@ -198,11 +199,12 @@ class _Findings:
     reasons: list[str]
     passed: list[str]
     notes: list[str]
+    doubts: list[str]
 
 
 def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -> VerdictReport:
     """Return the verdict from the residual by part, none where it was not checked, and the other checks."""
-    findings = _Findings([], [], [])
+    findings = _Findings([], [], [], [])
     if check.pixels_used:
         _judge_residual(parts, evidence, check, findings)
         _judge_error(check, findings)
@@ -213,11 +215,24 @@ def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -
     return VerdictReport(
         trusted=not findings.reasons,
         reasons=tuple(findings.reasons),
+        doubts=tuple(findings.doubts),
         passed=tuple(findings.passed),
         notes=tuple(findings.notes),
         p_value=p_value,
         parts=tuple(parts),
     )
+
+
+def with_gain(verdict: VerdictReport, gain: float | None, prior: str) -> VerdictReport:
+    """Return the verdict with a doubt about an estimate that is worse than one sub-image by `gain`, in dB below 0.
+
+    prior : its kind
+    """
+    if gain is None or gain >= 0:
+        return verdict
+    remedy = "less noise, more sub-imagers or other lens types help" if prior == "fit" else "set prior.kind to 'fit'"
+    words = f"the estimate is {-gain:.1f} dB worse than the best single sub-image, enlarged; {remedy}"
+    return verdict.model_copy(update={"doubts": (*verdict.doubts, words)})
 
 
 def excesses(parts: list[ResidualPart]) -> list[ResidualPart]:
@@ -288,6 +303,11 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
         findings.reasons.append(
             f"the variances of some pixels are wrong by {100 * check.variance_bound:.2g} % or more: the solver's map of"
             " them is an approximation; crop the target, or for pinholes set estimator.method to 'tiles'"
+        )
+    elif check.variance_bound > ROUGH:
+        findings.doubts.append(
+            f"the variances of some pixels are wrong by {100 * check.variance_bound:.2g} %: the solver's map of them is"
+            " an approximation"
         )
 
 

@@ -128,13 +128,12 @@ def of_parts(folder: Path, parts: dict[str, Any]) -> dict[str, Any]:
 
 def _head(run: Run) -> dict[str, Any]:
     report = run.report
-    trusted = verdict_words.is_trusted(report)
     return {
         "title": run.title,
         "heading": verdict_words.heading(report),
         "sentence": words.sentence(report),
-        "reasons": [] if trusted else words.grounds(report),
-        "grounds": words.grounds(report) if trusted else [],
+        "reasons": words.reasons(report),
+        "grounds": words.grounds(report),
         "notes": words.notes(report),
         "cautions": words.cautions(report),
         "assumptions": words.assumptions(report),

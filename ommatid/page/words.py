@@ -21,21 +21,23 @@ def sentence(report: RunReport) -> str:
     if not is_trusted(report):
         return f"{words} The figures below rest on assumptions that do not hold; resolve this first."
     baseline, gain = report.error.baseline, report.error.gain
-    if baseline is None or gain is None:
+    if baseline is None or gain is None or gain < 0:  # which is a doubt
         return words
-    compared = "better" if gain >= 0 else "worse"
-    return f"{words} That is {abs(gain):.1f} dB {compared} than the best single sub-image, {baseline.sub_imager}."
+    return f"{words} That is {gain:.1f} dB better than the best single sub-image, {baseline.sub_imager}."
+
+
+def reasons(report: RunReport) -> list[str]:
+    """Return what speaks against the result, one sentence for each reason or doubt."""
+    verdict = report.verdict
+    return [] if verdict is None else [_sentence(words) for words in verdict.reasons or verdict.doubts]
 
 
 def grounds(report: RunReport) -> list[str]:
-    """Return what the verdict rests on, one sentence for each reason or passed check."""
-    verdict = report.verdict
-    listed = (
-        [verdict_words.grounds(report)]
-        if verdict is None
-        else list(verdict.reasons or (*verdict.doubts, *verdict.passed))
-    )
-    return [_sentence(words) for words in listed or [verdict_words.grounds(report)]]
+    """Return what the verdict of a result that can be trusted rests on, one sentence for each passed check."""
+    if not is_trusted(report):
+        return []
+    passed = () if report.verdict is None else report.verdict.passed
+    return [_sentence(words) for words in passed or (verdict_words.grounds(report),)]
 
 
 def notes(report: RunReport) -> list[str]:

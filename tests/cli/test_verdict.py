@@ -35,7 +35,7 @@ def test_a_trusted_scene_passes_and_the_worst_exit_code_of_a_batch_counts(ommati
     assert both.code == 3
     assert [run["verdict"]["trusted"] for run in json.loads(both.out)] == [True, False]
     index = Path("out/index.html").read_text(encoding="utf-8")
-    assert index.index(">trusted</td>") < index.index(">not to be trusted</td>")
+    assert index.index(">trusted with a doubt</td>") < index.index(">not to be trusted</td>")
     assert "; not to be trusted: Tiny" in index
 
 

@@ -56,7 +56,7 @@ def observed(camera: Camera) -> Observation:
 
 def sliding(camera: Camera, weights: tuple[float, ...], prior: float) -> SlidingCamera:
     """The shift-invariant camera that this one is."""
-    return sliding_camera(observed(camera), weights, prior)
+    return sliding_camera(observed(camera), camera.types, weights, prior)
 
 
 def precision(matrix: sparse.csr_array, weights: FloatArray, prior: float) -> FloatArray:

@@ -96,7 +96,7 @@ def _reconstructed(recording: PredictedRecording) -> _Outcome:
 
     def work(choice: MethodChoice) -> _Outcome:
         assumed = assumptions_for(stack, model, choice, Execution())
-        truth = truth_for(choice, recording.truth, stack.camera)
+        truth = truth_for(assumed.method, recording.truth, stack.camera)
         return _Outcome(choice, assumed, assumed.result(truth))
 
     return with_fallback(stack, model, work)

@@ -52,7 +52,7 @@ RENDERING = 0.03  # relative deviation of the error by rendering from that of it
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:
     """Return True if H is applied without being stored; methods for misalignment start from H as designed."""
     trusted = stack.scene.estimator.misalignment == "trust"
-    return (model.is_applied if trusted else model.is_exact) and not stack.camera.has_detail
+    return model.is_applied if trusted else model.is_exact
 
 
 @dataclass(frozen=True)

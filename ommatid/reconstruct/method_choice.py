@@ -24,6 +24,7 @@ from .methods.tile_method import TileMethod
 from .misalignment.misaligned_methods import AlignedMethod, RobustMethod
 
 PROGRAM_MEMORY = 300_000_000  # bytes, of the program itself and its libraries
+WORLD_IMAGES = 200  # of a world finer than f, that its solver holds at once; measured at 239 x 239 pixels of f
 TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on average; 0.17 where types see all edges
 
 METHODS: dict[str, type[Method]] = {
@@ -52,11 +53,13 @@ def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
     exact : whether H is applied by boxes and kernels
     Raises InputError where no method fits into memory.
     """
-    exact = exact and not camera.has_detail  # the model of f has entries
     allowed = allowed_memory(scene.estimator.memory)
     if scene.estimator.misalignment != "trust":
         return _misaligned(scene, camera, exact, allowed)
-    names, why = _of_world(scene, camera) or _candidates(scene, camera, exact)
+    of_world = _of_world(scene, camera)
+    if camera.has_detail and (of_world is None or has_moments(camera)):  # the model of f has no boxes
+        exact = exact and camera.unknowns > MOST_DENSE and not camera.has_box_footprints
+    names, why = of_world or _candidates(scene, camera, exact)
     memory = {name: _memory(name, scene, camera, exact) for name in names}
     for name in names:
         if memory[name] <= allowed:
@@ -163,17 +166,16 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
     if method == "tiles":
         side = scene.tiles.size**2
         return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory(3 * side, side)
+    if camera.has_detail and scene.prior.kind != "independent":
+        return PROGRAM_MEMORY + images + entries + 8 * WORLD_IMAGES * camera.world.unknowns
     longest = max(camera.shape)
     strips = 8 * 4 * longest * (5 * widest) * (5 * widest * (widest - 1) + widest)
     if serves(camera, scene.prior.kind == "independent"):
         band = 8 * camera.unknowns * band_width(camera)
         return PROGRAM_MEMORY + images + entries + 5 * band  # the factor, a copy, and two matrices per block of lines
     if exact:
-        return (
-            PROGRAM_MEMORY
-            + images
-            + max(strips + 8 * 2 * longest * 81 * widest**2 * (widest - 1), window_memory(camera))
-        )
+        strips += 8 * 2 * longest * 81 * widest**2 * (widest - 1)
+        return PROGRAM_MEMORY + images + max(strips, window_memory(camera))
     normal_matrix = 12 * 3 * (2 * widest + 1) ** 2 * camera.unknowns  # K, stored
     edges = 2 * 8 * 2 * longest * widest * (40 + 10 * widest) ** 2
     return PROGRAM_MEMORY + images + entries + strips + normal_matrix + edges

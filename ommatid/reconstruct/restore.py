@@ -21,12 +21,13 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .assumptions import Assumptions, assumptions_for, with_fallback
+from .detail.detail_method import DetailMethod
 from .detail.detailed_model import DetailedModel
 from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
-from .methods.method import EstimationTask, Execution, MethodResult, is_uniform, total_variance
+from .methods.method import EstimationTask, Execution, Method, MethodResult, is_uniform, total_variance
 from .methods.prepared import Prepared
 from .misalignment.robust_noise import CAUSE
 from .noise import Noise, UsablePixels, uniform
@@ -239,7 +240,7 @@ def _restored(
 ) -> Reconstruction:
     start, shape = perf_counter(), stack.camera.shape
     assumed = assumptions_for(stack, model, choice, execution)
-    result, task = assumed.result(truth_for(choice, truth, stack.camera)), assumed.method.task
+    result, task = assumed.result(truth_for(assumed.method, truth, stack.camera)), assumed.method.task
     truth = None if truth is None else _image(truth, stack.camera)
     error = None if truth is None else measure_error(result.image, truth, shape)
     spurious = _spurious_information(task, result.expected)
@@ -264,9 +265,9 @@ def _restored(
     )
 
 
-def truth_for(choice: MethodChoice, truth: FloatArray | None, camera: Camera) -> FloatArray | None:
+def truth_for(method: Method, truth: FloatArray | None, camera: Camera) -> FloatArray | None:
     """Return what a method compares its estimate with: the world where it takes detail into account, else f."""
-    knows_world = choice.method == "detail" or (choice.method == "frame" and camera.has_detail)
+    knows_world = isinstance(method, DetailMethod) or method.task.finer > 1
     return truth if truth is None or knows_world else _image(truth, camera)
 
 

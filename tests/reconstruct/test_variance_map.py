@@ -95,7 +95,9 @@ def test_a_small_frame_is_the_dense_answer(correlated: bool) -> None:
     """All parts of Eq. 5, of kernels that vary over the field and of actual noise that differs by lens type."""
     observation, ratios = over_the_field((21, 18)), (1.0, 0.5, 3.0)
     spectrum = 1e4 / (1 + np.add.outer(np.arange(21), np.arange(18)) ** 2.0)
-    system = sliding_camera(observation, (30.0, 20.0, 10.0), 1 / spectrum if correlated else 1 / P0)
+    system = sliding_camera(
+        observation, diffracting((21, 18)).types, (30.0, 20.0, 10.0), 1 / spectrum if correlated else 1 / P0
+    )
     matrices = [part.to_sparse().toarray() for part in observation.parts]
     waves = np.kron(*(fft.dct(np.eye(size), norm="ortho", axis=0) for size in (21, 18)))
     prior = waves.T @ np.diag(1 / spectrum.ravel()) @ waves if correlated else np.eye(378) / P0
@@ -112,7 +114,7 @@ def test_kernels_that_vary_over_the_field() -> None:
     """To 0.5 % of a deviation where the light varies by a quarter, at corners, edges and elsewhere: exact solutions."""
     shape = 83, 90
     observation = over_the_field(shape)
-    system = sliding_camera(observation, (100.0,) * 3, 1 / P0)
+    system = sliding_camera(observation, diffracting(shape).types, (100.0,) * 3, 1 / P0)
     frames = SmallFrames(system, lambda _: 1 / P0, (1.0,) * 3, far=False)
     variance = (frames.relative(1.0) * frames.interior(1.0))[0]
     exact = FrameSystem(observation, np.full(observation.measurements, 100.0), 1 / P0)

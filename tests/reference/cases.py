@@ -62,16 +62,21 @@ def scene(
     *,
     aperture: str = "",
     target: str = 'image = "photo:camera"\norigin = [16, 24]',
+    camera: str = 'pixel_pitch = "6 um"\nlens_pitch = "2 mm"',
+    optics: str = "",
 ) -> str:
-    """Text of a scene file with these magnifications and arrays; tables : those that follow the lens types."""
+    """Text of a scene file with these magnifications and arrays.
+
+    tables : those that follow the lens types;  optics : further keys and tables of every lens type
+    """
     types = "".join(
         f'\n[[camera.lens]]\nname = "{"I" * number}"\nmagnification = "{magnification}"\narray = {list(array)}\n'
-        'pixels = "fit"\n' + (f'aperture = "{aperture}"\n' if aperture else "")
+        'pixels = "fit"\n' + (f'aperture = "{aperture}"\n' if aperture else "") + optics
         for number, (magnification, array) in enumerate(lenses, 1)
     )
     return (
         f'[target]\n{target}\nshape = {list(shape)}\npixel_pitch = "1 mm"\ndistance = "1 m"\n\n'
-        f'[camera]\npixel_pitch = "6 um"\nlens_pitch = "2 mm"\n{types}\n{tables}'
+        f"[camera]\n{camera}\n{types}\n{tables}"
     )
 
 

@@ -271,9 +271,9 @@ class ErrorMap:
     @cached_property
     def _sliding(self) -> SlidingCamera:
         """The shift-invariant camera like this one, with the mean weight of each lens type."""
-        slices = self.task.model.camera.type_slices()
+        model, slices = self.task.model, self.task.model.camera.type_slices()
         means = tuple(float(self.system.weights[part].mean()) for part in slices)
-        return sliding_camera(self.task.model.alike, means, self.system.prior)
+        return sliding_camera(model.alike, model.camera.types, means, self.system.prior)
 
     @cached_property
     def as_expected(self) -> bool:

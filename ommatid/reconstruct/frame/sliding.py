@@ -20,7 +20,6 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.observation import Observation
-from ommatid.scenes.optics.boxes import Box
 
 
 @dataclass(frozen=True)
@@ -154,22 +153,19 @@ def is_sliding(observation: Observation, types: tuple[LensType, ...]) -> bool:
     return len(observation.parts) == len(types) and all(lens_type.is_sliding for lens_type in types)
 
 
-def sliding_camera(observation: Observation, weights: tuple[float, ...], prior: float | FloatArray) -> SlidingCamera:
-    """Return the shift-invariant camera of an H by boxes and kernels. Raises ValueError for another H."""
+def sliding_camera(
+    observation: Observation, lens_types: tuple[LensType, ...], weights: tuple[float, ...], prior: float | FloatArray
+) -> SlidingCamera:
+    """Return the shift-invariant camera that an H is like: lens types without kernels average over boxes."""
+    kernels = {part.places.lens_type: part for part in observation.parts if isinstance(part, KernelFootprints)}
     types: list[SlidingType] = []
-    for part in observation.parts:
-        if isinstance(part, Box) and part.lens_type.is_sliding:
-            lens_type, ratio = part.lens_type, int(part.lens_type.ratio)
-            spans = zip(lens_type.origin, lens_type.span, observation.shape, strict=True)
-            axes = [BoxMeans(ratio, int(first), int(first + span), size) for first, span, size in spans]
-            types.append(SlidingType(axes[0], axes[1]))
-        elif isinstance(part, KernelFootprints) and part.places.lens_type.is_sliding:
-            wide = part.places.width
-            axes = [
-                BoxMeans(wide, int(start.min()), int(start.max()) + wide, size)
-                for start, size in zip(part.places.starts, observation.shape, strict=True)
-            ]
-            types.append(SlidingType(axes[0], axes[1], part))
-        else:
-            raise ValueError("expected a lens type of m x m sub-imagers with step 1 and magnification 1/m")
+    for lens_type in lens_types:
+        part = kernels.get(lens_type)
+        beside = 0 if part is None else part.places.margin
+        spans = zip(lens_type.origin, lens_type.span, observation.shape, strict=True)
+        axes = [
+            BoxMeans(int(lens_type.ratio) + 2 * beside, int(first) - beside, int(first + span) + beside, size)
+            for first, span, size in spans
+        ]
+        types.append(SlidingType(axes[0], axes[1], part))
     return SlidingCamera(tuple(types), weights, prior)

@@ -44,7 +44,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/frames.md", "Error bars"): "experiments against exact solutions, which no command prints",
     ("docs/frames.md", "Tiles"): "experiments against exact solutions, which no command prints",
     ("docs/calibration.md", "H by few numbers"): "experiments against the true H, which no command prints",
-    ("docs/calibration.md", "Learnt kernels"): "`python -m tests.benchmarks.learnt_kernels`, twenty seeds",
+    ("docs/calibration.md", "Learnt kernels"): "an experiment against the closed form, twenty seeds",
     ("docs/choose-a-camera.md", "Describe the sensor and one lens"): "lengths of the example",
     ("docs/choose-a-camera.md", "What diffraction allows"): "lengths of the example",
     ("docs/diffraction.md", "One wavefront"): "constants of the text",

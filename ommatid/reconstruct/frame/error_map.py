@@ -30,8 +30,6 @@ from ..methods.method import EstimationTask, is_uniform
 from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, leaves_null_space
 from .sliding import SlidingCamera, is_sliding, sliding_camera
 from .variance_map import (
-    LARGEST_GAP,
-    NearlyEven,
     SmallFrames,
     VarianceMap,
     interior_variance,
@@ -330,22 +328,12 @@ class ErrorMap:
             pixels = pixel_numbers(model.camera.shape, rows, columns)
             return stored_stencil(self._by_pixel, weights, prior, pixels, reach)
 
-        even, known = None, None
+        even = None
         if self._is_sliding and reach >= max(widths) - 1:
             means = tuple(float(weights[part].mean()) for part in model.camera.type_slices())
             system = replace(self._sliding, weights=means, prior=prior)
             even = EvenNoise(even_couplings(widths, means, prior, reach), interior_variance(system))
-            if self._needs_window is not None:
-                known = NearlyEven(model.camera, system).variances(weights)
-                known[self._needs_window] = np.nan
-        return frame_variances(source, model.camera.shape, halo, even, known)
-
-    @cached_property
-    def _needs_window(self) -> NDArray[np.bool_] | None:
-        """Pixels whose noise is too uneven for a correction of the even map, (rows, columns); None: all."""
-        if not (self.task.model.is_exact and self.task.complete and self.as_expected):
-            return None
-        return NearlyEven(self.task.model.camera, self._sliding).gap(self.system.weights) > LARGEST_GAP
+        return frame_variances(source, model.camera.shape, halo, even)
 
     @cached_property
     def _by_pixel(self) -> sparse.csc_array:

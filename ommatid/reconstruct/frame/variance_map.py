@@ -1,21 +1,9 @@
-"""Posterior variance of every pixel of a frame without its covariance, of even noise and of nearly even noise.
+"""Posterior variance of every pixel of a frame without its covariance, of even noise.
 
 The interior follows from the transfer function, the border from strips along the edges, of whose inverses only the
 diagonal is computed. In a shift-invariant camera a pixel far from the edges has the mean of 1 / spectrum as its
 variance; near an edge, pixels deeper than some boxes have no effect. If the lens types leave no null space, both are
 accurate to 1e-3 or better; otherwise errors are correlated over any distance and the map is approximate.
-
-Where noise is nearly even, the interior is corrected locally. Let C = K^-1 for the mean weight w of each lens type, let
-(1 + d_i) w be the weight of measurement i, and
-
-    p_ij = w (C h_i)_j^2 / C_jj
-
-its share in the variance of pixel j. Far from the edges shares do not depend on the place, and add up to 1 less what
-the prior brings. The diagonal of K^-1 is convex in the weights, and weights other than the best do no better, so that
-
-    1 - sum of p d  <=  variance / C_jj  <=  1 - sum of p d / (1 + d).
-
-The value 1 / (1 + sum of p d) lies between these, whose distance is the sum of p d^2 / (1 + d).
 """
 
 from __future__ import annotations
@@ -31,12 +19,11 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.processors import one_thread, processors
-from ommatid.scenes.camera import Camera
+from ommatid.runtime.processors import one_thread
 
 from ..forms.cholesky import factorise_positive
 from .sliding import SlidingCamera, SlidingType
-from .window_variances import box_image, inverse_diagonal
+from .window_variances import inverse_diagonal
 
 FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
 DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
@@ -44,11 +31,8 @@ STEP = 1e-4  # relative step of a finite difference, and the largest relative er
 SIDE = 40  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
 LONG, SHORT = 60, 44  # of those from which the effect of the length follows
 LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one is at least
-GRID = 128  # pixels of the frame without edges on which shares and the effect of kernels are computed
+GRID = 128  # pixels of the frame without edges on which the effect of kernels is computed
 PLACES = 5  # along each axis, of whose kernels the effect is computed
-REACH = 32  # pixels beyond which a measurement has no share
-SLAB = 480  # rows that are transformed together
-LARGEST_GAP = 1e-3  # between the two bounds of a variance, relative
 
 
 @dataclass(frozen=True)
@@ -359,68 +343,3 @@ def _small_index(size: int, side: int) -> NDArray[np.intp]:
     """Index, on an axis of `side` pixels, of each of `size`: equally far from the nearer edge, or in the middle."""
     index = np.arange(size)
     return index if side >= size else np.where(index < side // 2, index, np.maximum(side - (size - index), side // 2))
-
-
-@dataclass(frozen=True)
-class NearlyEven:
-    """The interior of a frame whose lens types are shift-invariant, with mean weights as `system` has them."""
-
-    camera: Camera
-    system: SlidingCamera
-
-    def variances(self, weights: FloatArray) -> FloatArray:
-        """Return the variances for weights, (M,), near the means: (rows, columns)."""
-        variance = interior_variance(self.system)
-        return np.asarray(variance / (1 + self._average(weights, lambda excess: excess)))
-
-    def gap(self, weights: FloatArray) -> FloatArray:
-        """Return the distance between the bounds of each variance, relative: (rows, columns)."""
-        return self._average(weights, lambda excess: np.square(excess) / np.maximum(1 + excess, np.finfo(float).tiny))
-
-    def _average(self, weights: FloatArray, law: Callable[[FloatArray], FloatArray]) -> FloatArray:
-        """Return the sum over all measurements of p times `law` of d, for every pixel: (rows, columns)."""
-        rows, columns = self.camera.shape
-        images: list[FloatArray] = []
-        for lens_type, part, mean in zip(
-            self.camera.types, self.camera.type_slices(), self.system.weights, strict=True
-        ):
-            boxes = law(box_image(lens_type, weights[part]) / mean - 1)
-            placed = np.zeros((rows + 2 * REACH, columns + 2 * REACH))
-            top, left = (int(first) + REACH for first in lens_type.origin)
-            placed[top : top + boxes.shape[0], left : left + boxes.shape[1]] = boxes
-            images.append(placed)
-        return self._convolved(images)
-
-    def _convolved(self, images: list[FloatArray]) -> FloatArray:
-        """Return the sum of the convolutions of padded images with their shares, by slabs of rows."""
-        rows, columns = self.camera.shape
-        high = min(SLAB, rows) + 2 * REACH
-        shape = fft.next_fast_len(high, real=True), fft.next_fast_len(columns + 2 * REACH, real=True)
-        kernels = [fft.rfft2(np.asarray(share), s=shape) for share in self._shares()]
-        result = np.empty((rows, columns))
-        for top in range(0, rows, SLAB):
-            total = np.zeros((shape[0], shape[1] // 2 + 1), dtype=np.complex128)
-            for image, kernel in zip(images, kernels, strict=True):
-                total += np.asarray(fft.rfft2(image[top : top + high], s=shape, workers=processors())) * kernel
-            sums = np.asarray(fft.irfft2(total, s=shape, workers=processors(), overwrite_x=True))
-            part = result[top : top + SLAB]
-            part[:] = sums[2 * REACH : 2 * REACH + part.shape[0], 2 * REACH : 2 * REACH + columns]
-        return result
-
-    def _shares(self) -> list[FloatArray]:
-        """Return p of each type by the distance of the pixel from the first one of the box, from -REACH to REACH."""
-        boxes: list[FloatArray] = []
-        for each in self.system.types:
-            axes = [np.repeat([1 / means.width, 0.0], [means.width, GRID - means.width]) for means in each.axes]
-            boxes.append(np.outer(*axes))
-        transfer = [np.asarray(fft.fft2(box)) for box in boxes]
-        spectrum = float(np.asarray(self.system.prior)) + sum(
-            weight * np.square(np.abs(each)) for weight, each in zip(self.system.weights, transfer, strict=True)
-        )
-        variance = float(np.mean(1 / spectrum))
-        near = np.arange(-REACH, REACH + 1)
-        responses = [np.asarray(fft.ifft2(each / spectrum)).real[np.ix_(near, near)] for each in transfer]
-        return [
-            weight * np.square(response) / variance
-            for weight, response in zip(self.system.weights, responses, strict=True)
-        ]

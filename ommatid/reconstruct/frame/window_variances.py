@@ -276,36 +276,23 @@ class EvenNoise:
     variance: float
 
 
-def frame_variances(
-    source: Source, shape: tuple[int, int], halo: int, even: EvenNoise | None = None, known: FloatArray | None = None
-) -> FloatArray:
+def frame_variances(source: Source, shape: tuple[int, int], halo: int, even: EvenNoise | None = None) -> FloatArray:
     """Return the diagonal of K^-1 for the pixels of a frame: (rows, columns).
 
     source : K of any window;  halo : pixels around the core of a window
     even : of similar noise, to correct what the halo leaves out; None where that is nothing
-    known : variances far from the edges that need no window, (rows, columns), NaN where they do
     Windows are computed in parallel, each by one thread.
     """
     margin = halo + BESIDE
     with one_thread():
         if min(shape) <= 2 * (margin + halo):
             return _strip_variances(source, slice(0, shape[0]), slice(0, shape[1]))
-        variance, inner = np.zeros(shape), (slice(margin, -margin), slice(margin, -margin))
-        variance[inner] = np.nan if known is None else known[inner]
+        variance = np.zeros(shape)
         size = min(LENGTH, shape[0] - 2 * margin), min(CORE, shape[1] - 2 * margin)
-        correction = None
+        correction = 1.0 if even is None else _correction(even, size, halo)
+        lefts = _starts(margin, shape[1] - margin, size[1])
         with ThreadPoolExecutor(processors()) as threads:
             for top in _starts(margin, shape[0] - margin, size[0]):
-                unknown = np.isnan(variance[top : top + size[0]])
-                lefts = [
-                    left
-                    for left in _starts(margin, shape[1] - margin, size[1])
-                    if unknown[:, left : left + size[1]].any()
-                ]
-                if not lefts:
-                    continue
-                if correction is None:
-                    correction = 1.0 if even is None else _correction(even, size, halo)
                 slab = source(slice(top - halo, top + size[0] + halo), slice(0, shape[1]))
                 windows = [slab.columns(slice(left - halo, left + size[1] + halo)) for left in lefts]
                 for left, part in zip(lefts, threads.map(stencil_variances, windows), strict=True):

@@ -177,8 +177,9 @@ def _assumptions(
         return METHODS[choice.method](observation.task(observation.expected_noise(noise), shared), execution)
 
     def preliminary(observation: ObservedStack, noise: Noise) -> Method:
-        """Return a method for a first image, by the variances of detail alone where its covariance is known."""
-        if choice.method != "detail":
+        """Return a method for a first image, by the variances of detail alone where H on f's grid has entries."""
+        entries = isinstance(observation.model, DetailedModel) and observation.model.coarse is None
+        if not entries or choice.method not in ("detail", "frame"):
             return method_with(observation, noise)
         expected = observation.expected_noise(noise) + observation.detail_variance
         return METHODS["dense"](observation.task(expected), execution)

@@ -12,6 +12,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from math import gcd
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -91,6 +92,11 @@ class ObservationPart(ABC):
     @abstractmethod
     def reach(self) -> int:
         """Largest number of rows or of columns of f that a measurement spans."""
+
+    @property
+    def spacing(self) -> int:
+        """Pixels of f between neighbouring readings along an axis, a common factor of which divides the padded grid."""
+        return 1
 
     @abstractmethod
     def forward(self, seen: Seen, out: FloatArray) -> None:
@@ -262,8 +268,7 @@ class Observation:
 
     @cached_property
     def _padded(self) -> tuple[int, int]:
-        rows, columns = (fft.next_fast_len(size + self.reach, real=True) for size in self.shape)
-        return rows, columns
+        return padded_shape(self.shape, self.reach, gcd(*(part.spacing for part in self.parts)))
 
     def forward(self, image: FloatArray) -> FloatArray:
         """Return H f: (N,) or (rows, columns) to (M,)."""
@@ -319,6 +324,12 @@ class Observation:
 def repetition(size: int, detail: int) -> sparse.csr_array:
     """Return the matrix that repeats each of `size` pixels of an axis `detail` times: (detail size, size)."""
     return sparse.csr_array(sparse.kron(sparse.eye_array(size), np.ones((detail, 1)), format="csr"))
+
+
+def padded_shape(shape: tuple[int, int], reach: int, spacing: int) -> tuple[int, int]:
+    """Return rows and columns of a grid with fast transforms that is larger by `reach`: multiples of `spacing`."""
+    rows, columns = (spacing * fft.next_fast_len(-(-(size + reach) // spacing), real=True) for size in shape)
+    return rows, columns
 
 
 def on_lines(rows: sparse.csr_array, columns: sparse.csr_array, image: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import gcd
 from typing import Any, cast
 
 import numpy as np
@@ -28,7 +29,7 @@ from ommatid.runtime.processors import processors
 
 from ..camera import Camera
 from ..lens_type import LensType
-from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density, on_lines
+from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density, on_lines, padded_shape
 from .kernel_shapes import KernelShapes, Numbers
 
 VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
@@ -190,30 +191,53 @@ class KernelFootprints(ObservationPart):
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements of the type,)."""
         lines, (rows, columns) = self.places.lens_type.by_lines(readings), self._gather(back.padded)
-        for transfer, weight in zip(self._transfers_on(back.padded), self._weights(self.coefficients), strict=True):
+        transfers, count, length = self._transfers_on(back.padded), rows.shape[1], columns.shape[1]
+        frequencies: IntArray = np.arange(back.padded[1] // 2 + 1)
+        for transfer, weight in zip(transfers, self._weights(self.coefficients), strict=True):
             placed = on_lines(sparse.csr_array(rows.T), sparse.csr_array(columns.T), lines * weight)
-            spectrum = np.asarray(fft.rfft2(placed, back.padded, workers=processors(), overwrite_x=True))
-            spectrum *= np.conj(transfer)
-            back.add_spectrum(spectrum)
+            # Zeros between readings repeat the spectrum.
+            across = _coefficients(np.asarray(fft.rfft(placed, workers=processors())), length, frequencies)
+            spectrum = np.asarray(fft.fft(across, axis=0, workers=processors(), overwrite_x=True))
+            back.add_spectrum(
+                (np.conj(transfer.reshape(-1, count, frequencies.size)) * spectrum).reshape(transfer.shape)
+            )
 
     def _correlated(self, seen: Seen, transfers: ComplexArray) -> Iterator[FloatArray]:
         """Yield what each kernel with these transfer functions reads: (sensor rows, sensor columns)."""
         rows, columns = self._gather(seen.padded)
+        count, length, every = rows.shape[1], columns.shape[1], seen.padded[1] // columns.shape[1]
+        spectrum = seen.spectrum.reshape(-1, count, seen.spectrum.shape[1])
+        aliases = np.arange(length // 2 + 1) + length * np.arange(every)[:, None]
         for transfer in transfers:
-            product = seen.spectrum * transfer
-            every = cast(FloatArray, fft.irfft2(product, seen.padded, workers=processors(), overwrite_x=True))
-            yield on_lines(rows, columns, every)
+            # Of every so many pixels, the spectrum is the sum of its aliases.
+            product: ComplexArray = np.einsum("aij,aij->ij", spectrum, transfer.reshape(spectrum.shape))
+            down = np.asarray(fft.ifft(product, axis=0, workers=processors(), overwrite_x=True))
+            across = _coefficients(down, seen.padded[1], aliases).sum(axis=1)
+            readings = cast(FloatArray, fft.irfft(across, length, workers=processors(), overwrite_x=True))
+            yield on_lines(rows, columns, readings) / (len(spectrum) * every)
 
     def _transfers_on(self, padded: tuple[int, int]) -> ComplexArray:
         """Return the transfer function of each kernel on a padded grid: (S, rows, columns / 2 + 1)."""
         if padded not in self._transfers:
             self._transfers.clear()  # those of another grid are of no use any more
-            self._transfers[padded] = _transfers(self.shapes.kernels, padded)
+            self._transfers[padded] = self._transfers_of(self.shapes.kernels, padded)
         return self._transfers[padded]
 
+    def _transfers_of(self, kernels: FloatArray, padded: tuple[int, int]) -> ComplexArray:
+        """Return the conjugate transforms of kernels, which correlate an image with them."""
+        before = [(int(start[0]) % gcd(self.spacing, *padded), 0) for start in self.places.starts]
+        return np.conj(np.asarray(fft.rfft2(np.pad(kernels, [(0, 0), *before]), padded, workers=processors())))
+
+    @property
+    def spacing(self) -> int:
+        """Pixels of f between neighbouring readings along an axis."""
+        return gcd(*(int(start) for axis in self.places.starts for start in axis - axis[0])) or 1
+
     def _gather(self, padded: tuple[int, int]) -> tuple[sparse.csr_array, sparse.csr_array]:
-        """Return the matrices that take the sensor rows and the sensor columns out of a padded grid."""
-        rows, columns = (_chosen(start % size, size) for start, size in zip(self.places.starts, padded, strict=True))
+        """Return the matrices that take the sensor rows and the sensor columns out of every `spacing`-th pixel."""
+        every = gcd(self.spacing, *padded)
+        sizes = padded[0] // every, padded[1] // every
+        rows, columns = (_chosen(start // every % n, n) for start, n in zip(self.places.starts, sizes, strict=True))
         return rows, columns
 
     def _weights(self, coefficients: FloatArray) -> list[FloatArray | float]:
@@ -358,11 +382,11 @@ class KernelFootprints(ObservationPart):
 
     def error_directions(self, image: FloatArray) -> sparse.csc_array:
         """Return L, (measurements of the type, q): the error of H f is L xi, with independent xi of variance 1."""
-        rows, columns = (fft.next_fast_len(size + self.places.width, real=True) for size in self.shape)
-        seen = Seen(np.asarray(image, dtype=np.float64).reshape(self.shape), (rows, columns))
+        grid = padded_shape(self.shape, self.reach, self.spacing)
+        seen = Seen(np.asarray(image, dtype=np.float64).reshape(self.shape), grid)
         lines = np.zeros((len(self.error_coefficients), *(start.size for start in self.places.starts)))
         shares = [self._weights(coefficients) for coefficients in self.error_coefficients]
-        transfers = _transfers(self.shapes.error_kernels, seen.padded)
+        transfers = self._transfers_of(self.shapes.error_kernels, grid)
         for number, every in enumerate(self._correlated(seen, transfers)):
             for read, weights in zip(lines, shares, strict=True):
                 read += weights[number] * every
@@ -386,9 +410,11 @@ class KernelFootprints(ObservationPart):
         }
 
 
-def _transfers(kernels: FloatArray, padded: tuple[int, int]) -> ComplexArray:
-    """Return the conjugate transforms of kernels, which correlate an image with them."""
-    return np.conj(np.asarray(fft.rfft2(kernels, padded, workers=processors())))
+def _coefficients(half: ComplexArray, size: int, frequencies: IntArray) -> ComplexArray:
+    """Return coefficients of real lines of this size from those of rfft, (lines, size / 2 + 1)."""
+    mirrored = frequencies % size > size // 2
+    found = half[:, np.where(mirrored, -frequencies, frequencies) % size]
+    return np.where(mirrored, np.conj(found), found)
 
 
 def _near(starts: IntArray, wide: int, part: slice) -> tuple[IntArray, FloatArray]:

@@ -35,23 +35,35 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "corridor": DEEP,
     "distorted": (TRANSPORT,),
     "doublet": SAMPLES,
+    "doublet119": (),
+    "machine_vision": (),
     "misaligned": TILE,
     "photo": ("target.shape=[47, 47]", "estimator.method=tiles", TRANSPORT),
     "planoconvex": ("render.samples=8192", "calibration.samples=16384", "noise.variance=1e-2"),
     "sensor": (*TILE, "calibration.samples=4096"),
+    "sensor119": (),
     "single": ("target.shape=[29, 29]", TRANSPORT),
     "still_life": DEEP,
     "tile19": (TRANSPORT,),
     "tile35": (TRANSPORT,),
     "tile41": (TRANSPORT,),
 }
+LARGE = ("doublet119", "machine_vision", "sensor119")
+CROP = ("target.origin=[96, 224]", "target.shape=[13, 13]", "calibration.method=ideal", "render.samples=64")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", gallery_names())
-def test_a_scene_of_the_gallery_has_the_verdict_that_it_states(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        *(pytest.param(name, VARIANTS[name], marks=pytest.mark.slow, id=name) for name in gallery_names()),
+        *(pytest.param(name, CROP, id=f"{name}, a crop") for name in gallery_names() if name in LARGE),
+    ],
+)
+def test_a_scene_of_the_gallery_has_the_verdict_that_it_states(
+    name: str, changes: tuple[str, ...], tmp_path: Path
+) -> None:
     needs("llvm_ad_mono")
-    described = read(Path(name), VARIANTS[name])
+    described = read(Path(name), changes)
     camera = derive(described)
     setup = Setup(described, camera)
     truth = load(described) if described.world is None else cached_truth(tmp_path / "truth.exr", setup)

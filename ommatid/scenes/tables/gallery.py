@@ -11,8 +11,8 @@ GALLERY = Path(__file__).parents[1]
 STARTER = "starter"
 # By name, so that a user's own scene in the same folder of a checkout is not one of them.
 NAMES = (
-    *("corridor", "distorted", "doublet", "misaligned", "photo", "planoconvex"),
-    *("sensor", "single", "still_life", "tile19", "tile35", "tile41"),
+    *("corridor", "distorted", "doublet", "doublet119", "machine_vision", "misaligned", "photo", "planoconvex"),
+    *("sensor", "sensor119", "single", "still_life", "tile19", "tile35", "tile41"),
 )
 
 

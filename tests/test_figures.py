@@ -45,6 +45,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/frames.md", "Tiles"): "experiments against exact solutions, which no command prints",
     ("docs/calibration.md", "H by few numbers"): "experiments against the true H, which no command prints",
     ("docs/calibration.md", "Learnt kernels"): "an experiment against the closed form, twenty seeds",
+    ("docs/camera.md", "The gallery"): "runs of the large scenes, minutes each",
     ("docs/choose-a-camera.md", "Describe the sensor and one lens"): "lengths of the example",
     ("docs/choose-a-camera.md", "What diffraction allows"): "lengths of the example",
     ("docs/diffraction.md", "One wavefront"): "constants of the text",

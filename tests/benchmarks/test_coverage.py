@@ -13,7 +13,7 @@ from ..examples import needs
 from .coverage import command
 from .coverage.cell import Cell
 from .coverage.cells import CELLS
-from .coverage.journal import append
+from .coverage.journal import append, results
 from .coverage.run import Failure, Run, measured_run
 from .coverage.statistics import COLUMNS, allowed_misses, statistics
 
@@ -78,6 +78,16 @@ def test_runs_differ_in_their_seeds_and_cells_do_too() -> None:
     assert len({tolerance.seed for tolerance in drawn if tolerance is not None}) == 5
 
 
+def test_an_image_of_the_prior_has_its_mean_and_variance() -> None:
+    cell = BY_NAME["photo-79-prior-896"]
+    scene = cell.described(0)
+    image = cell.drawn_image(scene, (79, 79), 0)
+    limit = float(stats.norm.isf(SIGNIFICANCE / 2))
+    assert abs(image.mean() - scene.prior.mean) < limit * (scene.prior.variance / image.size) ** 0.5
+    assert abs(image.var() / scene.prior.variance - 1) < limit * (2 / image.size) ** 0.5
+    assert not np.array_equal(image, cell.drawn_image(scene, (79, 79), 1))
+
+
 def test_misses_are_allowed_that_one_in_a_hundred_explains() -> None:
     """The probability of more, summed term by term, is below 0.2 %, and that of one less is not."""
     for runs, allowed in ((20, 2), (40, 3)):
@@ -105,6 +115,25 @@ def test_statistics_count_alarms_and_misses() -> None:
     assert (found.chi_squared.value, found.z.value) == (pytest.approx(1.1), pytest.approx(2.0))
     assert not found.holds
     assert len(found.row("a cell")) == len(COLUMNS)
+
+
+def test_a_journal_keeps_the_last_result_of_every_run_and_an_unfinished_line_costs_its_own(tmp_path: Path) -> None:
+    append(tmp_path, CELL, Failure(number=1, error="MachineError: no memory"))
+    append(tmp_path, CELL, run_of(0, 1.0))
+    append(tmp_path, CELL, run_of(1, 1.5))
+    assert results(tmp_path, CELL) == {0: run_of(0, 1.0), 1: run_of(1, 1.5)}
+    path = tmp_path / f"{CELL.name}.jsonl"
+    path.write_bytes(path.read_bytes()[:-40])
+    append(tmp_path, CELL, run_of(2, 0.7))
+    left = results(tmp_path, CELL)
+    assert (left[0], left[2]) == (run_of(0, 1.0), run_of(2, 0.7))
+    assert left.get(1) != run_of(1, 1.5)
+
+
+def test_results_of_another_definition_of_a_cell_do_not_count(tmp_path: Path) -> None:
+    append(tmp_path, CELL, run_of(0, 1.0))
+    other = Cell(CELL.name, CELL.scene, (*CELL.changes, "noise.variance=1e-3"), CELL.seconds)
+    assert results(tmp_path, other) == {}
 
 
 def test_a_second_start_runs_what_is_missing_or_failed(

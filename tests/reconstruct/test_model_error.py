@@ -217,16 +217,6 @@ def test_bands_of_frequency_add_up_to_the_image() -> None:
 def test_a_hidden_end_of_a_spectrum_follows_its_power_law() -> None:
     frequencies = np.geomspace(0.01, 1, 9)
     spectrum = frequencies**-2.5
-    known = (frequencies < 0.2).astype(float)
-    np.testing.assert_allclose(continued(frequencies, np.where(known > 0, spectrum, -1.0), known), spectrum, rtol=0.01)
-    assert not continued(frequencies, spectrum, np.zeros(9)).any()
-
-
-def test_a_spectrum_changes_smoothly_with_what_is_determined() -> None:
-    frequencies, rng = np.geomspace(0.01, 1, 9), np.random.default_rng(0)
-    spectrum = frequencies**-2.5 * np.exp(rng.normal(size=9))
-    before = continued(frequencies, spectrum, np.where(frequencies < 0.2, 1.0, 0.0))
-    for bin_ in range(9):
-        known = np.where(frequencies < 0.2, 1.0, 0.0)
-        known[bin_] = abs(known[bin_] - 1e-6)
-        np.testing.assert_allclose(continued(frequencies, spectrum, known), before, rtol=0.02)
+    known = frequencies < 0.2
+    np.testing.assert_allclose(continued(frequencies, np.where(known, spectrum, -1.0), known), spectrum, rtol=1e-9)
+    assert not continued(frequencies, spectrum, np.zeros(9, dtype=np.bool_)).any()

@@ -232,6 +232,31 @@ def save_tiff(path: Path, pixels: NDArray[Any], **options: Any) -> Path:
     return path
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": "zlib", "predictor": True},
+        {"compression": "zlib", "tile": (16, 16)},
+        {"rowsperstrip": 5},
+        {"bigtiff": True},
+        {"byteorder": ">"},
+        {"planarconfig": "separate", "photometric": "rgb"},
+        {"photometric": "rgb"},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("dtype", ["u1", "u2", "i2", "f4", "f8"])
+def test_every_layout_of_a_tiff_is_the_same_picture(options: dict[str, Any], dtype: str, tmp_path: Path) -> None:
+    if "predictor" in options and dtype[0] == "f":
+        options = {"compression": "zlib"}
+    colours = np.stack([LETTER, LETTER // 2, LETTER // 3], axis=-1).astype(dtype)
+    pixels = colours if "photometric" in options else colours[..., 0]
+    stored = np.moveaxis(pixels, -1, 0) if "planarconfig" in options else pixels
+    decoded = read_picture(save_tiff(tmp_path / "a.tif", stored, **options), "here").pixels
+    assert decoded.dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(decoded, pixels)
+
+
 @pytest.mark.parametrize("length", [2, 150])
 def test_a_circular_list_of_pages_ends(length: int, tmp_path: Path) -> None:
     """tifffile follows a circle of more than a hundred pages without end."""

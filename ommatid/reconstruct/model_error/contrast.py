@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft, ndimage
 
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.model import Model
 
@@ -24,10 +24,9 @@ from .attenuation import FIRST_ORDER, Attenuation
 
 BINS = 12  # of frequency
 FEWEST_WAVES = 8  # in a bin
-SIGNAL = 0.5  # excess over the noise, relative, at which a bin is determined by half
+SIGNAL = 0.5  # excess over the noise, relative, from which a bin is determined
 FAINT = 1e-12  # power relative to the largest, below which a bin is empty
-REACH = 2.5  # bins within which those that are determined fix the power law
-FLATTEST = 1e-3  # part of the squared spacing of bins, whose spread is needed for a slope
+FITTED = 5  # bins at the end of the determined range that fix the power law
 TRANSFER = (0.25, 1.2)  # range of T: beyond it, it is chance, or waves that no lens type shows
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of two placements of the uncertainty of H
 LEAST = 0.05  # of the residual's share of the noise
@@ -87,13 +86,11 @@ def _white_noise(task: EstimationTask, rng: np.random.Generator) -> list[FloatAr
     return [rng.normal(size=task.expected_noise.size) for _ in range(count)]
 
 
-def _excess(waves: Waves, deviation: FloatArray, noise: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return the power of an estimate beyond that of its noise, and how well it is determined, 0 to 1: (bins,) each."""
+def _excess(waves: Waves, deviation: FloatArray, noise: tuple[FloatArray, ...]) -> tuple[FloatArray, BoolArray]:
+    """Return the power of an estimate beyond that of its noise, (bins,), and the bins in which it is determined."""
     by_noise = np.mean([waves.power(image) for image in noise], axis=0)
     excess = waves.power(deviation) - by_noise
-    least = by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
-    certain = np.square(np.maximum(excess, 0.0))  # squared twice: steep, but a bin counts more or less, not on or off
-    return excess, certain**2 / np.maximum(certain**2 + least**4, np.finfo(np.float64).tiny)
+    return excess, excess > by_noise * np.maximum(SIGNAL, 4 / np.sqrt(waves.counts))
 
 
 def _placements(
@@ -162,21 +159,18 @@ def _transfer(
     return np.clip(np.divide(power, whole, out=np.ones_like(whole), where=whole > FAINT * whole.max()), *TRANSFER)
 
 
-def continued(frequencies: FloatArray, spectrum: FloatArray, determined: FloatArray) -> FloatArray:
-    """Return a spectrum, (bins,), that follows the power law of bins nearby as far as it is not `determined`, 0 to 1.
+def continued(frequencies: FloatArray, spectrum: FloatArray, determined: BoolArray) -> FloatArray:
+    """Return a spectrum, (bins,), whose bins that are not determined follow the power law of those next to them.
 
     The power law falls or is flat; without any determined bin the spectrum is 0.
     """
-    known = np.where(spectrum > 0, determined, 0.0)
-    x, y = np.log(frequencies), np.log(spectrum, out=np.zeros_like(spectrum), where=known > 0)
-    index = np.arange(known.size)
-    weights = known * np.exp(-np.abs(index[:, None] - index) / REACH)
-    weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    middle, level = weights @ x, weights @ y
-    spread = weights @ np.square(x) - np.square(middle) + FLATTEST * np.square(np.ptp(x) / max(known.size - 1, 1))
-    slope = np.minimum((weights @ (x * y) - middle * level) / np.maximum(spread, np.finfo(np.float64).tiny), 0.0)
-    law = np.exp(level + slope * (x - middle)) * min(1.0, float(known.sum()))
-    return known * np.maximum(spectrum, 0.0) + (1 - known) * law
+    index = np.flatnonzero(determined)[-FITTED:]
+    if not index.size:
+        return np.zeros_like(spectrum)
+    logarithms = np.log(frequencies[index]), np.log(spectrum[index])
+    slope = min(float(np.polyfit(*logarithms, 1)[0]), 0.0) if index.size > 1 else 0.0
+    middle = float(np.mean(logarithms[1]) - slope * np.mean(logarithms[0]))
+    return np.where(determined, spectrum, np.exp(middle + slope * np.log(frequencies)))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes import model_file
 from ommatid.scenes.formats import exr
 
@@ -16,6 +17,28 @@ from .conftest import Ended
 MADE = ("stack.exr", "model.npz", "estimate.exr", "estimate.png", "overview.png", "run.json", "report.html")
 FILES = {"scene.toml", "truth.exr", *MADE}
 FORBIDDEN = 77  # exit code of a process that imports what it should not
+
+
+def report_of(**fields: Any) -> RunReport:
+    """A report of one pixel with these fields; those that it must have besides are of no consequence."""
+    nothing = {"pixels_used": 1, "pixels_dead": 0, "pixels_saturated": 0, "degrees_of_freedom": 1.0, "resolution": 1.0}
+    form = {"way": "dense", "method": "information", "why": "", "unit": ""}
+    numbers = {"condition": 1.0, "bound": 0.0, "variance_bound": 0.0, "refinements": 0}
+    least: dict[str, Any] = {
+        "title": "",
+        "measurements": 1,
+        "unknowns": 1,
+        "stages": {},
+        "error": {"predicted_mse": 1.0, "budget": {}},
+        "solver": {**form, **numbers},
+        "diagnostics": {**nothing, "chi_squared": None},
+        "model": {"rms_difference_from_ideal": None, "max_z": None, "p_value": None, "spurious_information": 0.0},
+        "skipped": (),
+        "versions": {},
+        "seeds": {"scene": 0, "data": 0, "calibration": None},
+        "spent": {"seconds": 1.0, "stages": {}, "noise_alone": 1.0},
+    }
+    return RunReport.model_validate({**least, **fields})
 
 
 def without(*packages: str) -> str:

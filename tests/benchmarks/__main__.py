@@ -18,7 +18,7 @@ from rich.table import Table
 from .camera import camera_table
 from .cells import command as cells
 from .chain import command as chain
-from .coverage.command import command as coverage
+from .coverage import command as coverage
 from .frames import frames_table
 from .nasty import command as nasty
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import comb
 from pathlib import Path
 
@@ -9,13 +10,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ommatid.interface import target_image
+from ommatid.reconstruct.output.run_json import RUN, ResidualReport, RunReport
+
 from ..examples import needs
-from .coverage import command
-from .coverage.cell import Cell
-from .coverage.cells import CELLS
-from .coverage.journal import append, results
-from .coverage.run import Failure, Run, measured_run
-from .coverage.statistics import COLUMNS, allowed_misses, statistics
+from ..runs import report_of
+from . import coverage
+from .coverage import allowed_misses, holds, is_inside, is_red, mean, measured_run, ratios, results, row
+from .coverage_cells import CELLS, Cell
 
 BY_NAME = {cell.name: cell for cell in CELLS}
 QUICK = ("tile19-coarse-ideal", "tile19-coarse-transport-1024", "tile19-coarse-I-prior-ideal")
@@ -23,25 +25,16 @@ CELL = BY_NAME[QUICK[0]]
 SIGNIFICANCE = 1e-3
 
 
-def run_of(number: int, mse: float, trusted: bool = True) -> Run:
+def run_of(mse: float, trusted: bool = True) -> RunReport:
     """A run of expected error 1, whose interval is 0.5 to 2, and of chi-squared 110 where 100 +- 5 are expected."""
-    return Run(
-        number=number,
-        mse=mse,
-        promised=2.0,
-        budget={"noise": 2.0},
-        expected=1.0,
-        low=0.5,
-        high=2.0,
-        chi_squared=110.0,
-        chi_expected=100.0,
-        chi_deviation=5.0,
-        trusted=trusted,
-        reasons=() if trusted else ("a reason",),
-        method="dense",
-        samples=None,
-        seconds=1.0,
+    interval, chi = {"mse": 1.0, "low": 0.5, "high": 2.0}, {"chi_squared": 110.0, "expected": 100.0, "deviation": 5.0}
+    report = report_of(
+        fingerprint=CELL.definition,
+        verdict={"trusted": trusted, "reasons": () if trusted else ("a reason",)},
+        error={"mse": mse, "predicted_mse": 2.0, "budget": {}, "expected_given_truth": interval},
     )
+    residual = ResidualReport.model_validate(chi)
+    return report.with_changes(diagnostics=report.diagnostics.model_copy(update={"chi_squared": residual}))
 
 
 @pytest.mark.slow
@@ -49,25 +42,21 @@ def run_of(number: int, mse: float, trusted: bool = True) -> Run:
 def test_intervals_hold_their_share_of_errors(name: str) -> None:
     """Twenty seeds; the mean error agrees with its expectation within Student's t of their own scatter."""
     needs("llvm_ad_mono")
-    runs = [measured_run(BY_NAME[name], number) for number in range(20)]
-    assert [run for run in runs if isinstance(run, Failure)] == []
-    found = statistics(runs)
-    assert found.judged == 20
-    assert found.holds, f"{found.inside} of {found.judged} inside"
-    limit = float(stats.t.isf(SIGNIFICANCE / 2, found.runs - 1))
-    assert abs(found.against_expectation.value - 1) < limit * found.against_expectation.error
-    assert found.red == 0
+    reports = [measured_run(BY_NAME[name], number) for number in range(20)]
+    assert None not in map(is_inside, reports)
+    assert holds(reports)
+    ratio, error = mean(ratios(reports)[1])
+    assert abs(ratio - 1) < float(stats.t.isf(SIGNIFICANCE / 2, len(reports) - 1)) * error
+    assert not any(map(is_red, reports))
 
 
 @pytest.mark.slow
 def test_predictions_that_few_samples_make_too_small_are_not_trusted() -> None:
     """Rough images and 256 samples: Eq. 5 takes their contrast from estimates that have lost some of it."""
     needs("llvm_ad_mono")
-    runs = [measured_run(BY_NAME["tile19-prior-transport-256"], number) for number in range(6)]
-    succeeded = [run for run in runs if isinstance(run, Run)]
-    assert len(succeeded) == len(runs)
-    assert np.mean([run.mse / run.promised for run in succeeded]) > 1.2
-    assert not any(run.trusted for run in succeeded)
+    reports = [measured_run(BY_NAME["tile19-prior-transport-256"], number) for number in range(6)]
+    assert np.mean(ratios(reports)[0]) > 1.2
+    assert all(map(is_red, reports))
 
 
 def test_runs_differ_in_their_seeds_and_cells_do_too() -> None:
@@ -78,14 +67,14 @@ def test_runs_differ_in_their_seeds_and_cells_do_too() -> None:
     assert len({tolerance.seed for tolerance in drawn if tolerance is not None}) == 5
 
 
-def test_an_image_of_the_prior_has_its_mean_and_variance() -> None:
+def test_an_image_of_the_prior_has_its_mean_and_variance(tmp_path: Path) -> None:
     cell = BY_NAME["photo-79-prior-896"]
-    scene = cell.described(0)
-    image = cell.drawn_image(scene, (79, 79), 0)
+    scene = cell.prepared(0, tmp_path)
+    image = target_image(scene)
     limit = float(stats.norm.isf(SIGNIFICANCE / 2))
     assert abs(image.mean() - scene.prior.mean) < limit * (scene.prior.variance / image.size) ** 0.5
     assert abs(image.var() / scene.prior.variance - 1) < limit * (2 / image.size) ** 0.5
-    assert not np.array_equal(image, cell.drawn_image(scene, (79, 79), 1))
+    assert not np.array_equal(image, target_image(cell.prepared(1, tmp_path)))
 
 
 def test_misses_are_allowed_that_one_in_a_hundred_explains() -> None:
@@ -99,59 +88,47 @@ def test_misses_are_allowed_that_one_in_a_hundred_explains() -> None:
         assert allowed_misses(runs) == allowed
 
 
-def test_statistics_count_alarms_and_misses() -> None:
-    runs = [
-        run_of(0, 1.0),
-        run_of(1, 3.0, trusted=False),  # outside and red
-        run_of(2, 3.0),  # outside and trusted
-        run_of(3, 1.0, trusted=False),  # inside and red
-    ]
-    found = statistics([*runs, Failure(number=4, error="MachineError: the disk is full")])
-    assert (found.runs, found.failed, found.inside, found.judged) == (4, 1, 2, 4)
-    assert (found.red, found.false_alarms, found.silent_misses) == (2, 1, 1)
-    assert found.against_expectation.value == pytest.approx(2.0)
-    assert found.against_promise.value == pytest.approx(1.0)
-    assert found.against_promise.error == pytest.approx((1 / 3) ** 0.5 / 2)  # of 0.5, 1.5, 1.5, 0.5
-    assert (found.chi_squared.value, found.z.value) == (pytest.approx(1.1), pytest.approx(2.0))
-    assert not found.holds
-    assert len(found.row("a cell")) == len(COLUMNS)
+def test_rows_count_alarms_and_misses() -> None:
+    """Inside, outside and red, outside and trusted, inside and red."""
+    reports = [run_of(1.0), run_of(3.0, trusted=False), run_of(3.0), run_of(1.0, trusted=False)]
+    assert not holds(reports)
+    deviation = (1 / 3) ** 0.5 / 2  # of the mean of 0.5, 1.5, 1.5, 0.5
+    cells = row("a cell", reports)
+    assert cells == (
+        "a cell",
+        "4",
+        f"1.000 ± {deviation:.3f}",
+        f"2.000 ± {2 * deviation:.3f}",
+        "**2 of 4**",
+        "1.100 ± 0.000",
+        "+2.00",
+        "2",
+        "1",
+        "1",
+    )
+    assert len(cells) == len(coverage.COLUMNS)
 
 
-def test_a_journal_keeps_the_last_result_of_every_run_and_an_unfinished_line_costs_its_own(tmp_path: Path) -> None:
-    append(tmp_path, CELL, Failure(number=1, error="MachineError: no memory"))
-    append(tmp_path, CELL, run_of(0, 1.0))
-    append(tmp_path, CELL, run_of(1, 1.5))
-    assert results(tmp_path, CELL) == {0: run_of(0, 1.0), 1: run_of(1, 1.5)}
-    path = tmp_path / f"{CELL.name}.jsonl"
-    path.write_bytes(path.read_bytes()[:-40])
-    append(tmp_path, CELL, run_of(2, 0.7))
-    left = results(tmp_path, CELL)
-    assert (left[0], left[2]) == (run_of(0, 1.0), run_of(2, 0.7))
-    assert left.get(1) != run_of(1, 1.5)
-
-
-def test_results_of_another_definition_of_a_cell_do_not_count(tmp_path: Path) -> None:
-    append(tmp_path, CELL, run_of(0, 1.0))
-    other = Cell(CELL.name, CELL.scene, (*CELL.changes, "noise.variance=1e-3"), CELL.seconds)
-    assert results(tmp_path, other) == {}
-
-
-def test_a_second_start_runs_what_is_missing_or_failed(
+def test_a_second_start_runs_what_is_missing_failed_damaged_or_of_another_definition(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     started: list[int] = []
 
-    def recorded(_cell: Cell, number: int) -> Run | Failure:
+    def recorded(_cell: Cell, number: int) -> RunReport:
         started.append(number)
-        return run_of(number, 1.0)
+        if number == 2 and len(started) == 3:
+            raise MemoryError
+        return run_of(1.0)
 
-    monkeypatch.setattr(command, "measured_run", recorded)
-    append(tmp_path, CELL, run_of(1, 1.0))
-    append(tmp_path, CELL, Failure(number=2, error="MachineError: no memory"))
-    command.command(["-o", str(tmp_path), "--cells", CELL.name, "--seeds", "4"])
-    assert started == [0, 2, 3]
-    printed = capsys.readouterr().out
-    command.command(["-o", str(tmp_path), "--table"])
-    assert capsys.readouterr().out == printed
+    monkeypatch.setattr(coverage, "measured_run", recorded)
+    words = ["-o", str(tmp_path), "--cells", CELL.name, "--seeds", "4"]
+    coverage.command(words)
+    assert set(results(tmp_path, CELL)) == {0, 1, 3}
+    (tmp_path / CELL.name / "1" / RUN).write_text("{", encoding="utf-8")
+    coverage.command(words)
+    assert started == [0, 1, 2, 3, 1, 2]
+    printed = capsys.readouterr().out.rsplit("| cell", 1)[1]
+    coverage.command(["-o", str(tmp_path), "--table"])
+    assert capsys.readouterr().out.endswith(printed)
     assert f"| {CELL.name} | 4 | 0.500 ± 0.000 | 1.000 ± 0.000 | 4 of 4 |" in printed
-    assert started == [0, 2, 3]
+    assert results(tmp_path, replace(CELL, changes=(*CELL.changes, "noise.variance=1e-3"))) == {}

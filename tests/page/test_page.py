@@ -32,8 +32,6 @@ from ommatid.page.panels import error_groups, point_response, sensor, time_curve
 from ommatid.page.sections import page, page_of
 from ommatid.reconstruct.measured_error import best_single_sub_image
 from ommatid.reconstruct.output.run_json import (
-    DiagnosticsReport,
-    ErrorReport,
     MoreTime,
     RunReport,
     TimeReport,
@@ -49,6 +47,7 @@ from ommatid.simulate.ideal import ideal_matrix, matrix_as_designed
 
 from ..bench.tables import bench_table, cell, exactly
 from ..examples import familywise, scene
+from ..runs import report_of
 from .runs import F, letter_run, synthetic
 
 VOID = {"meta", "link", "img", "input", "br"}
@@ -476,14 +475,10 @@ def test_a_bench_serves_the_same_camera_in_the_folder_or_its_parent(run: data.Ru
 def described(**error: Any) -> RunReport:
     """A report with this error and the fields that the summary depends on; four times the samples divide it by 8."""
     budget = {"null_space": 0.0, "noise": 1.0, "quantisation": 0.0, "rendering": 3.0, "calibration": 0.0}
-    diagnostics: dict[str, Any] = {"pixels_used": 9, "pixels_dead": 0, "pixels_saturated": 0, "resolution": 1.0}
-    return RunReport.model_construct(
-        error=ErrorReport.model_validate({"predicted_mse": 4.0, "budget": budget, **error}),
-        diagnostics=DiagnosticsReport.model_construct(**diagnostics),
-        spent=TimeReport(
-            seconds=1.0, stages={}, noise_alone=1.0, more=(MoreTime(times=4, seconds=2.0, predicted_mse=1.375),)
-        ),
-        verdict=None,
+    more = MoreTime(times=4, seconds=2.0, predicted_mse=1.375)
+    return report_of(
+        error={"predicted_mse": 4.0, "budget": budget, **error},
+        spent={"seconds": 1.0, "stages": {}, "noise_alone": 1.0, "more": (more.model_dump(),)},
     )
 
 

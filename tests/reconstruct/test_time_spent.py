@@ -7,53 +7,20 @@ import pytest
 from ommatid.reconstruct.output.run_json import RunReport, StageReport, TimeReport
 from ommatid.reconstruct.output.time_spent import FILES, PAGE, time_spent, with_stage, without_page
 
+from ..runs import report_of
+
 BUDGET = {"null_space": 0.0, "noise": 1.0, "quantisation": 0.0, "rendering": 0.5, "calibration": 0.25, "detail": 0.0}
 
 
-def report_of(**spent: object) -> RunReport:
+def timed(**spent: object) -> RunReport:
+    """A report of 3.5 s in three stages, with these fields of its times."""
     stages = {
         "render": StageReport(seconds=2.0, samples=64, sampler="multijitter"),
         "calibrate": StageReport(seconds=1.0, method="points"),
         "reconstruct": StageReport(seconds=0.5),
     }
-    given = {"predicted_mse": 1.75, "budget": BUDGET}
-    report = RunReport.model_validate(
-        {
-            "title": "",
-            "measurements": 1,
-            "unknowns": 1,
-            "stages": {name: stage.plain() for name, stage in stages.items()},
-            "error": given,
-            "solver": {
-                "way": "dense",
-                "method": "information",
-                "why": "",
-                "condition": 1.0,
-                "digits": 15.0,
-                "bound": 0.0,
-                "unit": "",
-                "variance_bound": 0.0,
-                "refinements": 0,
-            },
-            "diagnostics": {
-                "pixels_used": 1,
-                "pixels_dead": 0,
-                "pixels_saturated": 0,
-                "degrees_of_freedom": 1.0,
-                "resolution": 1.0,
-                "chi_squared": None,
-            },
-            "model": {
-                "rms_difference_from_ideal": None,
-                "max_z": None,
-                "p_value": None,
-                "spurious_information": 0.0,
-            },
-            "skipped": [],
-            "versions": {},
-            "seeds": {"scene": 0, "data": 0, "calibration": 0},
-            "spent": {"seconds": 3.5, "stages": {}, "noise_alone": 1.0},
-        }
+    report = report_of(
+        stages={name: stage.plain() for name, stage in stages.items()}, error={"predicted_mse": 1.75, "budget": BUDGET}
     )
     times = time_spent(stages, report.error, calibrated=True)
     return report.with_changes(spent=TimeReport.model_validate({**times.plain(), **spent}))
@@ -61,7 +28,7 @@ def report_of(**spent: object) -> RunReport:
 
 def test_every_stage_counts_in_the_total_and_in_the_time_with_more_samples() -> None:
     """Twice the samples take twice the 3 s of the stages that take samples, and 0.5 + 0.25 + 0.75 s as before."""
-    report = with_stage(with_stage(report_of(start_up=0.3), FILES, 0.25), PAGE, 0.75)
+    report = with_stage(with_stage(timed(start_up=0.3), FILES, 0.25), PAGE, 0.75)
     assert report.spent.seconds == pytest.approx(4.5)
     assert report.spent.stages == {"render": 2.0, "calibrate": 1.0, "reconstruct": 0.5, "files": 0.25, "page": 0.75}
     assert report.spent.more[0].seconds == pytest.approx(2 * 3 + 1.5)
@@ -69,12 +36,12 @@ def test_every_stage_counts_in_the_total_and_in_the_time_with_more_samples() -> 
 
 
 def test_a_time_limit_keeps_the_time_of_all_its_trials() -> None:
-    report = with_stage(report_of(within=20.0, seconds=17.0, chosen={"render.samples": 64}), PAGE, 0.75)
+    report = with_stage(timed(within=20.0, seconds=17.0, chosen={"render.samples": 64}), PAGE, 0.75)
     assert (report.spent.within, report.spent.seconds, report.spent.chosen) == (20.0, 17.0, {"render.samples": 64})
 
 
 @pytest.mark.parametrize("spent", [{}, {"within": 20.0, "seconds": 17.0}], ids=["plain", "time limit"])
 def test_a_page_stays_up_to_date_whatever_time_it_took(spent: dict[str, float]) -> None:
-    report = with_stage(report_of(**spent), FILES, 0.25)
+    report = with_stage(timed(**spent), FILES, 0.25)
     assert without_page(with_stage(report, PAGE, 0.75)) == without_page(report)
     assert without_page(with_stage(report, FILES, 0.5)) != without_page(report)

@@ -1,4 +1,4 @@
-"""All cells of the coverage table, the cheapest and most informative first.
+"""The cells of the coverage table: scenes of the gallery with some changes, the cheapest and most informative first.
 
 They span the gallery, sizes from 19 to 479 pixels, ways to H, numbers of samples, samplers, one to three lens types,
 and bright, dark and flat crops. `transport` yields the H of `points`, sooner. A name states the scene, its size or
@@ -8,8 +8,103 @@ crop, the lens types where not all are used, and H with its number of samples.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
-from .cell import Cell
+import numpy as np
+
+from ommatid.interface import read_scene
+from ommatid.reconstruct.prior import prior_of
+from ommatid.runtime.files import fingerprint
+from ommatid.runtime.streams import Purpose, derived_seed
+from ommatid.scenes.camera import derive
+from ommatid.scenes.scene import Scene, with_tables
+
+SEEDS = 20
+DRAWN, MISALIGNED = "image drawn from the prior", "misalignment"  # purposes of seeds besides the scene's own
+# Samples of rendering and calibration of scenes that take as many as they need: cells compare fixed numbers.
+SAMPLES = {
+    "tile19": (4096, 4096),
+    "tile35": (1024, 1024),
+    "tile41": (1024, 1024),
+    "distorted": (4096, 4096),
+    "misaligned": (8192, 8192),
+    "sensor": (4096, 16384),
+    "single": (256, 256),
+    "corridor": (1024, 256),
+    "still_life": (1024, 256),
+}
+ENOUGH = 896  # samples of entries of H, where the scene takes as many as the noise justifies
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A scene of the gallery with changes, and how often it is run.
+
+    changes, lenses : as of the options --set and --lens
+    seconds : of one run on two cores, roughly
+    drawn : True if every run has another image, drawn from the scene's prior; False for the scene's picture
+    seeds : number of runs
+    """
+
+    name: str
+    scene: str
+    changes: tuple[str, ...]
+    seconds: float
+    lenses: tuple[str, ...] = ()
+    drawn: bool = False
+    seeds: int = SEEDS
+
+    @property
+    def base(self) -> tuple[str, ...]:
+        """Changes of the scene before those of the cell."""
+        if self.scene not in SAMPLES:
+            return ()
+        rendering, calibration = SAMPLES[self.scene]
+        return f"render.samples={rendering}", f"calibration.samples={calibration}"
+
+    @property
+    def definition(self) -> str:
+        """Fingerprint of what the results of a run depend on, besides the program; the same in every checkout."""
+        scene = read_scene(self.scene, (*self.base, *self.changes), self.lenses)
+        if scene.world is not None:
+            scene = with_tables(scene, world=scene.world.model_copy(update={"file": Path(scene.world.file).name}))
+        return fingerprint([scene.plain(), self.name, self.drawn])
+
+    @property
+    def has_few_samples(self) -> bool:
+        """True if H is calibrated with fewer samples than the scene of the gallery asks for."""
+        own, changed = (
+            read_scene(self.scene, changes).calibration for changes in (self.base, (*self.base, *self.changes))
+        )
+        if "ideal" in (own.method, changed.method):
+            return False
+        asked = ENOUGH if own.samples == "auto" else own.sample_count
+        return changed.samples != "auto" and changed.sample_count < asked
+
+    def described(self, number: int, *changes: str) -> Scene:
+        """Return the scene of run `number`, with a seed of its own for data, noise and calibration.
+
+        A camera with tolerances is another draw of them in every run, since the error bars count them as random.
+        """
+        seeds = [f"render.seed={derived_seed(0, Purpose.REPEAT, self.name, number)}"]
+        if read_scene(self.scene, self.changes).camera.tolerance is not None:
+            seed = derived_seed(0, Purpose.REPEAT, f"{MISALIGNED}, {self.name}", number)
+            seeds.append(f"camera.tolerance.seed={seed}")
+        return read_scene(self.scene, (*self.base, *self.changes, *seeds, *changes), self.lenses)
+
+    def prepared(self, number: int, folder: Path) -> Scene:
+        """Return the scene of run `number`, whose image is drawn from its prior where the cell says so."""
+        scene = self.described(number)
+        if not self.drawn:
+            return scene
+        path, shape = folder / "drawn.npy", derive(scene).shape
+        prior = prior_of(scene.prior, shape, scene.target.pixel_pitch)
+        rng = np.random.default_rng(derived_seed(0, Purpose.REPEAT, f"{DRAWN}, {self.name}", number))
+        image = prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
+        np.save(path, image.astype(np.float32).reshape(shape))
+        return self.described(number, f"target.image={path}", "target.origin=[0, 0]")
+
 
 IDEAL, POINTS = "calibration.method=ideal", "calibration.fit=none"  # points are the scene's method
 COARSE = "render.samples=256"  # so few that rendering is most of the noise

@@ -64,7 +64,8 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check $(add
 $(READY): pyproject.toml $(CONSTRAINTS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@# An environment that somebody made by hand keeps its Python: another one over it leaves a mixture.
+	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(INSTALL) --editable '.[dev]'
 	@# Python before 3.13 reads this file in the locale's encoding, which may not have all letters of the folder's name.
 	@echo ../../../.. >$$(echo $(VENV)/lib/python3*/site-packages)/_ommatid.pth

@@ -28,7 +28,7 @@ def report_of(**fields: Any) -> RunReport:
         "title": "",
         "measurements": 1,
         "unknowns": 1,
-        "stages": {},
+        "stages": {"render": {}, "calibrate": {}, "reconstruct": {}},
         "error": {"predicted_mse": 1.0, "budget": {}},
         "solver": {**form, **numbers},
         "diagnostics": {**nothing, "chi_squared": None},

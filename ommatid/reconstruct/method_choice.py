@@ -99,6 +99,9 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
         return ["frame"], "kernels of the lens types apply H"
     if estimator.method in ("tiles", "frame"):
         return [estimator.method], "asked for"
+    if not camera.has_sharp_footprints and camera.unknowns > MOST_DENSE:
+        reason = f"{camera.unknowns} pixels behind blurred lenses, whose footprints are wider than tiles"
+        return ["frame" if camera.is_sliding and not noiseless else "dense"], reason
     if camera.unknowns <= MOST_DENSE:
         return ["dense", "tiles"], f"{camera.unknowns} pixels are few"
     if noiseless:

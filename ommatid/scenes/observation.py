@@ -123,8 +123,11 @@ class ObservationPart(ABC):
         """Return H from a window of f to the measurements inside it."""
 
     def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
-        """Return H from a window of f to some measurements; those that see more than it are kernels' alone."""
+        """Return H from a window of f to some measurements; what they see beside it is left out."""
         inside = self.measurements_inside(rows, columns)
+        if not np.isin(numbers, inside).all():
+            pixels = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)[rows, columns].ravel()
+            return sparse.csr_array(self.to_sparse()[numbers][:, pixels])
         order = np.argsort(inside)
         return self.submatrix(rows, columns)[order[np.searchsorted(inside, numbers, sorter=order)]]
 

@@ -9,15 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
 from ommatid.reconstruct.methods.tile_solver import overlapping_tiles
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_model
 
+from ..examples import with_optics
 from ..frames import drawn, recorded, wide
 
 NOISE = 1e-2
@@ -63,6 +66,17 @@ def test_one_tile_is_the_dense_estimate() -> None:
     assert dense.interval is not None
     assert tiled.interval.mse == pytest.approx(dense.interval.mse)
     assert tiled.interval.low < dense.interval.low < dense.interval.high < tiled.interval.high  # conservative
+
+
+def test_tiles_into_which_no_measurement_fits_are_refused_and_never_chosen() -> None:
+    """They would be the prior's mean, whose error bars are right and of no use."""
+    task = task_of(wide((30, 28), tiles={"size": 4, "overlap": 0}), drawn((30, 28)))
+    with pytest.raises(InputError, match=r"see up to 5 pixels of f, tiles have 4; raise tiles.size above 5"):
+        TileMethod(task, Execution())
+    ways = (("1/3", [3, 3], "fit"), "frame"), (("2/7", [2, 2], "fit"), "dense")
+    for lens, method in ways:
+        blurred, camera = with_optics({"aperture": "0.4 mm"}, {"lens_pitch": "1 mm"}, (lens,), (65, 65))
+        assert choose_method(blurred, camera, exact=False).method == method
 
 
 def test_separate_factorisations_give_the_same_image() -> None:

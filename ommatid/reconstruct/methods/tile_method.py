@@ -17,6 +17,7 @@ from scipy import linalg, sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import digest
 from ommatid.runtime.processors import one_thread, processors
@@ -34,6 +35,7 @@ from ..output.run_json import SolverReport
 from ..verdict.residual_power import ResidualInputs, ResidualPower
 from .method import (
     EstimationTask,
+    Execution,
     Method,
     MethodResult,
     PosteriorOperators,
@@ -133,6 +135,16 @@ def iterative_operators(task: EstimationTask) -> PosteriorOperators:
 
 class TileMethod(Method):
     """Estimation tile by tile."""
+
+    def __init__(self, task: EstimationTask, execution: Execution) -> None:
+        """Raises InputError if no measurement fits into a tile, whose pixels would be the prior's mean."""
+        super().__init__(task, execution)
+        reach, size = task.model.windowed.reach, task.tiles.size
+        if reach > size:
+            raise InputError(
+                f"estimator.method 'tiles': measurements of this camera see up to {reach} pixels of f, tiles have"
+                f" {size}; raise tiles.size above {reach}, or set estimator.method to 'auto'"
+            )
 
     def estimate_image(self) -> FloatArray:
         """Compute f^ without its error: (N,)."""

@@ -11,7 +11,7 @@ from math import log10
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, computed_field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, computed_field, field_validator
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
@@ -401,6 +401,14 @@ class RunReport(Record):
     regions: tuple[RegionReport, ...] = ()
     depth: tuple[DepthBin, ...] = ()
     study: tuple[StudyCase, ...] = ()
+
+    @field_validator("stages")
+    @classmethod
+    def _complete(cls, stages: dict[str, StageReport]) -> dict[str, StageReport]:
+        missing = [name for name in ("render", "calibrate", "reconstruct") if name not in stages]
+        if missing:
+            raise ValueError(f"expected the stage {missing[0]}")
+        return stages
 
     def with_changes(self, **fields: object) -> RunReport:
         """Return a copy with some fields replaced."""

@@ -30,7 +30,7 @@ from ..sampling.samplers import fitting
 from .averages import Averages, has_averages
 from .draws import Grid
 from .plugins import black, depths, scene_of, stock_sensors, target_of
-from .variant import activate, check_fast_variant
+from .variant import activate, check_fast_variant, ignored_samples
 from .worlds.placement import MILLIMETRES_AT_ORIGIN
 
 if TYPE_CHECKING:
@@ -152,6 +152,7 @@ class Renderer:
         subset : pixels of the group; None: all of them
         block : one of `blocks`, on the fast backends; else, and if absent, all of them
         """
+        ignored_samples()  # those of an earlier scene are not this one's
         if self._generators:
             blocks = self.blocks(group, samples, subset) if block is None else [block]
             rays = (self._rays(group, samples, seed, block, subset) for block in blocks)

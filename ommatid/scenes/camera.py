@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import BoolArray, IntArray
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.memory import check_memory
 
@@ -185,6 +185,21 @@ class Camera:
             or (lens_type.optics.aperture is not None and defocused)
             for lens_type in self.types
         )
+
+    @cached_property
+    def middles(self) -> tuple[FloatArray, FloatArray]:
+        """Row and column of the middle of each measurement's footprint: (M,) each."""
+        places: list[FloatArray] = []
+        for lens_type in self.on_grids.types:
+            ratio, order = float(lens_type.ratio), (*lens_type.array, *lens_type.pixels)
+            axes = [
+                np.add.outer([float(start) for start in lens_type.starts(axis)], ratio * (np.arange(pixels) + 0.5))
+                for axis, pixels in enumerate(lens_type.pixels)
+            ]
+            down = np.broadcast_to(axes[0][:, None, :, None], order)
+            places.append(np.stack([down.ravel(), np.broadcast_to(axes[1][None, :, None, :], order).ravel()]))
+        row, column = np.concatenate(places, axis=1)
+        return row, column
 
     @cached_property
     def sub_imagers(self) -> tuple[SubImager, ...]:

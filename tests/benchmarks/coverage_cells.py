@@ -203,6 +203,10 @@ def _frames() -> Iterable[Cell]:
     yield Cell("photo-79-prior-896", "photo", (_size(79), *_samples(896)), 20, drawn=True)
     yield Cell("photo-119-I-ideal", "photo", (_size(119), IDEAL), 6, ("I",))
     yield Cell("photo-119-I+II-ideal", "photo", (_size(119), IDEAL), 12, ("I", "II"))
+    yield Cell("photo-119-0.4mm-ideal", "photo", (_size(119), *_apertures("0.4 mm"), IDEAL), 10)
+    misaligned = "camera.tolerance.position=41 nm"
+    yield Cell("photo-119-misaligned-896", "photo", (_size(119), misaligned, *_samples(896)), 24)
+    yield Cell("sensor119", "sensor119", (), 30)
     # A drawn image is rough, so its rendering is noisy: with few samples the null space would be hidden in that noise.
     framed = (_size(59), IDEAL, "estimator.method=frame", "render.samples=16384")
     yield Cell("photo-59-I+II-prior-frame", "photo", framed, 15, ("I", "II"), drawn=True)

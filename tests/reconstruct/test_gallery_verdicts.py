@@ -30,6 +30,7 @@ TILE = (
     "camera.lens.III.pixels=[4, 4]",
 )
 SAMPLES = ("render.samples=8192", "calibration.samples=8192")
+PERSON = ("target.origin=[96, 224]",)
 DEEP = ("target.shape=[29, 29]", "render.samples=256")
 VARIANTS: dict[str, tuple[str, ...]] = {
     "corridor": DEEP,
@@ -40,6 +41,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "misaligned": TILE,
     "photo": ("target.shape=[47, 47]", "estimator.method=tiles", TRANSPORT),
     "planoconvex": ("render.samples=8192", "calibration.samples=16384", "noise.variance=1e-2"),
+    "planoconvex119": (*PERSON, "target.shape=[35, 35]", "noise.variance=1e-3"),  # a first image of entries
     "sensor": (*TILE, "calibration.samples=4096"),
     "sensor119": (),
     "single": ("target.shape=[29, 29]", TRANSPORT),
@@ -48,8 +50,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "tile35": (TRANSPORT,),
     "tile41": (TRANSPORT,),
 }
-LARGE = ("doublet119", "machine_vision", "sensor119")
-CROP = ("target.origin=[96, 224]", "target.shape=[13, 13]", "calibration.method=ideal", "render.samples=64")
+LARGE = ("doublet119", "machine_vision", "planoconvex119", "sensor119")
+CROP = (*PERSON, "target.shape=[13, 13]", "calibration.method=ideal", "render.samples=64")
 
 
 @pytest.mark.parametrize(

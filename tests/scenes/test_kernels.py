@@ -92,6 +92,24 @@ def test_it_is_applied_as_its_entries_are(margin: int) -> None:
     np.testing.assert_allclose(applied.submatrix(rows, columns).toarray(), expected, atol=1e-14)
 
 
+def test_every_kernel_of_the_mean_camera_is_the_mean_of_all() -> None:
+    part = random_kernels(0)
+    counts = [start.size for start in part.places.starts]
+    every = part.to_sparse().toarray().reshape(-1, *CAMERA.shape), part.mean.to_sparse().toarray()
+    found = part.places.lens_type.by_lines(np.arange(part.measurements, dtype=np.float64)).astype(int)
+    wide, total, squares = part.places.width, np.zeros_like(part.mean_kernel), 0.0
+    for row, column in np.ndindex(*counts):
+        top, left = (start[number] for start, number in zip(part.places.starts, (row, column), strict=True))
+        place = slice(top, top + wide), slice(left, left + wide)
+        total += every[0][found[row, column]][place] / np.prod(counts)
+        squares += np.square(every[0][found[row, column]][place] - part.mean_kernel).sum() / np.prod(counts)
+        mean = every[1][found[row, column]].reshape(CAMERA.shape)[place]
+        np.testing.assert_allclose(mean, part.mean_kernel, atol=1e-14)
+    np.testing.assert_allclose(total, part.mean_kernel, atol=1e-14)
+    assert part.variation == pytest.approx((squares / np.square(part.mean_kernel).sum()) ** 0.5, rel=1e-12)
+    assert part.mean.variation == 0
+
+
 @pytest.mark.parametrize("margin", [0, 3])
 def test_information_of_a_box_as_a_kernel(margin: int) -> None:
     """Far from the edges and in strips along them, by the cosine transform of kernels and of intervals."""

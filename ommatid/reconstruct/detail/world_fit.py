@@ -16,7 +16,6 @@ from scipy import linalg, optimize, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import PriorTable
 
@@ -156,7 +155,7 @@ def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slic
             break
     rows, columns = _middle(task.shape, WIDE, detail)
     down, across = (part.start + np.array([0.25, 0.75]) * (part.stop - part.start) for part in (rows, columns))
-    row, column = _footprints(fine.camera)
+    row, column = fine.camera.middles
     near = (row > down[0]) & (row < down[1]) & (column > across[0]) & (column < across[1])
     return rows, columns, np.flatnonzero(near & task.used)
 
@@ -169,21 +168,6 @@ def _middle(shape: tuple[int, int], side: int, detail: int) -> tuple[slice, slic
         for size, part in zip(shape, sides, strict=True)
     )
     return rows, columns
-
-
-def _footprints(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Return row and column of the middle of each measurement's footprint: (M,) each."""
-    places: list[FloatArray] = []
-    for lens_type in camera.on_grids.types:
-        ratio, order = float(lens_type.ratio), (*lens_type.array, *lens_type.pixels)
-        axes = [
-            np.add.outer([float(start) for start in lens_type.starts(axis)], ratio * (np.arange(pixels) + 0.5))
-            for axis, pixels in enumerate(lens_type.pixels)
-        ]
-        down = np.broadcast_to(axes[0][:, None, :, None], order)
-        places.append(np.stack([down.ravel(), np.broadcast_to(axes[1][None, :, None, :], order).ravel()]))
-    row, column = np.concatenate(places, axis=1)
-    return row, column
 
 
 def _variance_bounds(evidence: WorldEvidence) -> tuple[float, float]:

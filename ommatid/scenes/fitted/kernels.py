@@ -332,9 +332,28 @@ class KernelFootprints(ObservationPart):
     @cached_property
     def mean_kernel(self) -> FloatArray:
         """The mean of the kernels over the field: (W, W)."""
+        return np.tensordot(self._means, self.shapes.kernels, axes=1)
+
+    @property
+    def mean(self) -> KernelFootprints:
+        """H by the mean kernel everywhere, without errors."""
+        none = self.error_coefficients[:0, :0, :1]
+        return replace(self.without_errors, degree=0, coefficients=self._means[:, None], error_coefficients=none)
+
+    @property
+    def variation(self) -> float:
+        """RMS difference of the kernels over the field from their mean, relative to that."""
+        weights = np.array([np.ravel(every) for every in self._weights(self.coefficients)])  # (S, readings) or (S, 1)
+        flat, mean = self.shapes.kernels.reshape(len(weights), -1), weights.mean(axis=1)
+        products, apart = flat @ flat.T, weights - mean[:, None]
+        squares = np.einsum("sr,st,tr->r", apart, products, apart, optimize=True)
+        return float(np.sqrt(squares.mean() / (mean @ products @ mean)))
+
+    @property
+    def _means(self) -> FloatArray:
+        """The mean weights of the kernels over the field: (S,)."""
         down, across = (legendre.legvander(axis, self.degree).mean(axis=0) for axis in self.places.field)
-        means: FloatArray = np.asarray(np.einsum("sab,a,b->s", self._products(self.coefficients), down, across))
-        return np.tensordot(means, self.shapes.kernels, axes=1)
+        return np.asarray(np.einsum("sab,a,b->s", self._products(self.coefficients), down, across))
 
     @property
     def _densities(self) -> tuple[float, float]:

@@ -12,7 +12,7 @@ STARTER = "starter"
 # By name, so that a user's own scene in the same folder of a checkout is not one of them.
 NAMES = (
     *("corridor", "distorted", "doublet", "doublet119", "machine_vision", "misaligned", "photo", "planoconvex"),
-    *("sensor", "sensor119", "single", "still_life", "tile19", "tile35", "tile41"),
+    *("planoconvex119", "sensor", "sensor119", "single", "still_life", "tile19", "tile35", "tile41"),
 )
 
 

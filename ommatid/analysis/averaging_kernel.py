@@ -18,7 +18,7 @@ from ommatid.reconstruct.noise import known_noise
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack

@@ -24,7 +24,7 @@ from ommatid.reconstruct.output.verdict_words import (
     is_trusted,
 )
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 from ommatid.scenes.camera import derive
 from ommatid.scenes.optics.boxes import designed_box
 from ommatid.scenes.scene import Scene

@@ -12,7 +12,7 @@ from ommatid.reconstruct.misalignment.robust_noise import misalignment_variance
 from ommatid.reconstruct.prediction import Prediction, predict, predict_frame
 from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.optics.negligible import assumptions
 from ommatid.scenes.scene import Scene

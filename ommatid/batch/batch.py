@@ -19,9 +19,9 @@ from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Completed
 from ommatid.runtime.files import clear_abandoned, make_folder
 from ommatid.runtime.input_files import real_path
+from ommatid.runtime.machine import processors
 from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_output
 from ommatid.runtime.outputs.occupied import new_folder, occupied
-from ommatid.runtime.processors import processors
 from ommatid.scenes.formats.picture import write_truth
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, write
 from ommatid.scenes.setup import Setup

@@ -140,7 +140,7 @@ def observer(folder: Path, *, alone: bool = False, quiet: bool = False) -> RunOb
     quiet : True to show and say nothing
     """
     from ommatid.batch.remote import RunObserver
-    from ommatid.runtime.processors import seconds_since_start
+    from ommatid.runtime.machine import seconds_since_start
     from ommatid.runtime.progress import no_progress
 
     def done(stage: str, made: bool) -> None:

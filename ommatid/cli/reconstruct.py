@@ -75,7 +75,6 @@ ScenePrior = Annotated[
         "--scene-prior", help="Assume the scene's prior (default: an independent one is replaced by a fitted one)."
     ),
 ]
-StrictCheck = Annotated[bool, typer.Option("--strict", help="Exit with code 3 if the result is not to be trusted.")]
 
 
 def reconstruct(
@@ -230,7 +229,7 @@ def check(
     sets: Sets = None,
     lens: Lenses = "",
     scene_prior: ScenePrior = False,
-    strict: StrictCheck = False,
+    strict: Strict = False,
     as_json: Json = False,
 ) -> None:
     """Predict every sub-imager from all others.

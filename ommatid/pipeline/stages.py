@@ -14,7 +14,7 @@ from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.output.run_json import RunReport, StudyCase, TimeReport
 from ommatid.reconstruct.output.time_spent import FILES, with_stage
 from ommatid.runtime.errors import InputError, naming_source
-from ommatid.runtime.processors import one_thread, processors
+from ommatid.runtime.machine import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera, derive

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import free_memory
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import free_memory, processors
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene

@@ -16,7 +16,7 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import free_memory
+from ommatid.runtime.machine import free_memory
 
 from .prior import Prior
 

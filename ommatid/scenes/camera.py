@@ -18,7 +18,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 
 from .constants import MOST_DENSE
 from .formats.picture import target_shape

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import fft, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import processors
 
 from .lens_type import adjacent_slices
 

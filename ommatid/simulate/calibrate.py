@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Any
 
 from ommatid.runtime.files import cached, fingerprint
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes import model_file

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from math import ceil
+
 from ommatid.runtime.errors import naming_source
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.setup import Setup
 
 from .adaptive_render import check_noise_target
-from .entry_memory import check_entries
 from .renderer.variant import check_fast_variant, check_transport_variant, choose
 from .world_view import check_world
 
+ENTRY = 12 + 8 + 8 * 4  # bytes per entry of H: the entry, its variance, its batches
+SWEPT = 3 * 8 + 8 * 4 + 10 * 8  # bytes per reading of a sensor pixel: tallies, batches, and sorting into entries
+BESIDE = 2  # pixels of f around a footprint
 SENSOR, TARGET = 12 * 8, 6 * 8  # bytes that a rendering takes per measurement and per pixel of f
 
 
@@ -58,3 +64,38 @@ def check_lenses(camera: Camera) -> None:
             for sub, pose in zip(camera.sub_imagers, poses(camera), strict=True):
                 if sub.type == lens_type:
                     field(camera, sub, pose)
+
+
+def check_entries(camera: Camera, types: Iterable[LensType], method: str, why: str = "") -> None:
+    """Raise InputError if memory does not hold H of some lens types with the uncertainty of its entries.
+
+    method : of the calibration;  why : H has entries
+    """
+    entries = [lens.measurements * min(_visible_pixels(camera, lens), camera.unknowns) for lens in types]
+    needed = ENTRY * sum(entries) + (SWEPT * max(entries, default=0) if method == "points" else 0)
+    remedy = "crop the target or use fewer sub-imagers"
+    if method != "ideal" and camera.is_applied:
+        remedy = f"set calibration.method to 'ideal', whose kernels need no entries, or {remedy}"
+    check_memory(needed, f"{why}H of {camera.measurements} x {camera.unknowns}", remedy)
+
+
+def _visible_pixels(camera: Camera, lens_type: LensType) -> int:
+    """Approximate number of pixels of f that a sensor pixel may see."""
+    side = ceil(lens_type.ratio) + BESIDE
+    if lens_type.optics.surfaces is not None:
+        side += 2 * ceil(_diffraction_reach(camera, lens_type))
+    elif camera.is_blurred(lens_type):
+        from ommatid.scenes.optics.blur import blur_of
+
+        side += 2 * ceil(blur_of(camera, lens_type).reach)
+    return side**2
+
+
+def _diffraction_reach(camera: Camera, lens_type: LensType) -> float:
+    """How far, in pixels of f, the point-spread function of surfaces is computed in focus."""
+    from .lenses.prescription import prescription_of
+    from .lenses.wavefront import GRID_REACH
+
+    depth = camera.depth(lens_type)
+    working = prescription_of(camera, lens_type).working_f_number(depth)
+    return GRID_REACH * (camera.wavelength or 0.0) * working * camera.distance / depth / camera.target_pitch

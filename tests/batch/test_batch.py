@@ -15,7 +15,7 @@ from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_proc
 from ommatid.reconstruct import method_choice
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files
-from ommatid.runtime.processors import one_thread, processors
+from ommatid.runtime.machine import one_thread, processors
 
 from ..conftest import Command, shell
 from ..runs import FILES, assert_same_content, content

@@ -104,7 +104,7 @@ def covering(factors: Mapping[str, tuple[str | int, ...]]) -> list[Cell]:
 def answer(cell: Cell, folder: Path) -> str:
     """Return what `run --dry-run` says: the method of the estimator, or the reason of a refusal."""
     member = Member(write(cell, folder), folder / "out")
-    names = "ommatid.runtime.memory.free_memory", "ommatid.reconstruct.method_choice.free_memory"
+    names = "ommatid.runtime.machine.free_memory", "ommatid.reconstruct.method_choice.free_memory"
     with mock.patch(names[0], return_value=FREE), mock.patch(names[1], return_value=FREE):
         try:
             described = plan(member, open_member((), (), member), (), ())

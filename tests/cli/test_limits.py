@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import check_memory, free_memory
+from ommatid.runtime.machine import check_memory, free_memory
 from ommatid.scenes import camera, model_file, scene
 from ommatid.scenes.formats import npz, picture_file
 from ommatid.scenes.optics.blur import blur_of
@@ -113,14 +113,14 @@ def test_an_array_smaller_than_its_header_states_is_refused(tmp_path: Path) -> N
 
 def test_free_memory_respects_the_limit_of_the_process(tmp_path: Path) -> None:
     before = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({4 * GIBI}, {4 * GIBI}))"
-    before += "\nfrom ommatid.runtime.memory import free_memory"
+    before += "\nfrom ommatid.runtime.machine import free_memory"
     script = f"{before}\nassert 0 < free_memory() < {4 * GIBI}\nraise SystemExit"
     assert shell(cwd=tmp_path, before=script).err == ""
     assert free_memory() > 0
 
 
 def test_small_requests_are_never_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 0)
+    monkeypatch.setattr("ommatid.runtime.machine.free_memory", lambda: 0)
     check_memory(10**6, "it", "do nothing")
     with pytest.raises(InputError, match="it needs 1 GB of memory, 0 GB are free; do nothing"):
         check_memory(10**9, "it", "do nothing")

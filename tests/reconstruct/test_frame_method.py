@@ -51,7 +51,7 @@ def difference(frame: Reconstruction, dense: Reconstruction) -> FloatArray:
 
 CASES = {
     "exact H": ({"noise": NOISE}, 0.0),
-    "exact H, other expected noise": ({"noise": NOISE, "estimator": {"noise_variance": 1.0}}, 0.0),
+    "exact H, other expected noise": ({"noise": NOISE, "estimator": {"noise_variance": 0.5}}, 0.0),
     "uncertain H": ({"noise": NOISE}, 0.003),
     "uncertain H, other expected noise": ({"noise": NOISE, "estimator": {"noise_variance": 0.1}}, 0.003),
 }
@@ -59,7 +59,10 @@ CASES = {
 
 @pytest.mark.parametrize(
     ("case", "shape"),
-    [("exact H", SMALL), *(pytest.param(case, SHAPE, marks=pytest.mark.slow) for case in CASES)],
+    [
+        *((case, SMALL) for case in CASES if "uncertain" not in case),
+        *(pytest.param(case, SHAPE, marks=pytest.mark.slow) for case in CASES),
+    ],
 )
 def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str, shape: tuple[int, int]) -> None:
     """The variance map has its stated accuracy of 1e-3; much expected noise correlates distant pixels (1e-2).

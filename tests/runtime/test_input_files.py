@@ -28,7 +28,7 @@ OWN = {
     "ommatid.batch.frames": "a file that it wrote into a folder of its own",
     "ommatid.batch.remote": "results that it wrote, and files of a world, which have been read before",
     "ommatid.bench.cells": "/proc",
-    "ommatid.runtime.processors": "/proc",
+    "ommatid.runtime.machine": "/proc",
     "ommatid.scenes.tables.gallery": "scenes of the installation",
     "ommatid.scenes.formats.npz": "a stream that is open, and members of an archive",
     "ommatid.scenes.formats.picture": "pictures, which are checked before",

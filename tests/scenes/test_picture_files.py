@@ -195,7 +195,7 @@ def test_sizes_are_refused_from_headers(tmp_path: Path, monkeypatch: pytest.Monk
     with (tmp_path / "a.npy").open("wb") as stream:  # which is as long as it states, without using the disk
         stream.write(b"\x93NUMPY\1\0" + struct.pack("<H", len(text)) + text)
         stream.truncate(3_700_000_000)
-    monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 90_000_000)
+    monkeypatch.setattr("ommatid.runtime.machine.free_memory", lambda: 90_000_000)
     for path in sorted(tmp_path.iterdir()):
         assert "GB of memory, 0.09 GB are free" in refusal(path), path.name
 
@@ -203,7 +203,7 @@ def test_sizes_are_refused_from_headers(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_file_too_short_for_its_header_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """However much memory there is, pixels are not allocated."""
     write_large_headers(tmp_path)
-    monkeypatch.setattr("ommatid.runtime.memory.free_memory", lambda: 10**15)
+    monkeypatch.setattr("ommatid.runtime.machine.free_memory", lambda: 10**15)
     tracemalloc.start()
     for path in sorted(tmp_path.iterdir()):
         assert "it is damaged" in refusal(path) or "cut short" in refusal(path), path.name

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import fft, sparse
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import processors
 from ommatid.scenes.tables.estimation import PriorTable
 
 from ..prior import averaged_spectrum, coloured, cosine_waves, spectrum_of

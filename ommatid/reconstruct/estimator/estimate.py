@@ -20,7 +20,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import free_memory
+from ommatid.runtime.machine import free_memory
 
 from ..forms.cholesky import covariance, information
 from ..forms.dual import dual

@@ -24,7 +24,7 @@ import numpy as np
 from scipy import fft, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import processors
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType

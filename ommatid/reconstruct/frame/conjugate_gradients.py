@@ -25,7 +25,7 @@ from scipy import fft, linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera

@@ -19,7 +19,7 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 
 from ..forms.cholesky import factorise_positive
 from .sliding import SlidingCamera, SlidingType

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.processors import one_thread, processors
+from ommatid.runtime.machine import one_thread, processors
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 

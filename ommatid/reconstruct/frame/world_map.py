@@ -14,7 +14,7 @@ import numpy as np
 from scipy import fft, linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import processors
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.observation import Observation
 

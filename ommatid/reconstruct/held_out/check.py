@@ -18,7 +18,7 @@ from scipy import special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import Model

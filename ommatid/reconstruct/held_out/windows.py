@@ -20,7 +20,7 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.execution.pool import worker_pool
-from ommatid.runtime.processors import one_thread, processors
+from ommatid.runtime.machine import one_thread, processors
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.tables.estimation import PriorTable
 

@@ -20,7 +20,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import digest
-from ommatid.runtime.processors import one_thread, processors
+from ommatid.runtime.machine import one_thread, processors
 from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, interval

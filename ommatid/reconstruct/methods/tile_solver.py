@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
-from ommatid.runtime.processors import one_thread
+from ommatid.runtime.machine import one_thread
 from ommatid.scenes.tables.estimation import EstimatorTable
 
 from ..estimator.estimate import estimate

@@ -33,7 +33,6 @@ from ..prior import Prior
 from ..problem import gram
 from .robust_noise import as_misalignments, misaligned_matrix, tolerances
 
-MAX_PIXELS = 4000  # of f: beyond, its dense matrices take too long
 MAX_ITERATIONS = 30
 WHOLE_STEPS = 12  # after which steps are shortened, so that they do not go to and fro across a kink
 CONVERGED = 0.1  # change of every misalignment that ends the search, in its standard deviations
@@ -75,7 +74,7 @@ def align(
     """Fit the misalignments that are most likely given the camera's tolerance and the measurements.
 
     recorded, noise_variance : (m,) of the measurements used;  used : (M,) absent: all
-    Raises InputError for a frame, for a camera without tolerance or with lenses of surfaces, and without noise.
+    Raises InputError for a camera without tolerance or with lenses of surfaces, and without noise.
     """
     spread = _checked_tolerances(camera, noise_variance)
     chosen = np.ones(camera.measurements, dtype=np.bool_) if used is None else used
@@ -112,11 +111,6 @@ def align(
 
 def _checked_tolerances(camera: Camera, noise_variance: FloatArray) -> FloatArray:
     """Return the standard deviations of all parameters, (sub-imagers, 6). Raises InputError as `align` does."""
-    if camera.unknowns > MAX_PIXELS:
-        raise InputError(
-            f"estimator.misalignment: 'fit' serves up to {MAX_PIXELS} pixels of f, got {camera.rows} x"
-            f" {camera.columns}; take 'robust', or fit a smaller crop of the target"
-        )
     spread = tolerances(camera)
     if not spread.any():
         raise InputError("estimator.misalignment: 'fit' needs to know what may be misaligned; add a [camera.tolerance]")

@@ -24,8 +24,7 @@ from scipy import fft, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import shortened_repr
-from ommatid.runtime.memory import check_memory
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import check_memory, processors
 
 from ..camera import Camera
 from ..lens_type import LensType

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest, fingerprint, write_whole
 from ommatid.runtime.input_files import check_regular, parse_json
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 from ommatid.runtime.printable import printable
 
 from .stored_picture import StoredPicture, check_single, check_size

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import open_input
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 
 MOST_DEFLATED = 1032  # largest ratio of inflated to deflated bytes
 FASTEST = 1  # level of compression: entries of H take as many bytes as at level 6

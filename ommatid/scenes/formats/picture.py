@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import check_regular
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 from ommatid.runtime.printable import printable
 
 from ..constants import WHITE

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 
 BYTES = 24  # of memory per number: as stored, in float64, and a copy of that
 UPRIGHT = 1  # value of the orientation tag

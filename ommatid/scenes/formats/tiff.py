@@ -21,7 +21,7 @@ import numpy as np
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import open_input
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 
 from .stored_picture import BYTES, UPRIGHT, StoredPicture, check_single, profile_notes, upright
 

@@ -27,7 +27,7 @@ from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 
 from ..camera import Camera
 from ..fitted.kernel_shapes import KernelShapes

@@ -21,7 +21,7 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import processors
 
 from ..camera import Camera
 from ..lens_type import SubImager

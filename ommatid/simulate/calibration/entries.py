@@ -18,11 +18,11 @@ from ommatid.scenes.model import Model, fitted_model
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
-from ..entry_memory import check_entries
 from ..ideal import ideal_matrix
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import rounding_variance
+from ..validation import check_entries
 from .fit.chart import SIDE
 from .point_sources import Plans, Responses, Subsets, responses_from_points, same_plans
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes, ring_masks
 from ommatid.scenes.fitted.kernels import VALUES_AT_ONCE, KernelFootprints, KernelPlaces
 

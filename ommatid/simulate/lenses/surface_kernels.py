@@ -17,7 +17,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, basis, terms

@@ -22,7 +22,7 @@ from scipy import sparse
 from scipy.special import sici
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.memory import check_memory
+from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.pose import corner_offset, pose_of

@@ -23,7 +23,7 @@ import numpy as np
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.interpreter import python_command, python_environment
 from ommatid.runtime.files import fingerprint
-from ommatid.runtime.memory import free_memory
+from ommatid.runtime.machine import free_memory
 from ommatid.runtime.printable import printable
 
 from .checked_world import CheckedWorld, reason_of

@@ -1,8 +1,9 @@
-"""Number of available processors, age of the process, and linear algebra that does not depend on it."""
+"""What the machine gives this process, processors, memory and time, and linear algebra that does not depend on it."""
 
 from __future__ import annotations
 
 import os
+import resource
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -11,6 +12,9 @@ from pathlib import Path
 import psutil
 from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
+from .errors import InputError
+
+SMALL = 50_000_000  # bytes of memory; smaller demands are not checked
 START_TIME = 19  # position in /proc/self/stat after the name of the program: ticks from the start of the machine
 
 
@@ -37,3 +41,21 @@ def one_thread() -> Generator[None]:
 
     with threadpool_limits(1, "blas"):
         yield
+
+
+def free_memory() -> int:
+    """Return the bytes that this process can allocate without swapping, within its address-space limit (ulimit -v)."""
+    free = int(psutil.virtual_memory().available)
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return free
+    return max(min(free, limit - int(psutil.Process().memory_info().vms)), 0)
+
+
+def check_memory(needed: int, what: str, cure: str) -> None:
+    """Raise InputError if `what` needs more bytes than are free; the message ends with `cure`, the advice."""
+    if needed <= SMALL:
+        return
+    free = free_memory()
+    if needed > free:
+        raise InputError(f"{what} needs {needed / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are free; {cure}")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.processors import processors
+from ommatid.runtime.machine import processors
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 

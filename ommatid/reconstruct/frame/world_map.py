@@ -97,8 +97,7 @@ def world_map(
         return exact.variances(task.expected_noise, actual, task.shape_of_f), exact.pixels, True
     level = np.log(levels(task, observation, weights))
     variances = _frame_map(bands, task, mean_ratios(task, weights, actual), level)
-    varying = [isinstance(part, KernelFootprints) and part.variation > VARYING for part in observation.parts]
-    if any(varying) or len(observation.parts) != len(bands.types):
+    if any(isinstance(part, KernelFootprints) and part.variation > VARYING for part in observation.parts):
         variances = _by_windows(variances, task, observation, actual)
     return variances, bands.prior_variance, False
 
@@ -106,7 +105,7 @@ def world_map(
 def _by_windows(
     variances: VarianceMap, task: EstimationTask, observation: Observation, actual: FloatArray
 ) -> VarianceMap:
-    """Return the map of a camera that is not shift-invariant from that of the shift-invariant one like it.
+    """Return the map of a camera whose kernels vary over the field from that of their means.
 
     Their ratios are those of windows that are imaged by either, from the same readings, and linear between these.
     """
@@ -114,8 +113,8 @@ def _by_windows(
     side = min(WINDOW, *shape)
     starts = [np.unique(np.linspace(0, size - side, WINDOWS).round().astype(int)) for size in shape]
     spectrum = 1 / np.asarray(task.precision_on((side * fine, side * fine)))
-    parts = [part.mean if isinstance(part, KernelFootprints) else part for part in task.model.alike.parts]
-    like = Observation(task.model.alike.shape, tuple(parts))
+    parts = [part.mean if isinstance(part, KernelFootprints) else part for part in observation.parts]
+    like = Observation(observation.shape, tuple(parts))
     middle_row, middle_column = task.model.camera.middles
     ratios = np.ones((3, len(starts[0]), len(starts[1])))
     for row, column in np.ndindex(ratios.shape[1:]):

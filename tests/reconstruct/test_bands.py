@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import fft, sparse
 
+from ommatid.reconstruct.frame import world_map
 from ommatid.reconstruct.frame.bands import Bands, Readings
+from ommatid.reconstruct.frame.variance_map import VarianceMap
 from ommatid.reconstruct.frame.world_map import moments
 from ommatid.reconstruct.prior import exponential_spectrum, reflecting_root
-from ommatid.scenes.observation import repetition
+from ommatid.scenes.observation import Observation, repetition
+from tests.scenes.test_kernels import CAMERA, random_kernels
 
 Array = NDArray[np.float64]
 
@@ -116,3 +122,29 @@ def test_moments_are_products_with_the_covariance() -> None:
     np.testing.assert_allclose(found.readings, matrix @ covariance @ matrix.T, atol=1e-10)
     np.testing.assert_allclose(found.both, average @ covariance @ matrix.T, atol=1e-10)
     np.testing.assert_allclose(found.pixels, np.diagonal(average @ covariance @ average.T), atol=1e-10)
+
+
+def test_a_window_turns_the_map_of_mean_kernels_into_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One window as large as the image: the mean of the map is then that of the inverted precision."""
+    monkeypatch.setattr(world_map, "WINDOW", max(CAMERA.shape))
+    kernels = [random_kernels(0, index=number) for number in range(len(CAMERA.types))]
+    varying, means = (Observation(CAMERA.shape, tuple(parts)) for parts in (kernels, [each.mean for each in kernels]))
+    spectrum = exponential_spectrum(CAMERA.shape, 4.0)
+    root, noise = reflecting_root(spectrum), np.random.default_rng(3).uniform(1, 3, CAMERA.measurements)
+    maps: list[Array] = []
+    for observation in (varying, means):
+        matrix = observation.to_sparse().toarray()
+        posterior = np.linalg.inv(np.linalg.inv(root @ root.T) + matrix.T @ (matrix / noise[:, None]))
+        maps.append(np.diagonal(posterior).astype(np.float64).reshape(CAMERA.shape))
+    task: Any = SimpleNamespace(
+        shape_of_f=CAMERA.shape,
+        finer=1,
+        precision_on=lambda _: 1 / spectrum,
+        model=SimpleNamespace(camera=CAMERA),
+        used=np.ones(CAMERA.measurements, dtype=np.bool_),
+        among_used=lambda numbers: numbers,
+        expected_noise=noise,
+    )
+    found = world_map.by_windows(VarianceMap(maps[1], maps[1], maps[1]), task, varying, noise)
+    assert found.posterior.mean() == pytest.approx(maps[0].mean(), rel=1e-6)
+    assert abs(maps[0].mean() / maps[1].mean() - 1) > 0.05

@@ -98,11 +98,11 @@ def world_map(
     level = np.log(levels(task, observation, weights))
     variances = _frame_map(bands, task, mean_ratios(task, weights, actual), level)
     if any(isinstance(part, KernelFootprints) and part.variation > VARYING for part in observation.parts):
-        variances = _by_windows(variances, task, observation, actual)
+        variances = by_windows(variances, task, observation, actual)
     return variances, bands.prior_variance, False
 
 
-def _by_windows(
+def by_windows(
     variances: VarianceMap, task: EstimationTask, observation: Observation, actual: FloatArray
 ) -> VarianceMap:
     """Return the map of a camera whose kernels vary over the field from that of their means.

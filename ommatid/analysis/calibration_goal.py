@@ -71,8 +71,8 @@ def for_prior(setup: Setup) -> StoppingRule:
         model = model_of_f(model, camera, prior)
         from_model = model.prior_variance_from_model(np.full(model.unknowns, prior.variance), prior.mean)
         random = probe(Purpose.GOAL).normal(size=model.unknowns)
-        shared = model.error_variance(prior.mean + prior.variance**0.5 * random)
-        from_model = from_model if shared is None else from_model + shared
+        shared = model.errors(prior.mean + prior.variance**0.5 * random)
+        from_model = from_model if shared is None else from_model + shared.variance
         causes = {"noise": noise[used], "calibration": from_model[used]}
         setting = scene.estimator.noise_variance
         recorded = model.forward(np.full(model.unknowns, prior.mean))
@@ -107,8 +107,8 @@ def _bound(model: Model, used: BoolArray, others: FloatArray) -> float | None:
     mean, too, where H is large and follows from kernels, whose errors all measurements of a lens type share alike.
     """
     uncertain = model.prior_variance_from_model(np.full(model.unknowns, WHITE**2))
-    shared = model.error_variance(WHITE * probe(Purpose.GOAL_BOUND).random(model.unknowns))
-    uncertain = uncertain if shared is None else uncertain + shared
+    shared = model.errors(WHITE * probe(Purpose.GOAL_BOUND).random(model.unknowns))
+    uncertain = uncertain if shared is None else uncertain + shared.variance
     relative = uncertain[used] / np.maximum(others, TINY)
     if not relative.size or float(relative.max()) <= NEGLIGIBLE:
         return float(relative.max(initial=0.0))

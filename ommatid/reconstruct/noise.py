@@ -120,7 +120,7 @@ def certain(noise: Noise) -> Noise:
 
 def has_shared_errors(model: Model) -> bool:
     """Return True if entries of H follow from few numbers with errors."""
-    return model.error_variance(np.zeros(model.unknowns)) is not None
+    return model.errors(np.zeros(model.unknowns)) is not None
 
 
 @dataclass(frozen=True)
@@ -159,11 +159,10 @@ class ObservedStack:
         image : (N,), or None for one drawn from the prior, and the variance averaged over each sub-imager
         """
         others, model = {name: values for name, values in noise.items() if name != SHARED}, self.model
-        if not has_shared_errors(model):
+        errors = model.errors(self._drawn() if image is None else image) if has_shared_errors(model) else None
+        if errors is None:
             return others
-        variance = model.error_variance(self._drawn() if image is None else image)
-        if variance is None:
-            return others
+        variance = errors.variance
         if image is None:
             parts = model.camera.slices()
             variance = np.concatenate([np.full(part.stop - part.start, variance[part].mean()) for part in parts])
@@ -250,8 +249,8 @@ def censored(
 
     usable : of the stack as recorded;  fit : of its noise, if any
     """
-    noise, shared = noise_at(stack, model, image), model.error_variance(image)
-    variance = total_variance(fitted_noise(noise if shared is None else noise | {SHARED: shared}, fit))
+    noise, shared = noise_at(stack, model, image), model.errors(image)
+    variance = total_variance(fitted_noise(noise if shared is None else noise | {SHARED: shared.variance}, fit))
     light, deviation = model.light(image), np.sqrt(variance)
     with np.errstate(invalid="ignore", divide="ignore"):
         below = (_limit(stack) - light) / deviation

@@ -231,7 +231,7 @@ def restore(
     Raises InputError if memory does not suffice, if no method reaches the tolerance of the scene, or if the noise of a
     [sensor] is to be fitted.
     """
-    execution = Execution(workers, progress, prepared)
+    execution = Execution(workers, progress, prepared or Prepared(model))
     return with_fallback(stack, model, lambda choice: _restored(stack, model, truth, choice, execution))
 
 

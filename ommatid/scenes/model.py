@@ -20,7 +20,7 @@ from ommatid.runtime.errors import InputError
 
 from .camera import Camera
 from .constants import MOST_DENSE
-from .fitted.fitted_matrix import FittedMatrix, gradient
+from .fitted.fitted_matrix import Directions, FittedMatrix, gradient
 from .observation import Entries, Observation, ObservationPart
 from .optics.boxes import Box, designed_box
 from .scene import Scene
@@ -169,25 +169,12 @@ class Model:
         fitted = None if self.fitted is None else self.fitted.without_errors
         return replace(self, variance=np.zeros_like(self.variance), batches=self.batches[:0], fitted=fitted)
 
-    def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
-        """L, (M, q), such that the error of H f by that of few numbers is L xi with independent xi of variance 1."""
-        fitted = self._uncertain
-        return None if fitted is None else fitted.directions(image, self._gradients(image))
-
-    def error_variance(self, image: FloatArray) -> FloatArray | None:
-        """Variance of each measurement by the errors of few numbers, (M,): the diagonal of L L^T."""
-        fitted = self._uncertain
-        return None if fitted is None else fitted.error_variance(image, self._gradients(image))
-
-    def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
-        """A random error of H f by those of few numbers, L xi: (M,)."""
-        fitted = self._uncertain
-        return None if fitted is None else fitted.error_draw(image, self._gradients(image), rng)
-
-    @property
-    def _uncertain(self) -> FittedMatrix | None:
-        """H by few numbers, if these have errors."""
-        return self.fitted if self.fitted is not None and self.fitted.has_errors else None
+    def errors(self, image: FloatArray) -> Directions | None:
+        """Return the errors of H f by those of few numbers, None where H does not follow from such."""
+        fitted = self.fitted
+        if fitted is None or not fitted.has_errors:
+            return None
+        return fitted.errors(image, lambda: self._gradients(image))
 
     def _gradients(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """H applied to the gradient of f, (N,), down and across: (M,) each."""

@@ -21,6 +21,7 @@ from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.reconstruct.verdict.residual_parts import WhitenedResidual, residual_parts
 from ommatid.reconstruct.verdict.residual_power import squared_trace
 from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.fitted.fitted_matrix import Directions
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
@@ -59,28 +60,11 @@ class ShiftedModel(Model):
         shape = self.camera.world.shape if image.size != self.unknowns else self.camera.shape
         return [self.shift * (self.matrix @ (slope(axis, shape) @ image)) for axis in (0, 1)]
 
-    def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
+    def errors(self, image: FloatArray) -> Directions:
         """A column for each shift, with entries in the rows of its sub-imager alone."""
-        blocks = [
-            np.column_stack([change[part] for change in self.changes(image.ravel())]) for part in self.camera.slices()
-        ]
-        return sparse.csc_array(sparse.block_diag([sparse.csc_array(block) for block in blocks]))
-
-    def error_variance(self, image: FloatArray) -> FloatArray:
-        """Diagonal of L L^T, (M,)."""
-        return np.sum(np.square(self.changes(image.ravel())), axis=0)
-
-    def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """L xi, (M,)."""
-        shifts = rng.normal(size=(2, len(self.camera.sub_imagers)))
-        counts = [part.stop - part.start for part in self.camera.slices()]
-        return sum(
-            (
-                np.repeat(shift, counts) * change
-                for shift, change in zip(shifts, self.changes(image.ravel()), strict=True)
-            ),
-            np.zeros(self.measurements),
-        )
+        changes = self.changes(image.ravel())
+        blocks = [(part, np.column_stack([change[part] for change in changes])) for part in self.camera.slices()]
+        return Directions(self.measurements, lambda: ((part, sparse.csc_array(block)) for part, block in blocks))
 
 
 @cache
@@ -111,8 +95,7 @@ def case(kind: str = "independent", shift: float = SHIFT, detail: int = 1) -> tu
 
 def recorded(stack: Stack, model: ShiftedModel, image: FloatArray, rng: np.random.Generator) -> Stack:
     """The stack of an image by a camera whose views are off by a draw of the shifts."""
-    directions = model.error_directions(image)
-    assert directions is not None
+    directions = model.errors(image).matrix
     error = directions @ rng.normal(size=directions.shape[1])
     values = model.forward(image) + error + NOISE**0.5 * rng.normal(size=model.measurements)
     return replace(stack, values=values)
@@ -143,8 +126,7 @@ def operators_of(assumed: Assumptions) -> PosteriorOperators:
 def draws(image: FloatArray, count: int = DRAWS) -> tuple[FloatArray, FloatArray]:
     """What errors of the shifts and noise add to the readings of an image: (M, count) each."""
     _, model, _ = case()
-    directions, rng = model.error_directions(image), np.random.default_rng(1)
-    assert directions is not None
+    directions, rng = model.errors(image).matrix, np.random.default_rng(1)
     shared: FloatArray = directions @ rng.normal(size=(directions.shape[1], count))
     return shared, NOISE**0.5 * rng.normal(size=(model.measurements, count))
 
@@ -219,9 +201,12 @@ def test_errors_of_few_numbers_do_not_average_out_over_a_region() -> None:
     means = weights.ravel() @ operators.gain(shared)
     stated = errors.variance_of_sum(weights.ravel(), task, operators)
     assert abs(np.square(means).mean() / stated - 1) < 4 * (2 / DRAWS) ** 0.5
-    variance = task.model.error_variance(slope_of_columns)
-    assert variance is not None
-    as_independent = float(variance @ np.square(operators.weigh(task.observe(operators.posterior(weights.ravel())))))
+    independent, back = (
+        task.model.errors(slope_of_columns),
+        operators.weigh(task.observe(operators.posterior(weights.ravel()))),
+    )
+    assert independent is not None
+    as_independent = float(independent.variance @ np.square(back))
     assert stated > 9 * as_independent
     added = result.variance_of_sum(weights.ravel()) - assumed.method.result(
         {"noise": assumed.noise["noise"]}, None
@@ -289,8 +274,7 @@ def test_errors_act_on_detail_finer_than_f() -> None:
     assumed = assumptions_for(recorded(stack, model, world, np.random.default_rng(0)), model, choice, Execution())
     result, operators, of_f = assumed.result(world), operators_of(assumed), assumed.method.task.model
     assert isinstance(of_f, DetailedModel)
-    directions, rng = model.error_directions(world), np.random.default_rng(1)
-    assert directions is not None
+    directions, rng = model.errors(world).matrix, np.random.default_rng(1)
     shared: FloatArray = directions @ rng.normal(size=(directions.shape[1], DRAWS))
     noise = NOISE**0.5 * rng.normal(size=shared.shape)
     mean = assumed.prior.mean

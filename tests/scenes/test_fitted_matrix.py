@@ -116,8 +116,9 @@ def test_the_errors_of_numbers_are_differences_of_h() -> None:
     cam, rng = camera((23, 23), (("1/3", [2, 2], [5, 5]),)), np.random.default_rng(1)
     own = np.diag([1.0, 1.0, 0.0, 0.0, 0.0])[:, :2]
     fitted, f = with_numbers(cam, np.zeros(COUNT), own), rng.normal(127, 50, cam.unknowns)
-    gradients = tuple(fitted.to_sparse() @ each for each in gradient(f, cam.shape))
-    directions = fitted.directions(f, (gradients[0], gradients[1])).toarray()
+    down, across = (fitted.to_sparse() @ each for each in gradient(f, cam.shape))
+    errors = fitted.errors(f, lambda: (down, across))
+    directions = errors.matrix.toarray()
     assert directions.shape == (cam.measurements, 8)
     for axis in (ROW, COLUMN):
         step = 1e-3 * (np.arange(COUNT) == axis)
@@ -126,10 +127,8 @@ def test_the_errors_of_numbers_are_differences_of_h() -> None:
         for sub, place in zip(range(4), cam.slices(), strict=True):
             np.testing.assert_allclose(directions[place, 2 * sub + axis], expected[place], atol=1e-8)
             assert not np.delete(directions[:, 2 * sub + axis], np.r_[place]).any()
-    np.testing.assert_allclose(
-        fitted.error_variance(f, (gradients[0], gradients[1])), np.square(directions).sum(axis=1), rtol=1e-12
-    )
-    draws = [fitted.error_draw(f, (gradients[0], gradients[1]), np.random.default_rng(seed)) for seed in range(400)]
+    np.testing.assert_allclose(errors.variance, np.square(directions).sum(axis=1), rtol=1e-12)
+    draws = errors.draws(np.random.default_rng(2), 400)
     ratio = np.square(draws).mean(axis=0).sum() / np.square(directions).sum()
     assert abs(ratio - 1) < 4 * (2 / (400 * 8)) ** 0.5
 

@@ -74,7 +74,7 @@ def test_a_large_h_is_kernels_in_a_small_file(tmp_path: Path) -> None:
     again = model_file.read(tmp_path / "model.npz")
     assert again.stored is None
     np.testing.assert_array_equal(again.forward(image), model.forward(image))
-    assert again.error_variance(image) is None
+    assert again.errors(image) is None
     rows = model.to_sparse()
     np.testing.assert_allclose(model.forward(image), rows @ image, atol=1e-10)
 

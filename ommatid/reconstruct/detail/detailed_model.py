@@ -25,6 +25,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
+from ommatid.scenes.fitted.fitted_matrix import Directions
 from ommatid.scenes.model import Model
 from ommatid.scenes.observation import Observation
 from ommatid.scenes.tables.estimation import PriorTable
@@ -110,17 +111,9 @@ class DetailedModel(Model):
         world = repetition(self.camera.shape, self.camera.detail) @ prior_variance
         return self.fine.prior_variance_from_model(world, prior_mean)
 
-    def error_directions(self, image: FloatArray) -> sparse.csc_array | None:
-        """Return L, (M, q), such that the error of H by that of few numbers adds L xi to the measurements of f."""
-        return self.fine.error_directions(self._world_with_detail(image))
-
-    def error_variance(self, image: FloatArray) -> FloatArray | None:
-        """Return the variance of each measurement by the errors of few numbers, (M,)."""
-        return self.fine.error_variance(self._world_with_detail(image))
-
-    def error_draw(self, image: FloatArray, rng: np.random.Generator) -> FloatArray | None:
-        """Return a random error of the measurements of f by those of few numbers, (M,)."""
-        return self.fine.error_draw(self._world_with_detail(image), rng)
+    def errors(self, image: FloatArray) -> Directions | None:
+        """Return what errors of few numbers of H add to the measurements of f."""
+        return self.fine.errors(self._world_with_detail(image))
 
     def _world_with_detail(self, image: FloatArray) -> FloatArray:
         """Return a world, (pixels of the world,), that averages to f, (N,), with random detail of the prior.

@@ -111,15 +111,15 @@ class SlidingType:
         if self.footprints is None:
             return np.asarray(np.kron(self.vertical.gram.toarray(), self.horizontal.gram.toarray()), dtype=np.float64)
         rows, columns, places = self.vertical.size, self.horizontal.size, self.horizontal.places[:, None]
-        total = np.zeros((rows * columns, rows * columns))
-        for top, middle in enumerate(self.vertical.middles, self.vertical.first):
-            kernels = self.footprints.kernels_at(middle, self.horizontal.middles)
+        read = np.zeros((self.vertical.count, self.horizontal.count, rows, columns))
+        for number, middle in enumerate(self.vertical.middles):
+            top = self.vertical.first + number
             seen = slice(max(top, 0), min(top + self.vertical.width, rows))
-            inside = np.pad(kernels[:, seen.start - top : seen.stop - top], ((0, 0), (0, 0), (0, 1)))
-            read = np.take_along_axis(inside, places, axis=2).reshape(len(kernels), -1)
-            pixels = slice(seen.start * columns, seen.stop * columns)
-            total[pixels, pixels] += read.T @ read
-        return total
+            kernels = self.footprints.kernels_at(middle, self.horizontal.middles)[:, seen.start - top : seen.stop - top]
+            inside = np.pad(kernels, ((0, 0), (0, 0), (0, 1)))
+            read[number, :, seen] = np.take_along_axis(inside, places, axis=2)
+        matrix = read.reshape(-1, rows * columns)
+        return matrix.T @ matrix
 
 
 @dataclass(frozen=True)

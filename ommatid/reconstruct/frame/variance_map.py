@@ -9,6 +9,7 @@ accurate to 1e-3 or better; otherwise errors are correlated over any distance an
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
@@ -19,7 +20,7 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.machine import one_thread
+from ommatid.runtime.machine import one_thread, processors
 
 from ..forms.cholesky import factorise_positive
 from .sliding import SlidingCamera, SlidingType
@@ -201,10 +202,13 @@ class SmallFrames:
         total = np.zeros((3, *self.shape))
         local = self._local(scale)
         sides = [min(LONG if self._far else SIDE, size) for size in self.shape]
-        for places in product(*(self._places(size) for size in self.shape)):
+        every = list(product(*(self._places(size) for size in self.shape)))
+        with ThreadPoolExecutor(processors()) as threads:
+            found = list(threads.map(lambda places: self._at(scale, places), every))
+        for places, at in zip(every, found, strict=True):
             down, across = places
             kept = (each.kept(side) for each, side in zip(places, sides, strict=True))
-            maps = self._at(scale, places) / np.maximum(_interpolated(local, self.shape, *kept), np.finfo(float).tiny)
+            maps = at / np.maximum(_interpolated(local, self.shape, *kept), np.finfo(float).tiny)
             for each, found in zip(total, maps, strict=True):
                 each[np.ix_(down.pixels, across.pixels)] += np.outer(down.share, across.share) * found
         return total

@@ -14,6 +14,7 @@ from scipy import fft, sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.progress import Progress, no_progress
+from ommatid.scenes.fitted.fitted_matrix import Directions
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables import estimation
 
@@ -152,16 +153,21 @@ class EstimationTask:
         return readings if self.complete else readings[self.used]
 
     @cached_property
-    def shared_variance(self) -> FloatArray:
-        """Variance by errors of few numbers of H that is part of the expected noise: (measurements used,)."""
-        variance = None if self.shared_image is None else self.model.error_variance(self.shared_image)
-        return np.zeros(self.expected_noise.size) if variance is None else variance[self.used]
+    def shared_errors(self) -> Directions | None:
+        """The errors by few numbers of H that are part of the expected noise; None where there are none."""
+        return None if self.shared_image is None else self.model.errors(self.shared_image)
 
-    @cached_property
+    @property
+    def shared_variance(self) -> FloatArray:
+        """Their variances: (measurements used,)."""
+        errors = self.shared_errors
+        return np.zeros(self.expected_noise.size) if errors is None else errors.variance[self.used]
+
+    @property
     def shared_directions(self) -> sparse.csc_array | None:
-        """L of the errors that are part of the expected noise, (measurements used, q); None where there are none."""
-        directions = None if self.shared_image is None else self.model.error_directions(self.shared_image)
-        return None if directions is None else sparse.csc_array(sparse.csr_array(directions)[self.used])
+        """L of them, (measurements used, q); None where there are none."""
+        errors = self.shared_errors
+        return None if errors is None else sparse.csc_array(sparse.csr_array(errors.matrix)[self.used])
 
     def on_all_measurements(self, values: FloatArray, fill: float) -> FloatArray:
         """Return values of the used measurements on all of them: (measurements used,) to (M,), else `fill`."""

@@ -93,26 +93,19 @@ def whitened(residual: FloatArray, task: EstimationTask, operators: PosteriorOpe
 def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: FloatArray) -> SharedErrors | None:
     """Return the errors of few numbers for an image, (N,); None where H has none."""
     model, used, small = task.model, task.used, task.model.unknowns <= FEW_PIXELS
+    errors = task.shared_errors if image is task.shared_image else model.errors(image)
+    if errors is None:
+        return None
     # A column has entries in one sub-imager alone, and a sub-imager has few.
     stored = small or 6 * model.measurements <= MOST_STORED
-    directions = model.error_directions(image) if stored else None
-    if stored and directions is None:
-        return None
-    directions = None if directions is None else sparse.csc_array(sparse.csr_array(directions)[used])
+    directions = sparse.csc_array(sparse.csr_array(errors.matrix)[used]) if stored else None
     exact = small and directions is not None and directions.shape[1] <= FEW_COLUMNS
     if exact and directions is not None:
         readings: FloatArray = directions.T.toarray()
     else:
-        rng, variance = probe(Purpose.SHARED_ERRORS), model.error_variance(image)
-        share = 0.0 if variance is None else float(np.mean(variance[used] / task.expected_noise))
+        share = float(np.mean(errors.variance[used] / task.expected_noise))
         count = FEW_DRAWS if model.unknowns > MANY or share < SMALL else DRAWS
-        draws: list[FloatArray] = []
-        for _ in range(count):
-            draw = model.error_draw(image, rng)
-            if draw is None:
-                return None
-            draws.append(draw[used] / count**0.5)
-        readings = np.array(draws)
+        readings = errors.draws(probe(Purpose.SHARED_ERRORS), count)[:, used] / count**0.5
     residuals, images = np.empty_like(readings), np.empty((len(readings), task.shape_of_f[0] * task.shape_of_f[1]))
     for number, reading in enumerate(readings):
         solved = operators.gain(reading)
@@ -126,13 +119,13 @@ def bound(task: EstimationTask, image: FloatArray) -> float:
     A Rv^1/2 has no singular value above half the root of the largest eigenvalue p of P0, so that with variances d of
     the errors it is p / 4 times the sum of d / Rv, over N.
     """
-    variance = task.model.error_variance(image)
-    if variance is None or not variance.any():
+    errors = task.model.errors(image)
+    if errors is None or not errors.variance.any():
         return 0.0
     camera = task.model.camera
     largest = float(np.max(spectrum_of(task.prior, task.shape, camera.target_pitch, camera.detail)))
     with np.errstate(divide="ignore"):
-        return largest / 4 * float(np.sum(variance[task.used] / task.expected_noise)) / task.model.unknowns
+        return largest / 4 * float(np.sum(errors.variance[task.used] / task.expected_noise)) / task.model.unknowns
 
 
 def with_shared_errors(

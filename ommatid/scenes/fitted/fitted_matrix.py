@@ -6,7 +6,7 @@ over pixels. To first order a displaced view reads H f' along the displacement, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -79,6 +79,37 @@ class Views:
         if not set(structure) <= STRUCTURES:
             raise ValueError(f"the views {name} are none of {', '.join(sorted(STRUCTURES))}")
         return cls(numbers, explained, own, shared, structure)
+
+
+@dataclass(frozen=True)
+class Directions:
+    """L, (M, q), by lens type: the error of H f is L xi, with independent xi of variance 1.
+
+    blocks : yields the measurements of each lens type and its block of L
+    """
+
+    measurements: int
+    blocks: Callable[[], Iterator[tuple[slice, sparse.csc_array]]]
+
+    @property
+    def matrix(self) -> sparse.csc_array:
+        """L."""
+        return sparse.csc_array(sparse.block_diag([block for _, block in self.blocks()]))
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """The diagonal of L L^T: (M,)."""
+        variance = np.zeros(self.measurements)
+        for place, block in self.blocks():
+            variance[place] = np.asarray(block.power(2).sum(axis=1)).ravel()
+        return variance
+
+    def draws(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Return random errors of H f: (count, M)."""
+        drawn = np.zeros((count, self.measurements))
+        for place, block in self.blocks():
+            drawn[:, place] = (block @ rng.normal(size=(block.shape[1], count))).T
+        return drawn
 
 
 @dataclass(frozen=True)
@@ -196,36 +227,22 @@ class FittedMatrix:
         }
         return FittedMatrix(self.camera, views, {name: each.without_errors for name, each in self.kernels.items()})
 
-    def directions(self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]) -> sparse.csc_array:
-        """Return L, (M, q), such that the error of H f is L xi; gradients : H f' down and across, (M,) each."""
-        return sparse.csc_array(sparse.block_diag([of_type for _, of_type in self._directions(image, gradients)]))
-
-    def error_variance(self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]) -> FloatArray:
-        """Return the variance of each measurement by the errors of the numbers, (M,): the diagonal of L L^T."""
-        variance = np.zeros(self.camera.measurements)
-        for place, directions in self._directions(image, gradients):
-            variance[place] = np.asarray(directions.power(2).sum(axis=1)).ravel()
-        return variance
-
-    def error_draw(
-        self, image: FloatArray, gradients: tuple[FloatArray, FloatArray], rng: np.random.Generator
-    ) -> FloatArray:
-        """Return a random error of H f, L xi: (M,)."""
-        drawn = np.zeros(self.camera.measurements)
-        for place, directions in self._directions(image, gradients):
-            drawn[place] = directions @ rng.normal(size=directions.shape[1])
-        return drawn
+    def errors(self, image: FloatArray, gradients: Callable[[], tuple[FloatArray, FloatArray]]) -> Directions:
+        """Return the errors of H f; gradients : to H f' down and across, (M,) each, which views need."""
+        return Directions(self.camera.measurements, lambda: self._directions(image, gradients))
 
     def _directions(
-        self, image: FloatArray, gradients: tuple[FloatArray, FloatArray]
+        self, image: FloatArray, gradients: Callable[[], tuple[FloatArray, FloatArray]]
     ) -> Iterator[tuple[slice, sparse.csc_array]]:
         """Yield the measurements of each lens type, and its block of L: what its sub-imagers share, then their own."""
+        of_views = None
         for lens, views, subs, slices in self._types:
             measurements = slice(slices[0].start, slices[-1].stop)
             if lens.name in self.kernels:
                 yield measurements, self.kernels[lens.name].error_directions(image)
                 continue
-            moves = [self._moves(sub, gradients, place) for sub, place in zip(subs, slices, strict=True)]
+            of_views = of_views or gradients()
+            moves = [self._moves(sub, of_views, place) for sub, place in zip(subs, slices, strict=True)]
             shared, own = (
                 [sparse.csc_array(move @ factor) for move, factor in zip(moves, factors, strict=True)]
                 for factors in (views.shared, views.own)

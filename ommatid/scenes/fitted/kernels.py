@@ -124,6 +124,24 @@ class KernelPlaces:
 
 
 @dataclass(frozen=True, eq=False)
+class _Grid:
+    """What products on a padded grid need.
+
+    transfers : of each kernel, (S', rows, columns / 2 + 1)
+    rows, columns : matrices that take the sensor rows and columns out of every `spacing`-th pixel
+    """
+
+    transfers: ComplexArray
+    rows: sparse.csr_array
+    columns: sparse.csr_array
+
+    @cached_property
+    def scattered(self) -> tuple[sparse.csr_array, sparse.csr_array]:
+        """The transposes of `rows` and `columns`."""
+        return sparse.csr_array(self.rows.T), sparse.csr_array(self.columns.T)
+
+
+@dataclass(frozen=True, eq=False)
 class KernelFootprints(ObservationPart):
     """H of one lens type by its kernels.
 
@@ -136,9 +154,7 @@ class KernelFootprints(ObservationPart):
     shapes: KernelShapes
     coefficients: FloatArray
     error_coefficients: FloatArray
-    _transfers: dict[tuple[int, int], ComplexArray] = field(
-        default_factory=dict[tuple[int, int], ComplexArray], init=False, repr=False
-    )
+    _grids: dict[tuple[int, int], _Grid] = field(default_factory=dict[tuple[int, int], "_Grid"], init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Raise ValueError for arrays that do not belong together."""
@@ -151,7 +167,7 @@ class KernelFootprints(ObservationPart):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs: transfer functions are computed again there."""
-        return self.__dict__ | {"_transfers": {}}
+        return self.__dict__ | {"_grids": {}}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -182,18 +198,18 @@ class KernelFootprints(ObservationPart):
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements of the type,)."""
         total: FloatArray = np.zeros((self.places.starts[0].size, self.places.starts[1].size))
-        readings = self._correlated(seen, self._transfers_on(seen.padded))
-        for every, weight in zip(readings, self._weights(self.coefficients), strict=True):
+        readings = self._correlated(seen, self._grid(seen.padded).transfers)
+        for every, weight in zip(readings, self._applied_weights, strict=True):
             total += weight * every
         out[:] = self.places.lens_type.in_order(total)
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements of the type,)."""
-        lines, (rows, columns) = self.places.lens_type.by_lines(readings), self._gather(back.padded)
-        transfers, count, length = self._transfers_on(back.padded), rows.shape[1], columns.shape[1]
+        lines, grid = self.places.lens_type.by_lines(readings), self._grid(back.padded)
+        (down, across_them), count, length = grid.scattered, grid.rows.shape[1], grid.columns.shape[1]
         frequencies: IntArray = np.arange(back.padded[1] // 2 + 1)
-        for transfer, weight in zip(transfers, self._weights(self.coefficients), strict=True):
-            placed = on_lines(sparse.csr_array(rows.T), sparse.csr_array(columns.T), lines * weight)
+        for transfer, weight in zip(grid.transfers, self._applied_weights, strict=True):
+            placed = on_lines(down, across_them, lines * weight)
             # Zeros between readings repeat the spectrum.
             across = _coefficients(np.asarray(fft.rfft(placed, workers=processors())), length, frequencies)
             spectrum = np.asarray(fft.fft(across, axis=0, workers=processors(), overwrite_x=True))
@@ -203,7 +219,8 @@ class KernelFootprints(ObservationPart):
 
     def _correlated(self, seen: Seen, transfers: ComplexArray) -> Iterator[FloatArray]:
         """Yield what each kernel with these transfer functions reads: (sensor rows, sensor columns)."""
-        rows, columns = self._gather(seen.padded)
+        grid = self._grid(seen.padded)
+        rows, columns = grid.rows, grid.columns
         count, length, every = rows.shape[1], columns.shape[1], seen.padded[1] // columns.shape[1]
         spectrum = seen.spectrum.reshape(-1, count, seen.spectrum.shape[1])
         aliases = np.arange(length // 2 + 1) + length * np.arange(every)[:, None]
@@ -215,12 +232,32 @@ class KernelFootprints(ObservationPart):
             readings = cast(FloatArray, fft.irfft(across, length, workers=processors(), overwrite_x=True))
             yield on_lines(rows, columns, readings) / (len(spectrum) * every)
 
-    def _transfers_on(self, padded: tuple[int, int]) -> ComplexArray:
-        """Return the transfer function of each kernel on a padded grid: (S, rows, columns / 2 + 1)."""
-        if padded not in self._transfers:
-            self._transfers.clear()  # those of another grid are of no use any more
-            self._transfers[padded] = self._transfers_of(self.shapes.kernels, padded)
-        return self._transfers[padded]
+    def _grid(self, padded: tuple[int, int]) -> _Grid:
+        """Return what a padded grid needs, which is computed once."""
+        if padded not in self._grids:
+            self._grids.clear()  # that of another grid is of no use any more
+            every = gcd(self.spacing, *padded)
+            sizes = padded[0] // every, padded[1] // every
+            rows, columns = (_chosen(start // every % n, n) for start, n in zip(self.places.starts, sizes, strict=True))
+            self._grids[padded] = _Grid(self._transfers_of(self._applied[0], padded), rows, columns)
+        return self._grids[padded]
+
+    @cached_property
+    def _applied(self) -> tuple[FloatArray, FloatArray]:
+        """The fewest kernels that give the same H, (S', W, W), and their coefficients, (S', P)."""
+        kernels, constant = self.shapes.kernels, ~self.coefficients[:, 1:].any(axis=1)
+        by_terms = self.coefficients.any(axis=0)
+        if by_terms.sum() <= (~constant).sum():  # one kernel for each term
+            terms_used = np.eye(by_terms.size)[by_terms]
+            return np.tensordot(terms_used @ self.coefficients.T, kernels, axes=1), terms_used
+        same = np.tensordot(self.coefficients[constant, 0], kernels[constant], axes=1)
+        unit = np.eye(1, by_terms.size)
+        return np.concatenate([same[None], kernels[~constant]]), np.concatenate([unit, self.coefficients[~constant]])
+
+    @cached_property
+    def _applied_weights(self) -> list[FloatArray | float]:
+        """The weight of each of these kernels in every reading."""
+        return self._weights(self._applied[1])
 
     def _transfers_of(self, kernels: FloatArray, padded: tuple[int, int]) -> ComplexArray:
         """Return the conjugate transforms of kernels, which correlate an image with them."""
@@ -231,13 +268,6 @@ class KernelFootprints(ObservationPart):
     def spacing(self) -> int:
         """Pixels of f between neighbouring readings along an axis."""
         return gcd(*(int(start) for axis in self.places.starts for start in axis - axis[0])) or 1
-
-    def _gather(self, padded: tuple[int, int]) -> tuple[sparse.csr_array, sparse.csr_array]:
-        """Return the matrices that take the sensor rows and the sensor columns out of every `spacing`-th pixel."""
-        every = gcd(self.spacing, *padded)
-        sizes = padded[0] // every, padded[1] // every
-        rows, columns = (_chosen(start // every % n, n) for start, n in zip(self.places.starts, sizes, strict=True))
-        return rows, columns
 
     def _weights(self, coefficients: FloatArray) -> list[FloatArray | float]:
         """Return the weight of each kernel in every reading: (sensor rows, sensor columns), or one number for all."""
@@ -336,8 +366,10 @@ class KernelFootprints(ObservationPart):
     @property
     def mean(self) -> KernelFootprints:
         """H by the mean kernel everywhere, without errors."""
-        none = self.error_coefficients[:0, :0, :1]
-        return replace(self.without_errors, degree=0, coefficients=self._means[:, None], error_coefficients=none)
+        shapes = KernelShapes.dense(self.mean_kernel[None])
+        return replace(
+            self, degree=0, shapes=shapes, coefficients=np.ones((1, 1)), error_coefficients=np.zeros((0, 0, 1))
+        )
 
     @property
     def variation(self) -> float:
@@ -402,15 +434,19 @@ class KernelFootprints(ObservationPart):
         """Return L, (measurements of the type, q): the error of H f is L xi, with independent xi of variance 1."""
         grid = padded_shape(self.shape, self.reach, self.spacing)
         seen = Seen(np.asarray(image, dtype=np.float64).reshape(self.shape), grid)
-        lines = np.zeros((len(self.error_coefficients), *(start.size for start in self.places.starts)))
-        shares = [self._weights(coefficients) for coefficients in self.error_coefficients]
-        transfers = self._transfers_of(self.shapes.error_kernels, grid)
-        for number, every in enumerate(self._correlated(seen, transfers)):
-            for read, weights in zip(lines, shares, strict=True):
-                read += weights[number] * every
-        return sparse.csc_array(
-            np.array([self.places.lens_type.in_order(read) for read in lines]).reshape(len(lines), -1).T
-        )
+        sizes = tuple(start.size for start in self.places.starts)
+        every = np.zeros((self.error_coefficients.shape[1], *sizes))
+        for out, read in zip(
+            every, self._correlated(seen, self._transfers_of(self.shapes.error_kernels, grid)), strict=True
+        ):
+            out[:] = read
+        lines = np.zeros((len(self.error_coefficients), *sizes))
+        down, across = (np.asarray(legendre.legvander(axis, self.degree)) for axis in self.places.field)
+        for number, (a, b) in enumerate(terms(self.degree)):
+            of_term = np.tensordot(self.error_coefficients[:, :, number], every, axes=1)
+            lines += np.outer(down[:, a], across[:, b]) * of_term
+        readings = np.array([self.places.lens_type.in_order(read) for read in lines])
+        return sparse.csc_array(readings.reshape(len(lines), -1).T)
 
     @property
     def description(self) -> dict[str, Any]:

@@ -26,35 +26,34 @@ from rich.table import Table
 from ommatid.scenes.constants import WHITE
 
 ROOT = Path(__file__).parents[2]
-SIZES = (239, 479, 1019)
+SIZES = (119, 239, 479, 1019)
 NARROWEST = 200
 PITCH = 4.4e-3  # mm between lenses per pixel of f's side: sub-images of pixels of 6 um do not overlap
 STAGES = ("start-up", "render", "calibrate", "reconstruct", "files", "page")
 LENSES = ("I", "II", "III")
 AUTO = ("render.samples=auto", "calibration.samples=auto")
-APERTURE = "1 mm"
+APERTURES = tuple(f'camera.lens.{name}.aperture="0.4 mm"' for name in LENSES)
+GLASS = ("study=", *(f'camera.lens.{name}.pixels="fit"' for name in LENSES))
 
 
 @dataclass(frozen=True)
 class Case:
-    """A scene with changes of its keys, and the largest side for which it is of use."""
+    """A scene with changes of its keys, the largest side for which it is of use, and the world's pixels in one of f."""
 
     name: str
     scene: str
     changes: tuple[str, ...]
     largest: int = 5000
+    detail: int = 1
 
 
 CASES = (
     Case("ideal pinholes", "photo.toml", (*AUTO, "calibration.method=ideal")),
     Case("point sources", "photo.toml", AUTO),
-    Case("thin lens", "photo.toml", (*AUTO, *(f'camera.lens.{name}.aperture="{APERTURE}"' for name in LENSES))),
-    Case(
-        "doublet",
-        "doublet.toml",
-        (*AUTO, "target.detail=1", "study=", *(f'camera.lens.{name}.pixels="fit"' for name in LENSES)),
-        largest=239,
-    ),
+    Case("misaligned pinholes", "photo.toml", (*AUTO, 'camera.tolerance.position="41 nm"')),
+    Case("thin lenses of 0.4 mm", "photo.toml", (*AUTO, *APERTURES)),
+    Case("doublet", "doublet.toml", (*AUTO, *GLASS, "target.detail=1"), largest=239),
+    Case("doublet, detail 3", "doublet119.toml", (*AUTO, *GLASS), largest=239, detail=3),
 )
 
 
@@ -72,8 +71,8 @@ class Measurement:
 def command(arguments: Sequence[str]) -> None:
     """Measure the cases at the sizes of the command line, and print a row as soon as it is complete."""
     parser = ArgumentParser("python -m tests.benchmarks chain", description=str(__doc__).splitlines()[0])
-    parser.add_argument("sizes", nargs="*", type=int, metavar="SIZE", help="pixels a side; default: 239 479 1019")
-    parser.add_argument("--cases", default="", metavar="NAME,...", help="ideal, point, thin or doublet; default: all")
+    parser.add_argument("sizes", nargs="*", type=int, metavar="SIZE", help="pixels a side; default: 119 239 479 1019")
+    parser.add_argument("--cases", default="", metavar="NAME,...", help="ideal, point, misaligned, thin or doublet; default: all")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a key of every scene")
     options = parser.parse_args(arguments)
     chosen = [word for word in options.cases.split(",") if word]
@@ -91,7 +90,7 @@ def measure(case: Case, size: int, changes: Sequence[str] = ()) -> Measurement:
     """Run a case once in a process and a folder of its own."""
     with TemporaryDirectory(prefix="ommatid-chain-") as folder:
         picture = Path(folder) / "picture.npy"
-        np.save(picture, picture_of(size))
+        np.save(picture, picture_of(case.detail * size))
         out = Path(folder) / "out"
         settings = (f'target.image="{picture}"', "target.origin=[0,0]", f"target.shape=[{size},{size}]")
         pitch = f'camera.lens_pitch="{max(1.0, round(PITCH * size, 2)) * _pixel(case):g} mm"'
@@ -113,7 +112,7 @@ def measure(case: Case, size: int, changes: Sequence[str] = ()) -> Measurement:
 
 def _pixel(case: Case) -> float:
     """Return the pitch of the sensor pixels of a case, relative to 6 um."""
-    return 3.0 if case.scene == "doublet.toml" else 1.0
+    return 3.0 if case.scene.startswith("doublet") else 1.0
 
 
 def picture_of(size: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
@@ -130,7 +129,7 @@ def picture_of(size: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
 def table(rows: Sequence[tuple[Case, int, Measurement]]) -> Table:
     """Return the measurements as a table."""
     result = Table(title="From picture to page")
-    for name in ("case", "side", "all", *STAGES, "memory", "files"):
+    for name in ("case", "side", "all", *STAGES, "memory", "files", "MSE", "99 %", "chi-squared", "verdict"):
         result.add_column(name, justify="left" if name == "case" else "right")
     for case, size, measured in rows:
         result.add_row(case.name, str(size), *_cells(measured))
@@ -144,4 +143,8 @@ def _cells(measured: Measurement) -> list[str]:
     seconds = {name: stage["seconds"] for name, stage in measured.report["stages"].items()}
     seconds["start-up"] = measured.report["spent"].get("start_up", 0.0)
     stages = (f"{seconds.get(name, 0.0):.1f} s" for name in STAGES)
-    return [whole, *stages, f"{measured.memory / 1e9:.2f} GB", f"{measured.files / 1e6:.3g} MB"]
+    error, residual = measured.report["error"], measured.report["diagnostics"]["chi_squared"]
+    given = error["expected_given_truth"]
+    ratio = residual["chi_squared"] / residual["expected"]
+    found = f"{error['mse']:.4g}", f"{given['low']:.4g} to {given['high']:.4g}", f"{ratio:.3f}"
+    return [whole, *stages, f"{measured.memory / 1e9:.2f} GB", f"{measured.files / 1e6:.3g} MB", *found, measured.report["verdict"]["level"]]

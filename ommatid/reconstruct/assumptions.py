@@ -18,8 +18,8 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import DetailedModel, model_of_f
-from .detail.world_fit import fit_world
 from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
+from .fitting.window_fit import fit_by_window
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
 from .methods.method import Execution, Method, MethodResult, total_variance
@@ -245,8 +245,9 @@ def _fit(observation: ObservedStack, noise: Noise) -> PriorFit | None:
         return None
     known = observation.expected_noise(noise) if noise_known else total_variance(certain(noise))
     task = observation.task(known)
-    if isinstance(task.model, DetailedModel) and noise_known and not prior_known:
-        return fit_world(task)
+    kernels_alone = task.model.stored is None and not task.model.camera.has_sharp_footprints
+    if (isinstance(task.model, DetailedModel) or kernels_alone) and noise_known and not prior_known:
+        return fit_by_window(task)
     return fit_prior(*evidence_of(task, prior_known=prior_known, noise_known=noise_known))
 
 

@@ -175,7 +175,7 @@ def evidence_of(task: EstimationTask, *, prior_known: bool, noise_known: bool) -
     enough for three parameters.
     """
     mean = task.prior.mean
-    if task.model.unknowns <= MAX_COMPLETE:
+    if task.model.unknowns <= MAX_COMPLETE and task.model.stored is not None:
         prior = task.prior_on(task.shape) if prior_known else None
         matrix = task.model.matrix[task.used]
         residual = task.recorded[task.used] - matrix @ np.full(task.model.unknowns, mean)

@@ -1,8 +1,8 @@
-"""Fit of an exponential prior to a world finer than f, by the evidence of the measurements.
+"""Fit of an exponential prior by the evidence of the measurements of a window in the middle of the image.
 
-Detail tells of the prior as well, so the evidence is that of Hf w + v. With P = v K(length) its covariance is
+It serves worlds finer than f, of whose prior detail tells as well, so that the evidence is that of Hf w + v, and large
+images behind kernels, of which no tile holds a whole one. With P = v K(length) the covariance of the measurements is
 v Hf K Hf^T + Rv: whitened by Rv and diagonalised once for each length, it gives the evidence for every v at once.
-A large image is represented by the measurements of a window in its middle.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import PriorTable
 
-from ..fitting.prior_fit import MAX_LENGTH, MIN_LENGTH, MIN_MEASUREMENTS, RANGE, PriorFit
+from ..detail.detailed_model import DetailedModel
+from ..detail.world_prior import WorldPrior
 from ..methods.method import EstimationTask
-from .detailed_model import detailed
-from .world_prior import WorldPrior
+from .prior_fit import MAX_LENGTH, MIN_LENGTH, MIN_MEASUREMENTS, RANGE, PriorFit
 
 LENGTHS = (0.5, 1.5, 4.0, 10.0, 25.0, 60.0)  # pixels of f, from which the search starts
 MOST = 700  # measurements whose covariance is diagonalised
@@ -33,7 +33,7 @@ TOLERANCE = 0.02  # of the logarithm of the length, far below what the evidence 
 
 
 @dataclass(frozen=True)
-class WorldEvidence:
+class WindowEvidence:
     """Measurements in units of their noise, and the rows of H that they see, on the world's grid.
 
     matrix : (m, pixels of the window's world) whitened;  residual : (m,) whitened;  shape : of the window, pixels of f
@@ -86,13 +86,13 @@ class WorldEvidence:
         return float(np.log(total).sum() + (squares / total).sum())
 
 
-def fit_world(task: EstimationTask) -> PriorFit:
-    """Fit variance and correlation length, in pixels of f, of the world's prior.
+def fit_by_window(task: EstimationTask) -> PriorFit:
+    """Fit variance and correlation length, in pixels of f, of the prior of f or of the world.
 
     task : its model on f's grid, its expected noise all of the noise but that of detail
     Raises InputError where measurements are too few, or have no noise.
     """
-    evidence = world_evidence(task)
+    evidence = window_evidence(task)
     bounds = _variance_bounds(evidence)
 
     @cache
@@ -116,27 +116,29 @@ def fit_world(task: EstimationTask) -> PriorFit:
     )
 
 
-def world_evidence(task: EstimationTask) -> WorldEvidence:
+def window_evidence(task: EstimationTask) -> WindowEvidence:
     """Return the evidence of the measurements inside a window in the middle of the image, MOST of them at most."""
-    model = detailed(task.model)
+    model, offset = task.model, np.zeros(task.model.measurements)
+    if isinstance(model, DetailedModel):
+        model, offset = model.fine, model.offset
+    detail = model.camera.rows // task.shape[0]
     if not (task.expected_noise > 0).all():
         raise InputError(
             "a prior cannot be fitted to measurements without noise; set estimator.noise_variance to a number above 0"
         )
-    rows, columns, inside = _window(model.fine, task, model.camera.detail)
+    rows, columns, inside = _window(model, task, detail)
     if inside.size < MIN_MEASUREMENTS:
         raise InputError(
             f"a fit of the prior or the noise takes {MIN_MEASUREMENTS} measurements or more, got {inside.size}"
         )
-    matrix = model.fine.windowed.rows_on(inside, rows, columns)
-    light = model.fine.forward(np.ones(model.fine.unknowns))[inside]
-    residual = (task.recorded + model.offset)[inside] - task.prior.mean * light
+    matrix = model.windowed.rows_on(inside, rows, columns)
+    light = model.forward(np.ones(model.unknowns))[inside]
+    residual = (task.recorded + offset)[inside] - task.prior.mean * light
     beside = np.square(light - np.asarray(matrix.sum(axis=1)).ravel()) * float(np.mean(np.square(residual)))
     deviation = np.sqrt(task.on_all_measurements(task.expected_noise, 1.0)[inside] + beside)
     whitened = sparse.csr_array(sparse.diags_array(1 / deviation) @ matrix)
-    detail = model.camera.detail
     shape = (rows.stop - rows.start) // detail, (columns.stop - columns.start) // detail
-    return WorldEvidence(whitened, residual / deviation, shape, detail)
+    return WindowEvidence(whitened, residual / deviation, shape, detail)
 
 
 def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slice, IntArray]:
@@ -170,7 +172,7 @@ def _middle(shape: tuple[int, int], side: int, detail: int) -> tuple[slice, slic
     return rows, columns
 
 
-def _variance_bounds(evidence: WorldEvidence) -> tuple[float, float]:
+def _variance_bounds(evidence: WindowEvidence) -> tuple[float, float]:
     square = float(np.mean(np.square(evidence.residual)))
     if square == 0:
         raise InputError("the measurements equal those of the prior's mean to the last digit: nothing can be fitted")

@@ -103,6 +103,9 @@ class ExactVariances:
         solved = self._solve(weights, finest)
         if self.noise is not None:
             readings = self.system.observation.forward(solved)
+            if pixels.size == 1:  # the quadratic form is that of the pixel alone
+                missing = float(solved @ self.system.apply_prior_precision(solved))
+                return np.array([missing + float(self.noise @ np.square(readings))])
             readings *= self.noise
             right = self.system.observation.adjoint(readings) + self.system.apply_prior_precision(solved)
             smallest = float(np.min((signs * self._of_f(solved))[pixels]))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise, product
 
 import numpy as np
@@ -204,7 +204,7 @@ class SmallFrames:
         sides = [min(LONG if self._far else SIDE, size) for size in self.shape]
         every = list(product(*(self._places(size) for size in self.shape)))
         with ThreadPoolExecutor(processors()) as threads:
-            found = list(threads.map(lambda places: self._at(scale, places), every))
+            found = list(threads.map(partial(self._at, scale), every))
         for places, at in zip(every, found, strict=True):
             down, across = places
             kept = (each.kept(side) for each, side in zip(places, sides, strict=True))

@@ -10,24 +10,34 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
+from ommatid.reconstruct.assumptions import assumptions_for
+from ommatid.reconstruct.frame import frame_method
 from ommatid.reconstruct.method_choice import METHODS, choose_method
+from ommatid.reconstruct.methods.method import Execution
+from ommatid.reconstruct.methods.prepared import Prepared
 from ommatid.reconstruct.prediction import predict_frame
+from ommatid.reconstruct.prior import coloured, spectrum_of
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
-from ommatid.scenes.model import Model
+from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, views_as_designed
+from ommatid.scenes.fitted.kernels import KernelFootprints
+from ommatid.scenes.model import Model, fitted_model
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..frames import FITTED, blurred, drawn, recorded, wide, with_apertures
+from ..frames import FITTED, blurred, drawn, observed, recorded, wide, with_apertures
 
 ROOT = Path(__file__).parents[2]
 SHAPE = (52, 47)
 SMALL = (38, 35)  # strips along the edges cover it entirely
 NOISE = {"variance": 1e-2, "bits": 10}
 VARIANCE = 1e-2 + (256 / 2**10) ** 2 / 12
+SIMULATIONS = 200
 UNFITTED = (("1/3", [2, 3], "fit"),)
 
 
@@ -152,6 +162,46 @@ def test_error_bars_of_two_types_of_lenses() -> None:
     assert frame.solver.variance_bound < 0.04
 
 
+def hardly_varying(shape: tuple[int, int]) -> tuple[Scene, Model]:
+    """Thin lenses which diffract, and a calibrated H whose kernels vary by half a percent over the field."""
+    described = with_apertures(wide(shape, noise=NOISE))
+    camera = derive(described)
+    tilted = np.array([[1.0, 0.005, -0.003, -0.004, 0.003, -0.005]])  # a Legendre polynomial over the field
+    kernels = {
+        part.places.lens_type.name: replace(part, degree=2, coefficients=tilted, error_coefficients=np.zeros((0, 0, 6)))
+        for part in observed(camera).parts
+        if isinstance(part, KernelFootprints)
+    }
+    views = {
+        lens.name: views_as_designed([sub for sub in camera.sub_imagers if sub.type == lens]) for lens in camera.types
+    }
+    fitted = FittedMatrix(camera, views, kernels)
+    return described, fitted_model(described, camera, fitted, None, {"method": "transport", "versions": {}})
+
+
+def test_means_of_errors_by_mean_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interval, budget and expected residual are those by all kernels to 1 %; the estimate takes all of them."""
+    described, model = hardly_varying((65, 67))
+    truth = drawn((65, 67), 1)
+    stack = recorded(described, truth, VARIANCE, matrix=model.as_linear_operator())
+    found = restore(stack, model, truth)
+    monkeypatch.setattr(frame_method, "HARDLY", 0.0)
+    exact = restore(stack, model, truth)
+    assert found.choice.method == exact.choice.method == "frame"
+    np.testing.assert_allclose(found.estimate, exact.estimate, atol=1e-6)
+    assert found.result.interval is not None
+    assert exact.result.interval is not None
+    assert found.result.interval.mse == pytest.approx(exact.result.interval.mse, rel=0.01)
+    assert found.result.interval.high - found.result.interval.low == pytest.approx(
+        exact.result.interval.high - exact.result.interval.low, rel=0.05
+    )
+    assert found.residual is not None
+    assert exact.residual is not None
+    assert found.residual.expected == pytest.approx(exact.residual.expected, rel=0.01)
+    assert found.expected.parts == pytest.approx(exact.expected.parts, rel=0.01)
+    assert found.verdict.level == exact.verdict.level != "red"
+
+
 def test_large_cameras_of_lenses_are_applied_without_entries() -> None:
     """More than 4000 pixels behind lenses that diffract: no entries, the frame alone, other methods refused."""
     scene = with_apertures(wide((59, 119), FITTED, noise=NOISE, calibration={"method": "ideal"}))
@@ -251,3 +301,32 @@ def test_too_little_memory_for_any_method_is_refused() -> None:
     scene = wide((239, 239), noise=NOISE, estimator={"memory": "1 MB"})
     with pytest.raises(InputError, match=r"estimator needs .* GB .*0\.0 GB are allowed; raise estimator\.memory"):
         choose_method(scene, derive(scene), exact=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["frame", "auto"], ids=["frame", "dense"])
+@pytest.mark.parametrize("prior", [{}, {"kind": "exponential", "correlation_length": "8 mm"}], ids=["pixels", "waves"])
+def test_errors_of_drawn_images_are_uniform_in_their_quantiles(prior: dict[str, Any], method: str) -> None:
+    """Simulation-based calibration (Talts et al. 2018): pixels inside, at an edge and in a corner, a mean of 5 x 5."""
+    shape = 35, 33
+    described = with_apertures(wide(shape, noise=NOISE, prior=prior, estimator={"method": method}), 0.4)
+    camera = derive(described)
+    model, rng = ideal_model(described, camera), np.random.default_rng(7)
+    spectrum = spectrum_of(described.assumed_prior, shape, camera.target_pitch)
+    regions = np.zeros((4, *shape))
+    regions[0, 17, 16] = regions[1, 0, 15] = regions[2, -1, -1] = 1.0
+    regions[3, 10:15, 20:25] = 1 / 25
+    weights = regions.reshape(len(regions), -1)
+    scores: list[FloatArray] = []
+    deviations: FloatArray | None = None
+    choice, execution = choose_method(described, camera, exact=True), Execution(prepared=Prepared(model))
+    for _ in range(SIMULATIONS):
+        truth = 127.5 + coloured(spectrum, rng.normal(size=shape)).ravel()
+        stack = recorded(described, truth, VARIANCE, int(rng.integers(2**31)), matrix=model.as_linear_operator())
+        if deviations is None:
+            result = restore(stack, model, prepared=execution.prepared).result
+            deviations = np.sqrt([result.variance_of_sum(each) for each in weights])
+        scores.append(weights @ (assumptions_for(stack, model, choice, execution).method.image - truth) / deviations)
+    for each in np.array(scores).T:
+        assert stats.kstest(stats.norm.cdf(each), "uniform").pvalue > 1e-3
+        assert abs(np.square(each).mean() - 1) < 4 * (2 / SIMULATIONS) ** 0.5

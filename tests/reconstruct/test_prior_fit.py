@@ -8,17 +8,22 @@ import numpy as np
 import pytest
 from scipy import sparse, stats
 
+from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.fitting.evidence import Evidence
 from ommatid.reconstruct.fitting.prior_fit import PriorFit, fit_prior, search
-from ommatid.reconstruct.prior import Prior, exponential, independent, prior_of
+from ommatid.reconstruct.method_choice import choose_method
+from ommatid.reconstruct.methods.method import Execution
+from ommatid.reconstruct.prior import Prior, coloured, exponential, exponential_spectrum, independent, prior_of
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
 from ommatid.scenes.tables.estimation import PriorTable
-from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 from ..examples import camera, posterior_covariance
+from ..frames import recorded, wide, with_apertures
 
 SHAPE = (19, 19)
 MATRIX = ideal_matrix(camera())
@@ -213,3 +218,18 @@ def test_an_image_that_no_measurement_shows_makes_the_fit_doubtful(noise_known: 
     residual = matrix @ (board - 127.5) + 1e-2 * np.random.default_rng(0).normal(size=matrix.shape[0])
     known = np.full(residual.size, 1e-4 if noise_known else 0.0)
     assert fit_prior(Evidence(matrix, residual, known, shape, None, noise_known)).doubtful
+
+
+def test_a_prior_is_fitted_to_large_images_behind_kernels() -> None:
+    """No tile holds a whole kernel: a window in the middle does, and its light from beside it counts as noise."""
+    shape = 67, 65
+    described = with_apertures(wide(shape, noise={"variance": 1e-2}, prior={"kind": "fit"}))
+    layout = derive(described)
+    spectrum = 900.0 * exponential_spectrum(shape, 6.0)
+    truth = 127.5 + coloured(spectrum, np.random.default_rng(3).normal(size=shape)).ravel()
+    model = ideal_model(described, layout)
+    stack = recorded(described, truth, 1e-2, matrix=model.as_linear_operator())
+    assumed = assumptions_for(stack, model, choose_method(described, layout, exact=True), Execution())
+    assert assumed.fit is not None
+    logs = np.log([(assumed.fit.variance or 0) / 900.0, (assumed.fit.length or 0) / 6.0])
+    assert np.abs(logs / np.array(assumed.fit.spread)).max() < 4

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ommatid.reconstruct.methods.prepared import Prepared
+from ommatid.reconstruct.methods.method import Prepared
 from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import Reconstruction, check_camera

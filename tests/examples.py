@@ -12,9 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import sparse, stats
 
-from ommatid.reconstruct.forms.form import Form
 from ommatid.reconstruct.prior import Prior, independent
-from ommatid.reconstruct.problem import Problem
+from ommatid.reconstruct.problem import Form, Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera, derive

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.reconstruct.methods.prepared import Prepared
+from ommatid.reconstruct.methods.method import Prepared
 from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.estimate_formats import Format, check_formats, clear_formats, write_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.time_spent import PAGE, before_page, with_stage, without_page
+from ommatid.reconstruct.output.run_json import PAGE, before_page, with_stage, without_page
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.input_files import open_input
 from ommatid.scenes import stack

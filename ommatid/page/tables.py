@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from ommatid.analysis import depth_error, run_table, study
 from ommatid.analysis.summary import describe, skipped_words
-from ommatid.reconstruct.output.run_json import RunReport, StageReport
-from ommatid.reconstruct.output.time_spent import FILES, PAGE
+from ommatid.reconstruct.output.run_json import FILES, PAGE, RunReport, StageReport
 from ommatid.reconstruct.output.verdict_words import is_trusted
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.geometry.optical_terms import optical_terms

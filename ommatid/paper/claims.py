@@ -14,7 +14,7 @@ from math import inf, isfinite
 import numpy as np
 
 from ommatid.reconstruct.measured_error import TRIM
-from ommatid.reconstruct.methods.tile_merging import Posterior, disjoint_tiles, merge_posteriors, tile_posterior
+from ommatid.reconstruct.methods.tile_solver import Posterior, disjoint_tiles, merge_posteriors, tile_posterior
 from ommatid.reconstruct.prediction import observability
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray

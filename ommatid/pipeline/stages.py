@@ -11,8 +11,7 @@ from typing import Any
 from ommatid.batch.batch import Member, check_files, prepare
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
-from ommatid.reconstruct.output.run_json import RunReport, StudyCase, TimeReport
-from ommatid.reconstruct.output.time_spent import FILES, with_stage
+from ommatid.reconstruct.output.run_json import FILES, RunReport, StudyCase, TimeReport, with_stage
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress

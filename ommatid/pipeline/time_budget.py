@@ -16,8 +16,7 @@ import numpy as np
 from ommatid.batch.batch import Member
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.run_json import ErrorReport, RequestedTime, RunReport, TimeReport
-from ommatid.reconstruct.output.time_spent import STAGES
+from ommatid.reconstruct.output.run_json import STAGES, ErrorReport, RequestedTime, RunReport, TimeReport
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import read_text
 from ommatid.scenes import model_file, stack

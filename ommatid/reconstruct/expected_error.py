@@ -22,8 +22,7 @@ from ommatid.runtime.errors import InputError
 
 from .estimator.certificate import exact_sums, refine
 from .estimator.residuals import ExactResiduals, exact
-from .forms.form import Form
-from .problem import Whitening
+from .problem import Form, Whitening
 
 Pixels = NDArray[np.intp]
 

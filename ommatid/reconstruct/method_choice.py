@@ -11,8 +11,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
 
-from .detail.detail_method import DetailMethod
-from .detail.detailed_model import detail_memory, has_moments
+from .detail.detailed_model import DetailMethod, detail_memory, has_moments
 from .estimator.estimate import needed_memory
 from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
 from .frame.error_map import window_memory

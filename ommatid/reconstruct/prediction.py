@@ -17,13 +17,12 @@ from ommatid.scenes.tables.estimation import EstimatorTable
 
 from .estimator.estimate import factorise
 from .expected_error import ExpectedError, expected_error
-from .forms.form import Form
 from .measured_error import TRIM, trimmed_mean
 from .method_choice import METHODS, MethodChoice
 from .methods.method import EstimationTask, Execution
 from .noise import at_used, uniform
 from .prior import Prior
-from .problem import Problem, gram
+from .problem import Form, Problem, gram
 
 PRIOR_ALONE = 0.9  # of the prior's variance: error from which measurements bring next to nothing
 NOISELESS = 1e-12  # of a measurement's prior variance: noise in place of none that an estimator expects where some is

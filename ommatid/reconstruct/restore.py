@@ -21,18 +21,16 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .assumptions import Assumptions, assumptions_for, with_fallback
-from .detail.detail_method import DetailMethod
-from .detail.detailed_model import DetailedModel
+from .detail.detailed_model import DetailedModel, DetailMethod
 from .expected_error import ExpectedError, Interval
 from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
-from .methods.method import EstimationTask, Execution, Method, MethodResult, is_uniform, total_variance
-from .methods.prepared import Prepared
+from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, is_uniform, total_variance
 from .misalignment.robust_noise import CAUSE
 from .noise import Noise, UsablePixels, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
-from .verdict.residual_parts import WhitenedResidual, residual_parts
+from .verdict.residual import WhitenedResidual, residual_parts
 from .verdict.verdict import ErrorCheck, evidence_of, judge, without_pixels
 
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves

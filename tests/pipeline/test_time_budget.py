@@ -24,8 +24,7 @@ from ommatid.pipeline.time_allocation import (
     error_curve,
 )
 from ommatid.pipeline.time_budget import FEW, KEYS, MORE, run_within, shared_time
-from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.time_spent import time_spent
+from ommatid.reconstruct.output.run_json import RunReport, time_spent
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup

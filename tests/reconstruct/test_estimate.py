@@ -15,10 +15,9 @@ from ommatid.reconstruct.estimator.certificate import variance_error
 from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, estimate, factorise
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.reconstruct.forms.cholesky import information
-from ommatid.reconstruct.forms.form import NotSolvableError
 from ommatid.reconstruct.forms.square_root import square_root
 from ommatid.reconstruct.prior import Prior, independent
-from ommatid.reconstruct.problem import Problem
+from ommatid.reconstruct.problem import NotSolvableError, Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 

@@ -15,8 +15,7 @@ from scipy import stats
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.frame import frame_method
 from ommatid.reconstruct.method_choice import METHODS, choose_method
-from ommatid.reconstruct.methods.method import Execution
-from ommatid.reconstruct.methods.prepared import Prepared
+from ommatid.reconstruct.methods.method import Execution, Prepared
 from ommatid.reconstruct.prediction import predict_frame
 from ommatid.reconstruct.prior import coloured, spectrum_of
 from ommatid.reconstruct.restore import Reconstruction, restore

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ommatid.reconstruct.estimator import estimate
 from ommatid.reconstruct.frame.error_map import ErrorMap
 from ommatid.reconstruct.methods import dense_method
-from ommatid.reconstruct.methods.prepared import SAME_NOISE, Conditions, Prepared, relative_difference
+from ommatid.reconstruct.methods.method import SAME_NOISE, Conditions, Prepared, relative_difference
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive

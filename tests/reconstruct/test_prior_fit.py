@@ -10,8 +10,7 @@ from scipy import sparse, stats
 
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.estimator.estimate import estimate
-from ommatid.reconstruct.fitting.evidence import Evidence
-from ommatid.reconstruct.fitting.prior_fit import PriorFit, fit_prior, search
+from ommatid.reconstruct.fitting.prior_fit import Evidence, PriorFit, fit_prior, search
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.method import Execution
 from ommatid.reconstruct.prior import Prior, coloured, exponential, exponential_spectrum, independent, prior_of

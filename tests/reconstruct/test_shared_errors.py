@@ -18,8 +18,7 @@ from ommatid.reconstruct.methods.method import Execution, MethodResult, Posterio
 from ommatid.reconstruct.model_error import shared_errors as module
 from ommatid.reconstruct.model_error.shared_errors import shared_errors
 from ommatid.reconstruct.restore import Reconstruction, restore
-from ommatid.reconstruct.verdict.residual_parts import WhitenedResidual, residual_parts
-from ommatid.reconstruct.verdict.residual_power import squared_trace
+from ommatid.reconstruct.verdict.residual import WhitenedResidual, residual_parts, squared_trace
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.fitted.fitted_matrix import Directions
 from ommatid.scenes.formats.picture import averaged

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from ommatid.reconstruct.forms.square_root import Indices
-from ommatid.reconstruct.methods.tile_merging import (
+from ommatid.reconstruct.methods.tile_solver import (
     Posterior,
     disjoint_tiles,
     merge_posteriors,

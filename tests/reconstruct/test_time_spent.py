@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from ommatid.reconstruct.output.run_json import RunReport, StageReport, TimeReport
-from ommatid.reconstruct.output.time_spent import FILES, PAGE, time_spent, with_stage, without_page
+from ommatid.reconstruct.output.run_json import (
+    FILES,
+    PAGE,
+    RunReport,
+    StageReport,
+    TimeReport,
+    time_spent,
+    with_stage,
+    without_page,
+)
 
 from ..runs import report_of
 

@@ -18,8 +18,7 @@ from ommatid.reconstruct.methods.dense_method import DRAWS, residual_power
 from ommatid.reconstruct.output.run_json import VerdictReport
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore
-from ommatid.reconstruct.verdict.residual_parts import WhitenedResidual, regions, residual_parts
-from ommatid.reconstruct.verdict.residual_power import ResidualPower
+from ommatid.reconstruct.verdict.residual import ResidualPower, WhitenedResidual, regions, residual_parts
 from ommatid.reconstruct.verdict.verdict import error_p_value, excesses, with_gain
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive

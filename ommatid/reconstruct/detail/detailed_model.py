@@ -9,6 +9,8 @@ Rv + cov e in place of Rv give the best linear estimate of f. A prior of indepen
 world is then taken as made of f's pixels, and e is zero.
 
 Where these moments are too large, the world itself is estimated as a frame, and f as its averages.
+
+The dense method of few pixels takes the covariance of detail as noise.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
@@ -30,12 +32,21 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.observation import Observation
 from ommatid.scenes.tables.estimation import PriorTable
 
+from ..expected_error import CorrelatedNoise, Interval, interval, squared_error
+from ..methods.dense_method import DRAWS, DenseMethod, residuals
+from ..methods.method import total_variance
+from ..problem import Whitening
+from ..verdict.residual import ResidualInputs, ResidualPower
 from .world_prior import WorldPrior, averaging, repetition
 
+NEEDS_NOISE = (
+    "detail finer than f needs noise in every measurement, got some without; set noise.variance or"
+    " estimator.noise_variance to a number above 0, or target.detail to 1"
+)
 MAX_WORLD = 32_000  # pixels of the world, and
 MAX_MEASUREMENTS = 1_500  # measurements, up to which the exact moments take seconds
 CAUSE = "detail"  # in the error budget
-DRAWS = 4
+WORLDS = 4  # random worlds by which the uncertainty of H acts on detail
 
 
 @dataclass(frozen=True)
@@ -99,7 +110,7 @@ class DetailedModel(Model):
             return variance
         rng, scatter, power = probe(Purpose.DETAIL_SCATTER), 0.0, 0.0
         average = averaging(self.camera.shape, self.camera.detail)
-        for _ in range(DRAWS):
+        for _ in range(WORLDS):
             world = self.world.draw(rng)
             detail = world - self.interpolation @ (average @ world)
             scatter += float(self.fine.scatter(detail).sum())
@@ -243,3 +254,63 @@ def _entry_variance(model: Model, matrix: sparse.csr_array, interpolation: spars
     spread: Any = variance @ squares
     rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
     return np.asarray(sparse.csr_array(spread)[rows, matrix.indices], dtype=np.float64).ravel()
+
+
+class DetailMethod(DenseMethod):
+    """Rv holds the covariance of the detail finer than f, which is common to measurements of the same place."""
+
+    @property
+    def _model(self) -> DetailedModel:
+        return detailed(self.task.model)
+
+    @cached_property
+    def observation(self) -> tuple[sparse.csr_array, CorrelatedNoise]:
+        """H of the measurements used, and their noise with that of detail."""
+        task, model = self.task, self._model
+        whole = slice(0, task.expected_noise.size)
+        white = Whitening.of([(whole, _of_used(model, task.used))], task.expected_noise, NEEDS_NOISE)
+        # Errors that measurements share are whitened as independent ones, but the actual noise is without them.
+        return model.matrix[task.used], CorrelatedNoise(white, CAUSE, task.shared_variance)
+
+    def _noise_given(self, truth: FloatArray, noise: dict[str, FloatArray]) -> FloatArray:
+        """Return the noise, (measurements used,), with what the uncertainty of H adds for a world of known detail."""
+        if "calibration" in noise:
+            noise = noise | {"calibration": self._model.fine.variance_from_model(truth)[self.task.used]}
+        return total_variance(noise)
+
+    def residual_power(
+        self, truth: FloatArray | None, noise: dict[str, FloatArray], leverage: FloatArray | None
+    ) -> ResidualPower | None:
+        """Return the expected squares of the whitened residual; where its world is known, its detail is no noise."""
+        model, form = self._model, self.estimate.form
+        if truth is None or truth.size == form.problem.unknowns:
+            return super().residual_power(truth, noise, leverage)
+        inputs = ResidualInputs(
+            observe=lambda world: self.white(model.fine.forward(world)[self.task.used]),
+            draw_image=lambda _: np.zeros(truth.size),
+            actual=self._noise_given(truth, noise),
+            deviation=truth - model.prior_mean,
+            draws=DRAWS,
+            leverage=leverage,
+            whiten=self.white,
+        )
+        return inputs.power(residuals(form, inputs.block()), form.problem.noise_variance)
+
+    def interval(self, truth: FloatArray, noise: dict[str, FloatArray]) -> Interval:
+        """Return the expected error of one image; where its world is known, its detail is no noise."""
+        model, form, white = self._model, self.estimate.form, self.observation[1].white
+        if truth.size == form.problem.unknowns:
+            return super().interval(truth, noise)
+        deviation = truth - model.prior_mean
+        light = (model.fine.forward(deviation))[self.task.used]
+        bias: FloatArray = averaging(self.task.shape, model.camera.detail) @ deviation - form.gain(self.white(light))
+        pixels, given = np.arange(bias.size), self._noise_given(truth, noise)
+        mean, variance = squared_error(form, bias[:, None], given, pixels, white)
+        return interval(float(mean[0]), float(variance[0]), bias.size)
+
+
+def _of_used(model: DetailedModel, used: BoolArray) -> FloatArray:
+    covariance = model.detail_covariance
+    if covariance is None:
+        return np.diag(model.detail_variance[used])
+    return np.array(covariance) if used.all() else covariance[np.ix_(used, used)]

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 
-from ..forms.form import Form
+from ..problem import Form
 from .residuals import DoubleDouble, ExactResiduals, as_exact, column_dots, exact
 
 Indices = NDArray[np.intp]

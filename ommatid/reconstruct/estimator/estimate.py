@@ -24,10 +24,9 @@ from ommatid.runtime.machine import free_memory
 
 from ..forms.cholesky import covariance, information
 from ..forms.dual import dual
-from ..forms.form import Form, NotSolvableError
 from ..forms.square_root import square_root
 from ..output.run_json import RejectedForm, SolverReport
-from ..problem import Problem
+from ..problem import Form, NotSolvableError, Problem
 from .certificate import RefinedSolution, estimate_rounding, refine, variance_error, variance_rounding
 from .residuals import DoubleDouble, ExactResiduals
 

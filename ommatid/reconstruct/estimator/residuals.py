@@ -1,6 +1,6 @@
 """Residuals of the estimator's equations in double-double arithmetic.
 
-For right-hand sides c and r (`forms.form`) and a computed solution u and l,
+For right-hand sides c and r (`problem`) and a computed solution u and l,
 
     p = c + L^T H^T l - u,    q = r - H L u - Rv l.
 

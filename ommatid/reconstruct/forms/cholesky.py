@@ -20,8 +20,7 @@ from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..problem import Problem, gram
-from .form import Form, NotSolvableError, check_noise, multipliers
+from ..problem import Form, NotSolvableError, Problem, check_noise, gram, multipliers
 
 
 @dataclass(frozen=True)

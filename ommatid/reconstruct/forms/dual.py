@@ -16,8 +16,7 @@ from scipy import linalg
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..problem import Problem
-from .form import Form, root_variance
+from ..problem import Form, Problem, root_variance
 from .square_root import Indices, SortedQr, sorted_qr
 
 EPS = float(np.finfo(np.float64).eps)

@@ -17,8 +17,7 @@ from scipy import linalg
 
 from ommatid.runtime.arrays import FloatArray
 
-from ..problem import Problem
-from .form import Form, NotSolvableError, check_noise, multipliers, root_variance
+from ..problem import Form, NotSolvableError, Problem, check_noise, multipliers, root_variance
 
 Indices = NDArray[np.intp]
 

@@ -20,6 +20,7 @@ from ommatid.scenes.fitted.kernels import KernelFootprints
 from ..detail.detailed_model import CAUSE as DETAIL
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import (
+    SAME_NOISE,
     EstimationTask,
     Execution,
     Method,
@@ -29,10 +30,9 @@ from ..methods.method import (
     residual_multipliers,
     total_variance,
 )
-from ..methods.prepared import SAME_NOISE
 from ..output.run_json import SolverReport
 from ..prior import coloured
-from ..verdict.residual_power import ResidualInputs, ResidualPower
+from ..verdict.residual import ResidualInputs, ResidualPower
 from .bands import bands_of
 from .conjugate_gradients import (
     BandedSystem,

@@ -27,8 +27,7 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
 from ..forms.cholesky import information
-from ..forms.form import NotSolvableError
-from ..problem import Problem
+from ..problem import NotSolvableError, Problem
 
 EPS = float(np.finfo(np.float64).eps)
 MOST_EXACT = 1000  # measurements up to which S itself is factorised, which keeps ten digits or more

@@ -25,8 +25,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.tables.estimation import PriorTable
 
 from ..detail.detailed_model import DetailedModel
-from ..fitting.evidence import Evidence
-from ..fitting.prior_fit import MIN_MEASUREMENTS, fit_prior
+from ..fitting.prior_fit import MIN_MEASUREMENTS, Evidence, fit_prior
 from ..methods.method import EstimationTask, Execution
 from ..misalignment.misaligned_methods import RobustMethod
 from ..prior import Prior, covariance_root

@@ -12,11 +12,9 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..estimator.estimate import Estimate, estimate
 from ..expected_error import CorrelatedNoise, Interval, expected_error, expected_given, variance_of_sum
-from ..forms.form import Form
-from ..problem import Problem
-from ..verdict.residual_power import ResidualInputs, ResidualPower
-from .method import Method, MethodResult, PosteriorOperators, total_variance
-from .prepared import SAME_NOISE
+from ..problem import Form, Problem
+from ..verdict.residual import ResidualInputs, ResidualPower
+from .method import SAME_NOISE, Method, MethodResult, PosteriorOperators, total_variance
 
 DRAWS = 32  # of images and noise for the expected residual
 

@@ -32,7 +32,7 @@ from ..frame.conjugate_gradients import (
     shorter_side_first,
 )
 from ..output.run_json import SolverReport
-from ..verdict.residual_power import ResidualInputs, ResidualPower
+from ..verdict.residual import ResidualInputs, ResidualPower
 from .method import (
     EstimationTask,
     Execution,

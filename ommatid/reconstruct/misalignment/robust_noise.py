@@ -38,9 +38,8 @@ from ommatid.scenes.optics.footprints import matrix as footprints
 from ommatid.scenes.pose import Misalignment, pose_of
 
 from ..expected_error import solved_columns
-from ..forms.form import Form
 from ..prior import Prior
-from ..problem import Whitening
+from ..problem import Form, Whitening
 
 # |t| at a quarter of the points each, in standard deviations: the solution of three equations for the mean of |t|,
 # t^2 and |t|^3 with two equal levels. E t^4 is 2.78 instead of 3: no four real levels have all four moments.

@@ -23,7 +23,7 @@ from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, Interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
-from ..verdict.residual_power import ResidualPower
+from ..verdict.residual import ResidualPower
 
 NEIGHBOURHOOD = 5  # pixels, over which the square of the attenuation is averaged for the map
 GROUP_SIZE = 200  # fewest measurements over which a leverage is averaged

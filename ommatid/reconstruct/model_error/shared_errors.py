@@ -25,7 +25,7 @@ from ommatid.scenes.formats.picture import averaged
 from ..expected_error import ExpectedError, Interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
 from ..prior import spectrum_of
-from ..verdict.residual_power import ResidualPower, SharedResidual, squared_trace
+from ..verdict.residual import ResidualPower, SharedResidual, squared_trace
 
 FEW_PIXELS, FEW_COLUMNS = 4000, 1000  # up to which every column is taken
 DRAWS, FEW_DRAWS = 12, 4  # of combinations, otherwise

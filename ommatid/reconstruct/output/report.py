@@ -27,8 +27,8 @@ from .run_json import (
     SeedReport,
     SkippedReport,
     StageReport,
+    time_spent,
 )
-from .time_spent import time_spent
 
 
 def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunReport:

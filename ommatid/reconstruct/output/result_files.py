@@ -22,7 +22,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, with_changes
 from ommatid.scenes.stack import Stack
 
-from ..methods.prepared import Prepared
+from ..methods.method import Prepared
 from ..restore import Reconstruction, check_camera, restore
 from . import run_json
 from .estimate_formats import format_file

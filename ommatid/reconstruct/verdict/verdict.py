@@ -22,7 +22,7 @@ from ommatid.scenes.stack import Stack
 
 from ..expected_error import COVERAGE, Interval
 from ..output.run_json import ResidualPart, VerdictReport
-from .residual_parts import sidak
+from .residual import sidak
 
 DARK = 0.5  # share of the light of a type's other sub-imagers below which one counts as dark, and
 UNEXPLAINED = 0.8  # share of the light that the estimate predicts, since a part of the target may be dark

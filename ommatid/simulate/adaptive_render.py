@@ -17,6 +17,7 @@ the same time. The seeds of a sub-imager do not depend on the other ones.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby
@@ -67,6 +68,8 @@ REACHED = "reached"  # how a sub-imager ends; otherwise the reason why it could 
 TIME, SAMPLES, FLOAT32 = "render.time is over", "no more samples are taken", "float32 rounds as much"
 AllowedVariance = Callable[[FloatArray, slice], FloatArray]  # of light on some measurements, and their slice
 SHARE = 0.1  # of the sensor's variance
+LONG = 60.0  # s, from which the cost of the rounds is said
+WORTH = 0.5  # of the planned rays, below which fewer samples are offered
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,10 @@ def render_until(
         for done in rounds.render_exact(indices):
             progress((ended + done * len(indices) / 2) / len(rounds.sub_imagers))
         save()
+    told = False
     while unfinished := rounds.unfinished:
+        if limit == inf and not told and all(rounds.sub_imagers[index].rounds for index in unfinished):
+            told = _warn_of_cost(rounds, rounds.rays / max(clock() - start, 1e-9))
         for number, index in enumerate(unfinished):
             left = (limit - (clock() - start)) / (len(unfinished) - number)
             rounds.render_round(index, left, rounds.rays / max(clock() - start, 1e-9))
@@ -130,6 +136,28 @@ def render_until(
     progress(1.0)
     details = {"variant": variant, **rounds.record()}
     return AdaptiveRendering(rounds.mean, rounds.variance, details, renderer.direct_only)
+
+
+def _warn_of_cost(rounds: AdaptiveRounds, speed: float) -> bool:
+    """Log what the next rounds cost at `speed`, rays per second, where that is long; return True if it was logged."""
+    rays, (enough, all_rays) = rounds.planned_rays, rounds.enough
+    if rays / speed < LONG:
+        return False
+    sentence = (
+        f"render.samples = 'auto' takes about {duration(rays / speed)} more ({rays:.1e} rays), until the rendering's"
+        " variance is a tenth of the sensor's in every pixel"
+    )
+    if all_rays < WORTH * rays:
+        sentence += f"; on average it is with render.samples = {enough}, in {duration(all_rays / speed)}"
+    logging.getLogger(__name__).warning("%s; render.time limits it", sentence)
+    return True
+
+
+def duration(seconds: float) -> str:
+    """Return seconds, minutes or hours in words."""
+    if seconds >= 5400:
+        return f"{seconds / 3600:.1f} hours"
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
 class AdaptiveRounds:
@@ -159,6 +187,25 @@ class AdaptiveRounds:
     def rays(self) -> int:
         """Rays of all rounds."""
         return sum(sub.rays for sub in self.sub_imagers)
+
+    @property
+    def planned_rays(self) -> float:
+        """Rays of the next round of every sub-imager that has not ended."""
+        return float(sum(self.sub_imagers[index].next.total * self._left(index) for index in self.unfinished))
+
+    def _left(self, index: int) -> int:
+        return int(self._open[self._slices[index]].sum())
+
+    @property
+    def enough(self) -> tuple[int, float]:
+        """Samples per pixel with which the mean variance is the allowed one, and the rays of all pixels with these."""
+        most = 1
+        for index in self.unfinished:
+            rows, sub = self._slices[index], self.sub_imagers[index]
+            allowed = np.nanmean(self._allowed(self.mean[rows], rows))
+            factor = mean_of_known(self.variance[rows]) / allowed
+            most = max(most, sub.predicted_samples(max(float(factor), AIM), MOST_SAMPLES))
+        return most, float(most) * self.mean.size
 
     @property
     def exact(self) -> list[list[int]]:

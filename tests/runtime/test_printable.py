@@ -88,7 +88,8 @@ def test_a_message_names_its_file_once() -> None:
 @pytest.mark.filterwarnings("default")
 def test_warnings_of_libraries_are_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    monkeypatch.setattr(logging.getLogger("a.library"), "propagate", False)
+    for name in ("a.library", "ommatid.simulate"):
+        monkeypatch.setattr(logging.getLogger(name), "propagate", False)
     monkeypatch.delenv("OMMATID_TRACEBACK", raising=False)
     before = warnings.showwarning, logging.lastResort
     with library_warnings(said.append):
@@ -97,6 +98,7 @@ def test_warnings_of_libraries_are_said_once(monkeypatch: pytest.MonkeyPatch) ->
             warnings.warn_explicit("second", UserWarning, "/x/ommatid/a.py", 1)
             logging.getLogger("a.library").warning("third")
             logging.getLogger("a.library").info("nothing")
+            logging.getLogger("ommatid.simulate").warning("a whole sentence")
         for number in range(100):
             warnings.warn_explicit(f"number {number}", UserWarning, "/x/a.py", 1)
     assert [sentence.partition(";")[0] for sentence in said[:3]] == [
@@ -104,6 +106,7 @@ def test_warnings_of_libraries_are_said_once(monkeypatch: pytest.MonkeyPatch) ->
         "ommatid: second",
         "a: third",
     ]
+    assert said[3] == "a whole sentence"
     assert len(said) == 20
     assert (warnings.showwarning, logging.lastResort) == before
     monkeypatch.setenv("OMMATID_TRACEBACK", "1")

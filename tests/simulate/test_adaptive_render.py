@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +42,11 @@ from ..examples import SLOW_SCALAR, THREE, VARIANTS, needs, scene
 FRACTIONAL = (("2/5", [2, 2], [5, 5]), ("3/8", [2, 2], [4, 4]))  # pixels see pixels of f in part
 
 
+AUTO = {"samples": "auto", "variant": "scalar_rgb"}
+
+
 def auto(shape: tuple[int, int] = (19, 19), lenses: Any = THREE, **render: Any) -> Scene:
-    told = {"samples": "auto", "variant": "scalar_rgb", **render}
-    return scene(shape, lenses, render=told, noise={"variance": 1e-2})
+    return scene(shape, lenses, render=AUTO | render, noise={"variance": 1e-2})
 
 
 def lit(described: Scene, **more: Any) -> AdaptiveRendering:
@@ -122,6 +126,23 @@ def test_the_time_limit_ends_rendering_after_the_first_round() -> None:
     assert found.details["fewest_samples"] >= LEAST
     endless = lit(auto(lenses=THREE[:1], time="1e9 s"), clock=lambda: 0.0)
     assert endless.mean.tobytes() == lit(auto(lenses=THREE[:1])).mean.tobytes(), "an unused time limit changes nothing"
+
+
+def test_a_long_rendering_says_what_it_costs(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that jumps by 100 s makes it long: said once, with the rays; fewer samples are offered if worth it."""
+    described = scene((14, 14), FRACTIONAL[:1], render={**AUTO, "sampler": "independent"}, noise={"variance": 2.0})
+    for worth, offered in ((0.0, False), (math.inf, True)):
+        monkeypatch.setattr("ommatid.simulate.adaptive_render.WORTH", worth)
+        ticks = iter(range(0, 10**9, 100))
+        found = lit(described, clock=lambda ticks=ticks: float(next(ticks)))
+        assert found.details["rounds"] > 1
+        (message,) = caplog.messages
+        assert re.search(r"'auto' takes about .* more \(.*e\+.* rays\)", message)
+        assert ("; on average it is with render.samples = " in message) == offered
+        assert message.endswith("; render.time limits it")
+        caplog.clear()
+    lit(described, clock=lambda: 0.0)
+    assert not caplog.messages
 
 
 def test_an_unreachable_target_is_recorded_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:

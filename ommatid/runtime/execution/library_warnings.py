@@ -1,4 +1,4 @@
-"""Warnings of libraries, which become warnings of this program: one printable line each, and each once."""
+"""Warnings of libraries and of this program's own log: one printable line each, and each once."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import TextIO
 from ..printable import LONGEST_MESSAGE, printable_sentence
 
 TRACEBACK = "OMMATID_TRACEBACK"  # in the environment: failures and warnings are printed as Python prints them
+OWN_LOG = "ommatid"  # whose messages are whole sentences
 MOST = 20  # warnings of one process
 
 
@@ -35,15 +36,16 @@ def library_warnings(warn: Callable[[str], None]) -> Generator[None]:
         return
     said: set[str] = set()
 
-    def say(origin: str, message: object) -> None:
-        sentence = printable_sentence(f"{origin}: {message}; {TRACEBACK}=1 shows where", LONGEST_MESSAGE)
+    def say(text: str) -> None:
+        sentence = printable_sentence(text, LONGEST_MESSAGE)
         if sentence not in said and len(said) < MOST:
             said.add(sentence)
             warn(sentence)
 
     class LastHandler(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            say(record.name.partition(".")[0], record.getMessage())
+            origin, message = record.name.partition(".")[0], record.getMessage()
+            say(message if origin == OWN_LOG else f"{origin}: {message}; {TRACEBACK}=1 shows where")
 
     def show(
         message: Warning | str,
@@ -54,7 +56,8 @@ def library_warnings(warn: Callable[[str], None]) -> Generator[None]:
         line: str | None = None,
     ) -> None:
         del lineno, file, line
-        say(_library(filename) or ("numpy" if issubclass(category, RuntimeWarning) else "ommatid"), message)
+        origin = _library(filename) or ("numpy" if issubclass(category, RuntimeWarning) else "ommatid")
+        say(f"{origin}: {message}; {TRACEBACK}=1 shows where")
 
     before = warnings.showwarning, logging.lastResort
     warnings.showwarning, logging.lastResort = show, LastHandler(logging.WARNING)

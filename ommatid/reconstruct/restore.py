@@ -225,7 +225,7 @@ def restore(
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 
     truth : (N,) or (pixels of the world,), or None;  workers : for tiles, absent: threads of this process
-    prepared : what frames of this model share, None for a frame by itself
+    prepared : what other frames of this model left, None for a frame by itself
     Raises InputError if memory does not suffice, if no method reaches the tolerance of the scene, or if the noise of a
     [sensor] is to be fitted.
     """

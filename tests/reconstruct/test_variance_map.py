@@ -9,6 +9,7 @@ import pytest
 from scipy import fft, linalg, sparse
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
+from ommatid.reconstruct.frame.error_map import ExactVariances, check_map
 from ommatid.reconstruct.frame.sliding import sliding_camera
 from ommatid.reconstruct.frame.variance_map import (
     SmallFrames,
@@ -123,3 +124,19 @@ def test_kernels_that_vary_over_the_field() -> None:
         unit[place] = 1.0
         solved = exact.solve(unit.ravel(), 1e-6).image.reshape(shape)
         assert variance[place] == pytest.approx(solved[place], rel=0.01), place
+
+
+def test_a_map_without_variances_is_no_map() -> None:
+    """A pixel whose variance is 0, infinite or NaN: random pixels may miss it, the verdict does not."""
+    shape = 24, 21
+    camera = diffracting(shape)
+    system = FrameSystem(observed(camera), np.full(camera.measurements, 100.0), 1 / P0)
+    frames = SmallFrames(
+        sliding_camera(system.observation, camera.types, (100.0,) * 3, 1 / P0), lambda _: 1 / P0, (1.0,) * 3, far=False
+    )
+    variance = (frames.relative(1.0) * frames.interior(1.0))[0].ravel()
+    exact = ExactVariances(system, None, 1e-4)
+    assert check_map(variance, variance, shape, exact, local=True).worst < 0.01
+    for wrong in (0.0, -np.inf, np.nan):
+        changed = np.where(np.arange(variance.size) == 200, wrong, variance)
+        assert check_map(changed, variance, shape, exact, local=True).worst >= 1.0

@@ -105,14 +105,15 @@ def fit_by_window(task: EstimationTask) -> PriorFit:
     around = grid[start - 1], grid[start + 1]
     length = float(optimize.fminbound(lambda value: best(float(value))[1], *around, xtol=TOLERANCE))
     variance = best(length)[0]
+    spread = evidence.deviations(variance, length)
     distances = (length - ends[0], ends[1] - length, variance - bounds[0], bounds[1] - variance)
     return PriorFit(
         variance=exp(variance),
         length=exp(length),
         noise_variance=None,
-        spread=evidence.deviations(variance, length),
+        spread=spread,
         measurements=evidence.residual.size,
-        doubtful=min(distances) < TOLERANCE,
+        doubtful=min(distances) < TOLERANCE or not np.isfinite(spread).all(),
     )
 
 

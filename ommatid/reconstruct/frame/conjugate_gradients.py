@@ -193,7 +193,12 @@ class FrameSystem:
         while True:
             yield residual
             conditioned = self._precondition(residual)
-            previous, energy = energy, max(float(residual @ conditioned), 0.0)
+            previous, energy = energy, float(residual @ conditioned)
+            if not energy > 0:
+                raise NotReachedError(
+                    "the frame solver's preconditioner is not positive in double precision; set estimator.method ="
+                    " 'tiles', or raise the noise"
+                )
             if direction is None:
                 direction = conditioned
             else:

@@ -64,6 +64,7 @@ EDGES = 4  # sets of frames so small that a set has a pixel or two
 SINGLE = 6  # pixels where errors are correlated over any distance, and each needs a solution of its own
 FEW_SINGLE = 2  # of many pixels
 MANY = 250_000
+NO_VARIANCE = 1.0  # error of a map with pixels whose variance is not a positive number
 EXACT = 1e-3  # relative accuracy of a solution
 EVEN = 1e-3  # relative range of noise variances that count as equal
 HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
@@ -139,6 +140,8 @@ def check_map(
         ratios.append(variance[pixels] / exact.at(pixels, posterior, rng) - 1)
     ratio = np.concatenate(ratios)
     worst = float(np.abs(ratio).max())
+    if not (np.isfinite(variance) & (variance > 0)).all():
+        worst = max(worst, NO_VARIANCE)
     if not local:
         return MapCheck(worst, worst)
     return MapCheck(worst, min(worst, abs(float(ratio.mean())) + 2 * float(ratio.std()) / ratio.size**0.5))

@@ -51,7 +51,6 @@ WORLD = "the world finer than f is estimated, and f's pixels are its averages"
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
 SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
 ERRORS = "errors"  # name of a FrameError among what frames share
-HARDLY = 0.01  # variation of kernels over the field that changes means of errors by less than 1 %
 DRAWS = 2  # of images and noise for the expected residual
 
 
@@ -128,7 +127,7 @@ class FrameMethod(Method):
 
     def operators(self) -> PosteriorOperators:
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
-        return posterior_operators(self._nearly, self.task, self._solve)
+        return posterior_operators(self.system, self.task, self._solve)
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
@@ -195,7 +194,7 @@ class FrameMethod(Method):
         world = task.draw_deviation(probe(Purpose.DETAIL))
         spectrum = 1 / np.asarray(task.precision_on(task.shape))
         world -= world_of(task.of_f(world).reshape(task.shape_of_f), spectrum, task.finer)
-        right = self._nearly.right_hand_side(task.on_all_measurements(self._observe(world), 0.0))
+        right = self.system.right_hand_side(task.on_all_measurements(self.task.observe(world), 0.0))
         return float(np.square(task.of_f(self._solve(right))).mean())
 
     def _random_power(self, actual: FloatArray, freedoms: float) -> ResidualPower:
@@ -210,7 +209,7 @@ class FrameMethod(Method):
         if as_expected and actual.size > freedoms:
             total = actual.size - freedoms
         mean = np.zeros(task.model.unknowns)
-        inputs = ResidualInputs(self._observe, task.draw_deviation, actual, mean, draws, total=total)
+        inputs = ResidualInputs(self.task.observe, task.draw_deviation, actual, mean, draws, total=total)
         return inputs.power(map(self._residual, inputs.columns()), task.expected_noise)
 
     def _residual_power(self, power: ResidualPower, deviation: FloatArray | None) -> ResidualPower:
@@ -218,30 +217,17 @@ class FrameMethod(Method):
         if deviation is None:
             return replace(power, bias=None, noise=None)
         white = 1 / np.sqrt(self.task.expected_noise)
-        return replace(power, bias=np.square(white * self._residual(self._observe(deviation))))
-
-    def _observe(self, image: FloatArray) -> FloatArray:
-        """Return H f of the used measurements by `_nearly`: (N,) to (measurements used,)."""
-        readings = self._nearly.observation.forward(image)
-        return readings if self.task.complete else readings[self.task.used]
+        return replace(power, bias=np.square(white * self._residual(self.task.observe(deviation))))
 
     def _residual(self, column: FloatArray) -> FloatArray:
         """Return (I - H A) x: (measurements used,)."""
-        right = self._nearly.right_hand_side(self.task.on_all_measurements(column, 0.0))
-        observed = self._observe(self._solve(right))
+        right = self.system.right_hand_side(self.task.on_all_measurements(column, 0.0))
+        observed = self.task.observe(self._solve(right))
         return np.subtract(column, observed, out=observed)
-
-    @cached_property
-    def _nearly(self) -> FrameSystem:
-        """The system of means over the frame.
-
-        Signal, noise and residuals pass through this camera alone: a residual by two would hold their difference.
-        """
-        return _with_mean_kernels(self.system)
 
     def _solve(self, right: FloatArray) -> FloatArray:
         """Return C b for a mean over the frame, to a mean error of a hundredth of a posterior standard deviation."""
-        return self._nearly.solve(right, mean_accuracy(self.task)).image
+        return self.system.solve(right, mean_accuracy(self.task)).image
 
     def _variance_of_sum(self, weights: FloatArray, actual: FloatArray) -> float:
         """Eq. 5 of w^T f^."""
@@ -255,7 +241,7 @@ class FrameMethod(Method):
 
     def _transposed_gain(self, solved: FloatArray) -> FloatArray:
         """A^T w from c = C w: (measurements used,)."""
-        return self._observe(solved) / self.task.expected_noise
+        return self.task.observe(solved) / self.task.expected_noise
 
     def _parts(self, noise: dict[str, FloatArray], mean: float) -> dict[str, float]:
         """Share of each cause of noise in the mean of Eq. 5; they add up to `mean`."""
@@ -269,7 +255,7 @@ class FrameMethod(Method):
                 parts[name] = uniform[1] * float(values[0]) / uniform[0]
             else:
                 random = rng.normal(size=values.size) * np.sqrt(values)
-                solved = self._solve(self._nearly.right_hand_side(self.task.on_all_measurements(random, 0.0)))
+                solved = self._solve(self.system.right_hand_side(self.task.on_all_measurements(random, 0.0)))
                 parts[name] = float(np.mean(np.square(self.task.of_f(solved))))
                 uniform = (float(values[0]), parts[name]) if is_uniform(values) else uniform
         share = mean / (sum(parts.values()) or 1.0)
@@ -284,18 +270,13 @@ class FrameMethod(Method):
         along = self._noise_part(self._solve(task.of_unknowns(bias)), actual)
         random = probe(Purpose.ERROR_INTERVAL).normal(size=count)
         gain = self._transposed_gain(self._solve(task.of_unknowns(random)))
-        back = task.of_f(self._solve(self._nearly.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
+        back = task.of_f(self._solve(self.system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
         noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
         variance = 4 * along + 2 * float(back @ back) + (map_error * noisy) ** 2
         return interval(float(bias @ bias) + noisy, variance, count)
 
 
 def _with_mean_kernels(system: FrameSystem) -> FrameSystem:
-    """Return a system whose kernels, if they hardly vary over the field, are their mean, at a tenth of the time."""
-    before = system.observation.parts
-    parts = tuple(
-        part.mean if isinstance(part, KernelFootprints) and part.variation <= HARDLY else part for part in before
-    )
-    if all(part is other for part, other in zip(parts, before, strict=True)):
-        return system
-    return replace(system, observation=replace(system.observation, parts=parts))
+    """Return the system in which preconditioners are tried, fast: kernels are their mean over the field."""
+    parts = (part.mean if isinstance(part, KernelFootprints) else part for part in system.observation.parts)
+    return replace(system, observation=replace(system.observation, parts=tuple(parts)))

@@ -204,8 +204,8 @@ class SmallFrames:
         sides = [min(LONG if self._far else SIDE, size) for size in self.shape]
         every = list(product(*(self._places(size) for size in self.shape)))
         with ThreadPoolExecutor(processors()) as threads:
-            found = list(threads.map(partial(self._at, scale), every))
-        for places, at in zip(every, found, strict=True):
+            of_places = list(threads.map(partial(self._at, scale), every))
+        for places, at in zip(every, of_places, strict=True):
             down, across = places
             kept = (each.kept(side) for each, side in zip(places, sides, strict=True))
             maps = at / np.maximum(_interpolated(local, self.shape, *kept), np.finfo(float).tiny)

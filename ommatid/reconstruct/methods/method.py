@@ -153,7 +153,7 @@ class EstimationTask:
 
     recorded : (M,) g;  used : (M,) True for measurements that are used
     expected_noise : (measurements used,) the noise variance that the estimator assumes, 0 allowed
-    shared_image : (N,) whose `error_directions` by few numbers of H are part of the expected noise; None: they are not
+    shared_image : (N,) whose errors by few numbers of H are part of the expected noise; None: they are not
     prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
     finer : the model's pixels, the unknowns, are so many times finer than f's along both axes
     """

@@ -167,7 +167,8 @@ class KernelFootprints(ObservationPart):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs: transfer functions are computed again there."""
-        return self.__dict__ | {"_grids": {}}
+        made = ("_applied", "_applied_weights")
+        return {name: value for name, value in self.__dict__.items() if name not in made} | {"_grids": {}}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -244,7 +245,10 @@ class KernelFootprints(ObservationPart):
 
     @cached_property
     def _applied(self) -> tuple[FloatArray, FloatArray]:
-        """The fewest kernels that give the same H, (S', W, W), and their coefficients, (S', P)."""
+        """Kernels that give the same H, (S', W, W), and their coefficients, (S', P): one for all that are constant.
+
+        There is one for each term where these are fewer.
+        """
         kernels, constant = self.shapes.kernels, ~self.coefficients[:, 1:].any(axis=1)
         by_terms = self.coefficients.any(axis=0)
         if by_terms.sum() <= (~constant).sum():  # one kernel for each term
@@ -252,6 +256,8 @@ class KernelFootprints(ObservationPart):
             return np.tensordot(terms_used @ self.coefficients.T, kernels, axes=1), terms_used
         same = np.tensordot(self.coefficients[constant, 0], kernels[constant], axes=1)
         unit = np.eye(1, by_terms.size)
+        if not constant.any():
+            return kernels, self.coefficients
         return np.concatenate([same[None], kernels[~constant]]), np.concatenate([unit, self.coefficients[~constant]])
 
     @cached_property
@@ -445,8 +451,10 @@ class KernelFootprints(ObservationPart):
         for number, (a, b) in enumerate(terms(self.degree)):
             of_term = np.tensordot(self.error_coefficients[:, :, number], every, axes=1)
             lines += np.outer(down[:, a], across[:, b]) * of_term
-        readings = np.array([self.places.lens_type.in_order(read) for read in lines])
-        return sparse.csc_array(readings.reshape(len(lines), -1).T)
+        readings = np.zeros((len(lines), self.measurements))
+        for out, read in zip(readings, lines, strict=True):
+            out[:] = self.places.lens_type.in_order(read)
+        return sparse.csc_array(readings.T)
 
     @property
     def description(self) -> dict[str, Any]:

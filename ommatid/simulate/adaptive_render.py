@@ -124,10 +124,10 @@ def render_until(
         for done in rounds.render_exact(indices):
             progress((ended + done * len(indices) / 2) / len(rounds.sub_imagers))
         save()
-    told = False
+    warned = False
     while unfinished := rounds.unfinished:
-        if limit == inf and not told and all(rounds.sub_imagers[index].rounds for index in unfinished):
-            told = _warn_of_cost(rounds, rounds.rays / max(clock() - start, 1e-9))
+        if limit == inf and not warned and all(rounds.sub_imagers[index].rounds for index in unfinished):
+            warned = _warn_of_cost(rounds, rounds.rays / max(clock() - start, 1e-9))
         for number, index in enumerate(unfinished):
             left = (limit - (clock() - start)) / (len(unfinished) - number)
             rounds.render_round(index, left, rounds.rays / max(clock() - start, 1e-9))
@@ -202,9 +202,9 @@ class AdaptiveRounds:
         most = 1
         for index in self.unfinished:
             rows, sub = self._slices[index], self.sub_imagers[index]
-            allowed = np.nanmean(self._allowed(self.mean[rows], rows))
-            factor = mean_of_known(self.variance[rows]) / allowed
-            most = max(most, sub.predicted_samples(max(float(factor), AIM), MOST_SAMPLES))
+            allowed = mean_of_known(self._allowed(self.mean[rows], rows))
+            factor = mean_of_known(self.variance[rows]) / allowed if allowed else 0.0
+            most = max(most, sub.predicted_samples(max(factor, AIM), MOST_SAMPLES))
         return most, float(most) * self.mean.size
 
     @property

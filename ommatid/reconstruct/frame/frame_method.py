@@ -194,7 +194,7 @@ class FrameMethod(Method):
         world = task.draw_deviation(probe(Purpose.DETAIL))
         spectrum = 1 / np.asarray(task.precision_on(task.shape))
         world -= world_of(task.of_f(world).reshape(task.shape_of_f), spectrum, task.finer)
-        right = self.system.right_hand_side(task.on_all_measurements(self.task.observe(world), 0.0))
+        right = self.system.right_hand_side(task.on_all_measurements(task.observe(world), 0.0))
         return float(np.square(task.of_f(self._solve(right))).mean())
 
     def _random_power(self, actual: FloatArray, freedoms: float) -> ResidualPower:
@@ -209,7 +209,7 @@ class FrameMethod(Method):
         if as_expected and actual.size > freedoms:
             total = actual.size - freedoms
         mean = np.zeros(task.model.unknowns)
-        inputs = ResidualInputs(self.task.observe, task.draw_deviation, actual, mean, draws, total=total)
+        inputs = ResidualInputs(task.observe, task.draw_deviation, actual, mean, draws, total=total)
         return inputs.power(map(self._residual, inputs.columns()), task.expected_noise)
 
     def _residual_power(self, power: ResidualPower, deviation: FloatArray | None) -> ResidualPower:
@@ -221,8 +221,9 @@ class FrameMethod(Method):
 
     def _residual(self, column: FloatArray) -> FloatArray:
         """Return (I - H A) x: (measurements used,)."""
-        right = self.system.right_hand_side(self.task.on_all_measurements(column, 0.0))
-        observed = self.task.observe(self._solve(right))
+        task = self.task
+        right = self.system.right_hand_side(task.on_all_measurements(column, 0.0))
+        observed = task.observe(self._solve(right))
         return np.subtract(column, observed, out=observed)
 
     def _solve(self, right: FloatArray) -> FloatArray:
@@ -270,7 +271,7 @@ class FrameMethod(Method):
         along = self._noise_part(self._solve(task.of_unknowns(bias)), actual)
         random = probe(Purpose.ERROR_INTERVAL).normal(size=count)
         gain = self._transposed_gain(self._solve(task.of_unknowns(random)))
-        back = task.of_f(self._solve(self.system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
+        back = task.of_f(self._solve(system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
         noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
         variance = 4 * along + 2 * float(back @ back) + (map_error * noisy) ** 2
         return interval(float(bias @ bias) + noisy, variance, count)

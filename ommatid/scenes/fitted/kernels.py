@@ -207,10 +207,10 @@ class KernelFootprints(ObservationPart):
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements of the type,)."""
         lines, grid = self.places.lens_type.by_lines(readings), self._grid(back.padded)
-        (down, across_them), count, length = grid.scattered, grid.rows.shape[1], grid.columns.shape[1]
+        (to_rows, to_columns), count, length = grid.scattered, grid.rows.shape[1], grid.columns.shape[1]
         frequencies: IntArray = np.arange(back.padded[1] // 2 + 1)
         for transfer, weight in zip(grid.transfers, self._applied_weights, strict=True):
-            placed = on_lines(down, across_them, lines * weight)
+            placed = on_lines(to_rows, to_columns, lines * weight)
             # Zeros between readings repeat the spectrum.
             across = _coefficients(np.asarray(fft.rfft(placed, workers=processors())), length, frequencies)
             spectrum = np.asarray(fft.fft(across, axis=0, workers=processors(), overwrite_x=True))
@@ -254,10 +254,10 @@ class KernelFootprints(ObservationPart):
         if by_terms.sum() <= (~constant).sum():  # one kernel for each term
             terms_used = np.eye(by_terms.size)[by_terms]
             return np.tensordot(terms_used @ self.coefficients.T, kernels, axes=1), terms_used
-        same = np.tensordot(self.coefficients[constant, 0], kernels[constant], axes=1)
-        unit = np.eye(1, by_terms.size)
         if not constant.any():
             return kernels, self.coefficients
+        same = np.tensordot(self.coefficients[constant, 0], kernels[constant], axes=1)
+        unit = np.eye(1, by_terms.size)
         return np.concatenate([same[None], kernels[~constant]]), np.concatenate([unit, self.coefficients[~constant]])
 
     @cached_property

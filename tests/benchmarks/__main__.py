@@ -2,7 +2,7 @@
 
 `python -m tests.benchmarks frames` runs one part; the parts are `rendering` and `frames`. No speed is asserted, and
 other load slows both sides of a ratio alike, so compare ratios rather than times. Run by themselves: `chain`, the time,
-memory and files of every stage of a run from 239 x 239 pixels on, and the campaigns, which continue where they were
+memory and files of every stage of a run from 119 x 119 pixels on, and the campaigns, which continue where they were
 interrupted: `nasty`, half an hour, and `coverage`, which measures error bars for hours (`coverage --help`). `cells`
 says in ten minutes which cameras are served.
 """

@@ -37,10 +37,10 @@ from ..methods.method import EstimationTask
 from ..prior import Prior, exponential_spectrum, lag_distances, reflecting_root, wave_variances
 from ..problem import gram
 
-OUTSIDE = 1e-6  # share of a measurement's footprint that may lie outside its tile
 Score = Callable[[FloatArray], tuple[float, FloatArray]]
 Bounds = list[tuple[float, float]]
 
+OUTSIDE = 1e-6  # share of a measurement's footprint that may lie outside its tile
 REACH = 2.0  # half the width of a box, in logarithms
 LEAST_REACH = 0.01  # half the width of the smallest box
 MOST_BOXES = 25

@@ -7,6 +7,7 @@ v Hf K Hf^T + Rv: whitened by Rv and diagonalised once for each length, it gives
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cache
 from math import exp, log
@@ -148,14 +149,16 @@ def _window(fine: Model, task: EstimationTask, detail: int) -> tuple[slice, slic
     Where blur reaches so far that it holds too few, a window of WIDE pixels and the measurements of its middle; the
     light that these receive from beside it counts as noise.
     """
-    for side in range(max(task.shape), 0, -1):
+
+    def within(side: int) -> tuple[slice, slice, IntArray]:
         rows, columns = _middle(task.shape, side, detail)
         inside = fine.windowed.measurements_inside(rows, columns)
-        inside = inside[task.used[inside]]
-        if MIN_MEASUREMENTS <= inside.size <= MOST:
-            return rows, columns, inside
-        if inside.size <= MOST:
-            break
+        return rows, columns, inside[task.used[inside]]
+
+    sides = range(1, max(task.shape) + 1)
+    found = within(max(bisect_right(sides, MOST, key=lambda side: within(side)[2].size), 1))
+    if MIN_MEASUREMENTS <= found[2].size <= MOST:
+        return found
     rows, columns = _middle(task.shape, WIDE, detail)
     down, across = (part.start + np.array([0.25, 0.75]) * (part.stop - part.start) for part in (rows, columns))
     row, column = fine.camera.middles

@@ -279,5 +279,6 @@ class FrameMethod(Method):
 
 def _with_mean_kernels(system: FrameSystem) -> FrameSystem:
     """Return the system in which preconditioners are tried, fast: kernels are their mean over the field."""
-    parts = (part.mean if isinstance(part, KernelFootprints) else part for part in system.observation.parts)
+    every = system.observation.parts
+    parts = (part.mean if isinstance(part, KernelFootprints) and part.degree else part for part in every)
     return replace(system, observation=replace(system.observation, parts=tuple(parts)))

@@ -12,12 +12,17 @@ from functools import cached_property
 from itertools import accumulate, pairwise, product
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from .tables.camera import Surface
+
+Number = TypeVar("Number", np.float64, np.int64)
 
 MOST_SUB_IMAGERS, MOST_OF_ALL_TYPES = 2**14, 2**16
 
@@ -115,7 +120,7 @@ class LensType:
         """Number of sensor pixels of all sub-imagers."""
         return self.count * self.pixels[0] * self.pixels[1]
 
-    def in_order(self, lines: FloatArray) -> FloatArray:
+    def in_order(self, lines: NDArray[Number]) -> NDArray[Number]:
         """Return readings by (sensor rows, sensor columns) in the order of measurements."""
         (down, across), (rows, columns) = self.array, self.pixels
         return lines.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()

@@ -63,7 +63,7 @@ def test_directions_of_the_error_are_what_changed_kernels_read() -> None:
     image = np.random.default_rng(4).normal(size=CAMERA.shape)
     for margin in (0, 2, 18):
         footprints = random_kernels(margin)
-        directions = footprints.error_directions(image).toarray()
+        directions = footprints.error_directions(image)
         assert directions.shape == (CAMERA.types[1].measurements, 4)
         for column, coefficients in zip(directions.T, footprints.error_coefficients, strict=True):
             changed = replace(

@@ -92,7 +92,7 @@ def test_errors_of_h_f_are_as_large_as_promised() -> None:
         footprints = accepted(fit_kernels(drawn(truth, rng), camera, camera.types[0]))
         assert len(footprints.shapes.core)
         error = (footprints.to_sparse() - truth) @ image
-        promised = np.square(footprints.error_directions(image).toarray()).sum(axis=1)
+        promised = np.square(footprints.error_directions(image)).sum(axis=1)
         ratios.append(float(np.square(error).mean() / promised.mean()))
     assert np.mean(ratios) == pytest.approx(1, abs=3 * float(np.std(ratios, ddof=1)) / len(ratios) ** 0.5)
 
@@ -113,7 +113,7 @@ def test_wide_kernels_are_the_ideal_within_their_errors() -> None:
         footprints = accepted(fit_kernels(responses, camera, camera.types[0]))
         assert footprints.places.width == 115
         error = (footprints.to_sparse() - truth) @ image
-        deviation = np.sqrt(np.square(footprints.error_directions(image).toarray()).sum(axis=1))
+        deviation = np.sqrt(np.square(footprints.error_directions(image)).sum(axis=1))
         scores.append(float(np.abs(error / deviation).max()))
         assert np.square(error).mean() < 0.01 * np.square((responses.matrix - truth) @ image).mean()
     assert max(scores) < stats.norm.isf(0.5e-3 / len(scores) / camera.measurements)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import chain, islice
 from math import isfinite
 
 import numpy as np
@@ -209,15 +210,21 @@ class FrameMethod(Method):
         if as_expected and actual.size > freedoms:
             total = actual.size - freedoms
         mean = np.zeros(task.model.unknowns)
-        inputs = ResidualInputs(task.observe, task.draw_deviation, actual, mean, draws, total=total)
-        return inputs.power(map(self._residual, inputs.columns()), task.expected_noise)
+        inputs = ResidualInputs(lambda image: image, task.draw_deviation, actual, mean, draws, total=total)
+        columns = inputs.columns()
+        of_mean, of_noise = map(self._residual_of, islice(columns, 1)), map(self._residual, islice(columns, draws))
+        return inputs.power(chain(of_mean, of_noise, map(self._residual_of, columns)), task.expected_noise)
 
     def _residual_power(self, power: ResidualPower, deviation: FloatArray | None) -> ResidualPower:
         """Return the expected squares of the residual for the true image f0 + `deviation`, (N,), if it is known."""
         if deviation is None:
             return replace(power, bias=None, noise=None)
         white = 1 / np.sqrt(self.task.expected_noise)
-        return replace(power, bias=np.square(white * self._residual(self.task.observe(deviation))))
+        return replace(power, bias=np.square(white * self._residual_of(deviation)))
+
+    def _residual_of(self, deviation: FloatArray) -> FloatArray:
+        """Return (I - H A) H f = H C P0^-1 f of an image less its mean: (measurements used,)."""
+        return self.task.observe(self._solve(self.system.apply_prior_precision(deviation)))
 
     def _residual(self, column: FloatArray) -> FloatArray:
         """Return (I - H A) x: (measurements used,)."""

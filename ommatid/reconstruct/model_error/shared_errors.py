@@ -16,10 +16,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import ndimage
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
+from ommatid.scenes.fitted.fitted_matrix import Directions
 from ommatid.scenes.formats.picture import averaged
 
 from ..expected_error import ExpectedError, Interval
@@ -32,7 +33,6 @@ DRAWS, FEW_DRAWS = 12, 4  # of combinations, otherwise
 MANY = 250_000  # pixels above which a combination takes long and few are enough
 SMALL = 0.01  # mean share of the noise, below which few are enough, too
 CROSS_DRAWS = 4  # of combinations for the product with the noise
-MOST_STORED = 2**25  # entries of L that are kept for sums of pixels
 NEIGHBOURHOOD = 9  # pixels, over which the squares of few combinations are averaged for the map
 NEGLIGIBLE = 1e-3  # of the expected error, up to which a bound on the part makes its computation needless
 LEAST_LEFT = 0.05  # of an expected square of the residual
@@ -44,13 +44,12 @@ class SharedErrors:
 
     residuals : (K, measurements used) what the estimate leaves of each;  images : (K, N) A of each
     exact : True if they are all columns of L, False if their squares have the right mean alone
-    directions : L, (measurements used, q), None where it is too large
     """
 
     residuals: FloatArray
     images: FloatArray
     exact: bool
-    directions: sparse.csc_array | None
+    directions: Directions
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -59,10 +58,10 @@ class SharedErrors:
 
     def variance_of_sum(self, weights: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> float:
         """Return w^T K w of (N,) weights."""
-        if self.exact or self.directions is None:
+        if self.exact:
             return float(np.square(self.images @ weights).sum())
         back = operators.weigh(task.observe(operators.posterior(task.of_unknowns(weights))))
-        return float(np.square(self.directions.T @ back).sum())
+        return float(np.square(self.directions.adjoint(task.on_all_measurements(back, 0.0))).sum())
 
     def whitened(self, task: EstimationTask, operators: PosteriorOperators) -> SharedResidual:
         """Return their whitened residuals."""
@@ -96,21 +95,19 @@ def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: Fl
     errors = task.shared_errors if image is task.shared_image else model.errors(image)
     if errors is None:
         return None
-    # A column has entries in one sub-imager alone, and a sub-imager has few.
-    stored = small or 6 * model.measurements <= MOST_STORED
-    directions = sparse.csc_array(sparse.csr_array(errors.matrix)[used]) if stored else None
-    exact = small and directions is not None and directions.shape[1] <= FEW_COLUMNS
-    if exact and directions is not None:
-        readings: FloatArray = directions.T.toarray()
+    columns = errors.matrix if small else None
+    exact = columns is not None and columns.shape[1] <= FEW_COLUMNS
+    if exact and columns is not None:
+        readings: FloatArray = columns.T.toarray()[:, used]
     else:
-        share = float(np.mean(errors.variance[used] / task.expected_noise))
-        count = FEW_DRAWS if model.unknowns > MANY or share < SMALL else DRAWS
+        few = model.unknowns > MANY or float(np.mean(errors.variance[used] / task.expected_noise)) < SMALL
+        count = FEW_DRAWS if few else DRAWS
         readings = errors.draws(probe(Purpose.SHARED_ERRORS), count)[:, used] / count**0.5
     residuals, images = np.empty_like(readings), np.empty((len(readings), task.shape_of_f[0] * task.shape_of_f[1]))
     for number, reading in enumerate(readings):
         solved = operators.gain(reading)
         residuals[number], images[number] = reading - task.observe(solved), task.of_f(solved)
-    return SharedErrors(residuals, images, exact, directions)
+    return SharedErrors(residuals, images, exact, errors)
 
 
 def bound(task: EstimationTask, image: FloatArray) -> float:

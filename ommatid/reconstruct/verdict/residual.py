@@ -112,7 +112,7 @@ class ResidualPower:
 class ResidualInputs:
     """What the measurements deviate by from H f0, as the estimator's random or given inputs.
 
-    observe : image, (N,), to measurements used, (M,)
+    observe : image, (N,), to measurements used, (M,), or to itself where the solver takes it so
     draw_image : a random image of the prior less its mean, (N,);  actual : (M,) actual noise variances
     deviation : (N,) f - f0 of the true image, None without it
     leverage : (M,) exact (H A)_ii where the noise is as expected, None where it is not known

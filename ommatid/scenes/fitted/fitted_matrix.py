@@ -81,6 +81,9 @@ class Views:
         return cls(numbers, explained, own, shared, structure)
 
 
+Block = sparse.csc_array | FloatArray
+
+
 @dataclass(frozen=True)
 class Directions:
     """L, (M, q), by lens type: the error of H f is L xi, with independent xi of variance 1.
@@ -89,19 +92,23 @@ class Directions:
     """
 
     measurements: int
-    blocks: Callable[[], Iterator[tuple[slice, sparse.csc_array]]]
+    blocks: Callable[[], Iterator[tuple[slice, Block]]]
 
     @property
     def matrix(self) -> sparse.csc_array:
         """L."""
         return sparse.csc_array(sparse.block_diag([block for _, block in self.blocks()]))
 
+    def adjoint(self, readings: FloatArray) -> FloatArray:
+        """Return L^T g: (M,) to (q,)."""
+        return np.concatenate([block.T @ readings[place] for place, block in self.blocks()])
+
     @cached_property
     def variance(self) -> FloatArray:
         """The diagonal of L L^T: (M,)."""
         variance = np.zeros(self.measurements)
         for place, block in self.blocks():
-            variance[place] = np.asarray(block.power(2).sum(axis=1)).ravel()
+            variance[place] = np.asarray((block**2).sum(axis=1)).ravel()
         return variance
 
     def draws(self, rng: np.random.Generator, count: int) -> FloatArray:
@@ -233,7 +240,7 @@ class FittedMatrix:
 
     def _directions(
         self, image: FloatArray, gradients: Callable[[], tuple[FloatArray, FloatArray]]
-    ) -> Iterator[tuple[slice, sparse.csc_array]]:
+    ) -> Iterator[tuple[slice, Block]]:
         """Yield the measurements of each lens type, and its block of L: what its sub-imagers share, then their own."""
         of_views = None
         for lens, views, subs, slices in self._types:

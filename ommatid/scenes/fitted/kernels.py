@@ -16,7 +16,7 @@ from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import gcd
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -28,7 +28,7 @@ from ommatid.runtime.machine import check_memory, processors
 
 from ..camera import Camera
 from ..lens_type import LensType
-from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density, on_lines, padded_shape
+from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density, padded_shape
 from .kernel_shapes import KernelShapes, Numbers
 
 VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
@@ -103,6 +103,17 @@ class KernelPlaces:
         u, v = (float(np.abs(axis).max()) for axis in self.field)
         return u, v
 
+    @property
+    def sensor(self) -> tuple[int, int]:
+        """Sensor rows and sensor columns of the lens type."""
+        return self.starts[0].size, self.starts[1].size
+
+    @cached_property
+    def order(self) -> IntArray:
+        """The measurements, by their number among all sensor rows and columns in the order of starts."""
+        down, across = (np.argsort(np.argsort(start, kind="stable"), kind="stable") for start in self.starts)
+        return self.lens_type.in_order(down[:, None] * across.size + across)
+
     def lines(self, pixels: IntArray) -> tuple[IntArray, IntArray]:
         """Return the sensor row and the sensor column of pixels of the lens type, in the order of measurements."""
         (_, across), (rows, columns) = self.lens_type.array, self.lens_type.pixels
@@ -125,20 +136,55 @@ class KernelPlaces:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """What products on a padded grid need.
+    """The padded grid of products, folded to the pixels where readings may begin: every so many along both axes.
 
-    transfers : of each kernel, (S', rows, columns / 2 + 1)
-    rows, columns : matrices that take the sensor rows and columns out of every `spacing`-th pixel
+    transfers : conjugate transforms of the kernels, (S', rows, columns / 2 + 1)
+    rows, columns : places of the sensor rows and of the sensor columns, in rising order, on the folded grid
     """
 
-    transfers: ComplexArray
-    rows: sparse.csr_array
-    columns: sparse.csr_array
+    padded: tuple[int, int]
+    every: int
+    transfers: list[ComplexArray]
+    rows: IntArray
+    columns: IntArray
+
+    @property
+    def _folded(self) -> tuple[int, int]:
+        return self.padded[0] // self.every, self.padded[1] // self.every
 
     @cached_property
-    def scattered(self) -> tuple[sparse.csr_array, sparse.csr_array]:
-        """The transposes of `rows` and `columns`."""
-        return sparse.csr_array(self.rows.T), sparse.csr_array(self.columns.T)
+    def _places(self) -> tuple[Any, ...]:
+        """Index of the readings on the folded grid: a view of it where they lie side by side."""
+        if all(np.array_equal(axis, np.arange(axis.size)) for axis in (self.rows, self.columns)):
+            return slice(self.rows.size), slice(self.columns.size)
+        return np.ix_(self.rows, self.columns)
+
+    def read(self, spectrum: ComplexArray, transfer: ComplexArray, room: ComplexArray) -> FloatArray:
+        """Return what a kernel reads of an image with this spectrum: (sensor rows, sensor columns).
+
+        room : of the size of the spectrum, to be used again
+        """
+        (count, length), every = self._folded, self.every
+        lines = np.multiply(spectrum, transfer, out=room)
+        if every > 1:
+            lines = lines.reshape(every, count, -1).sum(axis=0)
+        lines = np.asarray(fft.ifft(lines, axis=0, workers=processors(), overwrite_x=True))
+        if every > 1:
+            lines = _folded(lines, self.padded[1], length)
+            lines /= every**2
+        return np.asarray(fft.irfft(lines, length, workers=processors(), overwrite_x=True))[self._places]
+
+    def spectrum_of(self, readings: FloatArray, weight: FloatArray | float) -> ComplexArray:
+        """Return the spectrum, (rows, columns / 2 + 1), of weighted readings, (sensor rows, sensor columns)."""
+        placed = np.zeros(self._folded)
+        if isinstance(self._places[0], slice):
+            np.multiply(readings, weight, out=placed[self._places])
+        else:
+            np.add.at(placed, self._places, weight * readings)  # several may begin at one pixel
+        if self.every == 1:
+            return np.asarray(fft.rfft2(placed, workers=processors(), overwrite_x=True))
+        whole = np.asarray(fft.fft2(placed, workers=processors(), overwrite_x=True))
+        return np.tile(whole, (self.every, self.every // 2 + 1))[:, : self.padded[1] // 2 + 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,50 +244,37 @@ class KernelFootprints(ObservationPart):
 
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements of the type,)."""
-        total: FloatArray = np.zeros((self.places.starts[0].size, self.places.starts[1].size))
-        readings = self._correlated(seen, self._grid(seen.padded).transfers)
-        for every, weight in zip(readings, self._applied_weights, strict=True):
-            total += weight * every
-        out[:] = self.places.lens_type.in_order(total)
+        grid, total, room = self._grid(seen.padded), np.zeros(self.places.sensor), np.empty_like(seen.spectrum)
+        for transfer, weight in zip(grid.transfers, self._applied_weights, strict=True):
+            read = grid.read(seen.spectrum, transfer, room)
+            read *= weight
+            total += read
+        out[:] = total.ravel()[self.places.order]
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements of the type,)."""
-        lines, grid = self.places.lens_type.by_lines(readings), self._grid(back.padded)
-        (to_rows, to_columns), count, length = grid.scattered, grid.rows.shape[1], grid.columns.shape[1]
-        frequencies: IntArray = np.arange(back.padded[1] // 2 + 1)
+        grid, ordered = self._grid(back.padded), np.empty(self.places.sensor)
+        ordered.ravel()[self.places.order] = readings
+        total: ComplexArray | None = None
         for transfer, weight in zip(grid.transfers, self._applied_weights, strict=True):
-            placed = on_lines(to_rows, to_columns, lines * weight)
-            # Zeros between readings repeat the spectrum.
-            across = _coefficients(np.asarray(fft.rfft(placed, workers=processors())), length, frequencies)
-            spectrum = np.asarray(fft.fft(across, axis=0, workers=processors(), overwrite_x=True))
-            back.add_spectrum(
-                (np.conj(transfer.reshape(-1, count, frequencies.size)) * spectrum).reshape(transfer.shape)
-            )
-
-    def _correlated(self, seen: Seen, transfers: ComplexArray) -> Iterator[FloatArray]:
-        """Yield what each kernel with these transfer functions reads: (sensor rows, sensor columns)."""
-        grid = self._grid(seen.padded)
-        rows, columns = grid.rows, grid.columns
-        count, length, every = rows.shape[1], columns.shape[1], seen.padded[1] // columns.shape[1]
-        spectrum = seen.spectrum.reshape(-1, count, seen.spectrum.shape[1])
-        aliases = np.arange(length // 2 + 1) + length * np.arange(every)[:, None]
-        for transfer in transfers:
-            # Of every so many pixels, the spectrum is the sum of its aliases.
-            product: ComplexArray = np.einsum("aij,aij->ij", spectrum, transfer.reshape(spectrum.shape))
-            down = np.asarray(fft.ifft(product, axis=0, workers=processors(), overwrite_x=True))
-            across = _coefficients(down, seen.padded[1], aliases).sum(axis=1)
-            readings = cast(FloatArray, fft.irfft(across, length, workers=processors(), overwrite_x=True))
-            yield on_lines(rows, columns, readings) / (len(spectrum) * every)
+            spectrum = grid.spectrum_of(ordered, weight)
+            np.conj(spectrum, out=spectrum)
+            spectrum *= transfer
+            total = spectrum if total is None else np.add(total, spectrum, out=total)
+        if total is not None:
+            back.add_spectrum(np.conj(total, out=total))
 
     def _grid(self, padded: tuple[int, int]) -> _Grid:
         """Return what a padded grid needs, which is computed once."""
         if padded not in self._grids:
             self._grids.clear()  # that of another grid is of no use any more
-            every = gcd(self.spacing, *padded)
-            sizes = padded[0] // every, padded[1] // every
-            rows, columns = (_chosen(start // every % n, n) for start, n in zip(self.places.starts, sizes, strict=True))
-            self._grids[padded] = _Grid(self._transfers_of(self._applied[0], padded), rows, columns)
+            self._grids[padded] = self._grid_of(padded, list(self._transfers_of(self._applied[0], padded)))
         return self._grids[padded]
+
+    def _grid_of(self, padded: tuple[int, int], transfers: list[ComplexArray]) -> _Grid:
+        every = gcd(self.spacing, *padded)
+        rows, columns = (np.sort(start - start.min()) // every for start in self.places.starts)
+        return _Grid(padded, every, transfers, rows, columns)
 
     @cached_property
     def _applied(self) -> tuple[FloatArray, FloatArray]:
@@ -262,13 +295,17 @@ class KernelFootprints(ObservationPart):
 
     @cached_property
     def _applied_weights(self) -> list[FloatArray | float]:
-        """The weight of each of these kernels in every reading."""
+        """The weight of each of these kernels in every reading, in the order of starts."""
         return self._weights(self._applied[1])
 
-    def _transfers_of(self, kernels: FloatArray, padded: tuple[int, int]) -> ComplexArray:
-        """Return the conjugate transforms of kernels, which correlate an image with them."""
-        before = [(int(start[0]) % gcd(self.spacing, *padded), 0) for start in self.places.starts]
-        return np.conj(np.asarray(fft.rfft2(np.pad(kernels, [(0, 0), *before]), padded, workers=processors())))
+    def _transfers_of(self, kernels: FloatArray, padded: tuple[int, int]) -> Iterator[ComplexArray]:
+        """Yield the conjugate transforms of kernels at the first place: they correlate an image with the kernels."""
+        first, beside = (start.min() + np.arange(self.places.width) for start in self.places.starts)
+        for kernel in kernels:
+            placed = np.zeros(padded)
+            placed[np.ix_(first % padded[0], beside % padded[1])] = kernel
+            spectrum = np.asarray(fft.rfft2(placed, workers=processors(), overwrite_x=True))
+            yield np.conj(spectrum, out=spectrum)
 
     @property
     def spacing(self) -> int:
@@ -276,11 +313,20 @@ class KernelFootprints(ObservationPart):
         return gcd(*(int(start) for axis in self.places.starts for start in axis - axis[0])) or 1
 
     def _weights(self, coefficients: FloatArray) -> list[FloatArray | float]:
-        """Return the weight of each kernel in every reading: (sensor rows, sensor columns), or one number for all."""
+        """Return the weight of each kernel in every reading, in the order of starts, or one number for all."""
         if self.degree == 0:
             return [float(each[0]) for each in coefficients]
-        down, across = (np.asarray(legendre.legvander(axis, self.degree)) for axis in self.places.field)
+        down, across = self._polynomials
         return [(down @ product) @ across.T for product in self._products(coefficients)]
+
+    @property
+    def _polynomials(self) -> tuple[FloatArray, FloatArray]:
+        """P_a of each sensor row and of each sensor column, in the order of starts: (sensor rows, degree + 1)."""
+        down, across = (
+            np.asarray(legendre.legvander(axis[np.argsort(start, kind="stable")], self.degree), dtype=np.float64)
+            for axis, start in zip(self.places.field, self.places.starts, strict=True)
+        )
+        return down, across
 
     def _products(self, coefficients: FloatArray) -> FloatArray:
         """Return the weights of products of polynomials down and across: (S, degree + 1, degree + 1)."""
@@ -436,25 +482,24 @@ class KernelFootprints(ObservationPart):
             total += read.T @ read
         return total
 
-    def error_directions(self, image: FloatArray) -> sparse.csc_array:
+    def error_directions(self, image: FloatArray) -> FloatArray:
         """Return L, (measurements of the type, q): the error of H f is L xi, with independent xi of variance 1."""
-        grid = padded_shape(self.shape, self.reach, self.spacing)
-        seen = Seen(np.asarray(image, dtype=np.float64).reshape(self.shape), grid)
-        sizes = tuple(start.size for start in self.places.starts)
-        every = np.zeros((self.error_coefficients.shape[1], *sizes))
-        for out, read in zip(
-            every, self._correlated(seen, self._transfers_of(self.shapes.error_kernels, grid)), strict=True
-        ):
-            out[:] = read
-        lines = np.zeros((len(self.error_coefficients), *sizes))
-        down, across = (np.asarray(legendre.legvander(axis, self.degree)) for axis in self.places.field)
-        for number, (a, b) in enumerate(terms(self.degree)):
-            of_term = np.tensordot(self.error_coefficients[:, :, number], every, axes=1)
-            lines += np.outer(down[:, a], across[:, b]) * of_term
-        readings = np.zeros((len(lines), self.measurements))
-        for out, read in zip(readings, lines, strict=True):
-            out[:] = self.places.lens_type.in_order(read)
-        return sparse.csc_array(readings.T)
+        padded, image = padded_shape(self.shape, self.reach, self.spacing), np.asarray(image, dtype=np.float64)
+        grid, seen = self._grid_of(padded, []), Seen(image.reshape(self.shape), padded)
+        transfers = self._transfers_of(self.shapes.error_kernels, padded)
+        every, room = np.zeros((self.error_coefficients.shape[1], *self.places.sensor)), np.empty_like(seen.spectrum)
+        for out, transfer in zip(every, transfers, strict=True):
+            out[:] = grid.read(seen.spectrum, transfer, room)
+        (directions, kernels, _), (rows, columns) = self.error_coefficients.shape, self.places.sensor
+        down, across = self._polynomials
+        count = self.degree + 1
+        shares = self._products(self.error_coefficients.reshape(directions * kernels, len(terms(self.degree))))
+        shares = shares.reshape(directions, kernels, count, count)
+        lines = np.empty((directions, rows, columns))
+        for row in range(rows):  # what is computed of a row stays in the processor's cache
+            of_row = np.tensordot(shares, down[row], axes=(2, 0)).reshape(directions, kernels * count)
+            lines[:, row] = of_row @ (every[:, row, None] * across.T).reshape(kernels * count, columns)
+        return lines.reshape(directions, rows * columns)[:, self.places.order].T
 
     @property
     def description(self) -> dict[str, Any]:
@@ -472,11 +517,18 @@ class KernelFootprints(ObservationPart):
         }
 
 
-def _coefficients(half: ComplexArray, size: int, frequencies: IntArray) -> ComplexArray:
-    """Return coefficients of real lines of this size from those of rfft, (lines, size / 2 + 1)."""
-    mirrored = frequencies % size > size // 2
-    found = half[:, np.where(mirrored, -frequencies, frequencies) % size]
-    return np.where(mirrored, np.conj(found), found)
+def _folded(half: ComplexArray, size: int, length: int) -> ComplexArray:
+    """Return coefficients of every (size / length)-th pixel of real lines, (lines, length / 2 + 1), from those of rfft.
+
+    They are sums of aliases.
+    """
+    total, kept = np.zeros((len(half), length // 2 + 1), dtype=np.complex128), length // 2
+    for first in range(0, size, length):
+        if 2 * first < size:
+            total += half[:, first : first + kept + 1]
+        else:  # the conjugates of those of negative frequencies
+            total += np.conj(half[:, size - first - kept : size - first + 1][:, ::-1])
+    return total
 
 
 def _near(starts: IntArray, wide: int, part: slice) -> tuple[IntArray, FloatArray]:
@@ -488,11 +540,6 @@ def _near(starts: IntArray, wide: int, part: slice) -> tuple[IntArray, FloatArra
     pixels: IntArray = np.asarray(range(part.start, part.stop), dtype=np.int64)
     index = pixels - near[:, None]
     return np.where((index >= 0) & (index < wide), index, wide), np.sqrt(counts)
-
-
-def _chosen(index: IntArray, size: int) -> sparse.csr_array:
-    """Return the matrix that takes elements `index` out of `size`: (indices, size)."""
-    return sparse.csr_array((np.ones(index.size), index, np.arange(index.size + 1)), shape=(index.size, size))
 
 
 def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, Any]) -> KernelFootprints:

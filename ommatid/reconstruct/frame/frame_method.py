@@ -151,8 +151,8 @@ class FrameMethod(Method):
             unit="posterior standard deviation",
         )
         return MethodResult(
-            task.of_f(self.image),
-            residual_multipliers(task, self.image),
+            task.of_f(self.image_of_mean),
+            residual_multipliers(task, self.image_of_mean),
             solver,
             expected,
             given,

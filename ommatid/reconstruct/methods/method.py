@@ -29,6 +29,7 @@ from ..expected_error import ExpectedError, Interval
 from ..output.run_json import SolverReport
 from ..prior import Prior, coloured, prior_of, spectrum_of
 from ..verdict.residual import ResidualPower
+from .level import Level
 
 Value = TypeVar("Value")
 
@@ -341,11 +342,33 @@ class Method(ABC):
     @cached_property
     def image(self) -> FloatArray:
         """The estimate f^ without its error: (N,)."""
+        level = self.level
+        return self.image_of_mean if level is None else self.image_of_mean + level.value * level.response
+
+    @cached_property
+    def image_of_mean(self) -> FloatArray:
+        """The estimate where the image's level is the prior's mean: (N,)."""
         return self.estimate_image()
 
     @abstractmethod
     def estimate_image(self) -> FloatArray:
-        """Compute f^ without its error: (N,)."""
+        """Compute the estimate where the image's level is the prior's mean, without its error: (N,)."""
+
+    @cached_property
+    def level(self) -> Level | None:
+        """The common level of the image, None where the prior knows it or operators cannot be applied."""
+        deviation, count = self.task.prior.level_deviation, self.task.model.unknowns
+        operators = self.operators() if deviation else None
+        if operators is None:
+            return None
+        hidden = operators.hidden
+        # Operators are as accurate as images of the prior need, so that they take one of the same size.
+        response, _ = self.shared("level", self.conditions(), lambda: hidden(np.full(count, deviation)) / deviation)
+        return Level.of(self.task, self.image_of_mean, response)
+
+    def less_level(self, truth: FloatArray) -> FloatArray:
+        """Return a true image about the prior's mean: less the level of the estimate."""
+        return truth if self.level is None else truth - self.level.value
 
     def operators(self) -> PosteriorOperators | None:
         """Return the operators of the estimate, None where this method cannot apply them, or not without noise."""
@@ -356,6 +379,14 @@ class Method(ABC):
 
         With P0M = c P0, Eq. 5 is c times that of the noise Rvm / c for images of the assumed prior P0.
         """
+        truth = None if truth is None else self.less_level(truth)
+        result, level = self._result_for_actual_prior(noise, truth), self.level
+        operators = None if level is None else self.operators()
+        if level is None or operators is None:
+            return result
+        return level.added_to(result, self.task, total_variance(noise), operators)
+
+    def _result_for_actual_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         ratio = self.task.prior_ratio
         if ratio == 1:
             return self.result_for_assumed_prior(noise, truth)
@@ -366,7 +397,10 @@ class Method(ABC):
 
     @abstractmethod
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
-        """Return the estimate and its error for the actual `noise` and images of the prior that is assumed."""
+        """Return the estimate and its error for the actual `noise` and images of the prior that is assumed.
+
+        The level of the image is the prior's mean.
+        """
 
 
 def _multiplied(result: MethodResult, ratio: float) -> MethodResult:

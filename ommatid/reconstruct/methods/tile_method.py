@@ -10,6 +10,7 @@ to a few hundredths. Conjugate gradients compute them to the few digits that mea
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -33,6 +34,7 @@ from ..frame.conjugate_gradients import (
 )
 from ..output.run_json import SolverReport
 from ..verdict.residual import ResidualInputs, ResidualPower
+from .level import Level
 from .method import (
     EstimationTask,
     Execution,
@@ -154,6 +156,11 @@ class TileMethod(Method):
                 image[tile.core] = values.reshape(image[tile.core].shape)
         return image.ravel()
 
+    @cached_property
+    def level(self) -> Level | None:
+        """None: tiles are estimated one by one, and take the level for known."""
+        return None
+
     def operators(self) -> PosteriorOperators | None:
         """Return the operators of the whole frame, None where a measurement has no noise."""
         return iterative_operators(self.task) if (self.task.expected_noise > 0).all() else None
@@ -183,11 +190,11 @@ class TileMethod(Method):
                 missing += share * expected.missing
                 parts = {name: part + share * expected.parts[name] for name, part in parts.items()}
                 sums += 0.0 if solved.given is None else solved.given[:, index]
-        self.image = image.ravel()
+        self.image_of_mean = image.ravel()
         cost = tile_cost(task, variance) if np.allclose(total_variance(noise), task.expected_noise, rtol=1e-9) else None
         return MethodResult(
-            self.image,
-            residual_multipliers(task, self.image),
+            self.image_of_mean,
+            residual_multipliers(task, self.image_of_mean),
             _worst([solved.solver for solved in results], len(groups), words(cost)),
             ExpectedError(variance.ravel(), missing, parts, resolved.ravel()),
             None if truth is None else interval(float(sums[0]), float(sums[1]), image.size),

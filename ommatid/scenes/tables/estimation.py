@@ -95,6 +95,9 @@ def adds_noise(tables: Mapping[str, object]) -> bool:
     return bool(noise.get("variance")) or "bits" in noise
 
 
+LEVEL = 64.0  # grey levels
+
+
 class PriorTable(Table):
     """Mean and covariance of the image before any measurement."""
 
@@ -104,12 +107,22 @@ class PriorTable(Table):
     )
     mean: float = Field(default=127.5, ge=-LARGEST, le=LARGEST)
     variance: float = Field(default=5461.25, gt=0, le=LARGEST**2, description="of every pixel; fitted by kind fit")
+    level: Literal["known"] | Annotated[float, Field(gt=0, le=LARGEST)] | None = Field(
+        default=None,
+        description='standard deviation of the image\'s common level about `mean`; "known": none, as in the paper;'
+        f" absent: {LEVEL:g}",
+    )
     correlation_length: Length | None = Field(
         default=None, description="length on the target, for kind exponential; fitted by kind fit"
     )
     exponent: float | None = Field(
         default=None, ge=0, le=8, description="a of a power spectrum 1/frequency^a, for kind power; absent: 2"
     )
+
+    @property
+    def level_deviation(self) -> float:
+        """Standard deviation of the image's common level about the mean, 0 where it is known."""
+        return 0.0 if self.level == "known" else LEVEL if self.level is None else self.level
 
     @model_validator(mode="after")
     def _check_kind(self) -> PriorTable:

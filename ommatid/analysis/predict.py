@@ -66,7 +66,9 @@ def predict_ideal(scene: Scene) -> Prediction:
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":
         added = partial(misalignment_variance, camera=camera, prior=prior.scaled(scene.prior_ratio))
     matrix = ideal_matrix(camera)
-    prediction = predict(matrix, prior, actual, scene.estimator, camera.shape, added, scene.prior_ratio)
+    prediction = predict(
+        matrix, prior, actual, scene.estimator, camera.shape, added, scene.prior_ratio, scene.prior.level_deviation
+    )
     return replace(prediction, assumes=_ideal_assumptions(setup))
 
 

@@ -19,6 +19,7 @@ from .estimator.estimate import factorise
 from .expected_error import ExpectedError, expected_error
 from .measured_error import TRIM, trimmed_mean
 from .method_choice import METHODS, MethodChoice
+from .methods.level import variance_of
 from .methods.method import EstimationTask, Execution
 from .noise import at_used, uniform
 from .prior import Prior
@@ -123,6 +124,7 @@ def predict(
     shape: tuple[int, int],
     misalignment_variance: Callable[[Form, BoolArray], FloatArray] | None = None,
     prior_ratio: float = 1.0,
+    level: float = 0.0,
 ) -> Prediction:
     """Predict the error of one dense problem with noise of variance `actual`.
 
@@ -134,6 +136,7 @@ def predict(
     prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
     misalignment_variance : from a form and the measurements used, (M,), to what misalignment adds, (N,); asked where
         the estimator expects noise
+    level : standard deviation of the image's common level, 0 where it is known or where there is no noise
     Raises InputError where the noise is to be fitted to a stack, or where no form is right.
     """
     noise, expected_noise, used = _noises(actual, matrix.shape[0], estimator)
@@ -145,6 +148,8 @@ def predict(
     form, solver = factorise(Problem(matrix, prior, expected_noise), estimator.tolerance)
     expected = expected_error(form, {"noise": noise / prior_ratio})
     variance = prior_ratio * expected.variance
+    if level and form.problem.noisy:
+        variance = variance + _by_level(form, level)
     if misalignment_variance is not None and form.problem.noisy:
         added = misalignment_variance(form, used)
         variance = variance + added
@@ -158,6 +163,15 @@ def predict(
         misalignment=None if added is None else float(added.mean()),
         prior_variance=prior_ratio * float(prior.variance.mean()),
     )
+
+
+def _by_level(form: Form, level: float) -> FloatArray:
+    """Return what an unknown level adds to Eq. 5 for the expected noise: (N,)."""
+    prior, matrix = form.problem.prior, form.problem.matrix
+    constant = np.ones(matrix.shape[1])
+    wave = float(np.mean(prior.apply_root(prior.apply_root_transposed(constant))))
+    response = constant - form.gain(matrix @ constant)
+    return variance_of(response, wave, level**2) * np.square(response)
 
 
 def predict_frame(choice: MethodChoice, model: Model, camera: Camera, actual: float | FloatArray) -> Prediction:

@@ -35,7 +35,8 @@ def described(assumed: float, shape: tuple[int, int] = (12, 12), **tables: Any) 
     """A scene with a null space and loud noise, so that the prior matters."""
     estimator = {"prior_variance": assumed, **tables.pop("estimator", {})}
     noise, ideal = {"variance": NOISE}, {"method": "ideal"}
-    return scene(shape, LENSES, noise=noise, calibration=ideal, estimator=estimator, **tables)
+    prior = {"level": "known", **tables.pop("prior", {})}
+    return scene(shape, LENSES, noise=noise, calibration=ideal, estimator=estimator, prior=prior, **tables)
 
 
 def dense(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -28,7 +28,7 @@ from tests.examples import THREE, scene, with_optics
 Array = NDArray[np.float64]
 
 NOISE = 0.5
-EXPONENTIAL = {"kind": "exponential", "correlation_length": "6 mm", "variance": 900.0}
+EXPONENTIAL = {"level": "known", "kind": "exponential", "correlation_length": "6 mm", "variance": 900.0}
 CAMERAS = {
     "distorted": ({"distortion": [0.3, 0]}, {"lens_pitch": "3 mm"}),
     "misaligned": ({}, {"tolerance": {"position": "0.5 um"}}),
@@ -65,7 +65,7 @@ class Case:
 @cache
 def case(kind: str, prior_kind: str = "exponential") -> Case:
     lens, camera_table = CAMERAS[kind]
-    prior = EXPONENTIAL if prior_kind == "exponential" else {"kind": prior_kind}
+    prior = EXPONENTIAL if prior_kind == "exponential" else {"kind": prior_kind, "level": "known"}
     tables = {"prior": prior, "noise": {"variance": NOISE}, "calibration": {"method": "ideal"}}
     described, _ = with_optics(lens, camera_table, SMALL, (11, 11), **tables)
     target = described.target.model_copy(update={"detail": 2})

@@ -70,11 +70,17 @@ def test_the_estimate_is_that_of_a_prior_with_one_covariance_more(lenses: Lenses
     assert result.verdict.level != "red"
 
 
+@pytest.mark.parametrize("ratio", [1.0, 0.3])
 @pytest.mark.parametrize("lenses", [ONE, FITTED])
-def test_noise_and_pixels_other_than_the_estimator_expects(lenses: Lenses) -> None:
+def test_noise_and_pixels_other_than_the_estimator_expects(lenses: Lenses, ratio: float) -> None:
     scene = described(lenses, "auto")
-    expecting = replace_tables(scene, noise={"variance": 9 * NOISE}, estimator={"noise_variance": NOISE})
-    _, covariance = exact(scene, 9 * NOISE)
+    expecting = replace_tables(
+        scene,
+        noise={"variance": 9 * NOISE},
+        prior={"variance": ratio * P0},
+        estimator={"noise_variance": NOISE, "prior_variance": P0},
+    )
+    _, covariance = exact(scene, 9 * NOISE, ratio)
     stack = recorded(expecting, dark(0), 9 * NOISE)
     result = restore(stack, ideal_model(expecting, stack.camera), dark(0))
     np.testing.assert_allclose(result.expected.variance, np.diagonal(covariance), rtol=1e-6)
@@ -112,6 +118,8 @@ def test_a_known_level_is_the_prior_of_the_paper() -> None:
     stack = recorded(scene, dark(0), NOISE)
     matrix = ideal_matrix(stack.camera).toarray()
     information = matrix.T @ matrix / NOISE + np.eye(matrix.shape[1]) / P0
-    expected = 127.5 + np.linalg.solve(information, matrix.T @ (stack.values - matrix @ np.full(SIDE**2, 127.5))) / NOISE
+    expected = (
+        127.5 + np.linalg.solve(information, matrix.T @ (stack.values - matrix @ np.full(SIDE**2, 127.5))) / NOISE
+    )
     result = restore(stack, ideal_model(scene, stack.camera))
     np.testing.assert_allclose(result.estimate, expected, atol=1e-6)

@@ -76,7 +76,7 @@ def test_dead_pixels_are_left_out_and_counted() -> None:
 def test_saturated_pixels_are_known_to_reach_the_limit(bits: int | None) -> None:
     """Taken for readings, they raise chi-squared of the residual; as censored, the error stays inside its interval."""
     noise = {"variance": 1.0, "saturation": 30.3} | ({} if bits is None else {"bits": bits})
-    stack, model, truth = recorded(scene(lenses=THREE, noise=noise))
+    stack, model, truth = recorded(scene(lenses=THREE, noise=noise, prior={"level": "known"}))
     assert stack.values.max() == 30.3
     restoration = restore(stack, model, truth)
     assert restoration.usable.saturated > 30
@@ -153,7 +153,7 @@ def test_a_stack_without_usable_pixels_gives_the_prior_and_a_warning() -> None:
         )
         restoration = restore(nothing, model, truth)
         assert restoration.estimate == pytest.approx(np.full(361, 99.0))
-        assert restoration.expected.variance == pytest.approx(np.full(361, 16.0))
+        assert restoration.expected.variance == pytest.approx(np.full(361, 16.0 + 64.0**2)), "the level is not known"
         assert restoration.usable.dead == 706
         assert "this is the prior and not an image" in rows(restoration, nothing, model)["verdict"]
 

@@ -51,7 +51,7 @@ def test_cores_partition_the_frame(rows: int, columns: int, size: int, overlap: 
 
 
 def test_one_tile_is_the_dense_estimate() -> None:
-    scene = wide((30, 28))
+    scene = wide((30, 28), prior={"level": "known"})
     truth = drawn((30, 28))
     task = task_of(scene, truth)
     noise = {"noise": task.expected_noise}

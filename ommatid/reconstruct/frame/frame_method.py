@@ -126,6 +126,11 @@ class FrameMethod(Method):
         """Compute f^ without its error: (N,)."""
         return self.solution.image + self.task.prior.mean
 
+    def left_of_constant(self, value: float) -> FloatArray:
+        """Return C P0^-1 1, (unknowns,), to the accuracy of the estimate for an image of this value."""
+        right = self.system.apply_prior_precision(np.full(self.task.model.unknowns, value))
+        return self.system.solve(right, self.task.settings.accuracy).image / value
+
     def operators(self) -> PosteriorOperators:
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
         return posterior_operators(self.system, self.task, self._solve)

@@ -15,15 +15,11 @@ For a noise Rvm and images of c P0, others than the estimator expects, and a = v
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from .method import EstimationTask, MethodResult, PosteriorOperators
 
 
 @dataclass(frozen=True)
@@ -40,40 +36,16 @@ class Level:
     response: FloatArray
 
     @classmethod
-    def of(cls, task: EstimationTask, estimate: FloatArray, response: FloatArray) -> Level:
-        """Return the level for an estimate by the prior's mean, (unknowns,), and h."""
-        wave = float(np.ravel(1 / np.asarray(task.precision_on(task.shape)))[0])
-        known = task.prior.level_deviation**2
-        variance = 1 / (max(float(np.sum(1 - response)), 0.0) / wave + 1 / known)
-        return cls(variance * float(np.sum(estimate - task.prior.mean)) / wave, variance, known, response)
+    def of(cls, deviation: FloatArray, response: FloatArray, wave: float, known: float) -> Level:
+        """Return the level from A (g - H f0) and h, (unknowns,) each, s and L^2."""
+        variance = variance_of(response, wave, known)
+        return cls(variance * float(deviation.sum()) / wave, variance, known, response)
 
-    def added_to(
-        self, result: MethodResult, task: EstimationTask, actual: FloatArray, operators: PosteriorOperators
-    ) -> MethodResult:
-        """Return the result for the prior's mean with the level; actual : (measurements used,) Rvm."""
-        read, response, ratio = task.observe(self.response), task.of_f(self.response), task.prior_ratio
-        gain = self.variance * operators.weigh(read)  # a
-        other = (actual - ratio * task.expected_noise) * gain
-        variance = self.variance + float(gain @ other) + (ratio - 1) * (self.variance - self.variance**2 / self.known)
-        changed = np.abs(other).max(initial=0.0) > 0
-        beside = task.of_f(operators.gain(other)) if changed else np.zeros(response.size)  # q
-        expected, before = result.expected, result.variance_of_sum
-        more = np.maximum(variance * response**2 + 2 * beside * response, -expected.variance)
+    def variance_for(self, gain: FloatArray, other: FloatArray, ratio: float) -> float:
+        """Return v for another noise and c P0; gain : a;  other : (Rvm - c Rv) a, (measurements used,) both."""
+        return self.variance + float(gain @ other) + (ratio - 1) * (self.variance - self.variance**2 / self.known)
 
-        def variance_of_sum(weights: FloatArray) -> float:
-            along = float(weights @ response)
-            return before(weights) + variance * along**2 + 2 * along * float(weights @ beside)
 
-        if operators.whiten is None:
-            multipliers = operators.weigh(read)
-        else:
-            multipliers = operators.whiten(read) / np.sqrt(task.expected_noise)
-        return replace(
-            result,
-            image=result.image + self.value * response,
-            multipliers=result.multipliers - self.value * multipliers,
-            expected=replace(
-                expected, variance=expected.variance + more, missing=expected.missing + float(more.mean())
-            ),
-            variance_of_sum=variance_of_sum,
-        )
+def variance_of(response: FloatArray, wave: float, known: float) -> float:
+    """Return v from h, (unknowns,), s and L^2."""
+    return 1 / (max(float(np.sum(1 - response)), 0.0) / wave + 1 / known)

@@ -356,15 +356,20 @@ class Method(ABC):
 
     @cached_property
     def level(self) -> Level | None:
-        """The common level of the image, None where the prior knows it or operators cannot be applied."""
-        deviation, count = self.task.prior.level_deviation, self.task.model.unknowns
-        operators = self.operators() if deviation else None
-        if operators is None:
+        """The common level of the image, None where the prior knows it or this method takes it for known."""
+        deviation, task = self.task.prior.level_deviation, self.task
+        if not deviation:
             return None
-        hidden = operators.hidden
-        # Operators are as accurate as images of the prior need, so that they take one of the same size.
-        response, _ = self.shared("level", self.conditions(), lambda: hidden(np.full(count, deviation)) / deviation)
-        return Level.of(self.task, self.image_of_mean, response)
+        response, _ = self.shared("level", self.conditions(), lambda: self.left_of_constant(deviation))
+        if response is None:
+            return None
+        wave = float(np.ravel(1 / np.asarray(task.precision_on(task.shape)))[0])
+        return Level.of(self.image_of_mean - task.prior.mean, response, wave, deviation**2)
+
+    def left_of_constant(self, value: float) -> FloatArray | None:
+        """Return C P0^-1 1, (unknowns,), as accurate as for an image of this value; None where there is no noise."""
+        operators = self.operators()
+        return None if operators is None else operators.hidden(np.full(self.task.model.unknowns, value)) / value
 
     def less_level(self, truth: FloatArray) -> FloatArray:
         """Return a true image about the prior's mean: less the level of the estimate."""
@@ -384,7 +389,7 @@ class Method(ABC):
         operators = None if level is None else self.operators()
         if level is None or operators is None:
             return result
-        return level.added_to(result, self.task, total_variance(noise), operators)
+        return _with_level(result, level, self.task, total_variance(noise), operators)
 
     def _result_for_actual_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         ratio = self.task.prior_ratio
@@ -401,6 +406,31 @@ class Method(ABC):
 
         The level of the image is the prior's mean.
         """
+
+
+def _with_level(
+    result: MethodResult, level: Level, task: EstimationTask, actual: FloatArray, operators: PosteriorOperators
+) -> MethodResult:
+    """Return the result for the prior's mean with the level added; actual : (measurements used,) Rvm."""
+    read, response, expected = task.observe(level.response), task.of_f(level.response), result.expected
+    gain = level.variance * operators.weigh(read)
+    other = (actual - task.prior_ratio * task.expected_noise) * gain
+    variance, before = level.variance_for(gain, other, task.prior_ratio), result.variance_of_sum
+    beside = task.of_f(operators.gain(other)) if other.any() else np.zeros(response.size)
+    more = np.maximum(variance * response**2 + 2 * beside * response, -expected.variance)
+    white = read / np.sqrt(task.expected_noise) if operators.whiten is None else operators.whiten(read)
+
+    def variance_of_sum(weights: FloatArray) -> float:
+        along = float(weights @ response)
+        return before(weights) + variance * along**2 + 2 * along * float(weights @ beside)
+
+    return replace(
+        result,
+        image=result.image + level.value * response,
+        multipliers=result.multipliers - level.value * white / np.sqrt(task.expected_noise),
+        expected=replace(expected, variance=expected.variance + more, missing=expected.missing + float(more.mean())),
+        variance_of_sum=variance_of_sum,
+    )
 
 
 def _multiplied(result: MethodResult, ratio: float) -> MethodResult:

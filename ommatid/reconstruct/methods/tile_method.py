@@ -10,7 +10,6 @@ to a few hundredths. Conjugate gradients compute them to the few digits that mea
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -34,7 +33,6 @@ from ..frame.conjugate_gradients import (
 )
 from ..output.run_json import SolverReport
 from ..verdict.residual import ResidualInputs, ResidualPower
-from .level import Level
 from .method import (
     EstimationTask,
     Execution,
@@ -156,10 +154,8 @@ class TileMethod(Method):
                 image[tile.core] = values.reshape(image[tile.core].shape)
         return image.ravel()
 
-    @cached_property
-    def level(self) -> Level | None:
-        """None: tiles are estimated one by one, and take the level for known."""
-        return None
+    def left_of_constant(self, value: float) -> None:
+        """Return None: tiles are estimated one by one, and take the level for known."""
 
     def operators(self) -> PosteriorOperators | None:
         """Return the operators of the whole frame, None where a measurement has no noise."""

@@ -31,7 +31,7 @@ from .misalignment.robust_noise import CAUSE
 from .noise import Noise, UsablePixels, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .verdict.residual import WhitenedResidual, residual_parts
-from .verdict.verdict import ErrorCheck, evidence_of, judge, without_pixels
+from .verdict.verdict import DITHER, ErrorCheck, evidence_of, judge, without_pixels
 
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
 BEYOND = 0.1  # share of the error by the next order, likewise
@@ -62,12 +62,23 @@ def verdict_of(
         calibration_share=expected.parts.get("calibration", 0.0) / expected.mse if expected.mse else 0.0,
         fit_doubtful=assumed.fit is not None and assumed.fit.doubtful,
         noise_fitted=assumed.fit is not None and assumed.fit.noise_variance is not None,
+        undithered=_undithered(assumed.noise),
         pixels_used=int(used.sum()),
         left_out=without_pixels(stack.camera, used),
     )
     light = partial(assumed.method.task.model.light, assumed.method.image)
     evidence = evidence_of(stack, model, used, light, assumed.prior.kind == "independent")
     return judge(_parts(stack, model, assumed, result), evidence, check)
+
+
+def _undithered(noise: Noise) -> float | None:
+    """Return the noise over the quantisation step where it is below DITHER, None elsewhere."""
+    rounding = noise.get("quantisation")
+    if rounding is None or not rounding.any():
+        return None
+    noisy = float(np.mean(noise["noise"])) if "noise" in noise else 0.0
+    share = (noisy / (12 * float(np.mean(rounding)))) ** 0.5
+    return share if share < DITHER else None
 
 
 def _spurious(share: FloatArray, expected: ExpectedError) -> float:

@@ -37,6 +37,7 @@ SINGLE = ("target.pixel_pitch=1 mm", "camera.lens_pitch=9 mm")
         (("camera.lens.I.aperture=80 um", RAYS), ("set camera.wavelength", "lens I is 5.6 sensor pixels wide at 550")),
         (("camera.lens.I.aperture=80 um",), ("wider than its sub-image", "5.59 sensor pixels", "aperture wider")),
         (("target.distance=4 mm", *SINGLE), ("field of view of 124 degrees", "target.distance longer")),
+        (("noise.variance=1e-2", "noise.bits=6"), ("0.025 times the", "EMVA 1288", "raise noise.bits")),
         (("camera.lens.I.f_number=0.4", "camera.lens_pitch=20 mm"), ("lens type I is f/0.4", "f/0.5")),
         # the root of 10000 electrons, of which 255 stands for all
         (("noise=",), ("sensor noise is not modelled: add [noise] or [sensor]", "deviation of 2.55 of 255")),
@@ -58,3 +59,14 @@ def test_diffraction_that_is_modelled_or_narrow_is_no_warning() -> None:
 
 def test_a_single_lens_may_be_wider_than_the_pitch() -> None:
     assert warnings_of("single", "camera.pixel_pitch=3 um") == []
+
+
+def test_a_sensor_whose_dark_noise_is_below_a_quarter_of_a_step() -> None:
+    """2 electrons and 20 per second for 0.1 s are a noise of 2.4, of 0.12 steps at 20 electrons per number."""
+    (words,) = warnings_of("sensor", "sensor.gain=0.05", *DARK)
+    assert "0.12 times the quantisation step" in words
+    assert "raise sensor.gain" in words
+    assert not warnings_of("sensor", "sensor.gain=0.2", *DARK)
+
+
+DARK = ("sensor.read_noise=2", "sensor.dark_current=20", "sensor.exposure=100 ms")

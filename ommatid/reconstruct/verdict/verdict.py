@@ -30,6 +30,7 @@ FEW = 0.2  # share of the sub-imagers that are few
 MOST_NAMED = 5  # sub-imagers in one sentence
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
+DITHER = 0.4  # noise over the quantisation step from which rounding errors are independent of the signal
 ROUGH = 0.05  # relative error of a map of variances from which it is a doubt
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
 UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
@@ -179,6 +180,7 @@ class ErrorCheck:
     spurious : relative error of Eq. 5 by the noise of H beyond what it counts
     spurious_share : of a pixel's information, on average
     calibration_share : of the predicted error that the uncertainty of H causes
+    undithered : noise over the quantisation step, None where it is large enough to make rounding errors independent
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
     """
 
@@ -190,6 +192,7 @@ class ErrorCheck:
     calibration_share: float
     fit_doubtful: bool
     noise_fitted: bool
+    undithered: float | None
     pixels_used: int
     left_out: tuple[str, ...]
 
@@ -208,6 +211,7 @@ def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -
     if check.pixels_used:
         _judge_residual(parts, evidence, check, findings)
         _judge_error(check, findings)
+        _judge_rounding(check, findings)
         _judge_assumptions(check, findings)
     else:
         findings.reasons.append("no sensor pixel could be used, so this is the prior and not an image")
@@ -291,10 +295,13 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
         findings.notes.append("the error was not checked: this method states no interval for one image")
     else:
         words = f"the error, {mse:.4g}, lies {{}} its 99 % interval, {interval.low:.4g} to {interval.high:.4g}"
-        outside = mse > (1 + SIZE) * interval.high or mse < (1 - SIZE) * interval.low
-        if outside and error_p_value(mse, interval) < SIGNIFICANCE:
-            reason = words.format("above" if mse > interval.high else "below")
-            findings.reasons.append(reason + (UNCERTAIN if check.calibration_share > SIZE else ""))
+        significant, uncertain = error_p_value(mse, interval) < SIGNIFICANCE, check.calibration_share > SIZE
+        if mse > (1 + SIZE) * interval.high and significant:
+            findings.reasons.append(words.format("above") + (UNCERTAIN if uncertain else ""))
+        elif mse < (1 - SIZE) * interval.low and significant:
+            cause = "rounding, or the noise" if check.undithered is not None else "the noise"
+            cause += ", or the uncertainty of H," if uncertain else "," if check.undithered is not None else ""
+            findings.notes.append(f"{words.format('below')}: {cause} is smaller than stated")
         elif interval.low <= mse <= interval.high:
             findings.passed.append(words.format("inside"))
         else:
@@ -308,6 +315,15 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
         findings.doubts.append(
             f"the variances of some pixels are wrong by {100 * check.variance_bound:.2g} %: the solver's map of them is"
             " an approximation"
+        )
+
+
+def _judge_rounding(check: ErrorCheck, findings: _Findings) -> None:
+    if check.undithered is not None:
+        findings.notes.append(
+            f"the noise is {check.undithered:.2g} times the quantisation step: where the picture is smooth,"
+            " neighbouring pixels are rounded alike, and their mean may be off by up to half a step; noise of"
+            f" {DITHER:g} steps or more makes errors of rounding independent"
         )
 
 

@@ -132,6 +132,7 @@ def _lens_terms(camera: Camera, lens_type: LensType, wavelength: float) -> LensT
     )
 
 
+LEAST_DITHER = 0.24  # quantisation steps of noise in the dark (EMVA 1288, release 4.0)
 WIDEST = 1.0  # sensor pixels, of an Airy disk that may be left out
 FASTEST = 0.5  # f-number of a sharp lens in air: 1 / (2 sin(angle)) of a cone of 90 degrees to the axis (Abbe)
 FULL_WELL = 10000  # electrons of a common pixel, the default of [sensor]
@@ -140,7 +141,7 @@ WIDEST_VIEW = 120.0  # degrees: beyond, the cos^4 law leaves less than 1/16 of t
 
 def camera_warnings(scene: Scene, camera: Camera, terms: OpticalTerms) -> list[str]:
     """Return one sentence per warning, which names the keys to change."""
-    return [*_without_noise(scene), *_left_out(camera, terms), *_absurd(camera, terms)]
+    return [*_without_noise(scene), *_coarse_steps(scene), *_left_out(camera, terms), *_absurd(camera, terms)]
 
 
 def _without_noise(scene: Scene) -> list[str]:
@@ -150,6 +151,23 @@ def _without_noise(scene: Scene) -> list[str]:
     return [
         "sensor noise is not modelled: add [noise] or [sensor]; photons alone bring a deviation of"
         f" {WHITE / sqrt(FULL_WELL):.3g} of {WHITE:g} to a pixel of {FULL_WELL} electrons"
+    ]
+
+
+def _coarse_steps(scene: Scene) -> list[str]:
+    """Rounding is no independent noise where the noise in the dark is below LEAST_DITHER steps."""
+    sensor, noise = scene.sensor, scene.noise
+    if sensor is not None:
+        steps, cure = sensor.gain * (sensor.read_noise**2 + sensor.dark_current * sensor.exposure) ** 0.5, "sensor.gain"
+    elif noise is not None and noise.level > 0:
+        steps, cure = noise.variance**0.5 / noise.level, "noise.bits"
+    else:
+        return []
+    if steps >= LEAST_DITHER:
+        return []
+    return [
+        f"the noise in the dark is {steps:.2g} times the quantisation step, where EMVA 1288 asks for {LEAST_DITHER:g}:"
+        f" smooth dark parts are rounded alike, and their mean may be off by up to half a step; raise {cure}"
     ]
 
 

@@ -83,9 +83,8 @@ class Assumptions:
             # Errors that measurements share count as independent ones of the same variance.
             return self._without_attenuation(self._with_shared_as_independent, truth)
         result, actual = self._without_attenuation(independent, truth), total_variance(independent)
-        about_mean = None if truth is None else method.less_level(truth)
         if self.contrast is not None:
-            known = about_mean if truth is not None and truth.size == method.task.model.unknowns else None
+            known = truth if truth is not None and truth.size == method.task.model.unknowns else None
             result = with_attenuation(result, method, operators, self.contrast.image, known, actual)
         if not shared:
             return result
@@ -94,7 +93,7 @@ class Assumptions:
             most = bound(method.task, image)
             if most <= NEGLIGIBLE_PART * result.expected.mse:
                 return replace(result, left_out=most)
-        return with_shared_errors(result, method, operators, image, about_mean, actual)
+        return with_shared_errors(result, method, operators, image, truth, actual)
 
     @property
     def _independent_noise(self) -> Noise:

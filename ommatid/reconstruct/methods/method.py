@@ -371,9 +371,10 @@ class Method(ABC):
         operators = self.operators()
         return None if operators is None else operators.hidden(np.full(self.task.model.unknowns, value)) / value
 
-    def less_level(self, truth: FloatArray) -> FloatArray:
-        """Return a true image about the prior's mean: less the level of the estimate."""
-        return truth if self.level is None else truth - self.level.value
+    @property
+    def mean(self) -> float:
+        """The prior's mean with the level of the estimate."""
+        return self.task.prior.mean + (0.0 if self.level is None else self.level.value)
 
     def operators(self) -> PosteriorOperators | None:
         """Return the operators of the estimate, None where this method cannot apply them, or not without noise."""
@@ -384,7 +385,7 @@ class Method(ABC):
 
         With P0M = c P0, Eq. 5 is c times that of the noise Rvm / c for images of the assumed prior P0.
         """
-        truth = None if truth is None else self.less_level(truth)
+        truth = None if truth is None else truth - (self.mean - self.task.prior.mean)
         result, level = self._result_for_actual_prior(noise, truth), self.level
         operators = None if level is None else self.operators()
         if level is None or operators is None:

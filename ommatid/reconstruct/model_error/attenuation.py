@@ -104,7 +104,7 @@ class Attenuation:
         return float(image @ (first + second)) / (2 * float(image @ image) or 1.0)
 
     def effect(self, image: FloatArray, mean: float) -> Effect:
-        """Return the effect on the estimate of an image, (N,); mean : of the prior."""
+        """Return the effect on the estimate of an image, (N,); mean : of the prior, with the level."""
         return Effect(image, self.operators.hidden(image - mean), self.halves(image))
 
     def residual_change(self, task: EstimationTask, effect: Effect) -> FloatArray:
@@ -167,8 +167,8 @@ def with_attenuation(
     unseen = task.prior_ratio**0.5 * operators.hidden(task.draw_deviation(rng))
     if not attenuation.strength(noise + unseen) <= FIRST_ORDER:
         return result
-    average = attenuation.effect(image + unseen, task.prior.mean)
-    given = None if truth is None else attenuation.effect(truth, task.prior.mean)
+    average = attenuation.effect(image + unseen, method.mean)
+    given = None if truth is None else attenuation.effect(truth, method.mean)
     first, second = average.halves
     before, power = result.variance_of_sum, result.residual_power
 

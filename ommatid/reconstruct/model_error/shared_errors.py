@@ -156,7 +156,7 @@ def with_shared_errors(
         expected=_with_variance(result.expected, errors, task.shape_of_f),
         interval=None
         if result.interval is None or truth is None
-        else _wider(result.interval, given, truth, actual, task, operators),
+        else _wider(result.interval, given, truth, actual, method, operators),
         variance_of_sum=variance_of_sum,
         residual_power=power,
     )
@@ -176,16 +176,17 @@ def _wider(
     errors: SharedErrors,
     truth: FloatArray,
     actual: FloatArray,
-    task: EstimationTask,
+    method: Method,
     operators: PosteriorOperators,
 ) -> Interval:
+    task = method.task
     (rows, columns), camera = task.shape_of_f, task.model.camera
     count, image = rows * columns, truth
     if truth.size > task.model.unknowns:
         image = averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
     elif truth.size < task.model.unknowns:
         image = task.finer**2 * task.of_unknowns(truth)
-    bias = task.of_f(operators.hidden(image - task.prior.mean))
+    bias = task.of_f(operators.hidden(image - method.mean))
     added = errors.variance_of_square(bias, actual, task, operators)
     return without.with_added(float(errors.variance.sum()), added, count)
 

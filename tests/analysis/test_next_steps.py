@@ -108,7 +108,7 @@ def test_another_lens_type_brings_what_the_prediction_says() -> None:
     after = {ratio: predict_ideal(with_lens(described, ratio)) for ratio in tried}
     assert other.magnification == min(tried, key=lambda ratio: after[ratio].mse)
     chosen, before = after[other.magnification], predict_ideal(described)
-    assert other.ratio == pytest.approx(chosen.mse / before.mse, rel=1e-6)
+    assert other.ratio == pytest.approx(chosen.mse / before.mse, rel=1e-4), "it takes the level for known"
     assert other.measurements == chosen.measurements - before.measurements
     step = next(step for step in next_steps(report, other) if "lens type" in step.change)
     assert step.mse == pytest.approx(chosen.mse, rel=1e-3)

@@ -117,6 +117,11 @@ class Scene(Table):
             raise ValueError(
                 f"estimator.prior_variance takes a known prior of f, got {conflict}; remove one of the two"
             )
+        if self.estimator.method == "tiles" and self.prior.level not in (None, "known"):
+            raise ValueError(
+                "estimator.method 'tiles' takes the level of the image for known, got prior.level"
+                f" {self.prior.level:g}; remove one of the two"
+            )
         if self.sensor is not None:
             for lens in self.camera.lens:
                 if lens.aperture is None and lens.surfaces is None:

@@ -10,6 +10,7 @@ import pytest
 
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from tests.examples import THREE, Lenses
@@ -111,6 +112,12 @@ def test_means_of_regions_of_dark_pictures_deviate_by_what_is_stated() -> None:
     known, unknown = (float(np.mean(np.square(ratios))) ** 0.5 for ratios in found)
     assert known > 3
     assert unknown < 1.5
+
+
+def test_tiles_refuse_a_level() -> None:
+    with pytest.raises(InputError, match=r"takes the level of the image for known, got prior.level 64"):
+        wide((SIDE, SIDE), ONE, prior={"level": LEVEL}, estimator={"method": "tiles"})
+    wide((SIDE, SIDE), ONE, estimator={"method": "tiles"})
 
 
 def test_a_known_level_is_the_prior_of_the_paper() -> None:

@@ -16,7 +16,7 @@ from scipy import linalg
 
 from ommatid.reconstruct.noise import known_noise
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.prior import prior_of
+from ommatid.reconstruct.prior import FittedPrior, prior_of
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import one_thread
 from ommatid.scenes.model import Model
@@ -102,7 +102,7 @@ def error_window(stack: Stack, model: Model, estimate: FloatArray, report: RunRe
         return None
     scene = stack.scene
     size = rows.stop - rows.start, columns.stop - columns.start
-    prior = prior_of(_prior(scene, report, stack.camera.target_pitch), size, stack.camera.target_pitch)
+    prior = prior_of(_prior(scene, report), size, stack.camera.target_pitch)
     variance = float(prior.variance.mean())
     if variance <= 0:
         return None
@@ -159,14 +159,11 @@ def _noise(stack: Stack, model: Model, estimate: FloatArray, report: RunReport) 
     return total + model.variance_from_model(estimate.ravel()) if model.variance.any() else total
 
 
-def _prior(scene: Scene, report: RunReport, pitch: float) -> PriorTable:
+def _prior(scene: Scene, report: RunReport) -> PriorTable:
     """Return the prior as assumed, or as the run fitted it."""
-    prior, fit = scene.assumed_prior, report.diagnostics.fit
+    prior = scene.assumed_prior
     if prior.kind != "fit":
         return prior
-    if "variance" not in fit or "correlation_length" not in fit:
+    if not report.diagnostics.fit_terms:
         return prior.model_copy(update={"kind": "independent"})
-    length = fit["correlation_length"].value * pitch
-    return prior.model_copy(
-        update={"kind": "exponential", "variance": fit["variance"].value, "correlation_length": length}
-    )
+    return FittedPrior.of(prior, report.diagnostics.fit_terms)

@@ -158,9 +158,7 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
         lines.append(("chi-squared of the residual", f"{residual.chi_squared:.4g}, {expected}"))
     for name, number in diagnostics.fit.items():
         unit = " pixels of f" if name == "correlation_length" else ""
-        precision = "of unknown precision"
-        if number.log_deviation is not None:
-            precision = f"within a factor of {exp(number.log_deviation):.3g}"
+        precision = f"within a factor of {exp(number.log_deviation):.3g}"
         lines.append((f"fitted {name.replace('_', ' ')}", f"{number.value:.4g}{unit}, {precision}"))
     return lines
 

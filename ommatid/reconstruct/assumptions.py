@@ -18,8 +18,6 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import DetailedModel, model_of_f
-from .fitting.prior_fit import PriorFit, evidence_of, fit_prior
-from .fitting.window_fit import fit_by_window
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
 from .methods.method import Execution, Method, MethodResult, total_variance
@@ -42,6 +40,7 @@ from .noise import (
     has_shared_errors,
     usable_pixels,
 )
+from .prior_fit import PriorFit, fit_prior
 
 Result = TypeVar("Result")
 
@@ -244,11 +243,7 @@ def _fit(observation: ObservedStack, noise: Noise) -> PriorFit | None:
     if not observation.usable.used.any() or (noise_known and prior_known):
         return None
     known = observation.expected_noise(noise) if noise_known else total_variance(certain(noise))
-    task = observation.task(known)
-    kernels_alone = task.model.stored is None and not task.model.camera.has_sharp_footprints
-    if (isinstance(task.model, DetailedModel) or kernels_alone) and noise_known and not prior_known:
-        return fit_by_window(task)
-    return fit_prior(*evidence_of(task, prior_known=prior_known, noise_known=noise_known))
+    return fit_prior(observation.task(known), prior_known=prior_known, noise_known=noise_known)
 
 
 def _with_fit(observation: ObservedStack, model: Model, noise: Noise, fit: PriorFit) -> tuple[ObservedStack, Noise]:
@@ -256,8 +251,6 @@ def _with_fit(observation: ObservedStack, model: Model, noise: Noise, fit: Prior
 
     model : as calibrated
     """
-    if fit.variance is not None and fit.length is not None:
-        update = {"kind": "exponential", "variance": fit.variance}
-        update["correlation_length"] = fit.length * observation.stack.camera.target_pitch
-        observation = observation.with_prior(observation.prior.model_copy(update=update), model)
+    if fit.prior is not None:
+        observation = observation.with_prior(fit.prior, model)
     return observation, fitted_noise(noise, fit)

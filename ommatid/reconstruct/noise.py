@@ -28,9 +28,9 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import DetailedModel, model_of_f
-from .fitting.prior_fit import PriorFit
 from .methods.method import EstimationTask, is_uniform, total_variance
 from .prior import coloured, spectrum_of
+from .prior_fit import PriorFit
 
 Noise = dict[str, FloatArray]  # variances by cause
 

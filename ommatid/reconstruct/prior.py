@@ -9,6 +9,7 @@ pixel, averaged over the image:
 
     exponential   s_k = c_k^T E c_k,   E = variance exp(-distance / length),   c_k the k-th wave
     power         s_k proportional to |w_k|^-a,   w_k = pi (row / rows, column / columns);   w_0 as the lowest other
+    fit           s_k = sum of c (1 / l^2 + |w|^2)^(-a/2) over terms (c, a, l), and over w_k and its nearest aliases w
 
 The first gives each wave the variance that it has where E is the covariance. That is the spectral density of E, the sum
 of (1 / length^2 + |w + 2 pi m|^2)^(-3/2) over all aliases m times a constant, averaged over the width of the wave in
@@ -18,6 +19,8 @@ frequency. So s is positive, and of all reflecting priors this one is the closes
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +34,28 @@ EPS = float(np.finfo(np.float64).eps)
 ROUNDING = 16 * EPS  # of an entry of L L^T, by those of the waves
 DEFAULT_EXPONENT = 2.0  # of the power-law spectrum
 NEEDS_FIT = "prior.kind 'fit' takes a recorded stack; set another kind to predict without one"
+
+
+class SpectralTerm(NamedTuple):
+    """A term c (1 / l^2 + |w|^2)^(-a/2) of a spectral density on the target; w in radians per millimetre.
+
+    density : c;  exponent : a;  length : l in millimetres
+    """
+
+    density: float
+    exponent: float
+    length: float
+
+
+class FittedPrior(estimation.PriorTable):
+    """A prior by its spectral density: the sum of `terms`; `variance` is that of a pixel of a window."""
+
+    terms: tuple[SpectralTerm, ...]
+
+    @classmethod
+    def of(cls, table: estimation.PriorTable, terms: tuple[SpectralTerm, ...], variance: float = 1.0) -> FittedPrior:
+        """Return the prior with the mean and the level of a [prior] table."""
+        return cls(kind="fit", mean=table.mean, level=table.level, variance=variance, terms=terms)
 
 
 @dataclass(frozen=True)
@@ -111,6 +136,9 @@ def spectrum_of(
     if table.kind == "independent":
         return table.variance
     fine = shape[0] * detail, shape[1] * detail
+    if isinstance(table, FittedPrior):
+        densities = [natural_spectrum(fine, pitch / detail, term) for term in table.terms]
+        return averaged_spectrum(np.sum(densities, axis=0), detail)
     if table.kind == "exponential" and table.correlation_length is not None:
         spectrum = exponential_spectrum(fine, table.correlation_length * detail / pitch)
     elif table.kind == "power":
@@ -163,6 +191,21 @@ def _power_spectrum(shape: tuple[int, int], exponent: float) -> FloatArray:
     frequency[0, 0] = 1 / max(shape)
     spectrum = (frequency * max(shape)) ** -exponent
     return spectrum / spectrum.mean()
+
+
+def natural_spectrum(shape: tuple[int, int], pitch: float, term: SpectralTerm) -> FloatArray:
+    """Return s, (rows, columns), of pixels that are samples of a term of a spectral density, by its nearest aliases.
+
+    pitch : of the pixels, in millimetres
+    """
+    total = np.zeros(shape)
+    for beyond in product((0, 2), repeat=2):
+        vertical, horizontal = (
+            np.square(np.pi * (np.arange(size) / size - alias) / pitch)
+            for size, alias in zip(shape, beyond, strict=True)
+        )
+        total += (vertical[:, None] + horizontal[None, :] + term.length**-2) ** (-term.exponent / 2)
+    return term.density / pitch**2 * total
 
 
 def averaged_spectrum(spectrum: FloatArray, detail: int) -> FloatArray:

@@ -23,13 +23,13 @@ from ommatid.scenes.tables.estimation import PriorTable
 from .assumptions import Assumptions, assumptions_for, with_fallback
 from .detail.detailed_model import DetailedModel, DetailMethod
 from .expected_error import ExpectedError, Interval
-from .fitting.prior_fit import PriorFit
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, is_uniform, total_variance
 from .misalignment.robust_noise import CAUSE
 from .noise import Noise, UsablePixels, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
+from .prior_fit import PriorFit
 from .verdict.residual import WhitenedResidual, residual_parts
 from .verdict.verdict import DITHER, ErrorCheck, evidence_of, judge, without_pixels
 

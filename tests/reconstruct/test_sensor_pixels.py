@@ -180,7 +180,7 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     assert restoration.error is not None
     assert restoration.error.mse < paper.error.mse / 3
     assert restoration.fit is not None
-    assert restoration.fit.noise_variance == pytest.approx(1.0, rel=4 * restoration.fit.spread[2])
+    assert restoration.fit.noise_variance == pytest.approx(1.0, rel=4 * restoration.fit.numbers["noise_variance"][1])
     lines = rows(restoration, stack, model)
     assert {"fitted variance", "fitted correlation length", "fitted noise variance"} <= set(lines)
     known = restored(scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}))
@@ -188,7 +188,7 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     assert known.fit.noise_variance is None
     noise_alone = restored(scene(lenses=THREE, noise={"variance": 9.0}, estimator={"noise_variance": "fit"}))
     assert noise_alone.fit is not None
-    assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.spread[0])
+    assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.numbers["noise_variance"][1])
     assert noise_alone.prior.kind == "independent"
 
 
@@ -255,6 +255,7 @@ def test_a_fit_with_an_uncertain_h(estimator: dict[str, Any]) -> None:
         stored=model.matrix
         + type(model.matrix)((spread, model.matrix.indices, model.matrix.indptr), model.matrix.shape),
         variance=np.full(model.matrix.nnz, 0.002**2),
+        record={"method": "points", "versions": {}},
     )
     restoration = restore(stack, uncertain, truth)
     assert restoration.residual is not None

@@ -179,7 +179,7 @@ def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
     """
     if not camera.has_detail:
         return model if camera.detail == model.camera.detail else replace(model, camera=camera)
-    if prior.kind in ("independent", "fit"):
+    if prior.kind == "independent":
         return _without_detail(model, camera, prior.mean)
     return _exact(model, camera, prior) if has_moments(camera) else model
 

@@ -29,7 +29,9 @@ from ..detail.detailed_model import DetailedModel
 from ..method_choice import MethodChoice
 from ..methods.method import EstimationTask, Execution
 from ..output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, HeldOutVerdict, HeldOutWindows
-from .windows import HeldOutSums, fitted_prior, held_out_sums, windows
+from ..prior import FittedPrior
+from ..prior_fit import fit_prior
+from .windows import HeldOutSums, held_out_sums, windows
 
 SIGNIFICANCE = 1e-4  # of all sub-imagers together
 LEAST_EXCESS = 0.1  # of the sum of squares over its expectation
@@ -92,7 +94,7 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
             " estimator.noise_variance to a number above 0"
         )
     to_fit = fitted and task.prior.kind == "independent" and len(task.model.camera.sub_imagers) > 1
-    prior = fitted_prior(task) if to_fit else None
+    prior = _fitted(task) if to_fit else None
     robust, execution = method == "robust", execution or Execution()
     if prior is None:
         return _check(task, robust, execution, fitted=False)
@@ -102,6 +104,18 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
     # Parts of a picture differ more from one another than the fitted prior knows; the scene's is wide enough for all.
     wide = _check(task, robust, execution, fitted=False)
     return wide if wide.verdict.trusted is not False else narrow
+
+
+def _fitted(task: EstimationTask) -> FittedPrior | None:
+    """Return a prior of natural pictures, None where the measurements are too few or show nothing.
+
+    The errors of predictions hardly depend on it, since other sub-imagers see most of what one sees. It matters in
+    components of the image that one sub-imager alone sees.
+    """
+    try:
+        return fit_prior(task).prior
+    except InputError:
+        return None
 
 
 def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: bool) -> HeldOutReport:

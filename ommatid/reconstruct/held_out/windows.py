@@ -1,11 +1,7 @@
-"""The problems in which sub-imagers are predicted: the whole of a small target, or windows of a frame; and their prior.
+"""The problems in which sub-imagers are predicted: the whole of a small target, or windows of a frame.
 
 The windows of a frame do not overlap, and a window holds the measurements that see nothing outside it. So sums of
 squares of different windows are independent where the pixels of the prior are, and a sub-imager's sums add up.
-
-A prior of natural pictures is fitted to a few small windows of the stack: seconds, whatever the size. The errors of
-predictions hardly depend on it, since other sub-imagers see most of what one sees. It matters in components of the
-image that one sub-imager alone sees.
 """
 
 from __future__ import annotations
@@ -22,10 +18,8 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.tables.estimation import PriorTable
 
 from ..detail.detailed_model import DetailedModel
-from ..fitting.prior_fit import MIN_MEASUREMENTS, Evidence, fit_prior
 from ..methods.method import EstimationTask, Execution
 from ..misalignment.misaligned_methods import RobustMethod
 from ..prior import Prior, covariance_root
@@ -39,45 +33,6 @@ WINDOW, WIDEST_WINDOW = 32, 60  # pixels, largest side of a window of a frame: o
 REACHES = 3  # footprints that fit side by side into a window
 LEAST_NOISE = 1e-3  # share of the expected noise that is independent, at least
 MOST_WINDOWS = 8  # along each axis; of larger frames so many at equal distances
-FIT_WINDOW = 16  # pixels, side of a window of narrow footprints
-FIT_REACHES = 2  # footprints that fit side by side into a window
-PER_AXIS = 3  # most windows along each axis
-
-
-def fitted_prior(task: EstimationTask) -> PriorTable | None:
-    """Return the exponential prior of largest evidence with the task's noise; None if measurements are too few."""
-    side = max(FIT_WINDOW, FIT_REACHES * task.model.windowed.reach)
-    if task.model.stored is None and side > WIDEST_WINDOW:  # kernels as wide as the windows
-        return None
-    windows = product(*(_spread(size, side) for size in task.shape))
-    blocks = [_window(task, rows, columns) for rows, columns in windows]
-    residual = np.concatenate([block.residual for block in blocks])
-    if residual.size < MIN_MEASUREMENTS or not residual.any():
-        return None
-    matrix = sparse.csr_array(sparse.block_diag([block.matrix for block in blocks], format="csr"))
-    noise = np.concatenate([block.known_noise for block in blocks])
-    fit = fit_prior(Evidence(matrix, residual, noise, task.shape, None, True), blocks)
-    if fit.variance is None or fit.length is None:
-        return None
-    length = fit.length * task.model.camera.target_pitch
-    update = {"kind": "exponential", "variance": fit.variance, "correlation_length": length, "exponent": None}
-    return task.prior.model_copy(update=update)
-
-
-def _spread(size: int, side: int) -> list[slice]:
-    """Return windows of one axis in the middle of equal parts of it, or all of it where it is short."""
-    count = min(size // side, PER_AXIS)
-    if count <= 1:
-        return [slice(0, size)]
-    starts = (np.arange(count) + 0.5) * size / count - side / 2
-    return [slice(int(start), int(start) + side) for start in starts]
-
-
-def _window(task: EstimationTask, rows: slice, columns: slice) -> Evidence:
-    """Return the evidence of the used measurements inside a window."""
-    window = task.window(rows, columns)
-    residual = window.recorded - task.prior.mean * window.matrix.sum(axis=1)
-    return Evidence(window.matrix, residual, window.expected_noise, window.shape, None, True)
 
 
 @dataclass(frozen=True)

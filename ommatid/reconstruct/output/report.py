@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from math import isfinite
 from time import perf_counter
 from typing import Any
 
@@ -79,7 +78,7 @@ def _held_out(restoration: Reconstruction) -> dict[str, Any]:
     report = quick_check(restoration.task, restoration.choice.method)
     if report is None:
         return {}
-    fitted = restoration.fit is not None and restoration.fit.variance is not None
+    fitted = restoration.fit is not None and restoration.fit.prior is not None
     return {"held_out": with_fitted_prior(report) if fitted else report}
 
 
@@ -110,13 +109,12 @@ def _diagnostics(restoration: Reconstruction) -> DiagnosticsReport:
     fit = restoration.fit
     fitted: dict[str, Any] = {}
     if fit is not None:
-        numbers = {"variance": fit.variance, "correlation_length": fit.length, "noise_variance": fit.noise_variance}
-        known = [(name, value) for name, value in numbers.items() if value is not None]
         fitted = {
             "fit": {
-                name: FittedNumber(value=value, log_deviation=deviation if isfinite(deviation) else None)
-                for (name, value), deviation in zip(known, fit.spread, strict=True)
+                name: FittedNumber(value=value, log_deviation=deviation)
+                for name, (value, deviation) in fit.numbers.items()
             },
+            "fit_terms": () if fit.prior is None else fit.prior.terms,
             "fit_measurements": fit.measurements,
             "fit_doubtful": fit.doubtful,
         }

@@ -19,6 +19,8 @@ from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_record
 from ommatid.scenes.formats.provenance import FitRecord
 
+from ..prior import SpectralTerm
+
 INDEPENDENT = 1.0  # variance of independent samples falls as 1 / samples
 STRATIFIED = 1.5  # that of all other samplers as samples^-1.5, for pinholes
 MORE = (2, 4, 16)  # factors on the number of samples
@@ -206,14 +208,16 @@ class VerdictReport(Record):
 
 
 class FittedNumber(Record):
-    """A fitted value and the standard deviation of its logarithm, None where the likelihood does not bend."""
+    """A fitted value and the standard deviation of its logarithm."""
 
     value: float
-    log_deviation: float | None
+    log_deviation: float
 
 
 class DiagnosticsReport(Record):
     """Numbers that assess an estimate.
+
+    fit_terms : density, exponent and length in millimetres of each term of the fitted spectrum
 
     noise_difference : largest relative difference of the noise variances from those of the frame whose error bars
         these are; absent where they were computed for this one
@@ -226,6 +230,7 @@ class DiagnosticsReport(Record):
     resolution: float | None
     chi_squared: ResidualReport | None
     fit: dict[str, FittedNumber] = Field(default_factory=dict[str, FittedNumber])
+    fit_terms: tuple[SpectralTerm, ...] = ()
     fit_measurements: int | None = None
     fit_doubtful: bool = False
     noise_difference: float | None = None

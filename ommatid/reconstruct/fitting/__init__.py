@@ -1,1 +1,0 @@
-"""Prior and noise of largest marginal likelihood."""

@@ -1,0 +1,379 @@
+"""The prior that a stack's measurements support, and the noise if asked for: the mean over their posterior.
+
+The spectrum of a picture is taken for that of natural ones (Field 1987), with three unknown numbers,
+
+    s(w) = c (1 / l^2 + |w|^2)^(-a/2),
+
+the exponent a from 0, independent pixels as in Wood et al., to 4, smooth shadings. The measurements of a window have,
+with an unknown level of deviation L, the density
+
+    g - H f0 ~ N(0, C),   C = H P(c, l, a) H^T + L^2 H 1 1^T H^T + t Rv,
+
+t = 1 where the noise is known. H P H^T, diagonalised once for each l and a, gives the evidence for every c and t; the
+windows count as independent (Stein, Chi and Welty 2004). Few measurements and much noise leave the numbers open, above
+all how much the image holds at frequencies that no lens sees. So the prior is the mean of these spectra, weighted by
+their evidence: its covariance is that of images whose numbers are drawn from the posterior, and Eq. 5 holds on average
+over them. The exponents and lengths lie on a grid; c, and t where the noise is fitted, on one that is refined where the
+evidence is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import exp, log
+from typing import NamedTuple
+
+import numpy as np
+from scipy import fft, linalg
+
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.model import Model
+
+from .detail.detailed_model import DetailedModel
+from .methods.method import EstimationTask
+from .prior import FittedPrior, SpectralTerm, natural_spectrum, spectrum_of
+
+LENGTHS = (1.5, 4.0, 10.0, 25.0)  # pixels of f
+EXPONENTS = (1.0, 2.0, 3.0, 4.0)  # and 0, which has no length
+WINDOW = 16  # pixels of f, side of a window
+WHOLE = 22  # pixels of f, side of the largest image that is one window
+WIDEST = 32  # pixels of f, side of the largest window; measurements that see more count what lies beside it as noise
+PER_AXIS = 3  # windows along an axis
+MOST = 400  # measurements of a window of more pixels
+LEAST = 10  # measurements, for three numbers
+COARSE, FINE = 1.0, 40  # step of logarithms at first, number of steps after each refinement
+REACH = 18.0  # logarithms from the mean square to either end
+BEYOND = 12.0  # units of log evidence below the largest, where the grid ends
+SEEN = 7.0  # units of log evidence by which an image must be more likely than none
+KEPT = 1e-3  # share of the variance, from which a term is kept
+REFINEMENTS = 2
+LEAST_NOISE = 1e-6  # of the known noise, that is fitted in addition to it
+ROUNDS, CONVERGED = 5, 0.02  # of the distribution of noise of which a part is known; its last relative change
+UNIFORM = 1e3  # of the largest known noise, beside which it is nearly uniform
+
+
+@dataclass(frozen=True)
+class PriorFit:
+    """The fitted prior and noise variance, None for what was known.
+
+    numbers : of a picture's spectrum, and the noise: the mean of each logarithm and its standard deviation, by name;
+        variance of a pixel in a window, correlation length in pixels of f, exponent, noise variance
+    measurements : number used
+    doubtful : True if no image is needed to explain the measurements, or a number lies at the end of its range
+    """
+
+    prior: FittedPrior | None
+    noise_variance: float | None
+    numbers: dict[str, tuple[float, float]]
+    measurements: int
+    doubtful: bool
+
+
+class _Spectrum(NamedTuple):
+    """A spectrum on a window's grid, (rows, columns) of mean 1 unless it is known, its numbers, and a weight."""
+
+    values: FloatArray
+    term: SpectralTerm
+    weight: int
+
+
+class Evidence(NamedTuple):
+    """What the evidence of a window depends on.
+
+    values : (k,) eigenvalues of H K H^T, whitened;  residual, light : (k,) g - H f0 and L H 1 along its eigenvectors
+    beside : of what no image of the window reaches: squares of both, their product, and the number of measurements
+    """
+
+    values: FloatArray
+    residual: FloatArray
+    light: FloatArray
+    beside: tuple[float, float, float, int]
+
+    def log(self, scales: FloatArray, noises: FloatArray) -> FloatArray:
+        """Return the log evidence, without constants, of multiples of K and of the noise: (scales, noises)."""
+        total = scales[:, None, None] * self.values + noises[:, None]
+        squares, lights, products, count = self.beside
+        residual = np.sum(self.residual**2 / total, axis=2) + squares / noises
+        light = 1 + np.sum(self.light**2 / total, axis=2) + lights / noises
+        mixed = np.sum(self.residual * self.light / total, axis=2) + products / noises
+        determinant = np.log(total).sum(axis=2) + count * np.log(noises) + np.log(light)
+        return -0.5 * (determinant + residual - mixed**2 / light)
+
+
+@dataclass(frozen=True)
+class Window:
+    """Whitened measurements of a window, turned so that no more are left than the window has pixels.
+
+    waves : (k, rows, columns) H C^T on the grid of the unknowns;  residual, light, beside : as of `Evidence`
+    """
+
+    waves: FloatArray
+    residual: FloatArray
+    light: FloatArray
+    beside: tuple[float, float, float, int]
+
+    @classmethod
+    def of(cls, matrix: FloatArray, shape: tuple[int, int], residual: FloatArray, light: FloatArray) -> Window:
+        """Turn measurements; matrix : (m, pixels), residual and light : (m,)."""
+        waves = np.asarray(fft.dctn(matrix.reshape(-1, *shape), 2, axes=(1, 2), norm="ortho"), dtype=np.float64)
+        count = matrix.shape[0] - matrix.shape[1]
+        if count <= 0:
+            return cls(waves, residual, light, (0.0, 0.0, 0.0, 0))
+        turn, kept = linalg.qr(waves.reshape(matrix.shape), mode="economic", check_finite=False)
+        turned = turn.T @ residual, turn.T @ light
+        left = residual - turn @ turned[0], light - turn @ turned[1]
+        beside = float(left[0] @ left[0]), float(left[1] @ left[1]), float(left[0] @ left[1]), count
+        return cls(np.asarray(kept, dtype=np.float64).reshape(-1, *shape), *turned, beside)
+
+    def evidence(self, spectrum: FloatArray) -> Evidence:
+        """Return the evidence of images with a spectrum, (rows, columns)."""
+        flat = self.waves.reshape(len(self.waves), -1)
+        covariance = (flat * spectrum.ravel()) @ flat.T
+        values, vectors = linalg.eigh((covariance + covariance.T) / 2, check_finite=False, driver="evd")
+        return Evidence(np.maximum(values, 0.0), vectors.T @ self.residual, vectors.T @ self.light, self.beside)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A window, in pixels of the unknowns, and the measurements that count for it."""
+
+    rows: slice
+    columns: slice
+    numbers: IntArray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the window."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    def window(self, task: EstimationTask, noise: FloatArray) -> Window:
+        """Return the measurements in units of `noise`, (measurements used,), to which what they see beside it adds."""
+        fine, offset = _unknowns(task)
+        matrix = np.asarray(fine.windowed.rows_on(self.numbers, self.rows, self.columns).toarray())
+        light = fine.forward(np.ones(fine.unknowns))[self.numbers]
+        residual = (task.recorded + offset)[self.numbers] - task.prior.mean * light
+        beside = np.square(light - matrix.sum(axis=1)) * float(np.mean(residual**2))
+        deviation = np.sqrt(task.on_all_measurements(noise, 1.0)[self.numbers] + beside)
+        level = task.prior.level_deviation * light
+        return Window.of(matrix / deviation[:, None], self.shape, residual / deviation, level / deviation)
+
+
+def _unknowns(task: EstimationTask) -> tuple[Model, FloatArray | float]:
+    """Return the model of the pixels that have the prior, of f or of a finer world, and what the data lack of it."""
+    return (task.model.fine, task.model.offset) if isinstance(task.model, DetailedModel) else (task.model, 0.0)
+
+
+def places_of(task: EstimationTask) -> list[Place]:
+    """Return the windows whose measurements count: the whole of a small image, else up to nine over it."""
+    fine, _ = _unknowns(task)
+    detail = fine.camera.rows // task.shape[0]
+    side = min(max(WINDOW, 2 * -(-fine.windowed.reach // detail)), WIDEST)
+    return [
+        Place(rows, columns, _numbers(task, fine, rows, columns))
+        for rows, columns in product(*(_spread(size, side, detail) for size in task.shape))
+    ]
+
+
+def _spread(size: int, side: int, detail: int) -> list[slice]:
+    """Return windows of one axis in the middle of equal parts of it, in pixels of the unknowns; one of a short axis."""
+    count = 1 if size <= WHOLE else min(size // side, PER_AXIS)
+    if count <= 1:
+        return [slice(0, size * detail)]
+    starts = [int((number + 0.5) * size / count - side / 2) for number in range(count)]
+    return [slice(start * detail, (start + side) * detail) for start in starts]
+
+
+def _numbers(task: EstimationTask, fine: Model, rows: slice, columns: slice) -> IntArray:
+    """Return the used measurements inside a window; if they are few, those of its middle that see more than it."""
+    inside = fine.windowed.measurements_inside(rows, columns)
+    found = inside[task.used[inside]]
+    if found.size < LEAST:
+        middles = zip(fine.camera.middles, (rows, columns), strict=True)
+        near = [abs(middle - (part.start + part.stop) / 2) < (part.stop - part.start) / 4 for middle, part in middles]
+        found = max(found, np.flatnonzero(near[0] & near[1] & task.used), key=len)
+    pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
+    if found.size <= MOST or found.size > pixels:
+        return found
+    return found[np.linspace(0, found.size - 1, MOST).astype(int)]
+
+
+def _spectra(task: EstimationTask, shape: tuple[int, int]) -> list[_Spectrum]:
+    """Return the spectra of natural pictures on a window's grid of this shape."""
+    pitch = task.model.camera.target_pitch
+    of_grid = pitch / (_unknowns(task)[0].camera.rows // task.shape[0])
+    found: list[_Spectrum] = []
+    for exponent, length in _grid():
+        term = SpectralTerm(1.0, exponent, length * pitch)
+        values = natural_spectrum(shape, of_grid, term)
+        term = term._replace(density=float(1 / values.mean()))
+        found.append(_Spectrum(values / values.mean(), term, 1 if exponent else len(LENGTHS)))
+    return found
+
+
+def _grid() -> list[tuple[float, float]]:
+    """Return exponents and lengths in pixels of f."""
+    return [(0.0, LENGTHS[0]), *product(EXPONENTS, LENGTHS)]
+
+
+def _known(task: EstimationTask, shape: tuple[int, int]) -> _Spectrum:
+    """Return the prior of the task on a window's grid of this shape."""
+    detail = _unknowns(task)[0].camera.rows // task.shape[0]
+    of_grid = task.model.camera.target_pitch / detail
+    values = np.broadcast_to(np.asarray(spectrum_of(task.prior, shape, of_grid)), shape)
+    return _Spectrum(values, SpectralTerm(1.0, 0.0, of_grid), 1)
+
+
+class Posterior(NamedTuple):
+    """The posterior of the logarithms of the multiples of K and of the noise.
+
+    mass, best : logarithms of the evidence, integrated and largest;  at_end : True if that is at the end of the range
+    means : of both multiples;  moments : of both logarithms, the means of themselves and of their squares
+    """
+
+    mass: float
+    best: float
+    at_end: bool
+    means: tuple[float, float]
+    moments: FloatArray
+
+    @classmethod
+    def of(cls, evidence: list[Evidence], ranges: tuple[FloatArray, FloatArray]) -> Posterior:
+        """Integrate over grids of the logarithms, which are refined where the evidence is."""
+
+        def scores() -> FloatArray:
+            return np.sum([part.log(np.exp(grids[0]), np.exp(grids[1])) for part in evidence], axis=0)
+
+        grids, found, at_end = list(ranges), np.zeros((1, 1)), False
+        for number in range(REFINEMENTS + 1):
+            found = scores()
+            if not number:
+                place = np.unravel_index(int(np.argmax(found)), found.shape)
+                at_end = any(grid.size > 1 and at in (0, grid.size - 1) for at, grid in zip(place, grids, strict=True))
+            if number < REFINEMENTS:
+                near = found > found.max() - BEYOND
+                grids = [_refined(grid, near.any(axis=1 - axis)) for axis, grid in enumerate(grids)]
+        weights = np.exp(found - found.max())
+        cell = float(np.prod([grid[1] - grid[0] for grid in grids if grid.size > 1]))
+        shares = [weights.sum(axis=1 - axis) / weights.sum() for axis in range(2)]
+        means = [float(share @ np.exp(grid)) for share, grid in zip(shares, grids, strict=True)]
+        moments = [[share @ grid, share @ grid**2] for share, grid in zip(shares, grids, strict=True)]
+        best = float(found.max())
+        return cls(best + log(weights.sum() * cell), best, at_end, (means[0], means[1]), np.array(moments))
+
+
+def _refined(grid: FloatArray, near: BoolArray) -> FloatArray:
+    """Return a finer grid of the part that is near the largest evidence."""
+    if grid.size == 1:
+        return grid
+    places = np.flatnonzero(near)
+    ends = max(places[0] - 1, 0), min(places[-1] + 1, grid.size - 1)
+    return np.linspace(grid[ends[0]], grid[ends[1]], FINE)
+
+
+def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: bool = True) -> PriorFit:
+    """Fit what is not known of a task's prior and noise; its expected noise is all of the noise, or the known part.
+
+    Raises InputError where measurements are too few, equal the prior's mean, or have no noise that is known.
+    """
+    if noise_known and not (task.expected_noise > 0).all():
+        raise InputError(
+            "a prior cannot be fitted to measurements without noise; set estimator.noise_variance to 'fit' or to a"
+            " number above 0"
+        )
+    places = places_of(task)
+    count = sum(place.numbers.size for place in places)
+    if count < LEAST:
+        raise InputError(f"a fit of the prior or the noise takes {LEAST} measurements or more, got {count}")
+    if noise_known:
+        return _fit(task, places, task.expected_noise, prior_known=prior_known, noise_known=True)
+    # A multiple of the whole noise is fitted, whose distribution over the measurements is uniform at first.
+    known = task.expected_noise
+    fit = _fit(task, places, known + (UNIFORM * float(known.max()) or 1.0), prior_known=prior_known, noise_known=False)
+    for _ in range(ROUNDS if np.ptp(known) else 0):
+        before = fit.noise_variance or LEAST_NOISE * float(known.mean())
+        fit = _fit(task, places, known + before, prior_known=prior_known, noise_known=False)
+        if abs((fit.noise_variance or 0.0) - before) < CONVERGED * before:
+            break
+    return fit
+
+
+def _fit(
+    task: EstimationTask, places: list[Place], noise: FloatArray, *, prior_known: bool, noise_known: bool
+) -> PriorFit:
+    """Return the fit of the prior, and of a multiple of `noise`, (measurements used,)."""
+    windows = [place.window(task, noise) for place in places if place.numbers.size]
+    square = float(np.mean(np.concatenate([window.residual for window in windows]) ** 2))
+    if square == 0:
+        raise InputError("the measurements equal those of the prior's mean to the last digit: nothing can be fitted")
+    fixed = np.zeros(1)
+    noises = fixed if noise_known else log(square) + np.arange(-2 * REACH, 3 * COARSE, COARSE)
+    spectra = [_known(task, places[0].shape)] if prior_known else _spectra(task, places[0].shape)
+    posteriors: list[Posterior] = []
+    evidence: list[Evidence] = []
+    for spectrum in spectra:
+        evidence = [window.evidence(spectrum.values) for window in windows]
+        seen = float(np.mean(np.concatenate([part.values for part in evidence])))
+        scales = fixed if prior_known else log(square / seen) + np.arange(-REACH, REACH, COARSE)
+        posteriors.append(Posterior.of(evidence, (scales, noises)))
+    masses = [log(spectrum.weight) + each.mass for spectrum, each in zip(spectra, posteriors, strict=True)]
+    shares = np.exp(np.array(masses) - max(masses))
+    shares /= shares.sum()
+    best = posteriors[int(np.argmax(shares))]
+    nothing = float(np.sum([part.log(np.zeros(1), np.exp(noises)) for part in evidence], axis=0).max())
+    multiple = float(shares @ [each.means[1] for each in posteriors])
+    # Known noise and a variance n have multiples of the whole noise whose mean is 1 + (n - the last n) mean(1 / noise).
+    noise_variance = float(noise[0] - task.expected_noise[0]) + (multiple - 1) / float(np.mean(1 / noise))
+    numbers = {} if prior_known else _numbers_of(spectra, posteriors, shares)
+    if not noise_known:
+        numbers["noise_variance"] = noise_variance, _moments(shares, [each.moments[1] for each in posteriors])[1]
+    return PriorFit(
+        prior=None if prior_known else _mean_prior(task, spectra, posteriors, shares),
+        noise_variance=None if noise_known else max(noise_variance, 0.0),
+        numbers=numbers,
+        measurements=sum(place.numbers.size for place in places),
+        doubtful=best.at_end
+        or (not noise_known and noise_variance < 0)
+        or (not prior_known and best.best - nothing < SEEN),
+    )
+
+
+def _mean_prior(
+    task: EstimationTask, spectra: list[_Spectrum], posteriors: list[Posterior], shares: FloatArray
+) -> FittedPrior:
+    """Return the prior whose spectrum is the mean of all, without those that hardly add to it."""
+    variances = shares * [each.means[0] for each in posteriors]
+    total = float(variances.sum())
+    terms = tuple(
+        spectrum.term._replace(density=float(variance) * spectrum.term.density)
+        for spectrum, variance in zip(spectra, variances, strict=True)
+        if variance > KEPT * total
+    )
+    return FittedPrior.of(task.prior, terms, total)
+
+
+def _numbers_of(
+    spectra: list[_Spectrum], posteriors: list[Posterior], shares: FloatArray
+) -> dict[str, tuple[float, float]]:
+    """Return variance, exponent, and the correlation length of spectra that have one, with relative deviations."""
+    variance, by_variance = _moments(shares, [each.moments[0] for each in posteriors])
+    exponents = np.array([spectrum.term.exponent for spectrum in spectra])
+    exponent = float(shares @ exponents)
+    numbers = {
+        "variance": (exp(variance), by_variance),
+        "exponent": (exponent, float(shares @ (exponents - exponent) ** 2) ** 0.5 / exponent if exponent else 0.0),
+    }
+    if shares[exponents > 0].any():
+        long = shares * (exponents > 0) / shares[exponents > 0].sum()
+        logs = np.log([length for _, length in _grid()])
+        length, by_length = _moments(long, [(each, each**2) for each in logs])
+        numbers["correlation_length"] = exp(length), by_length
+    return numbers
+
+
+def _moments(shares: FloatArray, moments: Sequence[Sequence[float] | FloatArray]) -> tuple[float, float]:
+    """Return mean and standard deviation of a mixture; moments : means of its parts, and of their squares."""
+    mean, square = shares @ np.array(moments)
+    return float(mean), float(max(square - mean**2, 0.0)) ** 0.5

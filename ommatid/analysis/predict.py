@@ -15,12 +15,13 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.optics.negligible import assumptions
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.scene import Scene, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.validation import check_lenses, check_scene_memory
 
 from .calibration_goal import expected_noise
+from .predicted_recording import prior_without_stack
 from .run_prediction import predict_run
 
 LEFT_OUT = "a perfect H and a perfect rendering: their uncertainty is left out"
@@ -53,14 +54,16 @@ def predict_scene(scene: Scene, rays: bool = True) -> Prediction:
 def predict_ideal(scene: Scene) -> Prediction:
     """Predict the error of a scene with the ideal H. Raises InputError where the estimator takes a recorded stack."""
     setup = Setup.from_scene(scene)
-    camera = setup.camera
+    camera, (assumed, fitted) = setup.camera, prior_without_stack(setup)
+    scene = with_tables(scene, prior=assumed)
+    assumes = *_ideal_assumptions(setup), *fitted
     choice = choose_method(scene, camera, exact=camera.is_applied)
     actual = expected_noise(setup)
     if choice.method == "fit":
         raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
     if choice.method != "dense" or camera.has_detail:
         model = model_of_f(ideal_model(scene, camera.with_grid_of_matrix), camera, scene.prior)
-        return replace(predict_frame(choice, model, camera, actual), assumes=_ideal_assumptions(setup))
+        return replace(predict_frame(choice, model, camera, actual), assumes=assumes)
     prior = prior_of(scene.assumed_prior, camera.shape, camera.target_pitch, camera.detail)
     added = None
     if camera.tolerance is not None and camera.has_sharp_footprints and scene.estimator.misalignment == "trust":
@@ -69,7 +72,7 @@ def predict_ideal(scene: Scene) -> Prediction:
     prediction = predict(
         matrix, prior, actual, scene.estimator, camera.shape, added, scene.prior_ratio, scene.prior.level_deviation
     )
-    return replace(prediction, assumes=_ideal_assumptions(setup))
+    return replace(prediction, assumes=assumes)
 
 
 def _ideal_assumptions(setup: Setup) -> tuple[str, ...]:

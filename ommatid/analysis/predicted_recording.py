@@ -12,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.reconstruct.prior import coloured, spectrum_of
+from ommatid.reconstruct.prior_fit import fit_picture, natural_prior
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, derived_seed, stream
@@ -19,6 +20,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.adaptive_render import AIM as RENDERING_AIM
 from ommatid.simulate.adaptive_render import DONE as RENDERING_DONE
 from ommatid.simulate.adaptive_render import SHARE, allowed_variance, check_noise_target
@@ -111,12 +113,30 @@ def _with_own_seed(setup: Setup) -> Setup:
     return replace(setup, scene=with_tables(setup.scene, render=render))
 
 
+def prior_without_stack(setup: Setup) -> tuple[PriorTable, Assumptions]:
+    """Return the prior that predictions assume, and the assumption where the scene's is one that is fitted to a stack.
+
+    It is fitted to the scene's picture, and where there is none to read it is that of natural pictures.
+    """
+    scene, camera = setup.scene, setup.camera
+    if scene.prior.kind != "fit":
+        return scene.prior, ()
+    fitted = None
+    if known_image(setup)[0] is not None:
+        fitted = fit_picture(setup.world.picture, camera.detail, camera.target_pitch, scene.prior)
+    if fitted is not None:
+        return fitted, ("a prior fitted to the scene's picture in place of its stack",)
+    return natural_prior(scene.prior, camera.target_pitch), (
+        "a prior of natural pictures, with a spectrum of 1/frequency^2, since the scene has no picture to fit it to",
+    )
+
+
 def _prior_draw(setup: Setup) -> FloatArray:
-    """Return an image drawn from the prior, (N,); of a prior that is to be fitted, with independent pixels."""
+    """Return an image drawn from the prior, (N,)."""
     scene, camera = setup.scene, setup.camera
     random = stream(scene.render.seed, Purpose.PREDICTED_IMAGE).normal(size=camera.shape)
-    table = scene.prior
-    spectrum = table.variance if table.kind == "fit" else spectrum_of(table, camera.shape, camera.target_pitch)
+    table, _ = prior_without_stack(setup)
+    spectrum = spectrum_of(table, camera.shape, camera.target_pitch, camera.detail)
     image = table.mean + coloured(spectrum, random).ravel()
     return np.maximum(image, 0.0) if scene.sensor is not None else image
 

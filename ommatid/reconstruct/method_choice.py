@@ -23,6 +23,7 @@ from .misalignment.misaligned_methods import AlignedMethod, RobustMethod
 
 PROGRAM_MEMORY = 300_000_000  # bytes, of the program itself and its libraries
 WORLD_IMAGES = 200  # of a world finer than f, that its solver holds at once; measured at 239 x 239 pixels of f
+MOST_CORRELATED = 500  # pixels of a dense problem of correlated pixels where a frame serves: a second
 TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on average; 0.17 where types see all edges
 
 METHODS: dict[str, type[Method]] = {
@@ -100,13 +101,15 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
     if not camera.has_sharp_footprints and camera.unknowns > MOST_DENSE:
         reason = f"{camera.unknowns} pixels behind blurred lenses, whose footprints are wider than tiles"
         return ["frame" if camera.is_sliding and not noiseless else "dense"], reason
+    independent, sliding = scene.prior.kind == "independent", camera.is_sliding and camera.has_sharp_footprints
+    if not independent and sliding and not noiseless and camera.unknowns > MOST_CORRELATED:
+        return ["frame", "dense"], f"{camera.unknowns} correlated pixels, and every lens type sees the same everywhere"
     if camera.unknowns <= MOST_DENSE:
         return ["dense", "tiles"], f"{camera.unknowns} pixels are few"
     if noiseless:
         return ["tiles"], "measurements without noise need a dense solution"
     if estimator.accuracy >= TILE_ACCURACY:
         return ["tiles"], f"tiles reach an accuracy of {estimator.accuracy:g} posterior standard deviations"
-    independent = scene.prior.kind == "independent"
     if camera.is_sliding and independent and leaves_null_space(camera) and not serves(camera, independent):
         return ["tiles"], "the lens types leave a null space, and the pixels are too many for a frame's error bars"
     if camera.is_sliding:

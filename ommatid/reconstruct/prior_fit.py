@@ -31,6 +31,7 @@ from scipy import fft, linalg
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
+from ommatid.scenes.tables.estimation import PriorTable
 
 from .detail.detailed_model import DetailedModel
 from .methods.method import EstimationTask
@@ -41,6 +42,7 @@ EXPONENTS = (1.0, 2.0, 3.0, 4.0)  # and 0, which has no length
 WINDOW = 16  # pixels of f, side of a window
 WHOLE = 22  # pixels of f, side of the largest image that is one window
 WIDEST = 32  # pixels of f, side of the largest window; measurements that see more count what lies beside it as noise
+NATURAL_EXPONENT, NATURAL_LENGTH = 2.0, 10.0  # of a picture that is not known; pixels of f
 PER_AXIS = 3  # windows along an axis
 MOST = 400  # measurements of a window of more pixels
 LEAST = 10  # measurements, for three numbers
@@ -48,6 +50,7 @@ COARSE, FINE = 1.0, 40  # step of logarithms at first, number of steps after eac
 REACH = 18.0  # logarithms from the mean square to either end
 BEYOND = 12.0  # units of log evidence below the largest, where the grid ends
 SEEN = 7.0  # units of log evidence by which an image must be more likely than none
+ROUNDING = 1 / 12  # variance of the noise of a picture's pixel, in squared grey levels
 KEPT = 1e-3  # share of the variance, from which a term is kept
 REFINEMENTS = 2
 LEAST_NOISE = 1e-6  # of the known noise, that is fitted in addition to it
@@ -161,6 +164,21 @@ class Place:
         return Window.of(matrix / deviation[:, None], self.shape, residual / deviation, level / deviation)
 
 
+@dataclass(frozen=True)
+class _Picture:
+    """A window of a picture, (rows, columns) less the prior's mean, with the noise of its rounding."""
+
+    image: FloatArray
+    level: float
+
+    def evidence(self, spectrum: FloatArray) -> Evidence:
+        """Return the evidence of a spectrum, (rows, columns): the waves of the picture are independent."""
+        residual = np.asarray(fft.dctn(self.image, 2, norm="ortho"), dtype=np.float64).ravel()
+        light = np.zeros(residual.size)
+        light[0] = self.level * light.size**0.5
+        return Evidence(spectrum.ravel() / ROUNDING, residual / ROUNDING**0.5, light / ROUNDING**0.5, (0, 0, 0, 0))
+
+
 def _unknowns(task: EstimationTask) -> tuple[Model, FloatArray | float]:
     """Return the model of the pixels that have the prior, of f or of a finer world, and what the data lack of it."""
     return (task.model.fine, task.model.offset) if isinstance(task.model, DetailedModel) else (task.model, 0.0)
@@ -168,8 +186,7 @@ def _unknowns(task: EstimationTask) -> tuple[Model, FloatArray | float]:
 
 def places_of(task: EstimationTask) -> list[Place]:
     """Return the windows whose measurements count: the whole of a small image, else up to nine over it."""
-    fine, _ = _unknowns(task)
-    detail = fine.camera.rows // task.shape[0]
+    (fine, _), detail = _unknowns(task), _detail(task)
     side = min(max(WINDOW, 2 * -(-fine.windowed.reach // detail)), WIDEST)
     return [
         Place(rows, columns, _numbers(task, fine, rows, columns))
@@ -200,14 +217,17 @@ def _numbers(task: EstimationTask, fine: Model, rows: slice, columns: slice) -> 
     return found[np.linspace(0, found.size - 1, MOST).astype(int)]
 
 
-def _spectra(task: EstimationTask, shape: tuple[int, int]) -> list[_Spectrum]:
-    """Return the spectra of natural pictures on a window's grid of this shape."""
-    pitch = task.model.camera.target_pitch
-    of_grid = pitch / (_unknowns(task)[0].camera.rows // task.shape[0])
+def _detail(task: EstimationTask) -> int:
+    """Return how many times finer than f the unknowns are."""
+    return _unknowns(task)[0].camera.rows // task.shape[0]
+
+
+def _spectra(shape: tuple[int, int], pitch: float, detail: int) -> list[_Spectrum]:
+    """Return the spectra of natural pictures on a window's grid of this shape; pitch : of f."""
     found: list[_Spectrum] = []
     for exponent, length in _grid():
         term = SpectralTerm(1.0, exponent, length * pitch)
-        values = natural_spectrum(shape, of_grid, term)
+        values = natural_spectrum(shape, pitch / detail, term)
         term = term._replace(density=float(1 / values.mean()))
         found.append(_Spectrum(values / values.mean(), term, 1 if exponent else len(LENGTHS)))
     return found
@@ -220,13 +240,12 @@ def _grid() -> list[tuple[float, float]]:
 
 def _known(task: EstimationTask, shape: tuple[int, int]) -> _Spectrum:
     """Return the prior of the task on a window's grid of this shape."""
-    detail = _unknowns(task)[0].camera.rows // task.shape[0]
-    of_grid = task.model.camera.target_pitch / detail
+    of_grid = task.model.camera.target_pitch / _detail(task)
     values = np.broadcast_to(np.asarray(spectrum_of(task.prior, shape, of_grid)), shape)
     return _Spectrum(values, SpectralTerm(1.0, 0.0, of_grid), 1)
 
 
-class Posterior(NamedTuple):
+class ScalePosterior(NamedTuple):
     """The posterior of the logarithms of the multiples of K and of the noise.
 
     mass, best : logarithms of the evidence, integrated and largest;  at_end : True if that is at the end of the range
@@ -240,7 +259,7 @@ class Posterior(NamedTuple):
     moments: FloatArray
 
     @classmethod
-    def of(cls, evidence: list[Evidence], ranges: tuple[FloatArray, FloatArray]) -> Posterior:
+    def of(cls, evidence: list[Evidence], ranges: tuple[FloatArray, FloatArray]) -> ScalePosterior:
         """Integrate over grids of the logarithms, which are refined where the evidence is."""
 
         def scores() -> FloatArray:
@@ -300,29 +319,40 @@ def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: b
     return fit
 
 
+def fit_picture(picture: FloatArray, detail: int, pitch: float, table: PriorTable) -> FittedPrior | None:
+    """Return the prior that a picture itself supports, None of a picture that equals the prior's mean everywhere.
+
+    picture : (rows, columns) of the world, so many times finer than f;  pitch : of f;  table : its mean and its level
+    """
+    rows, columns = (_spread(size // detail, WINDOW, detail) for size in picture.shape)
+    windows = [
+        _Picture(picture[down, across] - table.mean, table.level_deviation) for down, across in product(rows, columns)
+    ]
+    spectra = _spectra(windows[0].image.shape, pitch, detail)
+    if not any(window.image.any() for window in windows):
+        return None
+    posteriors, shares, _ = _posteriors(windows, spectra, prior_known=False, noise_known=True)
+    return _mean_prior(table, spectra, posteriors, shares)
+
+
+def natural_prior(table: PriorTable, pitch: float) -> FittedPrior:
+    """Return a prior of natural pictures with the variance, mean and level of a [prior] table; pitch : of f."""
+    shape = (WINDOW, WINDOW)
+    one = SpectralTerm(1.0, NATURAL_EXPONENT, NATURAL_LENGTH * pitch)
+    density = table.variance / float(natural_spectrum(shape, pitch, one).mean())
+    return FittedPrior.of(table, (one._replace(density=density),), table.variance)
+
+
 def _fit(
     task: EstimationTask, places: list[Place], noise: FloatArray, *, prior_known: bool, noise_known: bool
 ) -> PriorFit:
     """Return the fit of the prior, and of a multiple of `noise`, (measurements used,)."""
     windows = [place.window(task, noise) for place in places if place.numbers.size]
-    square = float(np.mean(np.concatenate([window.residual for window in windows]) ** 2))
-    if square == 0:
+    if not any(window.residual.any() for window in windows):
         raise InputError("the measurements equal those of the prior's mean to the last digit: nothing can be fitted")
-    fixed = np.zeros(1)
-    noises = fixed if noise_known else log(square) + np.arange(-2 * REACH, 3 * COARSE, COARSE)
-    spectra = [_known(task, places[0].shape)] if prior_known else _spectra(task, places[0].shape)
-    posteriors: list[Posterior] = []
-    evidence: list[Evidence] = []
-    for spectrum in spectra:
-        evidence = [window.evidence(spectrum.values) for window in windows]
-        seen = float(np.mean(np.concatenate([part.values for part in evidence])))
-        scales = fixed if prior_known else log(square / seen) + np.arange(-REACH, REACH, COARSE)
-        posteriors.append(Posterior.of(evidence, (scales, noises)))
-    masses = [log(spectrum.weight) + each.mass for spectrum, each in zip(spectra, posteriors, strict=True)]
-    shares = np.exp(np.array(masses) - max(masses))
-    shares /= shares.sum()
-    best = posteriors[int(np.argmax(shares))]
-    nothing = float(np.sum([part.log(np.zeros(1), np.exp(noises)) for part in evidence], axis=0).max())
+    shape, pitch = places[0].shape, task.model.camera.target_pitch
+    spectra = [_known(task, shape)] if prior_known else _spectra(shape, pitch, _detail(task))
+    posteriors, shares, doubtful = _posteriors(windows, spectra, prior_known=prior_known, noise_known=noise_known)
     multiple = float(shares @ [each.means[1] for each in posteriors])
     # Known noise and a variance n have multiples of the whole noise whose mean is 1 + (n - the last n) mean(1 / noise).
     noise_variance = float(noise[0] - task.expected_noise[0]) + (multiple - 1) / float(np.mean(1 / noise))
@@ -330,18 +360,35 @@ def _fit(
     if not noise_known:
         numbers["noise_variance"] = noise_variance, _moments(shares, [each.moments[1] for each in posteriors])[1]
     return PriorFit(
-        prior=None if prior_known else _mean_prior(task, spectra, posteriors, shares),
+        prior=None if prior_known else _mean_prior(task.prior, spectra, posteriors, shares),
         noise_variance=None if noise_known else max(noise_variance, 0.0),
         numbers=numbers,
         measurements=sum(place.numbers.size for place in places),
-        doubtful=best.at_end
-        or (not noise_known and noise_variance < 0)
-        or (not prior_known and best.best - nothing < SEEN),
+        doubtful=doubtful or (not noise_known and noise_variance < 0),
     )
 
 
+def _posteriors(
+    windows: Sequence[Window | _Picture], spectra: list[_Spectrum], *, prior_known: bool, noise_known: bool
+) -> tuple[list[ScalePosterior], FloatArray, bool]:
+    """Return the posterior for every spectrum, its share of the evidence, and True where an image is not needed."""
+    every = [[window.evidence(spectrum.values) for window in windows] for spectrum in spectra]
+    fixed, square = np.zeros(1), float(np.mean(np.concatenate([part.residual for part in every[0]]) ** 2))
+    noises = fixed if noise_known else log(square) + np.arange(-2 * REACH, 3 * COARSE, COARSE)
+    nothing = float(np.sum([part.log(fixed, np.exp(noises)) for part in every[0]], axis=0).max())
+    posteriors: list[ScalePosterior] = []
+    for evidence in every:
+        seen = float(np.mean(np.concatenate([part.values for part in evidence])))
+        scales = fixed if prior_known else log(square / seen) + np.arange(-REACH, REACH, COARSE)
+        posteriors.append(ScalePosterior.of(evidence, (scales, noises)))
+    masses = [log(spectrum.weight) + each.mass for spectrum, each in zip(spectra, posteriors, strict=True)]
+    shares = np.exp(np.array(masses) - max(masses))
+    best = posteriors[int(np.argmax(shares))]
+    return posteriors, shares / shares.sum(), best.at_end or (not prior_known and best.best - nothing < SEEN)
+
+
 def _mean_prior(
-    task: EstimationTask, spectra: list[_Spectrum], posteriors: list[Posterior], shares: FloatArray
+    table: PriorTable, spectra: list[_Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
 ) -> FittedPrior:
     """Return the prior whose spectrum is the mean of all, without those that hardly add to it."""
     variances = shares * [each.means[0] for each in posteriors]
@@ -351,11 +398,11 @@ def _mean_prior(
         for spectrum, variance in zip(spectra, variances, strict=True)
         if variance > KEPT * total
     )
-    return FittedPrior.of(task.prior, terms, total)
+    return FittedPrior.of(table, terms, total)
 
 
 def _numbers_of(
-    spectra: list[_Spectrum], posteriors: list[Posterior], shares: FloatArray
+    spectra: list[_Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
 ) -> dict[str, tuple[float, float]]:
     """Return variance, exponent, and the correlation length of spectra that have one, with relative deviations."""
     variance, by_variance = _moments(shares, [each.moments[0] for each in posteriors])

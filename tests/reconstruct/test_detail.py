@@ -257,7 +257,7 @@ def test_a_prior_is_fitted_to_the_world() -> None:
         assert not result.fit.doubtful
         assert result.error is not None
         ratios.append(result.error.mse / result.expected.mse)
-    assert np.mean(ratios) == pytest.approx(1, abs=0.1 + 3 * np.std(ratios, ddof=1) / 20**0.5)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.1 + 3 * float(np.std(ratios, ddof=1)) / 20**0.5)
 
 
 def test_uncertain_entries_of_the_world_become_uncertain_measurements() -> None:

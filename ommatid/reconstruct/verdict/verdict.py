@@ -363,8 +363,8 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
         )
     if check.fit_doubtful:
         findings.reasons.append(
-            "the stack does not determine the fitted prior or noise: a value lies on the bound of its range, the"
-            " likelihood has no maximum there, or noise alone explains the measurements"
+            "the stack does not determine the fitted prior or noise: a number lies at the end of its range, or"
+            " noise alone explains the measurements"
         )
     if check.left_out:
         findings.notes.append(

@@ -57,6 +57,9 @@ shape = [12, 12]
 pixel_pitch = "1 mm"
 distance = "1 m"
 
+[prior]
+kind = "independent"
+
 [camera]
 pixel_pitch = "6 um"
 lens_pitch = "0.5 mm"

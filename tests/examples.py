@@ -41,7 +41,7 @@ def scene(
     """A scene with lens types A, B, ... of (magnification, array, pixels) and more tables by name.
 
     A calibrated H has entries, which most tests are about, unless `calibration` names another fit, and the numbers of
-    samples are fixed unless `render` and `calibration` name others.
+    samples are fixed unless `render` and `calibration` name others. Pixels are independent unless `prior` says more.
     """
     calibration = {"samples": 256} | tables.get("calibration", {})
     if calibration.get("method") != "ideal":
@@ -65,6 +65,7 @@ def scene(
             ],
         },
         **tables,
+        "prior": {"kind": "independent"} | tables.get("prior", {}),
     }
     return parse(data, Path("test.toml"))
 

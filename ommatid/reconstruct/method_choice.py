@@ -88,7 +88,7 @@ def _of_world(scene: Scene, camera: Camera) -> tuple[list[str], str] | None:
 def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], str]:
     """Return methods in the order of preference, and why the first one is."""
     estimator = scene.estimator
-    noiseless = estimator.noise_variance == 0 or (estimator.noise_variance is None and exact and not _has_noise(scene))
+    noiseless = estimator.noise_variance == 0 or (estimator.noise_variance is None and exact and not scene.has_noise)
     if exact and camera.is_sliding and not camera.has_box_footprints:
         if estimator.method not in ("auto", "frame"):
             raise InputError(
@@ -101,8 +101,9 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
     if not camera.has_sharp_footprints and camera.unknowns > MOST_DENSE:
         reason = f"{camera.unknowns} pixels behind blurred lenses, whose footprints are wider than tiles"
         return ["frame" if camera.is_sliding and not noiseless else "dense"], reason
-    independent, sliding = scene.prior.kind == "independent", camera.is_sliding and camera.has_sharp_footprints
-    if not independent and sliding and not noiseless and camera.unknowns > MOST_CORRELATED:
+    independent = scene.prior.kind == "independent"
+    as_designed = camera.is_sliding and camera.tolerance is None
+    if not independent and as_designed and not noiseless and camera.unknowns > MOST_CORRELATED:
         return ["frame", "dense"], f"{camera.unknowns} correlated pixels, and every lens type sees the same everywhere"
     if camera.unknowns <= MOST_DENSE:
         return ["dense", "tiles"], f"{camera.unknowns} pixels are few"
@@ -150,12 +151,6 @@ def allowed_memory(limit: int | None) -> int:
     """Return the bytes that may be used: the limit, at most what is free; without a limit half of what is free."""
     free = free_memory()
     return free // 2 if limit is None else min(limit, free)
-
-
-def _has_noise(scene: Scene) -> bool:
-    if scene.sensor is not None:
-        return True
-    return scene.noise is not None and scene.noise.variance + scene.noise.quantisation_variance > 0
 
 
 def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:

@@ -64,15 +64,17 @@ class PriorFit:
 
     numbers : of a picture's spectrum, and the noise: the mean of each logarithm and its standard deviation, by name;
         variance of a pixel in a window, correlation length in pixels of f, exponent, noise variance
-    measurements : number used
-    doubtful : True if no image is needed to explain the measurements, or a number lies at the end of its range
+    measurements : number used; if they are few, or equal the prior's mean, there is no fit and pixels are independent
+    doubtful : True if a number lies at the end of its range, or if noise that is fitted explains the measurements alone
+    flat : True if noise that is known explains the measurements alone
     """
 
     prior: FittedPrior | None
     noise_variance: float | None
     numbers: dict[str, tuple[float, float]]
     measurements: int
-    doubtful: bool
+    doubtful: bool = False
+    flat: bool = False
 
 
 class _Spectrum(NamedTuple):
@@ -151,6 +153,12 @@ class Place:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the window."""
         return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    def differs(self, task: EstimationTask) -> bool:
+        """Return True if a measurement differs from what the prior's mean would give."""
+        fine, offset = _unknowns(task)
+        mean = task.prior.mean * fine.forward(np.ones(fine.unknowns))
+        return bool(((task.recorded + offset)[self.numbers] != mean[self.numbers]).any())
 
     def window(self, task: EstimationTask, noise: FloatArray) -> Window:
         """Return the measurements in units of `noise`, (measurements used,), to which what they see beside it adds."""
@@ -295,7 +303,8 @@ def _refined(grid: FloatArray, near: BoolArray) -> FloatArray:
 def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: bool = True) -> PriorFit:
     """Fit what is not known of a task's prior and noise; its expected noise is all of the noise, or the known part.
 
-    Raises InputError where measurements are too few, equal the prior's mean, or have no noise that is known.
+    Raises InputError where measurements have no noise that is known, and where they are too few to fit the noise, or
+    the prior of a world finer than f.
     """
     if noise_known and not (task.expected_noise > 0).all():
         raise InputError(
@@ -304,8 +313,14 @@ def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: b
         )
     places = places_of(task)
     count = sum(place.numbers.size for place in places)
-    if count < LEAST:
-        raise InputError(f"a fit of the prior or the noise takes {LEAST} measurements or more, got {count}")
+    little = count < LEAST or not any(place.differs(task) for place in places)
+    if little and noise_known and _detail(task) == 1:
+        return PriorFit(None, None, {}, count)
+    if little:
+        raise InputError(
+            f"a fit takes {LEAST} measurements or more that differ from those of the prior's mean, got {count};"
+            " give prior.kind and estimator.noise_variance"
+        )
     if noise_known:
         return _fit(task, places, task.expected_noise, prior_known=prior_known, noise_known=True)
     # A multiple of the whole noise is fitted, whose distribution over the measurements is uniform at first.
@@ -331,7 +346,7 @@ def fit_picture(picture: FloatArray, detail: int, pitch: float, table: PriorTabl
     spectra = _spectra(windows[0].image.shape, pitch, detail)
     if not any(window.image.any() for window in windows):
         return None
-    posteriors, shares, _ = _posteriors(windows, spectra, prior_known=False, noise_known=True)
+    posteriors, shares, _, _ = _posteriors(windows, spectra, prior_known=False, noise_known=True)
     return _mean_prior(table, spectra, posteriors, shares)
 
 
@@ -348,11 +363,9 @@ def _fit(
 ) -> PriorFit:
     """Return the fit of the prior, and of a multiple of `noise`, (measurements used,)."""
     windows = [place.window(task, noise) for place in places if place.numbers.size]
-    if not any(window.residual.any() for window in windows):
-        raise InputError("the measurements equal those of the prior's mean to the last digit: nothing can be fitted")
     shape, pitch = places[0].shape, task.model.camera.target_pitch
     spectra = [_known(task, shape)] if prior_known else _spectra(shape, pitch, _detail(task))
-    posteriors, shares, doubtful = _posteriors(windows, spectra, prior_known=prior_known, noise_known=noise_known)
+    posteriors, shares, at_end, flat = _posteriors(windows, spectra, prior_known=prior_known, noise_known=noise_known)
     multiple = float(shares @ [each.means[1] for each in posteriors])
     # Known noise and a variance n have multiples of the whole noise whose mean is 1 + (n - the last n) mean(1 / noise).
     noise_variance = float(noise[0] - task.expected_noise[0]) + (multiple - 1) / float(np.mean(1 / noise))
@@ -364,14 +377,18 @@ def _fit(
         noise_variance=None if noise_known else max(noise_variance, 0.0),
         numbers=numbers,
         measurements=sum(place.numbers.size for place in places),
-        doubtful=doubtful or (not noise_known and noise_variance < 0),
+        doubtful=at_end or (not noise_known and (flat or noise_variance < 0)),
+        flat=noise_known and flat,
     )
 
 
 def _posteriors(
     windows: Sequence[Window | _Picture], spectra: list[_Spectrum], *, prior_known: bool, noise_known: bool
-) -> tuple[list[ScalePosterior], FloatArray, bool]:
-    """Return the posterior for every spectrum, its share of the evidence, and True where an image is not needed."""
+) -> tuple[list[ScalePosterior], FloatArray, bool, bool]:
+    """Return the posterior for every spectrum, and its share of the evidence.
+
+    Then whether a number lies at the end of its range, and whether noise alone explains the measurements.
+    """
     every = [[window.evidence(spectrum.values) for window in windows] for spectrum in spectra]
     fixed, square = np.zeros(1), float(np.mean(np.concatenate([part.residual for part in every[0]]) ** 2))
     noises = fixed if noise_known else log(square) + np.arange(-2 * REACH, 3 * COARSE, COARSE)
@@ -384,7 +401,7 @@ def _posteriors(
     masses = [log(spectrum.weight) + each.mass for spectrum, each in zip(spectra, posteriors, strict=True)]
     shares = np.exp(np.array(masses) - max(masses))
     best = posteriors[int(np.argmax(shares))]
-    return posteriors, shares / shares.sum(), best.at_end or (not prior_known and best.best - nothing < SEEN)
+    return posteriors, shares / shares.sum(), best.at_end, not prior_known and best.best - nothing < SEEN
 
 
 def _mean_prior(

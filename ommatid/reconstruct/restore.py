@@ -61,6 +61,7 @@ def verdict_of(
         spurious_share=float(spurious.mean()),
         calibration_share=expected.parts.get("calibration", 0.0) / expected.mse if expected.mse else 0.0,
         fit_doubtful=assumed.fit is not None and assumed.fit.doubtful,
+        fit_flat=assumed.fit is not None and assumed.fit.flat,
         noise_fitted=assumed.fit is not None and assumed.fit.noise_variance is not None,
         undithered=_undithered(assumed.noise),
         pixels_used=int(used.sum()),

@@ -157,6 +157,12 @@ class Scene(Table):
         """The actual variance of the prior over the one that the estimator assumes."""
         return self.prior.variance / self.assumed_prior.variance
 
+    @property
+    def has_noise(self) -> bool:
+        """True if the sensor adds noise or rounds."""
+        noise = self.noise
+        return self.sensor is not None or (noise is not None and noise.variance + noise.quantisation_variance > 0)
+
     def plain(self) -> dict[str, Any]:
         """The scene in types of TOML and JSON, without absent keys."""
         return self.model_dump(mode="json", exclude_none=True)
@@ -193,8 +199,25 @@ def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) ->
         raise InputError(f"{source}: {(absent and contradiction) or explain(error, completed, Scene)}") from error
     if contradiction:
         raise InputError(f"{source}: {contradiction}")
+    scene = _with_prior_kind(scene)
     scene._world_copy = world_copy  # pyright: ignore[reportPrivateUsage]
     return _with_source(scene, source)
+
+
+def _with_prior_kind(scene: Scene) -> Scene:
+    """Return the scene with a prior that is fitted, where it names no kind and a frame with noise is estimated at once.
+
+    Elsewhere pixels are independent: in the paper's tiles, with other lens types, where correlated pixels take ten
+    times as long, in front of a world finer than f, of misaligned cameras, and where a variance is stated.
+    """
+    prior, estimator = scene.prior, scene.estimator
+    stated = prior.model_fields_set & {"kind", "variance", "correlation_length", "exponent"}
+    plain = estimator.method != "tiles" and estimator.misalignment == "trust" and estimator.prior_variance is None
+    if stated or not scene.has_noise or not plain or estimator.noise_variance == 0 or scene.target.detail > 1:
+        return scene
+    if scene.camera.tolerance is not None or not all(lens.is_sliding for lens in scene.camera.lens):
+        return scene
+    return scene.model_copy(update={"prior": prior.model_copy(update={"kind": "fit"})})
 
 
 def parse_stored(data: object, source: Path) -> Scene:

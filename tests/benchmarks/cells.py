@@ -51,7 +51,7 @@ CALIBRATIONS = {
     "misaligned": f'{RAYS}[camera.tolerance]\nposition = "41 nm"\n',
     "entries": f'{RAYS}fit = "none"\n',
 }
-PRIORS = {"independent": "", "exponential": NEIGHBOURS, "fit": '[prior]\nkind = "fit"\n'}
+PRIORS = {"independent": '[prior]\nkind = "independent"\n', "exponential": NEIGHBOURS, "fit": '[prior]\nkind = "fit"\n'}
 NOISES = {"sensor": SENSOR, "quantised": f"{NOISE}bits = 8\n", "saturated": f"{NOISE}saturation = 200\n"}
 
 

@@ -98,12 +98,14 @@ class Cell:
         scene = self.described(number)
         if not self.drawn:
             return scene
+        kind = "independent" if scene.prior.kind == "fit" else scene.prior.kind
+        scene = self.described(number, f"prior.kind={kind}")
         path, shape = folder / "drawn.npy", derive(scene).shape
         prior = prior_of(scene.prior, shape, scene.target.pixel_pitch)
         rng = np.random.default_rng(derived_seed(0, Purpose.REPEAT, f"{DRAWN}, {self.name}", number))
         image = prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
         np.save(path, image.astype(np.float32).reshape(shape))
-        return self.described(number, f"target.image={path}", "target.origin=[0, 0]")
+        return self.described(number, f"prior.kind={kind}", f"target.image={path}", "target.origin=[0, 0]")
 
 
 IDEAL, POINTS = "calibration.method=ideal", "calibration.fit=none"  # points are the scene's method

@@ -24,6 +24,7 @@ from .formats import encoded, exr_damaged, model_resealed, npy_damaged, npz_dama
 EVERYTHING = (
     TINY.replace("pixels = [3, 3]", 'pixels = "fit"\naperture = "0.1 mm"\nfocus = "1.1 m"\nstep = 1')
     .replace("[noise]\nvariance = 1e-2\n", "")
+    .replace('[prior]\nkind = "independent"', '[prior]\nkind = "exponential"\ncorrelation_length = "3 mm"')
     .replace("[camera]", '[camera]\nwavelength = "550 nm"')
     + """
 [camera.tolerance]
@@ -35,10 +36,6 @@ focal_length = 0.001
 illuminance = "500 lux"
 exposure = "10 ms"
 read_noise = 2.0
-
-[prior]
-kind = "exponential"
-correlation_length = "3 mm"
 
 [estimator]
 memory = "1 GB"

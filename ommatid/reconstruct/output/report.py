@@ -55,6 +55,7 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
             for skipped in (
                 *skipped_effects(as_run, stack.camera),
                 *_skipped_in_world(stack),
+                *_skipped_fit(restoration),
                 *_skipped_errors(restoration),
             )
         ),
@@ -143,6 +144,15 @@ def _skipped_in_world(stack: Stack) -> tuple[SkippedEffect, ...]:
     if not stack.record.get(STRAIGHT):
         return ()
     return (SkippedEffect("interreflection", "nothing in the world reflects light: paths have one segment"),)
+
+
+def _skipped_fit(restoration: Reconstruction) -> tuple[SkippedEffect, ...]:
+    """Return the correlation of pixels where a prior was to be fitted, and the measurements show too little."""
+    fit = restoration.fit
+    if fit is None or fit.numbers:
+        return ()
+    why = f"{fit.measurements} measurements show too little to fit a prior to: pixels are independent"
+    return (SkippedEffect("covariances between pixels of the prior", why),)
 
 
 def _skipped_errors(restoration: Reconstruction) -> tuple[SkippedEffect, ...]:

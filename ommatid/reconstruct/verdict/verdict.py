@@ -191,6 +191,7 @@ class ErrorCheck:
     spurious_share: float
     calibration_share: float
     fit_doubtful: bool
+    fit_flat: bool
     noise_fitted: bool
     undithered: float | None
     pixels_used: int
@@ -365,6 +366,11 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
         findings.reasons.append(
             "the stack does not determine the fitted prior or noise: a number lies at the end of its range, or"
             " noise alone explains the measurements"
+        )
+    if check.fit_flat:
+        findings.doubts.append(
+            "noise alone explains the measurements, so that the fitted prior takes the picture for grey: if it has"
+            " detail that no lens shows, the error bars do not hold it; compare with prior.kind = 'independent'"
         )
     if check.left_out:
         findings.notes.append(

@@ -157,6 +157,12 @@ class LensTable(Table):
         default=None, description="sub-imagers with a window or an orientation of their own; absent: all on the grid"
     )
 
+    @property
+    def is_sliding(self) -> bool:
+        """True if all its sensor pixels see the same, one pixel of f apart: m x m sub-imagers of magnification 1/m."""
+        whole = self.array[0] == self.array[1] and self.magnification * self.array[0] == 1
+        return whole and self.step == (1, 1) and self.sub_imager is None
+
     @field_validator("pixels", mode="before")
     @classmethod
     def _check_pixels(cls, value: object) -> object:

@@ -34,6 +34,7 @@ SAMPLES = {
     "corridor": (1024, 256),
     "still_life": (1024, 256),
 }
+WITHOUT_PRIOR = ("photo", "single", "still_life", "corridor")  # of the paper's prior here, which they do not name
 ENOUGH = 896  # samples of entries of H, where the scene takes as many as the noise justifies
 
 
@@ -58,10 +59,11 @@ class Cell:
     @property
     def base(self) -> tuple[str, ...]:
         """Changes of the scene before those of the cell."""
+        prior = ("prior.kind=independent",) if self.scene in WITHOUT_PRIOR else ()
         if self.scene not in SAMPLES:
-            return ()
+            return prior
         rendering, calibration = SAMPLES[self.scene]
-        return f"render.samples={rendering}", f"calibration.samples={calibration}"
+        return *prior, f"render.samples={rendering}", f"calibration.samples={calibration}"
 
     @property
     def definition(self) -> str:
@@ -98,14 +100,12 @@ class Cell:
         scene = self.described(number)
         if not self.drawn:
             return scene
-        kind = "independent" if scene.prior.kind == "fit" else scene.prior.kind
-        scene = self.described(number, f"prior.kind={kind}")
         path, shape = folder / "drawn.npy", derive(scene).shape
         prior = prior_of(scene.prior, shape, scene.target.pixel_pitch)
         rng = np.random.default_rng(derived_seed(0, Purpose.REPEAT, f"{DRAWN}, {self.name}", number))
         image = prior.mean + prior.apply_root(rng.standard_normal(prior.dimension))
         np.save(path, image.astype(np.float32).reshape(shape))
-        return self.described(number, f"prior.kind={kind}", f"target.image={path}", "target.origin=[0, 0]")
+        return self.described(number, f"target.image={path}", "target.origin=[0, 0]")
 
 
 IDEAL, POINTS = "calibration.method=ideal", "calibration.fit=none"  # points are the scene's method

@@ -13,11 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.scene import Scene, read, resolved, with_changes, write
+from ommatid.scenes.scene import Scene, parse, read, resolved, with_changes, write
 from ommatid.scenes.tables import toml
 from ommatid.scenes.tables.toml import apply_overrides
 from ommatid.scenes.tables.units import FACTORS
 
+from ..conftest import TINY
 from ..examples import scene
 from ..modules import tracked
 
@@ -143,3 +144,30 @@ def test_common_units_are_those_of_pint_to_the_last_bit(unit: tuple[str, str], n
     """A scene means the same with and without the table of factors."""
     exact = float(REGISTRY.Quantity(f"{number} {unit[0]}").to(unit[1]).magnitude)
     assert float(number) * FACTORS[unit] == exact
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        ("", "fit"),
+        ("prior.level=known", "fit"),
+        ("prior.kind=power", "power"),
+        ("prior.variance=900", "independent"),
+        ("noise.variance=0", "independent"),
+        ("estimator.noise_variance=0", "independent"),
+        ("estimator.noise_variance=1", "fit"),
+        ("estimator.method=tiles", "independent"),
+        ("estimator.prior_variance=400", "independent"),
+        ("target.detail=2", "independent"),
+        ("camera.lens.I.array=[2, 3]", "independent"),
+        ("camera.lens.I.step=2", "independent"),
+        ("camera.lens.I.magnification=2/7", "independent"),
+        ("camera.tolerance.position=1 um", "independent"),
+    ],
+)
+def test_a_prior_without_a_kind_is_fitted_where_that_costs_little(tmp_path: Path, change: str, kind: str) -> None:
+    path = tmp_path / "plain.toml"
+    path.write_text(TINY.replace('[prior]\nkind = "independent"\n', ""), encoding="utf-8")
+    scene = read(path, [change] if change else [])
+    assert scene.prior.kind == kind
+    assert parse(scene.plain(), path).prior.kind == kind

@@ -40,8 +40,9 @@ from .prior import FittedPrior, SpectralTerm, natural_spectrum, spectrum_of
 LENGTHS = (1.5, 4.0, 10.0, 25.0)  # pixels of f
 EXPONENTS = (1.0, 2.0, 3.0, 4.0)  # and 0, which has no length
 WINDOW = 16  # pixels of f, side of a window
-WHOLE = 22  # pixels of f, side of the largest image that is one window
-WIDEST = 32  # pixels of f, side of the largest window; measurements that see more count what lies beside it as noise
+WHOLE = 22  # pixels of f, side of the largest image that is one window, and
+WHOLE_WIDE = 32  # of one in front of wide footprints
+WIDEST = 24  # pixels of f, side of the widest window of larger ones; what lies beside it counts as noise
 NATURAL_EXPONENT, NATURAL_LENGTH = 2.0, 10.0  # of a picture that is not known; pixels of f
 PER_AXIS = 3  # windows along an axis
 MOST = 400  # measurements of a window of more pixels
@@ -195,7 +196,7 @@ def _unknowns(task: EstimationTask) -> tuple[Model, FloatArray | float]:
 def places_of(task: EstimationTask) -> list[Place]:
     """Return the windows whose measurements count: the whole of a small image, else up to nine over it."""
     (fine, _), detail = _unknowns(task), _detail(task)
-    side = min(max(WINDOW, 2 * -(-fine.windowed.reach // detail)), WIDEST)
+    side = max(WINDOW, 2 * -(-fine.windowed.reach // detail))
     return [
         Place(rows, columns, _numbers(task, fine, rows, columns))
         for rows, columns in product(*(_spread(size, side, detail) for size in task.shape))
@@ -204,9 +205,10 @@ def places_of(task: EstimationTask) -> list[Place]:
 
 def _spread(size: int, side: int, detail: int) -> list[slice]:
     """Return windows of one axis in the middle of equal parts of it, in pixels of the unknowns; one of a short axis."""
-    count = 1 if size <= WHOLE else min(size // side, PER_AXIS)
-    if count <= 1:
+    if size <= max(WHOLE, min(side, WHOLE_WIDE)):
         return [slice(0, size * detail)]
+    side = min(side, WIDEST)
+    count = min(size // side, PER_AXIS)
     starts = [int((number + 0.5) * size / count - side / 2) for number in range(count)]
     return [slice(start * detail, (start + side) * detail) for start in starts]
 
@@ -377,7 +379,7 @@ def _fit(
         noise_variance=None if noise_known else max(noise_variance, 0.0),
         numbers=numbers,
         measurements=sum(place.numbers.size for place in places),
-        doubtful=at_end or (not noise_known and (flat or noise_variance < 0)),
+        doubtful=at_end and not flat if noise_known else at_end or flat or noise_variance < 0,
         flat=noise_known and flat,
     )
 

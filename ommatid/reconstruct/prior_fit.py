@@ -144,33 +144,30 @@ class Window:
 
 @dataclass(frozen=True)
 class Place:
-    """A window, in pixels of the unknowns, and the measurements that count for it."""
+    """A window, in pixels of the unknowns, and the measurements that count for it.
+
+    numbers : (m,);  light, residual : (m,) H 1 and g - H f0
+    """
 
     rows: slice
     columns: slice
     numbers: IntArray
+    light: FloatArray
+    residual: FloatArray
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the window."""
         return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
 
-    def differs(self, task: EstimationTask) -> bool:
-        """Return True if a measurement differs from what the prior's mean would give."""
-        fine, offset = _unknowns(task)
-        mean = task.prior.mean * fine.forward(np.ones(fine.unknowns))
-        return bool(((task.recorded + offset)[self.numbers] != mean[self.numbers]).any())
-
     def window(self, task: EstimationTask, noise: FloatArray) -> Window:
         """Return the measurements in units of `noise`, (measurements used,), to which what they see beside it adds."""
-        fine, offset = _unknowns(task)
+        fine, _ = _unknowns(task)
         matrix = np.asarray(fine.windowed.rows_on(self.numbers, self.rows, self.columns).toarray())
-        light = fine.forward(np.ones(fine.unknowns))[self.numbers]
-        residual = (task.recorded + offset)[self.numbers] - task.prior.mean * light
-        beside = np.square(light - matrix.sum(axis=1)) * float(np.mean(residual**2))
-        deviation = np.sqrt(task.on_all_measurements(noise, 1.0)[self.numbers] + beside)
-        level = task.prior.level_deviation * light
-        return Window.of(matrix / deviation[:, None], self.shape, residual / deviation, level / deviation)
+        beside = np.square(self.light - matrix.sum(axis=1)) * float(np.mean(self.residual**2))
+        deviation = np.sqrt(noise[task.among_used(self.numbers)] + beside)
+        level = task.prior.level_deviation * self.light
+        return Window.of(matrix / deviation[:, None], self.shape, self.residual / deviation, level / deviation)
 
 
 @dataclass(frozen=True)
@@ -195,12 +192,15 @@ def _unknowns(task: EstimationTask) -> tuple[Model, FloatArray | float]:
 
 def places_of(task: EstimationTask) -> list[Place]:
     """Return the windows whose measurements count: the whole of a small image, else up to nine over it."""
-    (fine, _), detail = _unknowns(task), _detail(task)
+    (fine, offset), detail = _unknowns(task), _detail(task)
     side = max(WINDOW, 2 * -(-fine.windowed.reach // detail))
-    return [
-        Place(rows, columns, _numbers(task, fine, rows, columns))
-        for rows, columns in product(*(_spread(size, side, detail) for size in task.shape))
-    ]
+    light = fine.forward(np.ones(fine.unknowns))
+    residual = task.recorded + offset - task.prior.mean * light
+    found: list[Place] = []
+    for rows, columns in product(*(_spread(size, side, detail) for size in task.shape)):
+        numbers = _numbers(task, fine, rows, columns)
+        found.append(Place(rows, columns, numbers, light[numbers], residual[numbers]))
+    return found
 
 
 def _spread(size: int, side: int, detail: int) -> list[slice]:
@@ -315,7 +315,7 @@ def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: b
         )
     places = places_of(task)
     count = sum(place.numbers.size for place in places)
-    little = count < LEAST or not any(place.differs(task) for place in places)
+    little = count < LEAST or not any(place.residual.any() for place in places)
     if little and noise_known and _detail(task) == 1:
         return PriorFit(None, None, {}, count)
     if little:

@@ -23,7 +23,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
@@ -95,13 +94,6 @@ class Prior:
     def scaled(self, ratio: float) -> Prior:
         """Return the prior with `ratio` times the covariance."""
         return self if ratio == 1 else Prior(self.mean, ratio**0.5 * self.root, self.rounding)
-
-    def restrict(self, pixels: NDArray[np.intp]) -> Prior:
-        """Return the marginal prior of these pixels."""
-        rows = self.root[pixels]
-        if self.independent:
-            return Prior(self.mean[pixels], rows)
-        return Prior(self.mean[pixels], covariance_root(rows @ rows.T), self.rounding)
 
 
 def independent(mean: float, variance: float, unknowns: int) -> Prior:

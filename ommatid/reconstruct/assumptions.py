@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
@@ -131,15 +132,23 @@ def method_for(stack: Stack, model: Model) -> Method:
 
 
 def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Result]) -> Result:
-    """Return work(choice) for the chosen method, or for tiles where a frame chosen by "auto" does not converge."""
+    """Return work(choice) for the chosen method, or for another where a frame chosen by "auto" does not converge.
+
+    That is one dense problem of few pixels, tiles of many. Few pixels behind a sensor with dead or saturated ones are
+    a dense problem at once: there the map of a frame's error bars is rough.
+    """
     check_noise_fit(stack)
     choice = choose_method(stack.scene, stack.camera, _needs_no_matrix(stack, model))
+    replaceable = stack.scene.estimator.method == "auto" and not stack.camera.has_detail
+    few = stack.camera.unknowns <= MOST_DENSE
+    if choice.method == "frame" and replaceable and few and not usable_pixels(stack, model).used.all():
+        choice = replace(choice, method="dense", why="some sensor pixels are dead or saturated")
     try:
         return work(choice)
     except NotReachedError as error:
-        if stack.scene.estimator.method != "auto" or stack.camera.has_detail:
+        if not replaceable:
             raise
-        return work(replace(choice, method="tiles", why=str(error)))
+        return work(replace(choice, method="dense" if few else "tiles", why=str(error)))
 
 
 def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution: Execution) -> Assumptions:

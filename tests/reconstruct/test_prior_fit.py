@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ommatid.analysis.predict import predict_ideal
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
@@ -18,6 +19,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.model import Model
+from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.ideal import ideal_model
 
@@ -219,3 +221,38 @@ def test_a_fitted_prior_is_that_of_every_grid() -> None:
     whole, averages = (np.asarray(spectrum_of(prior, SHAPE, PITCH, detail)) for detail in (1, 3))
     low = np.hypot(*np.indices(SHAPE)) < 6
     assert averages[low] == pytest.approx(whole[low], rel=0.12)
+
+
+def test_few_correlated_pixels_behind_dead_ones_are_a_dense_problem() -> None:
+    shape = (25, 25)
+    described = wide(shape, noise={"variance": 1.0}, prior={"kind": "fit"})
+    model, image = model_of(shape, FITTED), drawn(natural(2.0, 6.0, 900.0), 0, shape)
+    stack = recorded(described, image, 1.0)
+    dead = replace(stack, values=np.where(np.arange(stack.values.size) == 100, np.nan, stack.values))
+    assert restore(stack, model, image).choice.method == "frame"
+    result = restore(dead, model, image)
+    assert result.choice.method == "dense"
+    assert result.verdict.level == "green"
+
+
+def test_a_flat_picture_is_trusted_with_a_doubt() -> None:
+    described = wide(SHAPE, noise={"variance": 1.0}, prior={"kind": "fit"})
+    flat = np.full(361, 200.0)
+    result = restore(recorded(described, flat, 1.0), MODEL, flat)
+    assert result.verdict.level == "amber"
+    assert "noise alone explains the measurements" in " ".join(result.verdict.doubts)
+
+
+@pytest.mark.parametrize(("picture", "said"), [(True, "fitted to the scene's picture"), (False, "1/frequency^2")])
+def test_a_prediction_fits_the_prior_to_the_picture(picture: bool, said: str) -> None:
+    """Its error is that of the stack's own fit within a third; without a picture it says what it takes."""
+    described = wide(SHAPE, noise={"variance": 1.0}, prior={"kind": "fit"})
+    if not picture:
+        target = described.target.model_copy(update={"image": None, "origin": None})
+        described = described.model_copy(update={"target": target})
+    prediction = predict_ideal(described)
+    assert said in " ".join(prediction.assumes)
+    if picture:
+        truth = Setup.from_scene(described).image.ravel()
+        expected = restore(recorded(described, truth, 1.0), MODEL, truth).expected.mse
+        assert prediction.mse == pytest.approx(expected, rel=1 / 3)

@@ -25,7 +25,7 @@ from .methods.method import Execution, Method, MethodResult, total_variance
 from .model_error.attenuation import can_be_corrected, with_attenuation
 from .model_error.contrast import Contrast, true_contrast
 from .model_error.shared_errors import NEGLIGIBLE as NEGLIGIBLE_PART
-from .model_error.shared_errors import bound, with_shared_errors
+from .model_error.shared_errors import bound, with_common_rounding, with_shared_errors
 from .noise import (
     ROUNDS,
     SHARED,
@@ -35,10 +35,12 @@ from .noise import (
     censored,
     certain,
     check_noise_fit,
+    common_rounding,
     depends_on_light,
     fitted_noise,
     has_converged,
     has_shared_errors,
+    undithered,
     usable_pixels,
 )
 from .prior_fit import PriorFit, fit_prior
@@ -72,10 +74,20 @@ class Assumptions:
     shared_image: FloatArray | None = None
 
     def result(self, truth: FloatArray | None) -> MethodResult:
-        """Return the estimate and its error, with what the errors of H do beyond noise where that matters.
+        """Return the estimate and its error, with what errors of H and of rounding do beyond noise where that matters.
 
         truth : (N,), or (pixels of the world,) for a method that takes detail into account
         """
+        result, method = self._with_errors_of_h(truth), self.method
+        operators = None if undithered(self.noise) is None else method.operators()
+        if operators is None:
+            return result
+        task = method.task
+        columns = common_rounding(self.noise, task.model.light(method.image)[task.used])
+        actual = total_variance(self._independent_noise)
+        return with_common_rounding(result, method, operators, columns, truth, actual)
+
+    def _with_errors_of_h(self, truth: FloatArray | None) -> MethodResult:
         method, independent = self.method, self._independent_noise
         shared = has_shared_errors(method.task.model)
         operators = method.operators() if self.contrast is not None or shared else None

@@ -45,6 +45,8 @@ CERTAIN = (
 )  # noise that stays known when the rest of it is to be fitted
 ROUNDS = 6
 UNCHANGED = 0.05  # standard deviations of its noise: change of the light expected on a saturated pixel
+DITHER = 0.4  # noise over the quantisation step from which rounding errors are independent of the signal
+HARMONICS = 20  # of the mean error of rounding; those beyond are 3 % of its variance without noise
 LEAST_INFORMATION = 0.01  # of an unsaturated pixel: a saturated one with less is left out
 
 
@@ -233,6 +235,37 @@ def check_noise_fit(stack: Stack) -> None:
 def uniform(number: float, count: int) -> FloatArray:
     """Return an array that repeats one number `count` times and stores it once."""
     return np.broadcast_to(np.float64(number), (count,))
+
+
+def undithered(noise: Noise) -> float | None:
+    """Return the noise over the quantisation step where it is below DITHER, None elsewhere; noise : by cause."""
+    rounding = noise.get("quantisation")
+    if rounding is None or not rounding.any():
+        return None
+    noisy = float(np.mean(noise["noise"])) if "noise" in noise else 0.0
+    share = (noisy / (12 * float(np.mean(rounding)))) ** 0.5
+    return share if share < DITHER else None
+
+
+def common_rounding(noise: Noise, light: FloatArray) -> FloatArray:
+    """Return errors of rounding that measurements of like light share: (2, measurements used).
+
+    Rounding with a step q and noise of standard deviation s errs on average by a sine of the light, of frequency k / q
+    and amplitude q / (k pi) exp(-2 (k pi s / q)^2), k = 1, 2, ... (Widrow and Kollar 2008). The light is not known to
+    a fraction of a step, and where the picture is smooth that is one phase for many measurements: the errors are a
+    cosine and a sine of the estimate's light, each times a random number of variance 1. All harmonics together are
+    taken for the first.
+
+    noise : by cause, (measurements used,) each;  light : (measurements used,) that the estimate predicts
+    """
+    rounding = noise["quantisation"]
+    step = np.sqrt(12 * rounding)
+    others = total_variance({name: values for name, values in noise.items() if name != "quantisation"})
+    squares = np.zeros(light.size)
+    for order in np.pi * np.arange(1, HARMONICS + 1):
+        squares += np.exp(-4 * order**2 * others / step**2) / (2 * order**2)
+    phase = 2 * np.pi * light / step
+    return step * np.sqrt(squares) * np.stack([np.cos(phase), np.sin(phase)])
 
 
 def at_used(values: FloatArray, used: BoolArray) -> FloatArray:

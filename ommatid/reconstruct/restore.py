@@ -27,11 +27,11 @@ from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, is_uniform, total_variance
 from .misalignment.robust_noise import CAUSE
-from .noise import Noise, UsablePixels, uniform
+from .noise import Noise, UsablePixels, undithered, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .prior_fit import PriorFit
 from .verdict.residual import WhitenedResidual, residual_parts
-from .verdict.verdict import DITHER, ErrorCheck, evidence_of, judge, without_pixels
+from .verdict.verdict import ErrorCheck, evidence_of, judge, without_pixels
 
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
 BEYOND = 0.1  # share of the error by the next order, likewise
@@ -63,7 +63,8 @@ def verdict_of(
         fit_doubtful=assumed.fit is not None and assumed.fit.doubtful,
         fit_flat=assumed.fit is not None and assumed.fit.flat,
         noise_fitted=assumed.fit is not None and assumed.fit.noise_variance is not None,
-        undithered=_undithered(assumed.noise),
+        undithered=undithered(assumed.noise),
+        rounding_share=_rounding_share(assumed.noise),
         pixels_used=int(used.sum()),
         left_out=without_pixels(stack.camera, used),
     )
@@ -72,14 +73,9 @@ def verdict_of(
     return judge(_parts(stack, model, assumed, result), evidence, check)
 
 
-def _undithered(noise: Noise) -> float | None:
-    """Return the noise over the quantisation step where it is below DITHER, None elsewhere."""
-    rounding = noise.get("quantisation")
-    if rounding is None or not rounding.any():
-        return None
-    noisy = float(np.mean(noise["noise"])) if "noise" in noise else 0.0
-    share = (noisy / (12 * float(np.mean(rounding)))) ** 0.5
-    return share if share < DITHER else None
+def _rounding_share(noise: Noise) -> float:
+    """Return the share of quantisation in the noise."""
+    return float(np.mean(noise["quantisation"]) / np.mean(total_variance(noise))) if "quantisation" in noise else 0.0
 
 
 def _spurious(share: FloatArray, expected: ExpectedError) -> float:

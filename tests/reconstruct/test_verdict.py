@@ -203,18 +203,6 @@ def test_an_error_below_its_interval_is_a_note() -> None:
     assert note.endswith(": the noise is smaller than stated")
 
 
-@pytest.mark.parametrize("picture", ["dark", "flat", "ramp"])
-def test_rounding_that_no_noise_dithers_is_said_and_never_red(picture: str) -> None:
-    """Eight bits and a noise of 0.03 steps: rounding errors of smooth pictures are no noise of step^2 / 12."""
-    place = np.linspace(0, 1, 361)
-    truth = {"dark": 3 + 3 * np.sin(9 * place), "flat": np.full(361, 128.0), "ramp": 40 + 150 * place}[picture]
-    described = scene(lenses=THREE, noise={"variance": 1e-3, "bits": 8})
-    stack = recorded(described, truth, 1e-3, seed=2)
-    found = verdict(replace(stack, values=np.round(stack.values)), truth)
-    assert found.trusted
-    assert any("times the quantisation step" in note for note in found.notes)
-
-
 def test_a_larger_noise_than_stated_is_not_trusted() -> None:
     (reason,) = verdict(stack_of(3.0)).reasons
     assert "times what was expected" in reason

@@ -49,7 +49,7 @@ class SharedErrors:
     residuals: FloatArray
     images: FloatArray
     exact: bool
-    directions: Directions
+    directions: Directions | None = None
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -58,7 +58,7 @@ class SharedErrors:
 
     def variance_of_sum(self, weights: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> float:
         """Return w^T K w of (N,) weights."""
-        if self.exact:
+        if self.exact or self.directions is None:
             return float(np.square(self.images @ weights).sum())
         back = operators.weigh(task.observe(operators.posterior(task.of_unknowns(weights))))
         return float(np.square(self.directions.adjoint(task.on_all_measurements(back, 0.0))).sum())
@@ -103,11 +103,22 @@ def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: Fl
         few = model.unknowns > MANY or float(np.mean(errors.variance[used] / task.expected_noise)) < SMALL
         count = FEW_DRAWS if few else DRAWS
         readings = errors.draws(probe(Purpose.SHARED_ERRORS), count)[:, used] / count**0.5
+    return _passed(readings, task, operators, exact, errors)
+
+
+def _passed(
+    readings: FloatArray,
+    task: EstimationTask,
+    operators: PosteriorOperators,
+    exact: bool,
+    directions: Directions | None = None,
+) -> SharedErrors:
+    """Pass errors of the measurements, (K, measurements used), through the estimator."""
     residuals, images = np.empty_like(readings), np.empty((len(readings), task.shape_of_f[0] * task.shape_of_f[1]))
     for number, reading in enumerate(readings):
         solved = operators.gain(reading)
         residuals[number], images[number] = reading - task.observe(solved), task.of_f(solved)
-    return SharedErrors(residuals, images, exact, errors)
+    return SharedErrors(residuals, images, exact, directions)
 
 
 def bound(task: EstimationTask, image: FloatArray) -> float:
@@ -142,32 +153,63 @@ def with_shared_errors(
     errors = shared_errors(task, operators, image)
     if errors is None:
         return result
-    given, before, power = errors, result.variance_of_sum, result.residual_power
+    given, power = errors, result.residual_power
     if truth is not None and errors.exact:
         given = shared_errors(task, operators, truth) or errors
+    if power is not None:
+        power = _with_residuals(power, errors, given, task, operators)
+    added = _added(result, method, operators, errors, given, truth, actual, "calibration")
+    return replace(added, residual_power=power)
+
+
+def with_common_rounding(
+    result: MethodResult,
+    method: Method,
+    operators: PosteriorOperators,
+    columns: FloatArray,
+    truth: FloatArray | None,
+    actual: FloatArray,
+) -> MethodResult:
+    """Return a result whose Eq. 5, interval and sums of pixels hold errors of rounding that measurements share.
+
+    columns : (K, measurements used), see `noise.common_rounding`;  others as of `with_shared_errors`
+    """
+    errors = _passed(columns, method.task, operators, exact=True)
+    return _added(result, method, operators, errors, errors, truth, actual, "quantisation")
+
+
+def _added(
+    result: MethodResult,
+    method: Method,
+    operators: PosteriorOperators,
+    errors: SharedErrors,
+    given: SharedErrors,
+    truth: FloatArray | None,
+    actual: FloatArray,
+    cause: str,
+) -> MethodResult:
+    """Return a result with errors for its image, and in the interval those `given` the true one."""
+    task, before = method.task, result.variance_of_sum
 
     def variance_of_sum(weights: FloatArray) -> float:
         return before(weights) + errors.variance_of_sum(weights, task, operators)
 
-    if power is not None:
-        power = _with_residuals(power, errors, given, task, operators)
     return replace(
         result,
-        expected=_with_variance(result.expected, errors, task.shape_of_f),
+        expected=_with_variance(result.expected, errors, task.shape_of_f, cause),
         interval=None
         if result.interval is None or truth is None
         else _wider(result.interval, given, truth, actual, method, operators),
         variance_of_sum=variance_of_sum,
-        residual_power=power,
     )
 
 
-def _with_variance(expected: ExpectedError, errors: SharedErrors, size: tuple[int, int]) -> ExpectedError:
+def _with_variance(expected: ExpectedError, errors: SharedErrors, size: tuple[int, int], cause: str) -> ExpectedError:
     variance, mean = errors.variance, float(errors.variance.mean())
     if not errors.exact:
         smooth = ndimage.uniform_filter(variance.reshape(size), NEIGHBOURHOOD, mode="nearest").ravel()
         variance = smooth * (mean / (float(smooth.mean()) or 1.0))
-    parts = expected.parts | {"calibration": expected.parts.get("calibration", 0.0) + mean}
+    parts = expected.parts | {cause: expected.parts.get(cause, 0.0) + mean}
     return replace(expected, variance=expected.variance + variance, parts=parts)
 
 

@@ -21,6 +21,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
 from ..expected_error import COVERAGE, Interval
+from ..noise import DITHER
 from ..output.run_json import ResidualPart, VerdictReport
 from .residual import sidak
 
@@ -30,7 +31,6 @@ FEW = 0.2  # share of the sub-imagers that are few
 MOST_NAMED = 5  # sub-imagers in one sentence
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
-DITHER = 0.4  # noise over the quantisation step from which rounding errors are independent of the signal
 ROUGH = 0.05  # relative error of a map of variances from which it is a doubt
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
 UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
@@ -181,6 +181,7 @@ class ErrorCheck:
     spurious_share : of a pixel's information, on average
     calibration_share : of the predicted error that the uncertainty of H causes
     undithered : noise over the quantisation step, None where it is large enough to make rounding errors independent
+    rounding_share : of the noise
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
     """
 
@@ -194,6 +195,7 @@ class ErrorCheck:
     fit_flat: bool
     noise_fitted: bool
     undithered: float | None
+    rounding_share: float
     pixels_used: int
     left_out: tuple[str, ...]
 
@@ -240,16 +242,21 @@ def with_gain(verdict: VerdictReport, gain: float | None, prior: str) -> Verdict
     return verdict.model_copy(update={"doubts": (*verdict.doubts, words)})
 
 
-def excesses(parts: list[ResidualPart]) -> list[ResidualPart]:
-    """Return the parts whose residual is significantly and by more than a tenth larger than expected."""
-    return [part for part in parts if sidak([part.p_value] * len(parts)) < SIGNIFICANCE and part.ratio > 1 + SIZE]
+def excesses(parts: list[ResidualPart], largest: float = 1.0) -> list[ResidualPart]:
+    """Return the parts whose residual is significantly and by more than a tenth larger than expected.
+
+    largest : ratio to the expectation that is possible without a fault
+    """
+    most = (1 + SIZE) * largest
+    return [part for part in parts if sidak([part.p_value] * len(parts)) < SIGNIFICANCE and part.ratio > most]
 
 
 def _judge_residual(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck, findings: _Findings) -> None:
     if not parts:
         findings.notes.append("chi-squared was not checked: some measurements are expected to have no noise")
         return
-    whole, beyond = parts[0], excesses(parts)
+    # Readings that are rounded without dither scatter by step^2 / 4 in place of step^2 / 12 where all are at one edge.
+    whole, beyond = parts[0], excesses(parts, 1.0 if check.undithered is None else 1 + 2 * check.rounding_share)
     if check.noise_fitted:
         findings.notes.append("the noise was fitted to this stack, so chi-squared was checked by part only")
     if beyond:

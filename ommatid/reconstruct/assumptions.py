@@ -143,11 +143,16 @@ def method_for(stack: Stack, model: Model) -> Method:
     return with_fallback(stack, model, estimated)
 
 
-def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Result]) -> Result:
+def with_fallback(
+    stack: Stack,
+    model: Model,
+    work: Callable[[MethodChoice], Result],
+    is_rough: Callable[[Result], bool] = lambda _: False,
+) -> Result:
     """Return work(choice) for the chosen method, or for another where a frame chosen by "auto" does not converge.
 
-    That is one dense problem of few pixels, tiles of many. Few pixels behind a sensor with dead or saturated ones are
-    a dense problem at once: there the map of a frame's error bars is rough.
+    That is one dense problem of few pixels, tiles of many. Few pixels are a dense problem, too, where the map of a
+    frame's error bars `is_rough`, and at once behind a sensor with dead or saturated pixels.
     """
     check_noise_fit(stack)
     choice = choose_method(stack.scene, stack.camera, _needs_no_matrix(stack, model))
@@ -156,7 +161,10 @@ def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Res
     if choice.method == "frame" and replaceable and few and not usable_pixels(stack, model).used.all():
         choice = replace(choice, method="dense", why="some sensor pixels are dead or saturated")
     try:
-        return work(choice)
+        done = work(choice)
+        if not (choice.method == "frame" and replaceable and few and is_rough(done)):
+            return done
+        return work(replace(choice, method="dense", why="the map of the frame's error bars is rough"))
     except NotReachedError as error:
         if not replaceable:
             raise

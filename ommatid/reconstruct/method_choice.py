@@ -98,24 +98,25 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
         return ["frame"], "kernels of the lens types apply H"
     if estimator.method in ("tiles", "frame"):
         return [estimator.method], "asked for"
+    correlated = scene.prior.kind != "independent"
     if not camera.has_sharp_footprints and camera.unknowns > MOST_DENSE:
         reason = f"{camera.unknowns} pixels behind blurred lenses, whose footprints are wider than tiles"
-        return ["frame" if camera.is_sliding and not noiseless else "dense"], reason
-    independent = scene.prior.kind == "independent"
-    as_designed = camera.is_sliding and camera.tolerance is None
-    if not independent and as_designed and not noiseless and camera.unknowns > MOST_CORRELATED:
-        return ["frame", "dense"], f"{camera.unknowns} correlated pixels, and every lens type sees the same everywhere"
+        if noiseless:
+            return ["dense"], reason
+        return ["frame"] if camera.is_sliding or correlated else ["dense", "frame"], reason
+    if correlated and not noiseless and camera.unknowns > MOST_CORRELATED:
+        return ["frame", "dense" if camera.unknowns <= MOST_DENSE else "tiles"], f"{camera.unknowns} correlated pixels"
     if camera.unknowns <= MOST_DENSE:
         return ["dense", "tiles"], f"{camera.unknowns} pixels are few"
     if noiseless:
         return ["tiles"], "measurements without noise need a dense solution"
     if estimator.accuracy >= TILE_ACCURACY:
         return ["tiles"], f"tiles reach an accuracy of {estimator.accuracy:g} posterior standard deviations"
-    if camera.is_sliding and independent and leaves_null_space(camera) and not serves(camera, independent):
+    if camera.is_sliding and leaves_null_space(camera) and not serves(camera):
         return ["tiles"], "the lens types leave a null space, and the pixels are too many for a frame's error bars"
     if camera.is_sliding:
         return ["frame", "tiles"], f"{camera.unknowns} pixels, and every lens type sees the same everywhere"
-    if serves(camera, independent):
+    if serves(camera):
         return ["frame", "tiles"], f"{camera.unknowns} pixels, whose lens types do not see the same everywhere"
     return ["tiles"], "the lens types do not see the same everywhere: not all are m x m one pixel apart"
 
@@ -155,10 +156,9 @@ def allowed_memory(limit: int | None) -> int:
 
 def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
     """Return an upper estimate of the bytes that a method needs."""
-    widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
+    widest, correlated = max(ceil(lens_type.ratio) for lens_type in camera.types), scene.prior.kind != "independent"
     entries = 0 if exact else 12 * 10 * camera.measurements * widest**2
     if method in ("dense", "detail"):
-        correlated = scene.prior.kind != "independent"
         needed = needed_memory(camera.measurements, camera.unknowns, correlated=correlated) + entries
         return needed + (detail_memory(camera) if method == "detail" else 0)
     images = 8 * (5 * camera.measurements + 16 * camera.unknowns)
@@ -169,7 +169,7 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
         return PROGRAM_MEMORY + images + entries + 8 * WORLD_IMAGES * camera.world.unknowns
     longest = max(camera.shape)
     strips = 8 * 4 * longest * (5 * widest) * (5 * widest * (widest - 1) + widest)
-    if serves(camera, scene.prior.kind == "independent"):
+    if not correlated and serves(camera):
         band = 8 * camera.unknowns * band_width(camera)
         return PROGRAM_MEMORY + images + entries + 5 * band  # the factor, a copy, and two matrices per block of lines
     if exact:
@@ -182,12 +182,14 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
 
 def _seconds(method: str, scene: Scene, camera: Camera, exact: bool) -> float:
     """Return the time that a method takes on two cores, measured to within a factor of two or so."""
-    count = camera.unknowns
+    count, correlated = camera.unknowns, scene.prior.kind != "independent"
     if method in ("dense", "detail"):
-        return max(0.1, 7e-11 * count**3 * (10 if scene.prior.kind != "independent" else 1))
+        return max(0.1, 7e-11 * count**3 * (10 if correlated else 1))
     per_pixel = 0.15 * (scene.tiles.size / 35) ** 6 / (scene.tiles.size - 2 * scene.tiles.overlap) ** 2
     if method == "tiles":
         return 1.0 + count * (per_pixel if not exact else 2e-6)
-    if serves(camera, scene.prior.kind == "independent"):
+    if not correlated and serves(camera):
         return 1.5 + 1.5e-9 * band_work(camera)
+    if correlated and not camera.is_sliding:
+        return 1.5 + 2.2e-4 * count
     return 1.5 + count * (1.2e-5 if exact else 1.5e-4 + per_pixel / 2)

@@ -119,11 +119,16 @@ def prior_of(table: estimation.PriorTable, shape: tuple[int, int], pitch: float,
 
 
 def spectrum_of(
-    table: estimation.PriorTable, shape: tuple[int, int], pitch: float, detail: int = 1
+    table: estimation.PriorTable,
+    shape: tuple[int, int],
+    pitch: float,
+    detail: int = 1,
+    whole: tuple[int, int] | None = None,
 ) -> float | FloatArray:
     """Return the variance of independent pixels, else s, the eigenvalues of P0 under the DCT-II: (rows, columns).
 
-    Arguments as of `prior_of`. Raises InputError for kind "fit", which needs a stack.
+    Arguments as of `prior_of`;  whole : of the image that has the table's variance, if `shape` is a part of it
+    Raises InputError for kind "fit", which needs a stack.
     """
     if table.kind == "independent":
         return table.variance
@@ -134,7 +139,10 @@ def spectrum_of(
     if table.kind == "exponential" and table.correlation_length is not None:
         spectrum = exponential_spectrum(fine, table.correlation_length * detail / pitch)
     elif table.kind == "power":
-        spectrum = _power_spectrum(fine, DEFAULT_EXPONENT if table.exponent is None else table.exponent)
+        exponent = DEFAULT_EXPONENT if table.exponent is None else table.exponent
+        rows, columns = shape if whole is None else whole
+        every = _power_spectrum((rows * detail, columns * detail), exponent)
+        spectrum = _power_spectrum(fine, exponent) / every.mean()
     else:
         raise InputError(NEEDS_FIT)
     return table.variance * averaged_spectrum(spectrum, detail)
@@ -177,12 +185,11 @@ def _along_columns(lags: FloatArray) -> FloatArray:
 
 
 def _power_spectrum(shape: tuple[int, int], exponent: float) -> FloatArray:
-    """Return s, (rows, columns), of variance 1."""
+    """Return s, (rows, columns), of the density 1/frequency^a in every image."""
     vertical, horizontal = (np.arange(size) / size for size in shape)
     frequency = np.hypot(vertical[:, None], horizontal[None, :])
     frequency[0, 0] = 1 / max(shape)
-    spectrum = (frequency * max(shape)) ** -exponent
-    return spectrum / spectrum.mean()
+    return frequency**-exponent
 
 
 def natural_spectrum(shape: tuple[int, int], pitch: float, term: SpectralTerm) -> FloatArray:

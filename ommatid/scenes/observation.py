@@ -126,8 +126,7 @@ class ObservationPart(ABC):
         """Return H from a window of f to some measurements; what they see beside it is left out."""
         inside = self.measurements_inside(rows, columns)
         if not np.isin(numbers, inside).all():
-            pixels = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)[rows, columns].ravel()
-            return sparse.csr_array(self.to_sparse()[numbers][:, pixels])
+            return on_window(self.to_sparse()[numbers], self.shape[1], rows, columns)
         order = np.argsort(inside)
         return self.submatrix(rows, columns)[order[np.searchsorted(inside, numbers, sorter=order)]]
 
@@ -217,6 +216,10 @@ class Entries(ObservationPart):
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to the measurements inside it."""
         return on_window(self.matrix[self.measurements_inside(rows, columns)], self.grid[1], rows, columns)
+
+    def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
+        """Return H from a window of f to some measurements; what they see beside it is left out."""
+        return on_window(self.matrix[numbers], self.grid[1], rows, columns)
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key of the window alone: entries are never the same elsewhere."""
@@ -341,14 +344,16 @@ def on_lines(rows: sparse.csr_array, columns: sparse.csr_array, image: FloatArra
 
 
 def on_window(matrix: sparse.csr_array, width: int, rows: slice, columns: slice) -> sparse.csr_array:
-    """Return rows of H that see nothing outside a window, (m, N), on the window: (m, pixels of the window).
+    """Return rows of H, (m, N), on a window without what they see beside it: (m, pixels of the window).
 
     width : columns of f
     """
     row, column = np.divmod(matrix.indices, width)
+    inside = (row >= rows.start) & (row < rows.stop) & (column >= columns.start) & (column < columns.stop)
     shape = rows.stop - rows.start, columns.stop - columns.start
-    indices = (row - rows.start) * shape[1] + column - columns.start
-    return sparse.csr_array((matrix.data, indices, matrix.indptr), shape=(matrix.shape[0], shape[0] * shape[1]))
+    indices = ((row - rows.start) * shape[1] + column - columns.start)[inside]
+    pointers = np.concatenate([[0], np.cumsum(inside)])[matrix.indptr]
+    return sparse.csr_array((matrix.data[inside], indices, pointers), shape=(matrix.shape[0], shape[0] * shape[1]))
 
 
 def cosines(size: int, lags: int) -> FloatArray:

@@ -205,17 +205,15 @@ def parse(data: dict[str, Any], source: Path, world_copy: Path | None = None) ->
 
 
 def _with_prior_kind(scene: Scene) -> Scene:
-    """Return the scene with a prior that is fitted, where it names no kind and a frame with noise is estimated at once.
+    """Return the scene with a fitted prior, where it names no kind and an image is estimated at once from noisy data.
 
-    Elsewhere pixels are independent: in the paper's tiles, with other lens types, where correlated pixels take ten
-    times as long, in front of a world finer than f, of misaligned cameras, and where a variance is stated.
+    Elsewhere pixels are independent: in the paper's tiles, where a misalignment is estimated, and where a variance is
+    stated.
     """
     prior, estimator = scene.prior, scene.estimator
     stated = prior.model_fields_set & {"kind", "variance", "correlation_length", "exponent"}
     plain = estimator.method != "tiles" and estimator.misalignment == "trust" and estimator.prior_variance is None
-    if stated or not scene.has_noise or not plain or estimator.noise_variance == 0 or scene.target.detail > 1:
-        return scene
-    if scene.camera.tolerance is not None or not all(lens.is_sliding for lens in scene.camera.lens):
+    if stated or not scene.has_noise or not plain or estimator.noise_variance == 0:
         return scene
     return scene.model_copy(update={"prior": prior.model_copy(update={"kind": "fit"})})
 

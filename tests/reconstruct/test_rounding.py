@@ -17,7 +17,6 @@ from ommatid.simulate.ideal import ideal_model
 from ..frames import FITTED, recorded, wide
 
 VARIANCE, SEEDS = 1e-3, 24  # 0.03 steps of eight bits
-PRIOR = {"kind": "exponential", "correlation_length": "5 mm", "variance": 900.0}
 SIGNIFICANCE = 1e-3
 
 
@@ -44,7 +43,7 @@ def rounded(kind: str, shape: tuple[int, int], seed: int) -> tuple[Reconstructio
         truth += 6 * ndimage.gaussian_filter(rng.normal(size=shape), 3)
     if kind == "ramp":
         truth = 40 + 150 * np.linspace(0, 1, shape[0] * shape[1]).reshape(shape)
-    described = wide(shape, FITTED, noise={"variance": VARIANCE, "bits": 8}, prior=PRIOR)
+    described = wide(shape, FITTED, noise={"variance": VARIANCE, "bits": 8}, prior={"kind": "fit"})
     stack = recorded(described, truth.ravel(), VARIANCE, seed)
     stack = replace(stack, values=np.round(stack.values))
     return restore(stack, ideal_model(described, derive(described)), truth.ravel()), truth
@@ -53,7 +52,7 @@ def rounded(kind: str, shape: tuple[int, int], seed: int) -> tuple[Reconstructio
 @pytest.mark.parametrize(
     ("kind", "shape", "seeds"),
     [
-        ("flat", (13, 13), SEEDS),
+        ("flat", (13, 13), 8),
         pytest.param("smooth", (19, 19), SEEDS, marks=pytest.mark.slow),
         pytest.param("ramp", (19, 19), SEEDS, marks=pytest.mark.slow),
         pytest.param("flat", (47, 45), SEEDS, marks=pytest.mark.slow),

@@ -334,11 +334,11 @@ def banded_cholesky(precision: sparse.csr_array, order: Indices) -> FloatArray:
     return np.asarray(linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
 
 
-def serves(camera: Camera, independent: bool) -> bool:
-    """Return True where K of a frame is factorised: a null space or another array, few pixels, independent in P0."""
+def serves(camera: Camera) -> bool:
+    """Return True where K of a frame of independent pixels is factorised: a null space or another array, few pixels."""
     if not camera.has_sharp_footprints:  # a blurred footprint may be as wide as the frame
         return False
-    return independent and band_work(camera) <= MOST_WORK and not (camera.is_sliding and not leaves_null_space(camera))
+    return band_work(camera) <= MOST_WORK and not (camera.is_sliding and not leaves_null_space(camera))
 
 
 def band_work(camera: Camera) -> float:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import ceil
 
 import numpy as np
@@ -51,7 +51,7 @@ from .window_variances import (
     stored_stencil,
     whole_variances,
 )
-from .world_map import by_levels, levels, mean_ratios, world_map
+from .world_map import by_levels, is_invariant, levels, mean_ratios, world_map
 
 Pixels = NDArray[np.intp]
 
@@ -69,6 +69,7 @@ EXACT = 1e-3  # relative accuracy of a solution
 EVEN = 1e-3  # relative range of noise variances that count as equal
 HALO = 4  # boxes of the widest type around a window, beyond which pixels do not affect a variance
 SHORT_HALO = 3  # the same for many pixels: 3e-3 of a variance at worst where the noise varies tenfold
+WIDE_HALO = 16  # pixels of f, of windows of correlated pixels
 LONG_HALO = 6  # where that is not enough: 2e-2 at worst where the noise varies a thousandfold
 WORST, MEAN = 1e-2, 1e-3  # errors of a map at random pixels and of their mean, above which the halo is longer
 
@@ -156,15 +157,24 @@ def world_error_map(
     """
     if system.bands is None:
         raise TypeError("expected the system of a world finer than f")
-    variances, prior, is_exact = world_map(task, system.observation, system.weights, system.bands, actual)
+    make = partial(world_map, task, system.observation, system.weights, system.bands, actual)
+    variances, prior, is_exact = make()
     if is_exact:
         return variances, MapCheck(0.0, 0.0), prior
     noise = None
     if not np.allclose(actual, task.expected_noise, rtol=1e-12):
         noise = system.weights**2 * task.on_all_measurements(actual, 0.0)
     exact = ExactVariances(system, noise, task.settings.accuracy, task)
-    variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
-    return variances, check_map(variance, variances.posterior.ravel(), task.shape_of_f, exact, local=False), prior
+
+    def checked(maps: VarianceMap) -> MapCheck:
+        variance = np.maximum(maps.missing + maps.noisy, 0.0).ravel()
+        return check_map(variance, maps.posterior.ravel(), task.shape_of_f, exact, local=False)
+
+    check = checked(variances)
+    if check.worst > 2 * WORST and not is_invariant(task):
+        variances, prior, _ = make(WIDE_HALO)
+        check = checked(variances)
+    return variances, check, prior
 
 
 def spread_pixels(shape: tuple[int, int], rng: np.random.Generator, *, edges: bool, first: int = 0) -> Pixels:

@@ -44,7 +44,7 @@ from .conjugate_gradients import (
     serves,
 )
 from .error_map import MANY, ErrorMap, MapCheck, world_error_map
-from .world_map import world_of
+from .world_map import is_invariant, world_of
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 INVARIANT = "every lens type is shift-invariant except at the edges"
@@ -73,14 +73,8 @@ class FrameMethod(Method):
     def __init__(self, task: EstimationTask, execution: Execution) -> None:
         """Raises InputError if the camera is not shift-invariant and too large, or a measurement has no noise."""
         super().__init__(task, execution)
-        self._banded = task.finer == 1 and serves(task.model.camera, task.prior.kind == "independent")
-        for lens_type in task.model.camera.types:
-            if not (task.finer > 1 or self._banded or lens_type.is_sliding):
-                raise InputError(
-                    f"estimator.method 'frame': lens type '{lens_type.name}' is no array of m x m sub-imagers with"
-                    " step 1 and magnification 1/m, and the frame is too large for another solver, or its prior"
-                    " correlated; set estimator.method = 'tiles'"
-                )
+        self._banded = task.finer == 1 and task.prior.kind == "independent" and serves(task.model.camera)
+        self._by_waves = task.finer > 1 or not (self._banded or is_invariant(task))
         if not (task.expected_noise > 0).all():
             raise InputError(
                 "estimator.method 'frame' needs noise in every measurement; set estimator.noise_variance above 0"
@@ -99,8 +93,9 @@ class FrameMethod(Method):
             banded = BandedSystem(observation, weights, prior, task.model.matrix)
             return self.shared("system", self.conditions(), lambda: banded)[0]
         bands = None
-        if task.finer > 1:
-            bands = bands_of(task.model.camera, task.finer, 1 / np.asarray(prior), weights, observation)
+        if self._by_waves:
+            spectrum = np.broadcast_to(1 / np.asarray(prior), task.shape)
+            bands = bands_of(task.model.camera, task.finer, spectrum, weights, observation)
         system = FrameSystem(observation, weights, prior, alike=task.model.alike, bands=bands)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
@@ -169,7 +164,7 @@ class FrameMethod(Method):
     def _frame_error(self, noise: dict[str, FloatArray], actual: FloatArray) -> FrameError:
         """Return the expected error, which depends on the noise and not on what is recorded."""
         task, system = self.task, self.system
-        if task.finer > 1:
+        if self._by_waves:
             variances, check, prior = world_error_map(task, system, actual)
         else:
             errors, check = ErrorMap.of(task, system, actual)

@@ -291,28 +291,42 @@ class SmallFrames:
 
 def small_map(system: SlidingCamera, scale: float, ratios: tuple[float, ...]) -> FloatArray:
     """Return the diagonals of C, C P0^-1 C and C S C of a small frame for weights times `scale`: (3, rows, columns)."""
-    shape, count = system.shape, system.shape[0] * system.shape[1]
-    total = np.zeros((count, count))
-    for each, weight in zip(system.types, system.weights, strict=True):
-        total += scale * weight * each.information
-    if isinstance(system.prior, np.ndarray):
-        waves = np.kron(*(np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape))
-        total += waves.T @ (system.prior.ravel()[:, None] * waves)
-    else:
-        total[np.diag_indices(count)] += system.prior
-    factor, _ = factorise_positive(total)
-    covariance = factor.inverse()
-    if isinstance(system.prior, np.ndarray):
-        spread = np.asarray(fft.dctn(covariance.reshape(*shape, count), 2, axes=(0, 1), norm="ortho"))
-        missing = np.einsum("rc,rcn->n", system.prior, np.square(spread))
-    else:
-        missing = system.prior * np.square(covariance).sum(axis=0)
-    posterior, first = np.diagonal(covariance), ratios[0]
-    noisy = first * (posterior - missing)
-    for each, weight, ratio in zip(system.types, system.weights, ratios, strict=True):
+    parts = [scale * weight * each.information for each, weight in zip(system.types, system.weights, strict=True)]
+    first, excess = ratios[0], None
+    for part, ratio in zip(parts, ratios, strict=True):
         if not np.isclose(ratio, first, rtol=1e-12):
-            share = np.einsum("ij,ij->j", covariance, each.information @ covariance)
-            noisy += (ratio - first) * scale * weight * share
+            excess = (ratio - first) * part + (0.0 if excess is None else excess)
+    precision = np.sum(parts, axis=0) + prior_precision(system.prior, system.shape)
+    return precision_map(precision, system.prior, system.shape, first, excess)
+
+
+def prior_precision(prior: float | FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return P0^-1 of a small frame as a matrix, (N, N), from 1 / P0 or 1 / its spectrum under the DCT-II."""
+    if not isinstance(prior, np.ndarray):
+        return prior * np.eye(shape[0] * shape[1])
+    waves = np.kron(*(np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape))
+    return np.asarray(waves.T @ (prior.ravel()[:, None] * waves), dtype=np.float64)
+
+
+def precision_map(
+    precision: FloatArray, prior: float | FloatArray, shape: tuple[int, int], ratio: float, excess: FloatArray | None
+) -> FloatArray:
+    """Return the diagonals of C = K^-1, C P0^-1 C and C S C of a small frame: (3, rows, columns).
+
+    precision : (N, N) K;  prior : 1 / P0 or 1 / its spectrum
+    ratio, excess : S is `ratio` times H^T Rv^-1 H plus `excess`, (N, N), which None leaves out
+    """
+    factor, _ = factorise_positive(precision)
+    covariance = factor.inverse()
+    if isinstance(prior, np.ndarray):
+        spread = np.asarray(fft.dctn(covariance.reshape(*shape, -1), 2, axes=(0, 1), norm="ortho"))
+        missing = np.einsum("rc,rcn->n", prior, np.square(spread))
+    else:
+        missing = prior * np.square(covariance).sum(axis=0)
+    posterior = np.diagonal(covariance)
+    noisy = ratio * (posterior - missing)
+    if excess is not None:
+        noisy += np.einsum("ij,ij->j", covariance, excess @ covariance)
     return np.array([posterior, missing, noisy], dtype=np.float64).reshape(3, *shape)
 
 

@@ -231,7 +231,7 @@ class EstimationTask:
 
     def precision_on(self, shape: tuple[int, int]) -> float | FloatArray:
         """Return 1 / P0 of independent pixels, or 1 / its spectrum under the DCT-II: (rows, columns)."""
-        return 1 / spectrum_of(self.prior, shape, *self._scale)
+        return 1 / spectrum_of(self.prior, shape, *self._scale, self.shape)
 
     def prior_variance_of_sum(self, weights: FloatArray) -> float:
         """Return w^T P0 w, the prior variance of a weighted sum of pixels; weights : (N,)."""

@@ -244,7 +244,7 @@ def undithered(noise: Noise) -> float | None:
         return None
     noisy = float(np.mean(noise["noise"])) if "noise" in noise else 0.0
     share = (noisy / (12 * float(np.mean(rounding)))) ** 0.5
-    return share if share < DITHER else None
+    return share if round(share, 9) < DITHER else None
 
 
 def common_rounding(noise: Noise, light: FloatArray) -> FloatArray:
